@@ -1,0 +1,35 @@
+# Every target builds .venv first if it is missing or older than what it is built from.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+export OPENBLAS_NUM_THREADS := 1
+STAMP := .venv/.installed
+BIN := .venv/bin
+
+.PHONY: demo test check bench format clean
+demo: $(STAMP)
+	$(BIN)/flcav demo --out out/demo
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -n 2
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+bench: $(STAMP)
+	for b in benchmarks/bench_*.py; do $(BIN)/python $$b || exit 1; done
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "flcav needs Python 3.11 or newer: make PYTHON=python3.x"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	touch $(STAMP)
+
+clean:
+	rm -rf .venv out

@@ -1,0 +1,52 @@
+"""The `flcav` command. Exit 0 done; 2 invalid input, one sentence on stderr; 1 anything else."""
+
+import sys
+
+import click
+import typer
+
+from flcav import __version__
+from flcav.config import InputError
+
+app = typer.Typer(
+    name="flcav",
+    help="Design and verify federated learning for connected autonomous vehicle perception.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"flcav {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
+    pass
+
+
+def run(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit with its code: the only place where exceptions become exit codes."""
+    try:
+        code = app(args=arguments, standalone_mode=False)
+    except click.exceptions.Abort:
+        code = 130
+    except KeyboardInterrupt:
+        print("flcav: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        code = 130
+    except click.ClickException as error:
+        error.show()
+        code = 2
+    except InputError as error:
+        print(f"flcav: {error}", file=sys.stderr)
+        code = 2
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"flcav: {where}{error.strerror or error}", file=sys.stderr)
+        code = 1
+    sys.exit(code if isinstance(code, int) else 0)

@@ -1,0 +1,55 @@
+"""User-facing configuration: YAML in, a frozen and checked record out, one sentence where it is wrong."""
+
+from pathlib import Path
+from typing import TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+
+class InputError(ValueError):
+    """What the user gave cannot be used. The message is one sentence for them; the command line exits with 2."""
+
+
+class Config(BaseModel):
+    """Base of every user-facing configuration: frozen, and no unknown field passes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+ConfigT = TypeVar("ConfigT", bound=Config)
+
+
+def parse_config(model: type[ConfigT], values: object, origin: str) -> ConfigT:
+    """Return `values` as a checked `model`; raises `InputError` naming `origin`, the field, the value, the rule."""
+    if not isinstance(values, dict):
+        raise InputError(f"{origin}: expected a mapping of fields, found {type(values).__name__}")
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise InputError(f"{origin}: {_sentence(error, model)}") from None
+
+
+def read_config(model: type[ConfigT], path: Path) -> ConfigT:
+    """Return the YAML file at `path` as a checked `model`; raises `InputError`."""
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (IsADirectoryError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: not a YAML file ({reason})") from None
+    return parse_config(model, values, str(path))
+
+
+def _sentence(error: ValidationError, model: type[BaseModel]) -> str:
+    first = error.errors()[0]
+    field = ".".join(str(part) for part in first["loc"]) or "(whole)"
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    if first["type"] == "extra_forbidden":
+        known = ", ".join(sorted(model.model_fields)) if len(first["loc"]) == 1 else "see the documentation"
+        return f"unknown field '{field}'; known fields: {known}{more}"
+    if first["type"] == "missing":
+        return f"field '{field}' is missing{more}"
+    message = first["msg"].removeprefix("Value error, ")
+    return f"field '{field}' = {first['input']!r}: {message}{more}"

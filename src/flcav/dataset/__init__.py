@@ -1,0 +1,1 @@
+"""Recorded frames on disk: write, read, check."""

@@ -1,0 +1,1 @@
+"""The three training stages over a vehicle-edge-cloud network."""

@@ -1,0 +1,1 @@
+"""How an aggregator combines updates."""

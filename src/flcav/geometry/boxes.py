@@ -1,0 +1,111 @@
+"""The only box record of the project, and what can be asked of boxes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flcav.geometry.poses import Array, transform_points, wrap_angle, yaw_of
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """N upright 3D boxes in one frame (which one is said by whoever hands them over)."""
+
+    center: Array  # (N, 3) geometric centre x, y, z [m]
+    size: Array  # (N, 3) length along x, width along y, height along z of the box's own frame [m]
+    yaw: Array  # (N,) heading, counter-clockwise from the frame's x axis [rad]
+    label: NDArray[np.str_]  # (N,) class name
+    score: Array | None = None  # (N,) confidence in [0, 1]
+    variance: Array | None = None  # (N, 7) of x, y, z [m^2], length, width, height [m^2], yaw [rad^2]
+
+    def __post_init__(self) -> None:
+        n = len(self.center)
+        shapes = {
+            "center": (n, 3),
+            "size": (n, 3),
+            "yaw": (n,),
+            "label": (n,),
+            "score": (n,),
+            "variance": (n, 7),
+        }
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"Boxes.{name} has shape {value.shape}, expected {shape}")
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+    def __getitem__(self, index: ArrayLike | slice) -> "Boxes":
+        """Return the boxes that an index array, a boolean mask or a slice selects."""
+        if not isinstance(index, slice):
+            index = np.asarray(index)
+            index = index if index.dtype == bool else index.astype(np.int64)
+        score = None if self.score is None else self.score[index]
+        variance = None if self.variance is None else self.variance[index]
+        return Boxes(self.center[index], self.size[index], self.yaw[index], self.label[index], score, variance)
+
+    @classmethod
+    def empty(cls) -> "Boxes":
+        """Return no boxes."""
+        return cls.from_array(np.zeros((0, 7)), np.zeros(0, dtype=str))
+
+    @classmethod
+    def from_array(cls, array: ArrayLike, label: ArrayLike, score: ArrayLike | None = None) -> "Boxes":
+        """Return boxes from (N, 7) rows x, y, z, length, width, height, yaw and (N,) labels (or one for all)."""
+        rows = np.asarray(array, dtype=np.float64).reshape(-1, 7)
+        labels = np.broadcast_to(np.asarray(label, dtype=np.str_), len(rows))
+        scores = None if score is None else np.asarray(score, dtype=np.float64)
+        return cls(rows[:, :3], rows[:, 3:6], rows[:, 6], labels, scores)
+
+    def array(self) -> Array:
+        """Return (N, 7) rows x, y, z, length, width, height, yaw."""
+        return np.concatenate((self.center, self.size, self.yaw[:, None]), axis=1)
+
+    def transformed(self, target_from_source: Array) -> "Boxes":
+        """Return the boxes in another frame; the transform's roll and pitch move centres but do not tilt boxes."""
+        center = transform_points(target_from_source, self.center)
+        yaw = wrap_angle(self.yaw + yaw_of(target_from_source))
+        return replace(self, center=center, yaw=yaw)
+
+    def corners(self) -> Array:
+        """Return (N, 8, 3) corners: the bottom four counter-clockwise from front left, then the top four."""
+        signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+        unit = np.concatenate((np.c_[signs, np.full(4, -0.5)], np.c_[signs, np.full(4, 0.5)]))
+        local = unit[None] * self.size[:, None]
+        cos, sin = np.cos(self.yaw)[:, None], np.sin(self.yaw)[:, None]
+        x = local[..., 0] * cos - local[..., 1] * sin
+        y = local[..., 0] * sin + local[..., 1] * cos
+        return np.stack((x, y, local[..., 2]), axis=-1) + self.center[:, None]
+
+
+def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> NDArray[np.bool_]:
+    """Return (N, P): whether point p (P, >=3) of the boxes' frame lies in box n grown by `margin_m` on every side."""
+    xyz = np.asarray(points)[:, :3].astype(np.float64)
+    inside = np.zeros((len(boxes), len(xyz)), dtype=bool)
+    for i in range(len(boxes)):
+        delta = xyz - boxes.center[i]
+        half = boxes.size[i] / 2 + margin_m
+        near = np.flatnonzero(np.abs(delta[:, :2]).max(axis=1) <= np.hypot(half[0], half[1]))
+        cos, sin = np.cos(boxes.yaw[i]), np.sin(boxes.yaw[i])
+        dx, dy, dz = delta[near].T
+        local = np.stack((dx * cos + dy * sin, dy * cos - dx * sin, dz), axis=1)
+        inside[i, near] = (np.abs(local) <= half).all(axis=1)
+    return inside
+
+
+def concatenate(parts: Sequence[Boxes]) -> Boxes:
+    """Return all boxes of `parts` in order; scores and variances survive where every part has them."""
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return Boxes.empty()
+
+    def joined(name: str) -> NDArray | None:
+        values = [getattr(part, name) for part in parts]
+        return None if any(value is None for value in values) else np.concatenate(values)
+
+    rows = np.concatenate([part.array() for part in parts])
+    labels = np.concatenate([part.label for part in parts])
+    return Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], labels, joined("score"), joined("variance"))

@@ -1,0 +1,1 @@
+"""What moves over which link, and what it costs."""

@@ -1,0 +1,44 @@
+"""What a plan moves, and the one arithmetic of what that costs."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MessageSizes:
+    """Sizes of what crosses a link [MB; 1 MB = 10^6 bytes]."""
+
+    sample_mb: float  # one labelled sample
+    model_mb: float  # one model update
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """How much of each training stage one task takes."""
+
+    samples: int  # stage I: labelled samples uploaded vehicle -> edge -> cloud
+    edge_rounds: int  # stage II rounds, in every region
+    cloud_rounds: int  # stage III rounds
+    edge_groups: tuple[int, ...]  # vehicles per edge server
+    edge_rounds_per_cloud_round: int = 1  # k
+
+
+@dataclass(frozen=True)
+class Price:
+    """Uplink megabytes per link."""
+
+    wireless_mb: float
+    wireline_mb: float
+
+
+def price(plan: StagePlan, sizes: MessageSizes) -> Price:
+    """Return what `plan` costs on each uplink [MB].
+
+    wireless = samples * sample + (edge_rounds + k * cloud_rounds) * vehicles * model;
+    wireline = samples * sample + cloud_rounds * edge_servers * model.
+    """
+    wireless_rounds = plan.edge_rounds + plan.edge_rounds_per_cloud_round * plan.cloud_rounds
+    uploaded = plan.samples * sizes.sample_mb
+    return Price(
+        wireless_mb=uploaded + wireless_rounds * sum(plan.edge_groups) * sizes.model_mb,
+        wireline_mb=uploaded + plan.cloud_rounds * len(plan.edge_groups) * sizes.model_mb,
+    )

@@ -1,0 +1,1 @@
+"""What to move and where to look: learning curves, allocation, placement."""

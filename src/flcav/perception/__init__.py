@@ -1,0 +1,1 @@
+"""Tasks, their networks, metrics and errors."""

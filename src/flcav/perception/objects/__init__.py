@@ -1,0 +1,1 @@
+"""3D object detection from LiDAR (SECOND)."""

@@ -1,0 +1,1 @@
+"""Network operations in plain PyTorch."""

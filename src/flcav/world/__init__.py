@@ -1,0 +1,1 @@
+"""Towns, their traffic, and the rays that see them."""

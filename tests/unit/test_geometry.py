@@ -1,0 +1,41 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flcav.geometry import Boxes, inverse, points_in_boxes, pose, transform_points, wrap_angle
+
+coordinate = st.floats(-100, 100)
+angle = st.floats(-10, 10)
+
+
+@given(coordinate, coordinate, coordinate, angle, angle, angle)
+def test_a_pose_times_its_inverse_is_the_identity(x, y, z, yaw, pitch, roll):
+    world_from_body = pose(x, y, z, yaw, pitch, roll)
+    np.testing.assert_allclose(world_from_body @ inverse(world_from_body), np.eye(4), atol=1e-9)
+
+
+def test_yaw_turns_forward_to_the_left():
+    np.testing.assert_allclose(transform_points(pose(1, 2, yaw=np.pi / 2), [[1.0, 0.0, 0.0]]), [[1, 3, 0]], atol=1e-12)
+
+
+@given(angle)
+def test_wrapped_angles_point_the_same_way(value):
+    wrapped = float(wrap_angle(value))
+    assert -np.pi <= wrapped < np.pi
+    np.testing.assert_allclose([np.cos(wrapped), np.sin(wrapped)], [np.cos(value), np.sin(value)], atol=1e-9)
+
+
+@given(coordinate, coordinate, angle)
+def test_a_box_holds_its_shrunken_corners_and_not_its_grown_ones(x, y, yaw):
+    box = Boxes.from_array([[x, y, 0.8, 4.2, 1.8, 1.6, yaw]], "Car")
+    corners = box.corners()[0]
+    assert points_in_boxes(box.center + 0.99 * (corners - box.center), box).all()
+    assert not points_in_boxes(box.center + 1.01 * (corners - box.center), box).any()
+
+
+@given(coordinate, coordinate, angle)
+def test_boxes_move_as_their_corners_do(x, y, yaw):
+    target_from_source = pose(x, y, 1.0, yaw)
+    box = Boxes.from_array([[3, -2, 0.8, 4.2, 1.8, 1.6, 0.3]], "Car")
+    expected = transform_points(target_from_source, box.corners()[0])
+    np.testing.assert_allclose(box.transformed(target_from_source).corners()[0], expected, atol=1e-9)
