@@ -1,0 +1,127 @@
+"""An experiment as named steps that leave files: what is finished is not done again, what is independent runs beside.
+
+A step is finished when its `done.json` is there: the value it returned, and the fingerprint of what it was asked. It
+is written last, so a killed run goes on from its last finished step; a step may keep files to go on from within itself.
+"""
+
+import hashlib
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty
+from typing import Any
+
+from flcav.config import InputError
+from flcav.files import write_json
+from flcav.progress import Report
+
+Notify = Callable[[str, int, int, str], None]  # step, done, total, note
+DONE = "done.json"
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a step is given."""
+
+    folder: Path  # its own
+    inputs: Mapping[str, Path]  # folders of the steps it needs
+    report: Report
+
+    def result(self, step: str) -> Any:
+        """Return the value of a step that this one needs."""
+        return json.loads((self.inputs[step] / DONE).read_text())["value"]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One unit of work: a module-level function of (Work, **arguments) that returns a JSON value."""
+
+    name: str
+    run: Callable[..., Any]
+    arguments: Mapping[str, Any]  # JSON values
+    needs: tuple[str, ...] = ()
+
+    def fingerprint(self, inputs: Mapping[str, str]) -> str:
+        """Return what identifies this step's work: its function, arguments and what it is built on."""
+        parts = [self.run.__module__, self.run.__qualname__, self.arguments, {n: inputs[n] for n in self.needs}]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def run_steps(steps: Sequence[Step], folder: Path, *, jobs: int, notify: Notify) -> dict[str, Any]:
+    """Run `steps` (in an order where each comes after what it needs) and return their values by name.
+
+    `jobs` processes of one thread each. Raises `InputError` where `folder` holds steps of other arguments.
+    """
+    prints: dict[str, str] = {}
+    for step in steps:
+        prints[step.name] = step.fingerprint(prints)
+    values: dict[str, Any] = {}
+    for step in steps:
+        path = folder / step.name / DONE
+        if path.exists():
+            record = json.loads(path.read_text())
+            if record["fingerprint"] != prints[step.name]:
+                raise InputError(f"{folder}: holds the steps of another configuration; choose another folder")
+            values[step.name] = record["value"]
+            notify(step.name, 1, 1, "done before")
+    waiting = [step for step in steps if step.name not in values]
+    if not waiting:
+        return values
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    others = set(multiprocessing.active_children())
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start, initargs=(queue,)) as pool:
+        running: dict[Future, Step] = {}
+        try:
+            while waiting or running:
+                ready = [step for step in waiting if all(name in values for name in step.needs)]
+                for step in ready[: jobs - len(running)]:
+                    waiting.remove(step)
+                    running[pool.submit(_perform, step, folder, prints[step.name])] = step
+                finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+                _drain(queue, notify)
+                for future in finished:
+                    step = running.pop(future)
+                    values[step.name] = future.result()
+                    notify(step.name, 1, 1, "")
+        except BaseException:
+            for process in set(multiprocessing.active_children()) - others:
+                process.terminate()
+            raise
+    return values
+
+
+def _drain(queue: Any, notify: Notify) -> None:
+    while True:
+        try:
+            notify(*queue.get_nowait())
+        except Empty:
+            return
+
+
+_queue: Any = None
+
+
+def _start(queue: Any) -> None:
+    global _queue
+    _queue = queue
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ[name] = "1"
+
+
+def _perform(step: Step, folder: Path, fingerprint: str) -> Any:
+    own = folder / step.name
+    own.mkdir(parents=True, exist_ok=True)
+
+    def report(done: int, total: int, note: str = "") -> None:
+        _queue.put((step.name, done, total, note))
+
+    report(0, 1, "")
+    work = Work(own, {name: folder / name for name in step.needs}, report)
+    value = step.run(work, **step.arguments)
+    write_json(own / DONE, {"fingerprint": fingerprint, "value": value})
+    return json.loads((own / DONE).read_text())["value"]
