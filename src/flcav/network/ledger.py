@@ -1,0 +1,155 @@
+"""Every message that crossed a link, in bytes, and the uplink budgets that none may exceed."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Literal, get_args
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from flcav.config import InputError
+from flcav.files import atomic_path
+
+Link = Literal["wireless", "wireline"]
+Direction = Literal["up", "down"]
+
+LINKS: tuple[Link, ...] = get_args(Link)
+BYTES_PER_MB = 1_000_000
+
+
+class BudgetExceeded(InputError):
+    """A message that would not fit in what is left of its link's uplink budget."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Uplink megabytes that a run may spend on each link."""
+
+    wireless_mb: float
+    wireline_mb: float
+
+    def bytes_on(self, link: Link) -> int:
+        """Return the budget of `link` in bytes."""
+        return round((self.wireless_mb if link == "wireless" else self.wireline_mb) * BYTES_PER_MB)
+
+
+@dataclass(frozen=True)
+class LedgerEntry:
+    """One message that crossed one link."""
+
+    stage: str  # pretrain | edge | cloud
+    task: str  # e.g. "objects"
+    link: Link
+    direction: Direction  # up: towards the cloud; only this counts against a budget
+    round: int  # within its stage, from 1; 0 where a stage has no rounds
+    client: str  # who sent it (up) or received it (down), e.g. "grid/cav0"
+    bytes: int  # serialised size
+
+    def __post_init__(self) -> None:
+        if self.link not in LINKS:
+            raise ValueError(f"LedgerEntry.link = {self.link!r}, expected one of {LINKS}")
+        if self.direction not in get_args(Direction):
+            raise ValueError(f"LedgerEntry.direction = {self.direction!r}, expected one of {get_args(Direction)}")
+        if self.bytes < 0:
+            raise ValueError(f"LedgerEntry.bytes = {self.bytes}, expected at least 0")
+
+
+class Ledger:
+    """The entries of one run under one budget. Its whole state is `budget` and `entries`."""
+
+    def __init__(self, budget: Budget, entries: Iterable[LedgerEntry] = ()) -> None:
+        """Start from `entries`, each entered in turn; raises `BudgetExceeded` where they do not fit."""
+        self.budget = budget
+        self._entries: list[LedgerEntry] = []
+        self._up = dict.fromkeys(LINKS, 0)
+        for entry in entries:
+            self.enter(entry)
+
+    @property
+    def entries(self) -> tuple[LedgerEntry, ...]:
+        """Return everything entered so far, in order."""
+        return tuple(self._entries)
+
+    def enter(self, entry: LedgerEntry) -> None:
+        """Record `entry`; raises `BudgetExceeded`, recording nothing, if an uplink message does not fit."""
+        if entry.direction == "up":
+            used, budget = self._up[entry.link], self.budget.bytes_on(entry.link)
+            if used + entry.bytes > budget:
+                raise BudgetExceeded(
+                    f"{entry.link} uplink budget exceeded: {entry.client} wants {_mb(entry.bytes)} MB for round "
+                    f"{entry.round} of stage {entry.stage!r} of {entry.task!r}, but {_mb(used)} of the "
+                    f"{_mb(budget)} MB are spent"
+                )
+            self._up[entry.link] += entry.bytes
+        self._entries.append(entry)
+
+    def left_mb(self, link: Link) -> float:
+        """Return what is left of the uplink budget of `link` [MB]."""
+        return (self.budget.bytes_on(link) - self._up[link]) / BYTES_PER_MB
+
+    def used_bytes(
+        self,
+        link: Link | None = None,
+        *,
+        stage: str | None = None,
+        task: str | None = None,
+        direction: Direction = "up",
+    ) -> int:
+        """Return the bytes entered in `direction` on `link`, in `stage`, for `task` (each: all of them if None)."""
+        return sum(
+            entry.bytes
+            for entry in self._entries
+            if entry.direction == direction
+            and link in (None, entry.link)
+            and stage in (None, entry.stage)
+            and task in (None, entry.task)
+        )
+
+    def used_mb(
+        self,
+        link: Link | None = None,
+        *,
+        stage: str | None = None,
+        task: str | None = None,
+        direction: Direction = "up",
+    ) -> float:
+        """Return `used_bytes` in MB."""
+        return self.used_bytes(link, stage=stage, task=task, direction=direction) / BYTES_PER_MB
+
+    def save(self, path: Path) -> None:
+        """Write budget and entries as one Parquet file, atomically."""
+        columns = {field.name: [getattr(entry, field.name) for entry in self._entries] for field in fields(LedgerEntry)}
+        table = pa.table(columns, schema=_SCHEMA.with_metadata({"budget": json.dumps(asdict(self.budget))}))
+        with atomic_path(path) as temporary:
+            pq.write_table(table, temporary)
+
+    @classmethod
+    def load(cls, path: Path) -> "Ledger":
+        """Read a ledger that `save` wrote; raises `InputError` where `path` is not one."""
+        try:
+            table = pq.read_table(path)
+            budget = Budget(**json.loads((table.schema.metadata or {})[b"budget"]))
+            return cls(budget, (LedgerEntry(**row) for row in table.to_pylist()))
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such ledger") from None
+        except (pa.ArrowInvalid, KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path}: not a ledger ({' '.join(str(error).split())})") from None
+
+
+_SCHEMA = pa.schema(
+    [
+        ("stage", pa.string()),
+        ("task", pa.string()),
+        ("link", pa.string()),
+        ("direction", pa.string()),
+        ("round", pa.int64()),
+        ("client", pa.string()),
+        ("bytes", pa.int64()),
+    ]
+)
+
+
+def _mb(count: int) -> str:
+    return f"{count / BYTES_PER_MB:.6g}"
