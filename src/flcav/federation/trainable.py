@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
-Weights = Mapping[str, NDArray[np.generic]]  # name -> array, parameters and buffers, in a fixed order
+Weights = Mapping[str, NDArray[Any]]  # name -> array, parameters and buffers, in a fixed order
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,83 @@
+"""A grid that enters every message in the ledger; refuses what a budget cannot pay. Wraps any Flower grid."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from flwr.app import Message, RecordDict
+from flwr.serverapp import Grid
+
+from flcav.federation.records import CONFIG
+from flcav.federation.runtimes.embedded import wire_bytes
+from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link
+
+
+@dataclass(frozen=True)
+class Account:
+    """What a grid's messages are booked under."""
+
+    ledger: Ledger
+    stage: str
+    task: str
+    link: Link
+
+
+class MeteredGrid(Grid):
+    """Books what crosses another grid: down when the server sends, up when a node replies."""
+
+    def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:
+        """Meter `grid` on `account`; `names` are the registered names of its nodes."""
+        self._grid, self._account, self._names = grid, account, names
+        self._round = 0
+
+    def _enter(self, direction: Direction, node: int, content: RecordDict) -> None:
+        account = self._account
+        account.ledger.enter(
+            LedgerEntry(
+                stage=account.stage,
+                task=account.task,
+                link=account.link,
+                direction=direction,
+                round=self._round,
+                client=self._names[node],
+                bytes=wire_bytes(content),
+            )
+        )
+
+    def push_messages(self, messages: Iterable[Message]) -> list[str]:
+        """Send messages, each booked downlink."""
+        messages = list(messages)
+        for message in messages:
+            self._round = int(message.content.config_records[CONFIG]["round"])  # type: ignore[arg-type]
+            self._enter("down", message.metadata.dst_node_id, message.content)
+        return list(self._grid.push_messages(messages))
+
+    def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
+        """Return replies, each booked uplink first; raises `BudgetExceeded` before one that cannot be paid."""
+        replies = list(self._grid.pull_messages(message_ids))
+        for message in replies:
+            if message.has_content():
+                self._enter("up", message.metadata.src_node_id, message.content)
+        return replies
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
+        """Send messages one after another, so that a refused reply stops the round there."""
+        return [reply for message in messages for reply in self.pull_messages(self.push_messages([message]))]
+
+    def get_node_ids(self) -> list[int]:
+        """Return the metered grid's nodes."""
+        return list(self._grid.get_node_ids())
+
+    def create_message(
+        self, content: RecordDict, message_type: str, dst_node_id: int, group_id: str, ttl: float | None = None
+    ) -> Message:
+        """Return a message of the metered grid."""
+        return self._grid.create_message(content, message_type, dst_node_id, group_id, ttl)
+
+    def set_run(self, run) -> None:
+        """Pass Flower's record of the run on."""
+        self._grid.set_run(run)
+
+    @property
+    def run(self):
+        """Return Flower's record of the run."""
+        return self._grid.run

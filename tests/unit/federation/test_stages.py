@@ -1,0 +1,123 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flwr.supercore.task_identity import TaskIdentity
+from regression import START, TRUTH, ledger, vehicles
+
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.strategies.fedavg import ClientFailed, average
+from flcav.network.ledger import BudgetExceeded
+from flcav.network.plan import MessageSizes, StagePlan, price
+from flcav.seeds import child_seed
+
+SCHEDULE = Schedule(rounds=4, steps=20, learning_rate=0.05, final_learning_rate=0.01, seed=3)
+
+
+def edge(book=None):
+    return Account(book or ledger(), "edge", "regression", "wireless")
+
+
+def bare_fedavg(clients, weights, schedule):
+    """FedAvg written out, with no framework between."""
+    for round_ in range(1, schedule.rounds + 1):
+        work = schedule.work(round_)
+        updates = [
+            client.train(weights, steps=work.steps, learning_rate=work.learning_rate, seed=child_seed(work.seed, name))
+            for name, client in clients.items()
+        ]
+        total = sum(update.samples for update in updates)
+        w = np.sum([update.samples / total * update.weights["w"].astype(np.float64) for update in updates], axis=0)
+        weights = {"w": w.astype(np.float32), "count": updates[0].weights["count"]}
+    return weights
+
+
+def test_a_federation_is_a_bare_fedavg_loop():
+    clients = vehicles("grid", 4)
+    result = federate(clients, START, SCHEDULE, edge())
+    np.testing.assert_array_equal(result.weights["w"], bare_fedavg(clients, START, SCHEDULE)["w"])
+    assert result.samples == sum(len(client.inputs) for client in clients.values())
+    assert np.linalg.norm(result.weights["w"] - TRUTH) < 0.5 * np.linalg.norm(TRUTH)
+
+
+def test_integer_buffers_are_not_averaged():
+    a, b = {"n": np.array(3), "w": np.array([0.0])}, {"n": np.array(5), "w": np.array([4.0])}
+    combined = average([a, b], [1, 3])
+    assert combined["n"] == 3
+    assert combined["n"].dtype == np.array(3).dtype
+    np.testing.assert_allclose(combined["w"], [3.0])
+
+
+def test_clients_of_another_network_are_refused():
+    with pytest.raises(ValueError, match="different"):
+        average([{"w": np.zeros(3)}, {"w": np.zeros(4)}], [1, 1])
+
+
+def test_a_resumed_federation_ends_where_an_uninterrupted_one_does():
+    whole = federate(vehicles("grid", 3), START, SCHEDULE, edge())
+    kept = {}
+
+    def stop_after_two(round_, weights, loss):
+        kept.update(weights=weights, round=round_)
+        if round_ == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        federate(vehicles("grid", 3), START, SCHEDULE, edge(), on_round=stop_after_two)
+    resumed = federate(vehicles("grid", 3), kept["weights"], SCHEDULE, edge(), done=kept["round"])
+    np.testing.assert_array_equal(resumed.weights["w"], whole.weights["w"])
+
+
+def test_every_message_is_in_the_ledger_and_the_sum_is_the_price():
+    book = ledger()
+    federate(vehicles("grid", 4), START, SCHEDULE, edge(book))
+    up = [entry for entry in book.entries if entry.direction == "up"]
+    down = [entry for entry in book.entries if entry.direction == "down"]
+    assert len(up) == len(down) == 4 * 4
+    assert {(entry.round, entry.client) for entry in up} == {
+        (r, f"grid/cav{i}") for r in (1, 2, 3, 4) for i in range(4)
+    }
+    plan = StagePlan(samples=0, edge_rounds=4, cloud_rounds=0, edge_groups=(4,))
+    sizes = MessageSizes(sample_mb=0, model_mb=up[0].bytes / 1e6)
+    assert book.used_mb("wireless") == pytest.approx(price(plan, sizes).wireless_mb, rel=0.01)
+
+
+def test_an_overspend_is_refused_and_names_the_budget():
+    first = ledger()
+    federate(vehicles("grid", 2), START, replace(SCHEDULE, rounds=1), edge(first))
+    tight = ledger(wireless_mb=first.used_mb("wireless") * 1.75)
+    with pytest.raises(BudgetExceeded, match="wireless uplink budget exceeded"):
+        federate(vehicles("grid", 2), START, SCHEDULE, edge(tight))
+    assert tight.used_mb("wireless") <= tight.budget.wireless_mb
+
+
+def test_a_client_that_raises_ends_the_round_with_its_reason():
+    clients = vehicles("grid", 2)
+    clients["grid/cav1"].fail = True
+    with pytest.raises(ClientFailed, match="no power"):
+        federate(clients, START, SCHEDULE, edge())
+
+
+def test_cloud_rounds_average_edge_servers_that_start_from_their_own_models():
+    book = ledger()
+    own = {"grid": {**START, "w": np.full(3, 1.0, np.float32)}, "ring": {**START, "w": np.full(3, -1.0, np.float32)}}
+    account = Account(book, "cloud", "regression", "wireless")
+    regions = {"grid": vehicles("grid", 4), "ring": vehicles("ring", 3)}
+    servers = {name: EdgeServer(regions[name], 2, account, own[name]) for name in regions}
+    frozen = Schedule(rounds=1, steps=1, learning_rate=1e-12, final_learning_rate=1e-12, seed=0)
+    wireline = Account(book, "cloud", "regression", "wireline")
+    result = federate(servers, START, frozen, wireline)
+    grid, ring = (sum(len(vehicle.inputs) for vehicle in region.values()) for region in regions.values())
+    np.testing.assert_allclose(result.weights["w"], np.full(3, (grid - ring) / (grid + ring)), rtol=1e-4)
+    federate(servers, result.weights, replace(frozen, rounds=2), wireline, done=1)
+    up = [entry for entry in book.entries if entry.direction == "up"]
+    assert sum(entry.link == "wireless" for entry in up) == 2 * 2 * 7  # cloud rounds x k x vehicles
+    assert sum(entry.link == "wireline" for entry in up) == 2 * 2  # cloud rounds x edge servers
+    assert sorted({entry.round for entry in up if entry.link == "wireless"}) == [1, 2, 3, 4]
+
+
+def test_a_federation_leaves_flowers_process_wide_identity_as_it_was():
+    before = (TaskIdentity._run_id, TaskIdentity._node_id, TaskIdentity._task_id)
+    federate(vehicles("grid", 1), START, replace(SCHEDULE, rounds=1), edge())
+    assert (TaskIdentity._run_id, TaskIdentity._node_id, TaskIdentity._task_id) == before
