@@ -1,1 +1,20 @@
 """3D object detection from LiDAR (SECOND)."""
+
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.detect import detect, detect_all
+from flcav.perception.objects.model import Second, second, second_paper, second_tiny
+from flcav.perception.objects.samples import Sample, sample_from_frame
+from flcav.perception.objects.train import train_steps
+
+__all__ = [
+    "Sample",
+    "Second",
+    "SecondConfig",
+    "detect",
+    "detect_all",
+    "sample_from_frame",
+    "second",
+    "second_paper",
+    "second_tiny",
+    "train_steps",
+]

@@ -1,0 +1,59 @@
+"""Which network: the record that rebuilds one, stored beside its weights."""
+
+import math
+
+from pydantic import Field, model_validator
+
+from flcav.config import Config
+
+
+class Anchor(Config):
+    """The box an object class is regressed from, at every place of the grid, heading along x and along y."""
+
+    name: str  # detection class
+    length_m: float = Field(gt=0)
+    width_m: float = Field(gt=0)
+    height_m: float = Field(gt=0)
+    matched_iou: float = Field(gt=0, lt=1)  # bird's-eye IoU from which an anchor is positive
+    unmatched_iou: float = Field(gt=0, lt=1)  # and below which it is negative
+
+
+class SecondConfig(Config):
+    """A SECOND network in the LiDAR frame: x forward, y left, z up, metres, origin at the sensor."""
+
+    anchors: tuple[Anchor, ...] = Field(min_length=1)  # one per class; their order is the order of the scores
+    range_m: tuple[float, float, float, float, float, float]  # x, y, z minima, then maxima
+    voxel_m: tuple[float, float, float]  # x, y, z
+    sparse_channels: tuple[int, int, int, int]  # at strides 1, 2, 4, 8
+    sparse_out: int = Field(gt=0)  # after the last convolution along z
+    bev_layers: tuple[int, int]  # 3x3 convolutions after the first, at head strides 1 and 2
+    bev_channels: tuple[int, int]
+    bev_up_channels: tuple[int, int]
+    ground_z_m: float = -1.8  # height of the ground the anchors stand on: the sensor's height, negated
+
+    @model_validator(mode="after")
+    def _positive_extent(self) -> "SecondConfig":
+        low, high = self.range_m[:3], self.range_m[3:]
+        if any(b <= a for a, b in zip(low, high, strict=True)) or min(self.voxel_m) <= 0:
+            raise ValueError("every axis of range_m needs a maximum above its minimum, and voxel_m a positive size")
+        return self
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Return the detection classes, in the order of the scores."""
+        return tuple(anchor.name for anchor in self.anchors)
+
+    @property
+    def reach_m(self) -> float:
+        """Return the largest distance from the sensor's axis to a corner of the range [m]."""
+        x0, y0, _, x1, y1, _ = self.range_m
+        return max(math.hypot(x, y) for x in (x0, x1) for y in (y0, y1))
+
+
+ANCHORS = {
+    "Car": Anchor(name="Car", length_m=4.4, width_m=1.8, height_m=1.6, matched_iou=0.6, unmatched_iou=0.45),
+    "Pedestrian": Anchor(
+        name="Pedestrian", length_m=0.8, width_m=0.6, height_m=1.73, matched_iou=0.5, unmatched_iou=0.35
+    ),
+    "Cyclist": Anchor(name="Cyclist", length_m=1.76, width_m=0.6, height_m=1.73, matched_iou=0.5, unmatched_iou=0.35),
+}

@@ -1,0 +1,52 @@
+"""The loss of SECOND: focal on classes, smooth L1 with the sine of the yaw error on boxes, cross-entropy on direction.
+
+Yan et al. 2018, sec. 3.3, eqs. 1-4, with the published weights 1, 2, 0.2.
+"""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from flcav.perception.objects.anchors import anchor_classes
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import HeadOutput
+from flcav.perception.objects.targets import Targets
+
+ALPHA, GAMMA = 0.25, 2.0
+BOX_WEIGHT, DIRECTION_WEIGHT = 2.0, 0.2
+SMOOTH_L1_BETA = 1 / 9
+
+
+def second_loss(output: HeadOutput, targets: Sequence[Targets], config: SecondConfig) -> Tensor:
+    """Return the scalar loss, averaged over samples; each sample's sums are divided by its positive anchors."""
+    device = output.score.device
+    samples, anchors, classes = output.score.shape
+    count = torch.tensor([max(len(target.positive), 1) for target in targets], device=device)
+    positive = torch.cat([target.positive + i * anchors for i, target in enumerate(targets)]).to(device)
+    share = (1 / count).repeat_interleave(torch.tensor([len(target.positive) for target in targets], device=device))
+    weight = torch.stack([target.weight for target in targets]).to(device) / count[:, None]
+    kind = torch.tensor(anchor_classes(config), device=device)[positive % anchors]
+
+    logits = output.score.flatten()
+    wanted = torch.zeros_like(logits)
+    wanted[positive * classes + kind] = 1
+    scores = focal(logits, wanted).view(samples, anchors, classes).sum(2)
+    classification = (scores * weight).sum()
+
+    residual = torch.cat([target.residual for target in targets]).to(device)
+    error = output.box.flatten(0, 1)[positive] - residual
+    error = torch.cat((error[:, :6], torch.sin(error[:, 6:])), 1)
+    box = F.smooth_l1_loss(error, torch.zeros_like(error), beta=SMOOTH_L1_BETA, reduction="none").sum(1)
+
+    half_turn = torch.cat([target.direction for target in targets]).to(device)
+    direction = F.cross_entropy(output.direction.flatten(0, 1)[positive], half_turn, reduction="none")
+    return (classification + ((BOX_WEIGHT * box + DIRECTION_WEIGHT * direction) * share).sum()) / samples
+
+
+def focal(logits: Tensor, wanted: Tensor) -> Tensor:
+    """Return the focal loss of each logit (Lin et al., "Focal Loss for Dense Object Detection", eq. 5)."""
+    signed = torch.where(wanted > 0, logits, -logits)
+    balance = torch.where(wanted > 0, ALPHA, 1 - ALPHA)
+    return -balance * torch.sigmoid(-signed) ** GAMMA * F.logsigmoid(signed)

@@ -1,0 +1,92 @@
+"""What the detector learns from: a point cloud, the boxes to find, the places to leave out of the loss."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.geometry import Boxes
+from flcav.perception.objects.config import SecondConfig
+from flcav.sensors.frame import Frame
+
+DETECTION_CLASS = {
+    "car": "Car",
+    "van": "Car",
+    "pedestrian": "Pedestrian",
+    "bicycle": "Cyclist",
+    "motorcycle": "Cyclist",
+}
+LOOKALIKE = {"truck": "Car", "bus": "Car"}  # neutral: neither to be found nor to be kept apart
+MIN_RETURNS = 5  # LiDAR returns that make an object a target; with fewer it is neutral
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One labelled sweep, LiDAR frame."""
+
+    points: NDArray[np.float32]  # (N, 4) x, y, z [m], intensity [0, 1]
+    boxes: Boxes  # objects to find; label = detection class
+    ignore: Boxes = field(default_factory=Boxes.empty)  # objects that are neither positive nor negative
+    free: NDArray[np.float32] | None = None  # (K, 2) x, y [m] known to be free of objects; None: wherever no box is
+
+
+def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Sample:
+    """Return the frame's sweep with its ground truth as labels.
+
+    Objects with at least `MIN_RETURNS` returns are to be found, with fewer but some they are ignored, and so are trucks
+    and buses beside cars; objects without a return are background. Points that cannot come into `config`'s range, turned
+    and scaled as training does, are left out.
+    """
+    name = only_lidar(frame, lidar)
+    truth = frame.annotations
+    boxes = truth.boxes.transformed(np.linalg.inv(frame.world_from_sensor(name)))
+    label = detection_labels(truth.boxes.label, config.classes)
+    wanted = (label != "") & (truth.returns >= MIN_RETURNS)
+    neutral = (truth.returns > 0) & ~wanted & (label != "")
+    neutral |= (truth.returns > 0) & is_lookalike(truth.boxes.label, config.classes)
+    learn = boxes[wanted]
+    learn = Boxes(learn.center, learn.size, learn.yaw, label[wanted])
+    return Sample(near_range(frame.lidar[name], config), learn, boxes[neutral])
+
+
+def detection_labels(category: NDArray[np.str_], classes: tuple[str, ...]) -> NDArray[np.str_]:
+    """Return the detection class of every actor category, "" where the network knows none."""
+    mapped = [DETECTION_CLASS.get(str(name), "") for name in category]
+    return np.array([name if name in classes else "" for name in mapped], dtype=np.str_)
+
+
+def is_lookalike(category: NDArray[np.str_], classes: tuple[str, ...]) -> NDArray[np.bool_]:
+    """Return which actors look so much like one of `classes` that finding them is no mistake (trucks, buses)."""
+    return np.array([LOOKALIKE.get(str(name)) in classes for name in category], dtype=bool)
+
+
+def only_lidar(frame: Frame, name: str | None = None) -> str:
+    """Return `name`, or the frame's first LiDAR; raises `InputError` where it has none."""
+    if name is None and frame.lidar:
+        return next(iter(frame.lidar))
+    if name is None or name not in frame.lidar:
+        raise InputError(f"frame {frame.key}: no LiDAR {name or ''} in it; it has {sorted(frame.lidar)}")
+    return name
+
+
+def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:
+    """Return the points that augmentation may bring into the range."""
+    x0, y0, z0, x1, y1, z1 = config.range_m
+    margin = 0.35 * config.reach_m
+    low, high = (x0 - margin, y0 - margin, z0 - 0.2), (x1 + margin, y1 + margin, z1 + 0.2)
+    kept = ((points[:, :3] >= low) & (points[:, :3] <= high)).all(1)
+    return points[kept]
+
+
+def checked_points(points: NDArray[np.float32], origin: str | Path) -> NDArray[np.float32]:
+    """Return the points, or raise `InputError` where a detector can do nothing with them."""
+    if points.ndim != 2 or points.shape[1] != 4:
+        raise InputError(f"{origin}: a point cloud of shape {points.shape}; (N, 4) x, y, z, intensity is wanted")
+    if not len(points):
+        raise InputError(f"{origin}: the point cloud is empty")
+    if not np.isfinite(points).all():
+        bad = int((~np.isfinite(points)).any(1).sum())
+        raise InputError(f"{origin}: {bad} of {len(points)} points are not finite numbers")
+    return points

@@ -1,0 +1,158 @@
+"""What every anchor should say: positive, negative or nothing, and which residuals.
+
+Matching is by bird's-eye IoU after turning boxes to the nearest axis (Yan et al. 2018, sec. 3.2; matched .6, unmatched
+.45 for cars); the best anchors of an object are positive even below that. Residuals are those of VoxelNet, eq. 1.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from flcav.geometry import Boxes
+from flcav.perception.objects.anchors import anchor_boxes, anchor_classes, cell_size
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import HEADINGS, head_shape
+from flcav.perception.objects.samples import Sample
+
+Array = NDArray[np.float64]
+
+IGNORE_IOU = 0.1  # an anchor that overlaps a neutral box this much says nothing
+IGNORE_MARGIN_M = 0.5  # nor does one whose centre lies in a neutral box grown by this
+
+
+@dataclass(frozen=True)
+class Targets:
+    """For A anchors of one sample."""
+
+    positive: Tensor  # (P,) int64 anchor indices
+    weight: Tensor  # (A,) float32: 1 where the anchor counts in the classification loss, else 0
+    residual: Tensor  # (P, 7) float32
+    direction: Tensor  # (P,) int64: 1 where the heading is in [-3/4 pi, pi/4) turned by half, see `direction_of`
+
+
+def encode(boxes: Array, anchors: Array) -> Array:
+    """Return (P, 7) residuals of boxes (P, 7) from anchors (P, 7): offsets by diagonal and height, log sizes, yaw."""
+    diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
+    plane = (boxes[:, :2] - anchors[:, :2]) / diagonal
+    height = (boxes[:, 2] - anchors[:, 2]) / anchors[:, 5]
+    size = np.log(boxes[:, 3:6] / anchors[:, 3:6])
+    return np.concatenate((plane, height[:, None], size, (boxes[:, 6] - anchors[:, 6])[:, None]), 1)
+
+
+def decode(residual: Array, direction: NDArray[np.int64], anchors: Array) -> Array:
+    """Return (P, 7) boxes from residuals, the inverse of `encode` where `direction` is the boxes' `direction_of`."""
+    diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
+    plane = residual[:, :2] * diagonal + anchors[:, :2]
+    height = residual[:, 2] * anchors[:, 5] + anchors[:, 2]
+    size = np.exp(np.clip(residual[:, 3:6], -2, 2)) * anchors[:, 3:6]
+    axis = np.mod(residual[:, 6] + anchors[:, 6] - np.pi / 4, np.pi) + np.pi / 4
+    yaw = np.mod(axis + np.pi * direction + np.pi, 2 * np.pi) - np.pi
+    return np.concatenate((plane, height[:, None], size, yaw[:, None]), 1)
+
+
+def direction_of(yaw: Array) -> NDArray[np.int64]:
+    """Return 0 where the heading lies in [pi/4, 5/4 pi), else 1: what a box's axis alone leaves open."""
+    return (np.mod(yaw - np.pi / 4, 2 * np.pi) >= np.pi).astype(np.int64)
+
+
+def in_range(boxes: Boxes, config: SecondConfig) -> NDArray[np.bool_]:
+    """Return (N,) whether a box's centre lies within the range, seen from above."""
+    x, y = boxes.center[:, 0], boxes.center[:, 1]
+    x0, y0, _, x1, y1, _ = config.range_m
+    return (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+
+
+def free_cells(free: NDArray[np.float32], config: SecondConfig) -> NDArray[np.bool_]:
+    """Return (rows, columns) of the head's grid: True where one of the positions (K, 2) x, y [m] falls.
+
+    Give positions at most half a cell apart where an area is known to be free, or a turned sample has holes.
+    """
+    rows, columns = head_shape(config)
+    dx, dy = cell_size(config)
+    column = np.floor((free[:, 0] - config.range_m[0]) / dx).astype(np.int64)
+    row = np.floor((free[:, 1] - config.range_m[1]) / dy).astype(np.int64)
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    mask = np.zeros((rows, columns), dtype=bool)
+    mask[row[inside], column[inside]] = True
+    return mask
+
+
+def assign(sample: Sample, config: SecondConfig) -> Targets:
+    """Return the targets of a sample. Boxes outside the range are ignored, as those in `sample.ignore` are."""
+    anchors, classes = anchor_boxes(config), anchor_classes(config)
+    inside = in_range(sample.boxes, config)
+    boxes, labels = sample.boxes.array()[inside], sample.boxes.label[inside]
+    counts = np.ones(len(anchors), dtype=bool)
+    if sample.free is not None:
+        counts &= np.repeat(free_cells(sample.free, config).ravel(), HEADINGS * len(config.classes))
+    ignored = np.concatenate((sample.ignore.array(), sample.boxes.array()[~inside]))
+    counts[_touched(ignored, config)] = False
+    owner = np.full(len(anchors), -1)
+    for index, anchor in enumerate(config.anchors):
+        rows = np.flatnonzero(labels == anchor.name)
+        near = _near(boxes[rows], config)
+        near = near[classes[near] == index]
+        if not len(rows) or not len(near):
+            continue
+        overlap = _axis_aligned_iou(anchors[near], boxes[rows])  # (near, rows)
+        best, of = overlap.max(1), overlap.argmax(1)
+        top = overlap.max(0)
+        forced, forced_of = np.nonzero((overlap == top) & (top > 0.1))
+        matched = best >= anchor.matched_iou
+        matched[forced], of[forced] = True, forced_of
+        counts[near[best >= anchor.unmatched_iou]] = False
+        owner[near[matched]] = rows[of[matched]]
+    positive = np.flatnonzero(owner >= 0)
+    counts[positive] = True
+    targets = boxes[owner[positive]]
+    return Targets(
+        positive=torch.from_numpy(positive),
+        weight=torch.from_numpy(counts.astype(np.float32)),
+        residual=torch.from_numpy(encode(targets, anchors[positive]).astype(np.float32)),
+        direction=torch.from_numpy(direction_of(targets[:, 6])),
+    )
+
+
+def _near(boxes: Array, config: SecondConfig) -> NDArray[np.int64]:
+    """Return the indices of anchors in cells that any of the boxes could overlap."""
+    rows, columns = head_shape(config)
+    dx, dy = cell_size(config)
+    close = np.zeros((rows, columns), dtype=bool)
+    longest = max(max(anchor.length_m, anchor.width_m) for anchor in config.anchors)
+    for x, y, radius in zip(boxes[:, 0], boxes[:, 1], (np.hypot(boxes[:, 3], boxes[:, 4]) + longest) / 2, strict=True):
+        row, column = (y - config.range_m[1]) / dy, (x - config.range_m[0]) / dx
+        low_row, low_column = max(0, int(row - radius / dy)), max(0, int(column - radius / dx))
+        close[low_row : max(0, int(row + radius / dy) + 1), low_column : max(0, int(column + radius / dx) + 1)] = True
+    per_cell = HEADINGS * len(config.anchors)
+    return (np.flatnonzero(close)[:, None] * per_cell + np.arange(per_cell)).ravel()
+
+
+def _touched(boxes: Array, config: SecondConfig) -> NDArray[np.int64]:
+    near = _near(boxes, config)
+    if not len(near):
+        return near
+    anchors = anchor_boxes(config)[near]
+    delta = anchors[:, None, :2] - boxes[None, :, :2]
+    cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
+    along = np.abs(delta[..., 0] * cos + delta[..., 1] * sin) <= boxes[:, 3] / 2 + IGNORE_MARGIN_M
+    across = np.abs(delta[..., 1] * cos - delta[..., 0] * sin) <= boxes[:, 4] / 2 + IGNORE_MARGIN_M
+    overlaps = _axis_aligned_iou(anchors, boxes) > IGNORE_IOU
+    return near[((along & across) | overlaps).any(1)]
+
+
+def _axis_aligned_iou(a: Array, b: Array) -> Array:
+    """Return (A, B) bird's-eye IoU of boxes (., 7) after turning each to the nearest axis."""
+    a_low, a_high = _axis_aligned(a)
+    b_low, b_high = _axis_aligned(b)
+    shared = np.minimum(a_high[:, None], b_high) - np.maximum(a_low[:, None], b_low)
+    overlap = np.maximum(shared, 0).prod(-1)
+    return overlap / ((a[:, 3] * a[:, 4])[:, None] + b[:, 3] * b[:, 4] - overlap)
+
+
+def _axis_aligned(boxes: Array) -> tuple[Array, Array]:
+    across = np.abs(np.sin(boxes[:, 6])) > np.sqrt(0.5)
+    half = np.where(across[:, None], boxes[:, 4:2:-1], boxes[:, 3:5]) / 2
+    return boxes[:, :2] - half, boxes[:, :2] + half

@@ -1,0 +1,108 @@
+"""Intersection over union of turned boxes, and non-maximum suppression by it. Float64 throughout.
+
+Boxes are rows x, y, z, length, width, height, yaw. Two rectangles meet in the convex hull of the corners of each that
+lie in the other and of their edges' crossings. Coordinates are taken about the pair's midpoint, so that precision does
+not depend on where in the world they are.
+"""
+
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Kind = Literal["3d", "bev"]
+PAIRS_AT_ONCE = 100_000
+
+
+def iou(a: Tensor, b: Tensor, kind: Kind = "3d") -> Tensor:
+    """Return (A, B) float64 IoU of boxes a (A, 7) and b (B, 7): of volumes, or of footprints (`bev`)."""
+    a, b = a.double(), b.double()
+    out = a.new_zeros(len(a), len(b))
+    reach_a, reach_b = a[:, 3:5].norm(dim=1) / 2, b[:, 3:5].norm(dim=1) / 2
+    apart = (a[:, None, :2] - b[None, :, :2]).norm(dim=2)
+    first, second = (apart < reach_a[:, None] + reach_b).nonzero(as_tuple=True)
+    for i, j in zip(first.split(PAIRS_AT_ONCE), second.split(PAIRS_AT_ONCE), strict=True):
+        out[i, j] = paired_iou(a[i], b[j], kind)
+    return out
+
+
+def paired_iou(a: Tensor, b: Tensor, kind: Kind = "3d") -> Tensor:
+    """Return (P,) float64 IoU of each box of a (P, 7) with the same row of b (P, 7)."""
+    a, b = a.double(), b.double()
+    shared = intersection_area(a, b)
+    if kind == "bev":
+        return shared / (a[:, 3] * a[:, 4] + b[:, 3] * b[:, 4] - shared)
+    top = torch.minimum(a[:, 2] + a[:, 5] / 2, b[:, 2] + b[:, 5] / 2)
+    bottom = torch.maximum(a[:, 2] - a[:, 5] / 2, b[:, 2] - b[:, 5] / 2)
+    shared = shared * (top - bottom).clamp(min=0)
+    return shared / (a[:, 3:6].prod(1) + b[:, 3:6].prod(1) - shared)
+
+
+def intersection_area(a: Tensor, b: Tensor) -> Tensor:
+    """Return (P,) area [m^2] that the footprints of paired boxes (P, 7) share."""
+    middle = (a[:, :2] + b[:, :2]) / 2
+    a = torch.cat((a[:, :2] - middle, a[:, 2:]), 1)
+    b = torch.cat((b[:, :2] - middle, b[:, 2:]), 1)
+    corners_a, corners_b = _corners(a), _corners(b)
+    crossings, crossed = _crossings(corners_a, corners_b)
+    points = torch.cat((corners_a, corners_b, crossings), 1)  # (P, 24, 2)
+    valid = torch.cat((_inside(corners_a, b), _inside(corners_b, a), crossed), 1)
+    center = (points * valid[..., None]).sum(1) / valid.sum(1, keepdim=True).clamp(min=1)
+    spokes = points - center[:, None]
+    angle = torch.atan2(spokes[..., 1], spokes[..., 0]).masked_fill(~valid, 9.0)
+    order = angle.argsort(1)
+    spokes = spokes.gather(1, order[..., None].expand(-1, -1, 2))
+    valid = valid.gather(1, order)
+    spokes = torch.where(valid[..., None], spokes, spokes[:, :1])  # unused ones fall on the first: no area
+    return _cross(spokes, spokes.roll(-1, 1)).sum(1).abs() / 2
+
+
+def nms(boxes: Tensor, scores: Tensor, *, overlap: float = 0.01, consider: int = 256, keep: int = 100) -> Tensor:
+    """Return the indices of boxes (N, 7) that survive, best score first.
+
+    A box falls where its bird's-eye IoU with a better survivor exceeds `overlap`; the `consider` best are looked at.
+    """
+    order = scores.argsort(descending=True, stable=True)[:consider]
+    clash = (iou(boxes[order], boxes[order], "bev") > overlap).cpu().numpy()
+    fallen = np.zeros(len(order), dtype=bool)
+    kept: list[int] = []
+    for i in range(len(order)):
+        if not fallen[i] and len(kept) < keep:
+            kept.append(i)
+            fallen |= clash[i]
+    return order[torch.tensor(kept, dtype=torch.int64, device=order.device)]
+
+
+def _corners(boxes: Tensor) -> Tensor:
+    """Return (P, 4, 2) footprint corners, counter-clockwise."""
+    cos, sin = boxes[:, 6].cos()[:, None], boxes[:, 6].sin()[:, None]
+    along = boxes[:, 3:4] / 2 * boxes.new_tensor([1, -1, -1, 1])
+    across = boxes[:, 4:5] / 2 * boxes.new_tensor([1, 1, -1, -1])
+    return torch.stack((boxes[:, :1] + along * cos - across * sin, boxes[:, 1:2] + along * sin + across * cos), 2)
+
+
+def _inside(points: Tensor, boxes: Tensor) -> Tensor:
+    delta = points - boxes[:, None, :2]
+    cos, sin = boxes[:, 6].cos()[:, None], boxes[:, 6].sin()[:, None]
+    along = delta[..., 0] * cos + delta[..., 1] * sin
+    across = delta[..., 1] * cos - delta[..., 0] * sin
+    return (along.abs() <= boxes[:, 3:4] / 2 + 1e-10) & (across.abs() <= boxes[:, 4:5] / 2 + 1e-10)
+
+
+def _crossings(corners_a: Tensor, corners_b: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (P, 16, 2) points where edges of the two rectangles cross, and (P, 16) whether they do."""
+    edge_a = (corners_a.roll(-1, 1) - corners_a)[:, :, None]
+    edge_b = (corners_b.roll(-1, 1) - corners_b)[:, None]
+    gap = corners_b[:, None] - corners_a[:, :, None]
+    area = _cross(edge_a, edge_b)
+    skew = area.abs() > 1e-12
+    area = torch.where(skew, area, torch.ones_like(area))
+    on_a, on_b = _cross(gap, edge_b) / area, _cross(gap, edge_a) / area
+    crossed = skew & (on_a >= 0) & (on_a <= 1) & (on_b >= 0) & (on_b <= 1)
+    points = corners_a[:, :, None] + on_a[..., None] * edge_a
+    return points.flatten(1, 2), crossed.flatten(1)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -1,0 +1,141 @@
+"""Which input voxel meets which output voxel through which kernel offset: the rules of sparse 3D convolution.
+
+A voxel of sample b at grid cell (z, y, x) has the integer key ((b D + z + 1) H + y + 1) W + x + 1, where D, H, W are the
+grid's extents plus two: with one cell of padding on every side, adding an offset's key difference never wraps to another
+row. Keys are kept sorted, so a neighbour is found by binary search. (Graham et al., "3D Semantic Segmentation with
+Submanifold Sparse Convolutional Networks", CVPR 2018, names the two kinds of convolution.)
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import torch
+from torch import Tensor
+
+Triple = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Rules:
+    """P pairs (source voxel, target voxel), grouped by kernel offset; within an offset, targets ascend."""
+
+    source: Tensor  # (P,) int64 row of the input
+    target: Tensor  # (P,) int64 row of the output
+    counts: tuple[int, ...]  # pairs per kernel offset, z-major
+    sources: int  # input voxels
+    targets: int  # output voxels
+    mirrored: bool  # pairs of offset k are those of offset K-1-k with the roles exchanged, in the same order
+
+    @cached_property
+    def by_target(self) -> tuple[Tensor, Tensor]:
+        """Return the pairs sorted by target: (P,) pair numbers and (targets,) where each target's pairs begin."""
+        return _grouped(self.target, self.counts, self.targets)
+
+    @cached_property
+    def by_source(self) -> tuple[Tensor, Tensor]:
+        """Return the pairs sorted by source: (P,) pair numbers and (sources,) where each source's pairs begin."""
+        return _grouped(self.source, self.counts, self.sources)
+
+
+def _grouped(row: Tensor, counts: tuple[int, ...], rows: int) -> tuple[Tensor, Tensor]:
+    pairs = torch.arange(len(row), device=row.device, dtype=torch.int32)
+    offset = torch.repeat_interleave(torch.tensor(counts, device=row.device), output_size=len(row))
+    table = torch.full((rows, len(counts)), -1, device=row.device, dtype=torch.int32)
+    table.view(-1)[row * len(counts) + offset] = pairs  # a row meets each offset once at most
+    used = table >= 0
+    per_row = used.sum(1, dtype=torch.int32)
+    return table[used], per_row.cumsum(0, dtype=torch.int32) - per_row
+
+
+def keys_of(cells: Tensor, shape: Triple) -> Tensor:
+    """Return (N,) keys of (N, 4) cells (sample, z, y, x) of a grid of extents `shape` (z, y, x)."""
+    depth, height, width = (extent + 2 for extent in shape)
+    sample, z, y, x = cells.unbind(1)
+    return ((sample * depth + z + 1) * height + y + 1) * width + x + 1
+
+
+def cells_of(keys: Tensor, shape: Triple) -> Tensor:
+    """Return (N, 4) cells (sample, z, y, x) of (N,) keys."""
+    depth, height, width = (extent + 2 for extent in shape)
+    row = keys.div(width, rounding_mode="floor")
+    layer = row.div(height, rounding_mode="floor")
+    sample = layer.div(depth, rounding_mode="floor")
+    return torch.stack((sample, layer - sample * depth - 1, row - layer * height - 1, keys - row * width - 1), 1)
+
+
+def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
+    """Return the rules of a 3x3x3 convolution whose outputs are the input voxels `keys` (N,), sorted.
+
+    Half of the offsets suffice: the pairs of the others are the same with the roles exchanged. Three offsets that
+    differ in x only share one search, because their keys are consecutive.
+    """
+    _, height, width = (extent + 2 for extent in shape)
+    count = len(keys)
+    later = torch.cat((keys, keys.new_full((3,), -1)))  # so that looking up to 3 rows past the end finds no key
+    lines = [height_step * width for height_step in (1,)]
+    lines += [(height + height_step) * width for height_step in (-1, 0, 1)]
+    wanted = keys[None] + (keys.new_tensor(lines) - 1)[:, None]  # (4, N): the first of three consecutive keys
+    place = torch.searchsorted(keys, wanted)
+    found, where = [later[1 : count + 1] == keys + 1], [torch.arange(1, count + 1, device=keys.device)]
+    for line in range(4):
+        at = place[line]
+        for step in range(3):
+            hit = later[at] == wanted[line] + step
+            found.append(hit)
+            where.append(at)
+            at = at + hit
+    hits = torch.stack(found)  # (13, N): whether voxel n has a neighbour at the offset
+    counts = hits.sum(1).tolist()
+    offset, near = hits.nonzero(as_tuple=True)
+    far = torch.stack(where)[offset, near]
+    itself = torch.arange(count, device=keys.device)
+    near_parts, far_parts = near.split(counts)[::-1], far.split(counts)[::-1]
+    return Rules(
+        source=torch.cat((*near_parts, itself, far)),
+        target=torch.cat((*far_parts, itself, near)),
+        counts=(*counts[::-1], count, *counts),
+        sources=count,
+        targets=count,
+        mirrored=True,
+    )
+
+
+def strided_rules(
+    keys: Tensor, shape: Triple, kernel: Triple, stride: Triple, padding: Triple, samples: int
+) -> tuple[Rules, Tensor, Triple]:
+    """Return the rules of a strided convolution, its output keys (M,) sorted, and its output grid (z, y, x).
+
+    The outputs are the cells whose window holds an input voxel. Axes are independent: an input cell c reaches output
+    (c + padding - k) / stride through kernel index k, where that is whole and inside.
+    """
+    out_shape = tuple((n + 2 * p - k) // s + 1 for n, k, s, p in zip(shape, kernel, stride, padding, strict=True))
+    depth, height, width = (extent + 2 for extent in out_shape)
+    cells = cells_of(keys, shape)
+    reaches: list[list[tuple[Tensor, Tensor]]] = []
+    for axis, key_step in enumerate((height * width, width, 1)):
+        shifted = cells[:, axis + 1] + padding[axis]
+        axis_reaches = []
+        for k in range(kernel[axis]):
+            place = (shifted - k).div(stride[axis], rounding_mode="floor")
+            valid = (place * stride[axis] == shifted - k) & (place >= 0) & (place < out_shape[axis])
+            axis_reaches.append((valid, (place + 1) * key_step))
+        reaches.append(axis_reaches)
+    first = cells[:, 0] * (depth * height * width)
+    sources, reached = [], []
+    for (z_valid, z_key), (y_valid, y_key) in product(reaches[0], reaches[1]):
+        line = (z_valid & y_valid).nonzero()[:, 0]
+        line_key = (first + z_key + y_key)[line]
+        for x_valid, x_key in reaches[2]:
+            kept = x_valid[line].nonzero()[:, 0]
+            source = line[kept]
+            sources.append(source)
+            reached.append(line_key[kept] + x_key[source])
+    all_keys = torch.cat(reached)
+    occupied = torch.zeros(samples * depth * height * width, dtype=torch.bool, device=keys.device)
+    occupied[all_keys] = True
+    out_keys = occupied.nonzero()[:, 0]
+    target = torch.searchsorted(out_keys, all_keys)
+    counts = tuple(len(source) for source in sources)
+    rules = Rules(torch.cat(sources), target, counts, len(keys), len(out_keys), mirrored=False)
+    return rules, out_keys, (out_shape[0], out_shape[1], out_shape[2])

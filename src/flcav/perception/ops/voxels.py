@@ -1,0 +1,35 @@
+"""Point clouds to voxels: the mean of the points in each cell (the mean VFE of SECOND's published configuration)."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from flcav.perception.ops.rules import Triple, keys_of
+
+
+def grid_shape(range_m: Sequence[float], voxel_m: Sequence[float]) -> Triple:
+    """Return the extents z, y, x of a range (x, y, z minima, then maxima) cut into voxels (x, y, z sizes) [m].
+
+    One empty layer is added on top, as the published network does, so that its strides come out even.
+    """
+    nx, ny, nz = (round((range_m[i + 3] - range_m[i]) / voxel_m[i]) for i in range(3))
+    return nz + 1, ny, nx
+
+
+def voxelize(
+    points: Tensor, sample: Tensor, range_m: Sequence[float], voxel_m: Sequence[float], shape: Triple
+) -> tuple[Tensor, Tensor]:
+    """Return (V, C) voxel means and (V,) ascending keys of points (N, C), x, y, z first [m], of samples (N,).
+
+    Points outside `range_m` are left out.
+    """
+    low, size = points.new_tensor(range_m[:3]), points.new_tensor(voxel_m)
+    cell = torch.floor((points[:, :3] - low) / size)
+    inside = ((cell >= 0) & (cell < points.new_tensor((shape[2], shape[1], shape[0] - 1)))).all(1)
+    x, y, z = cell[inside].long().unbind(1)
+    points = points[inside]
+    keys, order = keys_of(torch.stack((sample[inside], z, y, x), 1), shape).sort(stable=True)
+    keys, count = torch.unique_consecutive(keys, return_counts=True)
+    means = torch.segment_reduce(points[order], "mean", lengths=count, axis=0)
+    return means, keys
