@@ -1,0 +1,70 @@
+"""What a roadside LiDAR tells the vehicles of its region about one spin: boxes, and where it saw what.
+
+The detector at the pole is *ideal* here: it labels exactly the objects its own LiDAR has enough returns from. Every
+figure that rests on it is an upper bound of what a trained roadside detector would give.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+from scipy.ndimage import binary_dilation
+
+from flcav.geometry import Boxes, transform_points
+from flcav.sensors.frame import Frame
+
+MIN_RETURNS = 10  # an object with fewer returns from the roadside LiDAR is not labelled
+CELL_M = 0.4  # of the grids that say where something was seen
+REACH = np.ones((5, 5), dtype=bool)  # what a return says of the cells around it: up to two cells away
+GROUND_M = (-0.3, 0.3)  # a return between these heights above the road is ground (kerbs are 0.12)
+TOP_M = 3.0  # what is higher (crowns, signs, walls) says nothing about the road below
+
+
+@dataclass(frozen=True)
+class RoadView:
+    """One spin of one roadside sensor, world frame."""
+
+    boxes: Boxes  # labelled objects; label = actor category
+    origin: NDArray[np.float64]  # (2,) world x, y of the corner of cell (0, 0) [m]
+    ground: NDArray[np.bool_]  # (X, Y) cells of CELL_M that are seen to be free
+    occupied: NDArray[np.bool_]  # (X, Y) cells with returns above the ground
+
+    def at(self, cells: NDArray[np.bool_], xy: NDArray) -> NDArray[np.bool_]:
+        """Return (K,): `cells` (`ground` or `occupied`) at world positions (K, 2); False outside the grid."""
+        index = np.floor((xy - self.origin) / CELL_M).astype(np.int64)
+        inside = ((index >= 0) & (index < cells.shape)).all(axis=1)
+        out = np.zeros(len(xy), dtype=bool)
+        out[inside] = cells[index[inside, 0], index[inside, 1]]
+        return out
+
+    def message(self) -> bytes:
+        """Return the view as it crosses the radio: float32 boxes and one bit per cell."""
+        arrays = {
+            "boxes": self.boxes.array().astype(np.float32),
+            "category": np.frombuffer("\n".join(self.boxes.label).encode() or b"\n", dtype=np.uint8),
+            "origin": self.origin,
+            "ground": np.packbits(self.ground),
+            "occupied": np.packbits(self.occupied),
+        }
+        return save(arrays)
+
+
+def road_view(frame: Frame, lidar: str = "lidar") -> RoadView:
+    """Return what an ideal detector at a roadside sensor tells of its `frame`."""
+    labelled = frame.annotations.returns >= MIN_RETURNS
+    points = transform_points(frame.world_from_sensor(lidar), frame.lidar[lidar][:, :3].astype(np.float64))
+    origin = np.floor(points[:, :2].min(axis=0) / CELL_M) * CELL_M
+    shape = tuple(np.floor((points[:, :2].max(axis=0) - origin) / CELL_M).astype(int) + 1)
+    ground, occupied = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    x, y = np.floor((points[:, :2] - origin) / CELL_M).astype(np.int64).T
+    low = (points[:, 2] > GROUND_M[0]) & (points[:, 2] < GROUND_M[1])
+    high = (points[:, 2] >= GROUND_M[1]) & (points[:, 2] < TOP_M)
+    ground[x[low], y[low]] = True
+    occupied[x[high], y[high]] = True
+    return RoadView(frame.annotations.boxes[labelled], origin, free_cells(ground, occupied), occupied)
+
+
+def free_cells(ground: NDArray[np.bool_], standing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the cells at or beside a ground return with nothing standing at or beside them."""
+    return np.asarray(binary_dilation(ground, REACH)) & ~np.asarray(binary_dilation(standing, REACH), dtype=bool)
