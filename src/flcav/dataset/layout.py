@@ -1,0 +1,66 @@
+"""Where things lie in a dataset folder, and its manifest."""
+
+import json
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from flcav.config import InputError
+
+FORMAT = 1
+MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
+CALIBRATION = "calibration.json"  # agent -> sensor -> agent_from_sensor, row by row
+TRACES = "traces"
+WORK = ".recording"  # what a recording under way keeps; gone when it is done
+PACKAGES = ("flcav", "embreex", "libsumo", "numba", "numpy", "pyarrow")  # those that decide the bytes
+
+
+@dataclass(frozen=True)
+class FrameKey:
+    """Which frame."""
+
+    scene: str
+    index: int  # spin number within the scene
+    agent: str
+    time_s: float
+
+
+def table_path(name: str) -> str:
+    """Return the file of the table `name`."""
+    return f"{name}.parquet"
+
+
+def points_path(lidar: str, key: str) -> str:
+    """Return the file of one point cloud: (N, 4) little-endian float32 x, y, z [m], intensity; sensor frame."""
+    return f"{lidar}/{key}.bin"
+
+
+def trace_path(scene: str) -> str:
+    """Return the file of a scene's traffic."""
+    return f"{TRACES}/{scene}.parquet"
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of the packages that decide what is recorded."""
+    return {name: version(name) for name in PACKAGES}
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return a dataset's manifest; raises `InputError` where the folder holds no finished dataset."""
+    path = folder / MANIFEST
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such dataset folder")
+    if not path.is_file():
+        reason = "an unfinished recording; record it again to finish it" if (folder / WORK).exists() else "no dataset"
+        raise InputError(f"{path}: missing, so {folder} is {reason}")
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{path}: not JSON ({error})") from None
+    expected = {"format", "recipe", "versions", "counts", "scenes", "files"}
+    if not isinstance(manifest, dict) or not expected <= manifest.keys():
+        raise InputError(f"{path}: not a dataset manifest; it must hold {', '.join(sorted(expected))}")
+    if manifest["format"] != FORMAT:
+        raise InputError(f"{path}: dataset format {manifest['format']}, this version of flcav reads format {FORMAT}")
+    return manifest
