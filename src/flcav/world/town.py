@@ -4,9 +4,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
+from flcav.config import InputError, read_config
+from flcav.seeds import stream
+from flcav.world import placement
+from flcav.world.parameters import TownParameters
+from flcav.world.roads import RoadNet, read_net
+from flcav.world.surfaces import kerb_lines, simple_polygons, surfaces
+
 Array = NDArray[np.float64]
+
+TOWNS: tuple[str, ...] = ("suburb", "grid", "ring")
+MARGIN_M = 5.0  # of open land around the outermost thing
 
 
 @dataclass(frozen=True)
@@ -34,15 +45,79 @@ class Town:
 
     name: str
     net: Path  # the SUMO net file (.net.xml)
+    parameters: TownParameters  # what the town was furnished by, and its traffic
     bounds: tuple[float, float, float, float]  # x_min, y_min, x_max, y_max [m]
-    roads: tuple[Array, ...]  # polygons (K, 2) of drivable surface
-    sidewalks: tuple[Array, ...]  # polygons (K, 2), raised by the kerb
+    roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, without holes
+    sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2), raised by the kerb; traffic islands too
     kerbs: tuple[Array, ...]  # polylines (K, 2) where road meets sidewalk
     buildings: Array  # (B, 6) centre x, y, yaw, length, width, height
     trees: Array  # (T, 4) x, y, height, crown radius
-    clutter: tuple[
-        tuple[str, Array], ...
-    ]  # (kind, (K, 6) x, y, yaw, length, width, height): shelter, kiosk, bin, hedge...
+    clutter: tuple[tuple[str, Array], ...]  # (kind of `parameters.CLUTTER`, (K, 6) x, y, yaw, length, width, height)
     poles: Poles
     signs: Signs
     lamps: Array  # (L, 3) street lamp foot x, y and height
+
+
+def load_town(name: str | Path) -> Town:
+    """Return the town of that name, or of the folder `name` with `town.net.xml` and `town.yaml`.
+
+    The same files give the same town. Raises `InputError` for an unknown name and for files that do not fit together.
+    """
+    folder = Path(name) if isinstance(name, Path) else Path(__file__).parent / "towns" / name
+    if isinstance(name, str) and name not in TOWNS:
+        folder = Path(name)
+        if not folder.is_dir():
+            raise InputError(f"unknown town {name!r}; known towns: {', '.join(TOWNS)}, or a folder with a town.yaml")
+    parameters = read_config(TownParameters, folder / "town.yaml")
+    net = read_net(folder / "town.net.xml")
+    _check(net, parameters, folder / "town.yaml")
+    return _furnish(folder.name, folder / "town.net.xml", net, parameters)
+
+
+def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
+    if missing := sorted({edge.type for edge in net.streets} - set(parameters.streets)):
+        raise InputError(f"{origin}: field 'streets' lacks the street type '{missing[0]}' of the net")
+    walked = {edge.id for edge in net.streets if edge.lanes_of("sidewalk")}
+    for pole in parameters.poles:
+        if pole.edge not in walked:
+            raise InputError(f"{origin}: pole {pole.id} stands on '{pole.edge}', which is no edge with a sidewalk")
+
+
+def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:
+    ground = surfaces(net, {kind: street.frontage_m for kind, street in parameters.streets.items()})
+    rows = list(placement.verges(net, parameters))
+    paved = ground.roads.union(ground.sidewalks)
+    land = placement.Plot(paved)
+    buildings = placement.place_buildings(rows, land, stream(parameters.seed, "buildings"))
+    walked = shapely.union_all([verge.line.buffer(verge.half_width, cap_style="flat") for verge in rows])
+    facades = [placement.footprint(x, y, yaw, length, width).buffer(0.1) for x, y, yaw, length, width, _ in buildings]
+    open_land = placement.Plot(shapely.union_all([ground.roads, walked, *facades]))
+    clutter = placement.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
+    trees = placement.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
+    poles = placement.place_poles(net, parameters.poles)
+    signs = placement.place_signs(net)
+    low_x, low_y, high_x, high_y = shapely.union_all([paved, *facades]).bounds
+    return Town(
+        name=name,
+        net=path,
+        parameters=parameters,
+        bounds=(low_x - MARGIN_M, low_y - MARGIN_M, high_x + MARGIN_M, high_y + MARGIN_M),
+        roads=simple_polygons(ground.roads),
+        sidewalks=simple_polygons(ground.sidewalks),
+        kerbs=kerb_lines(ground),
+        buildings=buildings,
+        trees=trees,
+        clutter=clutter,
+        poles=Poles(
+            id=np.array([row[0] for row in poles], dtype=np.int64),
+            position=np.array([row[1] for row in poles], dtype=np.float64).reshape(-1, 3),
+            yaw=np.array([row[2] for row in poles], dtype=np.float64),
+            kind=tuple(row[3] for row in poles),
+        ),
+        signs=Signs(
+            position=np.array([row[0] for row in signs], dtype=np.float64).reshape(-1, 3),
+            yaw=np.array([row[1] for row in signs], dtype=np.float64),
+            kind=tuple(row[2] for row in signs),
+        ),
+        lamps=placement.place_lamps(rows, stream(parameters.seed, "lamps")),
+    )

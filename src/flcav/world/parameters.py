@@ -1,0 +1,109 @@
+"""What makes a town this town and no other, beside its road net: the file `town.yaml`."""
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from flcav.config import Config
+from flcav.world.shapes import SHAPES
+
+
+def _interval(value: tuple[float, float]) -> tuple[float, float]:
+    if not 0 <= value[0] <= value[1]:
+        raise ValueError("must be two numbers, 0 <= low <= high")
+    return value
+
+
+def _vehicle_mix(value: dict[str, float]) -> dict[str, float]:
+    allowed = [name for name in SHAPES if name != "pedestrian"]
+    return _mix(value, allowed)
+
+
+def _mix(value: dict[str, float], allowed: list[str]) -> dict[str, float]:
+    if unknown := sorted(set(value) - set(allowed)):
+        raise ValueError(f"unknown {unknown[0]!r}; allowed: {', '.join(allowed)}")
+    if min(value.values(), default=0.0) < 0 or sum(value.values()) <= 0:
+        raise ValueError("weights must be >= 0 and not all zero")
+    return value
+
+
+def _clutter_mix(value: dict[str, float]) -> dict[str, float]:
+    return _mix(value, list(CLUTTER))
+
+
+CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, height [m]
+    "hedge": (5.0, 0.8, 1.2),
+    "bins": (3.2, 0.9, 1.3),
+    "planter": (3.4, 1.3, 1.0),
+    "kiosk": (3.6, 1.8, 2.2),
+    "shelter": (4.0, 1.5, 2.3),
+    "container": (4.2, 1.8, 1.6),
+    "cabinet": (1.4, 0.6, 1.3),
+}
+
+Interval = Annotated[tuple[float, float], AfterValidator(_interval)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+VehicleMix = Annotated[dict[str, float], AfterValidator(_vehicle_mix)]
+ClutterMix = Annotated[dict[str, float], AfterValidator(_clutter_mix)]
+
+
+class StreetParameters(Config):
+    """One street type: what lines it, who parks on it, how much it draws."""
+
+    frontage_m: NotNegative = 0.0  # paving behind the sidewalk
+    setback_m: Interval = (2.0, 4.0)  # from the paving to the facades
+    building_length_m: Interval = (9.0, 14.0)
+    building_depth_m: Interval = (8.0, 11.0)
+    building_height_m: Interval = (5.0, 8.0)
+    building_gap_m: Interval = (3.0, 7.0)
+    tree_spacing_m: Positive = 18.0
+    lamp_spacing_m: Positive = 32.0
+    clutter_spacing_m: Positive = 25.0
+    clutter: ClutterMix = {"hedge": 1.0}
+    parked: Share = 0.0  # share of the parking lane's places that are taken
+    parked_mix: VehicleMix = {"car": 1.0}
+    traffic: NotNegative = 1.0  # relative weight of its edges as a destination of vehicles
+    footfall: NotNegative = 1.0  # and of pedestrians
+
+
+class PoleParameters(Config):
+    """A candidate site at the kerb of an edge."""
+
+    id: Annotated[int, Field(ge=1)]
+    kind: Literal["straight", "cross", "tee", "roundabout"]
+    edge: str  # stands on the right of this edge
+    before_end_m: NotNegative  # distance to the edge's end; other than straight: watches the junction there
+    height_m: Positive = 6.0
+
+
+class TownParameters(Config):
+    """A town's parameter file."""
+
+    description: str
+    seed: int  # of everything that stands still
+    vehicles: Annotated[int, Field(ge=0)]  # moving at once, CAVs apart
+    pedestrians: Annotated[int, Field(ge=0)]
+    mix: VehicleMix  # category -> weight among moving vehicles
+    shapes: dict[
+        str, dict[str, float]
+    ] = {}  # category -> shape -> weight; a category left out has all its shapes alike
+    streets: dict[str, StreetParameters]  # by the net's edge type
+    poles: tuple[PoleParameters, ...] = ()
+
+    @model_validator(mode="after")
+    def _known_shapes(self) -> "TownParameters":
+        for category, weights in self.shapes.items():
+            _mix({category: 1.0}, list(SHAPES))
+            _mix(weights, [shape.name for shape in SHAPES[category]])
+        ids = [pole.id for pole in self.poles]
+        if len(set(ids)) != len(ids):
+            raise ValueError("pole ids must differ")
+        return self
+
+    def shape_weights(self, category: str) -> list[float]:
+        """Return the weight of each of a category's shapes, in the order of `SHAPES`, summing to one."""
+        weights = self.shapes.get(category) or {shape.name: 1.0 for shape in SHAPES[category]}
+        total = sum(weights.values())
+        return [weights.get(shape.name, 0.0) / total for shape in SHAPES[category]]

@@ -1,0 +1,128 @@
+"""A SUMO road net as records: edges with their lanes, junctions, and who gives way where.
+
+Format: https://sumo.dlr.de/docs/Networks/SUMO_Road_Networks.html
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One lane of an edge."""
+
+    id: str
+    kind: str  # driving | bicycle | parking (closed to all traffic) | sidewalk | crossing | walkingarea
+    shape: Array  # (K, 2) centre line in driving direction, outline of a walkingarea, world [m]
+    width: float  # [m]
+    speed: float  # limit [m/s]
+
+
+@dataclass(frozen=True)
+class Edge:
+    """One direction of a street, or a piece of a junction's inside."""
+
+    id: str
+    function: str  # normal | internal | crossing | walkingarea
+    start: str  # junction ids; empty for the inside of a junction
+    end: str
+    type: str  # street type of the town's parameters
+    lanes: tuple[Lane, ...]  # from the kerb to the middle of the road
+
+    def lanes_of(self, kind: str) -> tuple[Lane, ...]:
+        """Return the lanes of a kind, from the kerb to the middle."""
+        return tuple(lane for lane in self.lanes if lane.kind == kind)
+
+
+@dataclass(frozen=True)
+class Junction:
+    """Where edges meet."""
+
+    id: str
+    kind: str  # SUMO's type: priority, priority_stop, traffic_light, ...
+    centre: Array  # (2,) [m]
+    shape: Array  # (K, 2) outline [m]; empty at a bare node
+
+
+@dataclass(frozen=True)
+class RoadNet:
+    """All of a net that the static world and the traffic are made from."""
+
+    edges: dict[str, Edge]
+    junctions: dict[str, Junction]
+    roundabouts: frozenset[str]  # junctions on a roundabout
+    right_of_way: dict[
+        str, str
+    ]  # edge -> link states of its driving lanes, e.g. "MMm"; s stops, m gives way, M has priority
+
+    @property
+    def streets(self) -> Iterator[Edge]:
+        """Iterate over the edges outside junctions."""
+        return (edge for edge in self.edges.values() if edge.function == "normal")
+
+
+def read_net(path: Path) -> RoadNet:
+    """Return the net file at `path`; raises `InputError` where it is no SUMO net."""
+    try:
+        root = ElementTree.parse(path).getroot()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: not a SUMO net ({error})") from None
+    if root.tag != "net":
+        raise InputError(f"{path}: not a SUMO net (its root is <{root.tag}>, expected <net>)")
+    edges = {row.attrib["id"]: _edge(row) for row in root.iterfind("edge")}
+    junctions = {
+        row.attrib["id"]: Junction(
+            row.attrib["id"],
+            row.attrib["type"],
+            np.array([float(row.attrib["x"]), float(row.attrib["y"])]),
+            _points(row.get("shape", "")),
+        )
+        for row in root.iterfind("junction")
+        if row.attrib["type"] != "internal"
+    }
+    circling = (row.attrib["nodes"].split() for row in root.iterfind("roundabout"))
+    states: dict[str, str] = {}
+    for row in root.iterfind("connection"):
+        edge = edges[row.attrib["from"]]
+        if edge.function == "normal" and edge.lanes[int(row.attrib["fromLane"])].kind == "driving":
+            states[edge.id] = states.get(edge.id, "") + row.attrib["state"]
+    return RoadNet(edges, junctions, frozenset(name for names in circling for name in names), states)
+
+
+def _edge(row: ElementTree.Element) -> Edge:
+    function = row.get("function", "normal")
+    lanes = tuple(
+        Lane(
+            lane.attrib["id"],
+            _lane_kind(function, lane),
+            _points(lane.attrib["shape"]),
+            float(lane.get("width", "3.2")),
+            float(lane.attrib["speed"]),
+        )
+        for lane in row.iterfind("lane")
+    )
+    return Edge(row.attrib["id"], function, row.get("from", ""), row.get("to", ""), row.get("type", ""), lanes)
+
+
+def _lane_kind(function: str, lane: ElementTree.Element) -> str:
+    if function in ("crossing", "walkingarea"):
+        return function
+    if lane.get("disallow") == "all":
+        return "parking"
+    return {"pedestrian": "sidewalk", "bicycle": "bicycle"}.get(lane.get("allow", ""), "driving")
+
+
+def _points(text: str) -> Array:
+    rows = [point.split(",")[:2] for point in text.split()]
+    return np.array(rows, dtype=np.float64).reshape(-1, 2)

@@ -1,0 +1,61 @@
+"""One SUMO run in a process of its own: `python -m flcav.world.sumo_process JOB.json OUT.npz`.
+
+libsumo holds one simulation per process, and a second start silently replaces the first; so nobody imports it but here.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+STEP_S = 0.1
+
+
+def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path) -> None:
+    """Simulate up to the last of `steps` (ascending, of 0.1 s) and write what was read at each to `out` (.npz).
+
+    Arrays: `id`, `type` (A,); `row` (N, 2) instant and actor index; `state` (N, 4) SUMO's x, y [m], angle [deg clockwise
+    from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of all links of each traffic light.
+    """
+    import libsumo
+
+    libsumo.start(
+        ["sumo", "--net-file", str(net), "--route-files", str(routes), "--seed", str(seed)]
+        + ["--step-length", str(STEP_S), "--default.action-step-length", "0.5", "--lanechange.duration", "2"]
+        + ["--time-to-teleport", "-1", "--collision.action", "none", "--no-step-log", "true", "--no-warnings", "true"]
+    )
+    index: dict[str, int] = {}
+    kinds: list[str] = []
+    rows: list[tuple[int, int]] = []
+    states: list[tuple[float, float, float, float]] = []
+    lights = libsumo.trafficlight.getIDList()
+    light_states: list[list[str]] = []
+    now = 0
+    for instant, step in enumerate(steps):
+        while now < step:
+            libsumo.simulationStep()
+            now += 1
+        for domain in (libsumo.vehicle, libsumo.person):
+            for name in domain.getIDList():
+                if name not in index:
+                    index[name] = len(kinds)
+                    kinds.append(domain.getTypeID(name))
+                rows.append((instant, index[name]))
+                states.append((*domain.getPosition(name), domain.getAngle(name), domain.getSpeed(name)))
+        light_states.append([libsumo.trafficlight.getRedYellowGreenState(light) for light in lights])
+    libsumo.close()
+    np.savez(
+        out,
+        id=np.array(list(index), dtype=np.str_),
+        type=np.array(kinds, dtype=np.str_),
+        row=np.array(rows, dtype=np.int64).reshape(-1, 2),
+        state=np.array(states, dtype=np.float64).reshape(-1, 4),
+        light=np.array(lights, dtype=np.str_),
+        light_state=np.array(light_states, dtype=np.str_).reshape(len(steps), len(lights)),
+    )
+
+
+if __name__ == "__main__":
+    job = json.loads(Path(sys.argv[1]).read_text())
+    run(Path(job["net"]), Path(job["routes"]), job["seed"], job["steps"], Path(sys.argv[2]))
