@@ -1,0 +1,182 @@
+import errno
+import hashlib
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from toy_source import ToySource
+
+from flcav.config import InputError
+from flcav.dataset import layout
+from flcav.dataset.recorder import record
+from flcav.dataset.store import Dataset
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Return every file below `folder`, hidden ones too, with its hash."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    out = tmp_path_factory.mktemp("whole") / "data"
+    assert record(ToySource(), out)
+    return digests(out)
+
+
+def test_same_seed_same_bytes_whatever_the_jobs(tmp_path: Path, uninterrupted: dict[str, str]):
+    counts = []
+    record(ToySource(), tmp_path / "data", jobs=2, progress=lambda done, total, note: counts.append((done, total)))
+    assert digests(tmp_path / "data") == uninterrupted
+    assert counts[-1] == (12, 12)
+    assert not multiprocessing.active_children()
+
+
+def test_another_seed_gives_other_frames(tmp_path: Path, uninterrupted: dict[str, str]):
+    record(ToySource(seed=1), tmp_path / "data")
+    assert digests(tmp_path / "data").keys() - uninterrupted.keys()
+
+
+def test_the_manifest_lists_every_file_and_no_surroundings(tmp_path: Path):
+    record(ToySource(), tmp_path / "data")
+    manifest = Dataset.open(tmp_path / "data").manifest
+    found = digests(tmp_path / "data")
+    del found["manifest.json"]
+    assert {name: entry["sha256"] for name, entry in manifest["files"].items()} == found
+    assert manifest["counts"] == {"scenes": 2, "frames": 12, "annotations": 48, "points": 12 * 125}
+    assert manifest["recipe"] == ToySource().describe()
+    assert str(tmp_path) not in (tmp_path / "data" / "manifest.json").read_text()
+
+
+def test_a_finished_recording_is_left_alone(tmp_path: Path):
+    assert record(ToySource(), tmp_path / "data")
+    before = digests(tmp_path / "data")
+    assert not record(ToySource(), tmp_path / "data")
+    assert digests(tmp_path / "data") == before
+
+
+def test_another_recipe_is_refused_by_name(tmp_path: Path):
+    record(ToySource(), tmp_path / "data")
+    with pytest.raises(InputError, match=r"holds another dataset \(different: seed, spins_per_scene\)"):
+        record(ToySource(seed=1, spins=4), tmp_path / "data")
+    (tmp_path / "data" / "manifest.json").unlink()
+    with pytest.raises(InputError, match="holds other files"):
+        record(ToySource(), tmp_path / "data")
+
+
+def test_another_recipe_cannot_finish_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(OSError, match="No space left"):
+        record(ToySource(fail_at=1), tmp_path / "data")
+    with pytest.raises(InputError, match=r"unfinished recording of another \(different: seed\)"):
+        record(ToySource(seed=1), tmp_path / "data")
+    monkeypatch.setattr("flcav.dataset.recorder.package_versions", lambda: {"numpy": "0.1"})
+    with pytest.raises(InputError, match=r"different: embreex, flcav, libsumo"):
+        record(ToySource(), tmp_path / "data")
+
+
+def test_a_folder_of_other_things_is_refused(tmp_path: Path):
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(InputError, match="holds other files"):
+        record(ToySource(), tmp_path)
+    with pytest.raises(InputError, match="is a file"):
+        record(ToySource(), tmp_path / "letter.txt")
+    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, jobs: int, uninterrupted: dict[str, str]):
+    with pytest.raises(OSError, match="No space left on device"):
+        record(ToySource(fail_at=1), tmp_path / "data", jobs=jobs)
+    assert [path.name for path in (tmp_path / "data").iterdir()] == [layout.WORK]
+    with pytest.raises(InputError, match="unfinished"):
+        Dataset.open(tmp_path / "data")
+    record(ToySource(), tmp_path / "data", jobs=jobs)
+    assert digests(tmp_path / "data") == uninterrupted
+
+
+def test_an_interruption_while_files_move_is_made_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, str]
+):
+    from flcav.dataset import recorder
+
+    move, moves = recorder._move, len(uninterrupted)
+    for last in range(0, moves, 4):
+        out = tmp_path / str(last)
+        moved = 0
+
+        def failing(source: Path, target: Path) -> None:
+            nonlocal moved
+            if moved == last:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            moved += 1
+            move(source, target)
+
+        monkeypatch.setattr(recorder, "_move", failing)
+        with pytest.raises(OSError, match="No space left"):
+            record(ToySource(), out)
+        monkeypatch.setattr(recorder, "_move", move)
+        record(ToySource(), out)
+        assert digests(out) == uninterrupted
+
+
+@pytest.mark.parametrize(("jobs", "number"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGINT)])
+def test_a_killed_recording_is_finished_by_the_same_command(
+    tmp_path: Path, jobs: int, number: int, uninterrupted: dict[str, str]
+):
+    out = tmp_path / "data"
+    script = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+if __name__ == "__main__":
+    from pathlib import Path
+    from flcav.dataset.recorder import record
+    from toy_source import ToySource
+    record(ToySource(pause_s=0.3), Path({str(out)!r}), jobs={jobs})
+"""
+    (tmp_path / "run.py").write_text(script)
+    process = subprocess.Popen([sys.executable, tmp_path / "run.py"], stderr=subprocess.DEVNULL, start_new_session=True)
+    while not list(out.glob(f"{layout.WORK}/*/files/lidar/*.bin")):
+        assert process.poll() is None
+        time.sleep(0.02)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # as the terminal does
+    else:
+        process.send_signal(number)
+    assert process.wait(10) != 0
+    deadline = time.monotonic() + 10
+    while group_lives(process.pid):
+        assert time.monotonic() < deadline, "a worker outlived the recording"
+        time.sleep(0.02)
+    assert not (out / "manifest.json").exists()
+    record(ToySource(), out)
+    assert digests(out) == uninterrupted
+
+
+def group_lives(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError):
+        record(ToySource(), tmp_path / "file" / "data")
+
+
+def test_names_that_would_leave_the_folder_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    source = ToySource()
+    monkeypatch.setattr(ToySource, "scenes", lambda self: ["../x"])
+    with pytest.raises(ValueError, match="cannot hold"):
+        record(source, tmp_path / "data")
