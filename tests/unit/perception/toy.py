@@ -41,8 +41,8 @@ def cast(rays: np.ndarray, boxes: np.ndarray, range_m: float = 80.0) -> tuple[np
 def toy_sample(seed: int, rays: np.ndarray, reach_m: float = 46.0, side_m: float = 22.0) -> Sample:
     """Return a scene of 3-7 cars and 4-8 pieces of clutter ahead; cars with at least 5 returns are labelled."""
     rng = np.random.default_rng(seed)
-    cars = _place(rng, rng.integers(3, 8), reach_m, side_m, car=True, taken=[])
-    clutter = _place(rng, rng.integers(4, 9), reach_m, side_m, car=False, taken=cars)
+    cars = _place(rng, int(rng.integers(3, 8)), reach_m, side_m, car=True, taken=[])
+    clutter = _place(rng, int(rng.integers(4, 9)), reach_m, side_m, car=False, taken=cars)
     parts = [part for car in cars for part in _car_parts(car)] + clutter
     owner = np.array([i // 2 for i in range(2 * len(cars))] + [-1] * (len(clutter) + 2))
     distance, hit = cast(rays, np.array(parts))
@@ -60,7 +60,7 @@ def _place(
     rng: np.random.Generator, count: int, reach_m: float, side_m: float, *, car: bool, taken: list[np.ndarray]
 ) -> list[np.ndarray]:
     placed: list[np.ndarray] = []
-    for _ in range(20 * int(count)):
+    for _ in range(20 * count):
         if len(placed) == count:
             break
         x, y = rng.uniform(4, reach_m), rng.uniform(-side_m, side_m)

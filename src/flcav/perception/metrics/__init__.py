@@ -1,1 +1,6 @@
 """Detection metrics."""
+
+from flcav.perception.metrics.average_precision import average_precision, bootstrap_difference, bootstrap_interval
+from flcav.perception.metrics.matching import Matches, match
+
+__all__ = ["Matches", "average_precision", "bootstrap_difference", "bootstrap_interval", "match"]

@@ -2,12 +2,14 @@
 
 import math
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass
 
-from flcav.config import Config
+STRICT = ConfigDict(extra="forbid")
 
 
-class Anchor(Config):
+@dataclass(frozen=True, config=STRICT)
+class Anchor:
     """The box an object class is regressed from, at every place of the grid, heading along x and along y."""
 
     name: str  # detection class
@@ -18,7 +20,8 @@ class Anchor(Config):
     unmatched_iou: float = Field(gt=0, lt=1)  # and below which it is negative
 
 
-class SecondConfig(Config):
+@dataclass(frozen=True, config=STRICT)
+class SecondConfig:
     """A SECOND network in the LiDAR frame: x forward, y left, z up, metres, origin at the sensor."""
 
     anchors: tuple[Anchor, ...] = Field(min_length=1)  # one per class; their order is the order of the scores

@@ -17,7 +17,7 @@ from flcav.perception.ops.norm import RowBatchNorm
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d
 from flcav.perception.ops.voxels import grid_shape, voxelize
 
-NORM = {"eps": 1e-3, "momentum": 0.1}
+EPSILON, MOMENTUM = 1e-3, 0.1  # of every batch normalisation
 HEADINGS = 2  # anchors per class and place: along x, along y
 
 
@@ -35,7 +35,7 @@ class SparseBlock(nn.Module):
     def __init__(self, convolution: SubmanifoldConv3d | StridedConv3d, channels: int) -> None:
         super().__init__()
         self.convolution = convolution
-        self.norm = RowBatchNorm(channels, **NORM)
+        self.norm = RowBatchNorm(channels, EPSILON, MOMENTUM)
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Return the block's output voxels."""
@@ -65,9 +65,17 @@ def head_shape(config: SecondConfig) -> tuple[int, int]:
     return rows, columns
 
 
-def _conv2d(inputs: int, outputs: int, stride: int = 1) -> list[nn.Module]:
-    convolution = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
-    return [convolution, nn.BatchNorm2d(outputs, **NORM), nn.ReLU(inplace=True)]
+def _normalized(convolution: nn.Conv2d | nn.ConvTranspose2d) -> list[nn.Module]:
+    norm = nn.BatchNorm2d(convolution.out_channels, EPSILON, MOMENTUM)
+    return [convolution, norm, nn.ReLU(inplace=True)]
+
+
+def _scale(inputs: int, outputs: int, stride: int, layers: int) -> nn.Sequential:
+    """Return one scale of the bird's-eye network: a 3x3 convolution with the stride, then `layers` more."""
+    modules = _normalized(nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False))
+    for _ in range(layers):
+        modules += _normalized(nn.Conv2d(outputs, outputs, 3, padding=1, bias=False))
+    return nn.Sequential(*modules)
 
 
 class BirdsEye(nn.Module):
@@ -76,15 +84,10 @@ class BirdsEye(nn.Module):
     def __init__(self, inputs: int, config: SecondConfig) -> None:
         super().__init__()
         (near, far), (near_up, far_up) = config.bev_channels, config.bev_up_channels
-        near_layers, far_layers = config.bev_layers
-        self.near = nn.Sequential(*_conv2d(inputs, near), *(m for _ in range(near_layers) for m in _conv2d(near, near)))
-        self.far = nn.Sequential(*_conv2d(near, far, 2), *(m for _ in range(far_layers) for m in _conv2d(far, far)))
-        self.near_up = nn.Sequential(
-            nn.Conv2d(near, near_up, 1, bias=False), nn.BatchNorm2d(near_up, **NORM), nn.ReLU(inplace=True)
-        )
-        self.far_up = nn.Sequential(
-            nn.ConvTranspose2d(far, far_up, 2, 2, bias=False), nn.BatchNorm2d(far_up, **NORM), nn.ReLU(inplace=True)
-        )
+        self.near = _scale(inputs, near, 1, config.bev_layers[0])
+        self.far = _scale(near, far, 2, config.bev_layers[1])
+        self.near_up = nn.Sequential(*_normalized(nn.Conv2d(near, near_up, 1, bias=False)))
+        self.far_up = nn.Sequential(*_normalized(nn.ConvTranspose2d(far, far_up, 2, 2, bias=False)))
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (B, sum of bev_up_channels, H, W) from (B, C, H, W)."""

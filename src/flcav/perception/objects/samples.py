@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, inverse
 from flcav.perception.objects.config import SecondConfig
 from flcav.sensors.frame import Frame
 
@@ -35,13 +35,13 @@ class Sample:
 def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Sample:
     """Return the frame's sweep with its ground truth as labels.
 
-    Objects with at least `MIN_RETURNS` returns are to be found, with fewer but some they are ignored, and so are trucks
-    and buses beside cars; objects without a return are background. Points that cannot come into `config`'s range, turned
-    and scaled as training does, are left out.
+    Objects with at least `MIN_RETURNS` returns are to be found, with fewer but some they are ignored, and so are
+    trucks and buses beside cars; objects without a return are background. Points that cannot come into `config`'s
+    range, turned and scaled as training does, are left out.
     """
     name = only_lidar(frame, lidar)
     truth = frame.annotations
-    boxes = truth.boxes.transformed(np.linalg.inv(frame.world_from_sensor(name)))
+    boxes = truth.boxes.transformed(inverse(frame.world_from_sensor(name)))
     label = detection_labels(truth.boxes.label, config.classes)
     wanted = (label != "") & (truth.returns >= MIN_RETURNS)
     neutral = (truth.returns > 0) & ~wanted & (label != "")

@@ -1,9 +1,9 @@
 """Which input voxel meets which output voxel through which kernel offset: the rules of sparse 3D convolution.
 
-A voxel of sample b at grid cell (z, y, x) has the integer key ((b D + z + 1) H + y + 1) W + x + 1, where D, H, W are the
-grid's extents plus two: with one cell of padding on every side, adding an offset's key difference never wraps to another
-row. Keys are kept sorted, so a neighbour is found by binary search. (Graham et al., "3D Semantic Segmentation with
-Submanifold Sparse Convolutional Networks", CVPR 2018, names the two kinds of convolution.)
+A voxel of sample b at grid cell (z, y, x) has the integer key ((b D + z + 1) H + y + 1) W + x + 1, where D, H, W are
+the grid's extents plus two: with one cell of padding on every side, adding an offset's key difference never wraps to
+another row. Keys are kept sorted, so a neighbour is found by binary search. (Graham et al., "3D Semantic Segmentation
+with Submanifold Sparse Convolutional Networks", CVPR 2018, names the two kinds of convolution.)
 """
 
 from dataclasses import dataclass
@@ -73,9 +73,8 @@ def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
     _, height, width = (extent + 2 for extent in shape)
     count = len(keys)
     later = torch.cat((keys, keys.new_full((3,), -1)))  # so that looking up to 3 rows past the end finds no key
-    lines = [height_step * width for height_step in (1,)]
-    lines += [(height + height_step) * width for height_step in (-1, 0, 1)]
-    wanted = keys[None] + (keys.new_tensor(lines) - 1)[:, None]  # (4, N): the first of three consecutive keys
+    lines = keys.new_tensor([width, (height - 1) * width, height * width, (height + 1) * width])
+    wanted = keys[None] + lines[:, None] - 1  # (4, N): the first of three consecutive keys
     place = torch.searchsorted(keys, wanted)
     found, where = [later[1 : count + 1] == keys + 1], [torch.arange(1, count + 1, device=keys.device)]
     for line in range(4):

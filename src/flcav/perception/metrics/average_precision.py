@@ -1,0 +1,70 @@
+"""Average precision over 40 recall positions, and how sure one can be of it.
+
+AP|R40 is the mean over recalls 1/40, 2/40, ..., 1 of the best precision reached at that recall or a higher one
+(Simonelli et al., "Disentangling Monocular 3D Object Detection", ICCV 2019, sec. 5; KITTI's measure since then).
+Intervals are percentile bootstraps over scenes: frames of one scene share traffic, so whole scenes are redrawn.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flcav.perception.metrics.matching import Matches
+
+RECALLS = np.arange(1, 41) / 40
+CONFIDENCE = 0.95
+
+
+def average_precision(matches: Matches, frames: ArrayLike | None = None) -> float:
+    """Return AP|R40 in [0, 1] over `frames`, an index array in which frames may repeat (None: each frame once).
+
+    NaN where those frames hold nothing to find.
+    """
+    if frames is None:
+        return _weighted(matches, np.ones(len(matches.targets), dtype=np.int64))
+    times = np.bincount(np.asarray(frames, dtype=np.int64), minlength=len(matches.targets))
+    return _weighted(matches, times)
+
+
+def bootstrap_interval(
+    matches: Matches, scene_of_frame: ArrayLike, n: int = 1000, *, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return the 95 % percentile interval of AP under redrawing of scenes; `scene_of_frame` (F,) names each's scene."""
+    draws = np.array([_weighted(matches, times) for times in _redrawn(scene_of_frame, n, rng)])
+    return _interval(draws)
+
+
+def bootstrap_difference(
+    before: Matches, after: Matches, scene_of_frame: ArrayLike, n: int = 1000, *, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return the 95 % percentile interval of AP(after) - AP(before), both on the same redrawn frames."""
+    draws = [_weighted(after, times) - _weighted(before, times) for times in _redrawn(scene_of_frame, n, rng)]
+    return _interval(np.array(draws))
+
+
+def _weighted(matches: Matches, times: NDArray[np.int64]) -> float:
+    wanted = int((matches.targets * times).sum())
+    if not wanted:
+        return float("nan")
+    weight = times[matches.frame]
+    hits, all_detections = np.cumsum(weight * matches.hit), np.cumsum(weight)
+    ends = np.flatnonzero(np.diff(matches.score, append=-np.inf) != 0)  # equal scores enter together
+    hits, all_detections = hits[ends], all_detections[ends]
+    precision = hits / np.maximum(all_detections, 1)
+    best_onwards = np.maximum.accumulate(precision[::-1])[::-1]
+    place = np.searchsorted(hits, RECALLS * wanted - 1e-9)  # first threshold that reaches the recall
+    return float(np.append(best_onwards, 0.0)[place].mean())
+
+
+def _redrawn(scene_of_frame: ArrayLike, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return (n, F) how often each frame occurs in each of n redrawings of the scenes."""
+    names, scene = np.unique(np.asarray(scene_of_frame), return_inverse=True)
+    times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=n)
+    return times[:, scene]
+
+
+def _interval(draws: NDArray[np.float64]) -> tuple[float, float]:
+    known = draws[np.isfinite(draws)]
+    if not len(known):
+        return float("nan"), float("nan")
+    low, high = np.quantile(known, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)

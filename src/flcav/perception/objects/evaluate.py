@@ -1,0 +1,141 @@
+"""How well detections agree with the truth: AP per class, in 3D and bird's-eye, at IoU 0.5 and 0.7."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.geometry import Boxes, inverse
+from flcav.perception.metrics import Matches, average_precision, bootstrap_interval, match
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.detect import detect_all
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.samples import MIN_RETURNS, detection_labels, is_lookalike, only_lidar
+from flcav.perception.objects.targets import in_range
+from flcav.perception.ops.rotated import Kind
+from flcav.progress import Report, silent
+from flcav.seeds import stream
+from flcav.sensors.frame import Frame
+
+OVERLAPS: tuple[tuple[Kind, float], ...] = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
+LOWEST_SCORE = 0.05  # detections below add nothing that the intervals would show
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What one frame holds for a network to find, LiDAR frame, detection classes."""
+
+    scene: str
+    targets: Boxes  # in range, with at least `MIN_RETURNS` returns
+    neutral: Boxes  # finding them is neither right nor wrong; label = the class they are neutral for
+    hidden: Boxes  # in range without a return: counted, not asked for
+
+
+@dataclass(frozen=True)
+class Score:
+    """The result for one class under one measure of overlap."""
+
+    name: str  # detection class
+    kind: Kind
+    overlap: float  # IoU that makes a detection a hit
+    ap: float  # [0, 1]; NaN where there was nothing to find
+    low: float  # 95 % interval over scenes
+    high: float
+    matches: Matches
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The scores of one network on one set of frames."""
+
+    scores: tuple[Score, ...]
+    frames: int
+    scenes: tuple[str, ...]  # (frames,) the scene of each
+    targets: dict[str, int]  # class -> objects asked for
+    hidden: dict[str, int]  # class -> objects in range without a single return
+
+    def score(self, name: str = "Car", kind: Kind = "3d", overlap: float = 0.5) -> Score:
+        """Return the score of a class; raises `KeyError` for one that was not evaluated."""
+        for score in self.scores:
+            if (score.name, score.kind, score.overlap) == (name, kind, overlap):
+                return score
+        raise KeyError((name, kind, overlap))
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers as JSON knows them; AP is null where there was nothing to find."""
+        rows = [
+            {
+                "class": score.name,
+                "kind": score.kind,
+                "iou": score.overlap,
+                "ap": _number(score.ap),
+                "low": _number(score.low),
+                "high": _number(score.high),
+                "targets": self.targets[score.name],
+                "hidden": self.hidden[score.name],
+            }
+            for score in self.scores
+        ]
+        return {"frames": self.frames, "scenes": len(set(self.scenes)), "scores": rows}
+
+
+def truth_of(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Truth:
+    """Return what `frame` holds for a network of `config`, by the rules of evaluation.
+
+    Targets are objects of its classes whose centre is in range, with enough returns. Objects with fewer, objects out of
+    range, and trucks and buses beside cars are neutral.
+    """
+    annotations = frame.annotations
+    boxes = annotations.boxes.transformed(inverse(frame.world_from_sensor(only_lidar(frame, lidar))))
+    label = detection_labels(annotations.boxes.label, config.classes)
+    lookalike = is_lookalike(annotations.boxes.label, config.classes)
+    inside = in_range(boxes, config)
+    target = (label != "") & inside & (annotations.returns >= MIN_RETURNS)
+    hidden = (label != "") & inside & (annotations.returns == 0)
+    neutral = ((label != "") & ~target) | lookalike
+    boxes = Boxes(boxes.center, boxes.size, boxes.yaw, np.where(lookalike, "Car", label))
+    return Truth(frame.scene, boxes[target], boxes[neutral], boxes[hidden])
+
+
+def evaluate(
+    network: Second, frames: Iterable[Frame], *, total: int = 0, seed: int = 0, progress: Report = silent
+) -> Evaluation:
+    """Return the evaluation of `network` on `frames`; raises `InputError` where there are none."""
+    truths: list[Truth] = []
+    detections: list[Boxes] = []
+    for done, frame in enumerate(frames, start=1):
+        truths.append(truth_of(frame, network.config))
+        detections += detect_all(network, [frame.lidar[only_lidar(frame)]], score_threshold=LOWEST_SCORE)
+        progress(done, max(total, done), "")
+    return score_detections(detections, truths, network.config.classes, seed=seed)
+
+
+def score_detections(
+    detections: Sequence[Boxes], truths: Sequence[Truth], classes: tuple[str, ...], *, seed: int = 0
+) -> Evaluation:
+    """Return the evaluation of `detections` (LiDAR frame) against `truths`, frame by frame."""
+    if not truths:
+        raise InputError("evaluation on 0 frames: at least one is wanted")
+    scenes = tuple(truth.scene for truth in truths)
+    scores = []
+    for name in classes:
+        found = [_of_class(boxes, name) for boxes in detections]
+        targets = [_of_class(truth.targets, name) for truth in truths]
+        neutral = [_of_class(truth.neutral, name) for truth in truths]
+        for kind, overlap in OVERLAPS:
+            matches = match(found, targets, neutral, overlap, kind)
+            low, high = bootstrap_interval(matches, scenes, rng=stream(seed, "bootstrap"))
+            scores.append(Score(name, kind, overlap, average_precision(matches), low, high, matches))
+    targets_of = {name: sum(int((truth.targets.label == name).sum()) for truth in truths) for name in classes}
+    hidden_of = {name: sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes}
+    return Evaluation(tuple(scores), len(truths), scenes, targets_of, hidden_of)
+
+
+def _of_class(boxes: Boxes, name: str) -> Boxes:
+    return boxes[boxes.label == name]
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else round(value, 6)
