@@ -1,11 +1,15 @@
 """Which network: the record that rebuilds one, stored beside its weights."""
 
 import math
+from typing import Annotated
 
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 STRICT = ConfigDict(extra="forbid")
+Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(gt=0, lt=1)]
+Count = Annotated[int, Field(gt=0)]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -13,32 +17,32 @@ class Anchor:
     """The box an object class is regressed from, at every place of the grid, heading along x and along y."""
 
     name: str  # detection class
-    length_m: float = Field(gt=0)
-    width_m: float = Field(gt=0)
-    height_m: float = Field(gt=0)
-    matched_iou: float = Field(gt=0, lt=1)  # bird's-eye IoU from which an anchor is positive
-    unmatched_iou: float = Field(gt=0, lt=1)  # and below which it is negative
+    length_m: Positive
+    width_m: Positive
+    height_m: Positive
+    matched_iou: Share  # bird's-eye IoU from which an anchor is positive
+    unmatched_iou: Share  # and below which it is negative
 
 
 @dataclass(frozen=True, config=STRICT)
 class SecondConfig:
     """A SECOND network in the LiDAR frame: x forward, y left, z up, metres, origin at the sensor."""
 
-    anchors: tuple[Anchor, ...] = Field(min_length=1)  # one per class; their order is the order of the scores
+    anchors: Annotated[tuple[Anchor, ...], Field(min_length=1)]  # one per class; their order is the order of the scores
     range_m: tuple[float, float, float, float, float, float]  # x, y, z minima, then maxima
-    voxel_m: tuple[float, float, float]  # x, y, z
-    sparse_channels: tuple[int, int, int, int]  # at strides 1, 2, 4, 8
-    sparse_out: int = Field(gt=0)  # after the last convolution along z
+    voxel_m: tuple[Positive, Positive, Positive]  # x, y, z
+    sparse_channels: tuple[Count, Count, Count, Count]  # at strides 1, 2, 4, 8
+    sparse_out: Count  # after the last convolution along z
     bev_layers: tuple[int, int]  # 3x3 convolutions after the first, at head strides 1 and 2
-    bev_channels: tuple[int, int]
-    bev_up_channels: tuple[int, int]
+    bev_channels: tuple[Count, Count]
+    bev_up_channels: tuple[Count, Count]
     ground_z_m: float = -1.8  # height of the ground the anchors stand on: the sensor's height, negated
 
     @model_validator(mode="after")
     def _positive_extent(self) -> "SecondConfig":
         low, high = self.range_m[:3], self.range_m[3:]
-        if any(b <= a for a, b in zip(low, high, strict=True)) or min(self.voxel_m) <= 0:
-            raise ValueError("every axis of range_m needs a maximum above its minimum, and voxel_m a positive size")
+        if any(b <= a for a, b in zip(low, high, strict=True)):
+            raise ValueError("every axis of range_m needs a maximum above its minimum")
         return self
 
     @property
