@@ -1,0 +1,110 @@
+"""From ray hits to echoes: through panes of glass, and into the detector."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.world.materials import Material
+from flcav.world.rays.raycaster import Hits
+
+PANES = 6  # more panes than these stop a ray
+PANE_TRANSMISSION = 0.8  # of the power, there and back
+RETRO_GAIN = 4.0  # how much brighter than a white surface a retro-reflector is
+PAINT = int(Material.PAINT)
+GLASS = int(Material.GLASS)
+AFTER_PANE_M = 0.002
+
+Trace = Callable[[NDArray[np.float32], NDArray[np.float32] | None], Hits]  # directions, near_m -> hits
+
+
+class Echoes(NamedTuple):
+    """The surface each of N rays comes back from."""
+
+    distance: NDArray[np.float32]  # (N,) [m]; inf where none
+    instance: NDArray[np.int32]  # (N,) -1 where none
+    face: NDArray[np.int32]  # (N,)
+    panes: NDArray[np.uint8]  # (N,) panes of glass on the way
+
+
+def cast_through_glass(
+    trace: Trace,
+    directions: NDArray[np.float32],
+    passes: NDArray[np.bool_],
+    first: NDArray[np.int64],
+    material: NDArray[np.uint8],
+) -> Echoes:
+    """Return what comes back along `directions` (N, 3) when the rays that `passes` (N,) marks go through glass.
+
+    Face f of instance i is of `material[first[i] + f]`.
+    """
+    hits = trace(directions, None)
+    echoes = Echoes(*hits, np.zeros(len(directions), np.uint8))
+    through = _on_glass(hits.instance, hits.face, first, material, passes)
+    for _ in range(PANES):
+        if not len(through):
+            break
+        further = trace(directions[through], echoes.distance[through] + np.float32(AFTER_PANE_M))
+        for known, found in zip(echoes, further):
+            known[through] = found
+        echoes.panes[through] += 1
+        through = through[_on_glass(further.instance, further.face, first, material, passes[through])]
+    return echoes
+
+
+@numba.njit(nogil=True, cache=True)
+def _on_glass(instance, face, first, material, passes):
+    """Return the numbers of the rays that meet glass and pass it."""
+    found = np.empty(len(instance), np.int64)
+    count = 0
+    for ray in range(len(instance)):
+        if instance[ray] >= 0 and passes[ray] and material[first[instance[ray]] + face[ray]] == GLASS:
+            found[count] = ray
+            count += 1
+    return found[:count]
+
+
+@numba.njit(nogil=True, cache=True)
+def detect(echoes, directions, surfaces, sensor_from_instance, inverse_threshold, keep, chance, noise_m, points, actor):
+    """Write the detected echoes' `points` (N, 4) and `actor` (N,) and return their number.
+
+    An echo of power P is detected with a probability that rises from 0 at 0.7 P_min to `keep` at 1.3 P_min;
+    `chance` (N,) in [0, 1) decides. `inverse_threshold` is 1 / P_min; `sensor_from_instance` (I, 3, 3) turns normals.
+    """
+    count = 0
+    for ray in range(len(directions)):
+        instance = echoes.instance[ray]
+        if instance < 0:
+            continue
+        row = surfaces.first[instance] + echoes.face[ray]
+        material = surfaces.material[row]
+        x, y, z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        turn = sensor_from_instance[instance]
+        nx, ny, nz = surfaces.normal[row, 0], surfaces.normal[row, 1], surfaces.normal[row, 2]
+        cosine = abs(
+            x * (turn[0, 0] * nx + turn[0, 1] * ny + turn[0, 2] * nz)
+            + y * (turn[1, 0] * nx + turn[1, 1] * ny + turn[1, 2] * nz)
+            + z * (turn[2, 0] * nx + turn[2, 1] * ny + turn[2, 2] * nz)
+        )
+        if surfaces.retro[material]:
+            brightness = np.float32(RETRO_GAIN) * surfaces.reflectivity[material]
+        else:
+            brightness = surfaces.reflectivity[material] * cosine
+        if material == PAINT:
+            brightness *= surfaces.paint[instance]
+        for _ in range(echoes.panes[ray]):
+            brightness *= np.float32(PANE_TRANSMISSION)
+        distance = echoes.distance[ray]
+        margin = (brightness * inverse_threshold / (distance * distance) - np.float32(0.7)) / np.float32(0.6)
+        if chance[ray] >= keep * min(margin, np.float32(1.0)):
+            continue
+        measured = distance + noise_m[ray]
+        points[count, 0] = x * measured
+        points[count, 1] = y * measured
+        points[count, 2] = z * measured
+        points[count, 3] = min(brightness, np.float32(1.0))
+        actor[count] = instance - 1
+        count += 1
+    return count

@@ -1,0 +1,132 @@
+"""A spinning LiDAR: its rays, what they meet through glass, and what the detector makes of the echoes.
+
+Power received from a surface, relative to a white one face on at 1 m: P = reflectivity * cos(incidence) / R^2,
+detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3).
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flcav.config import Config
+from flcav.sensors.echoes import Echoes, cast_through_glass, detect
+from flcav.world.scene import Scene
+
+
+class Lidar(Config):
+    """What a LiDAR is built like; its pose is the rig's."""
+
+    channels: int = Field(default=32, ge=1, le=256)
+    azimuth_steps: int = Field(default=900, ge=4, le=8192)
+    range_m: float = Field(default=80.0, gt=0, le=1000)
+    up_deg: float = Field(default=3.0, ge=-90, le=90)  # elevation of the highest channel
+    down_deg: float = Field(default=-25.0, ge=-90, le=90)  # elevation of the lowest
+    elevations_deg: tuple[float, ...] | None = None  # of each channel, where they are not evenly spaced
+    rate_hz: float = Field(default=10.0, gt=0, le=100)
+    sensitivity_m: float = Field(default=300.0, gt=0)  # R_max: a white surface, face on, is detected up to here
+    noise_m: float = Field(default=0.02, ge=0, le=1)  # standard deviation of the measured range
+    dropout: float = Field(default=0.005, ge=0, lt=1)  # share of echoes lost whatever their power
+    glass_pass: float = Field(default=0.9, ge=0, le=1)  # share of rays that pass panes of glass
+
+    @model_validator(mode="after")
+    def _check_elevations(self) -> "Lidar":
+        if self.elevations_deg is not None:
+            if len(self.elevations_deg) != self.channels:
+                raise ValueError(
+                    f"{self.channels} channels need as many elevations_deg, not {len(self.elevations_deg)}"
+                )
+            if any(abs(elevation) > 90 for elevation in self.elevations_deg):
+                raise ValueError("every one of elevations_deg must lie within -90 and 90")
+        elif self.channels > 1 and self.down_deg >= self.up_deg:
+            raise ValueError(f"down_deg {self.down_deg} must be below up_deg {self.up_deg}")
+        return self
+
+
+def ray_pattern(lidar: Lidar) -> NDArray[np.float32]:
+    """Return (channels * azimuth_steps, 3) unit directions, sensor frame, channel after channel from the highest.
+
+    Within a channel, azimuth runs counter-clockwise once round from straight ahead.
+    """
+    if lidar.elevations_deg is None:
+        elevations = np.linspace(lidar.up_deg, lidar.down_deg, lidar.channels)
+    else:
+        elevations = np.sort(lidar.elevations_deg)[::-1]
+    return _ray_pattern(tuple(elevations), lidar.azimuth_steps)
+
+
+@lru_cache(maxsize=16)
+def _ray_pattern(elevations_deg: tuple[float, ...], steps: int) -> NDArray[np.float32]:
+    elevation = np.radians(elevations_deg)[:, None]
+    azimuth = np.arange(steps)[None] * (2 * np.pi / steps)
+    level = np.cos(elevation)
+    x, y, z = level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth
+    directions = np.stack((x, y, z), axis=-1).reshape(-1, 3).astype(np.float32)
+    directions.flags.writeable = False
+    return directions
+
+
+def draw_passes(lidar: Lidar, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Return, for each ray of the pattern, whether it passes the panes of glass it meets."""
+    return rng.random(lidar.channels * lidar.azimuth_steps, np.float32) < lidar.glass_pass
+
+
+def cast(
+    scene: Scene,
+    world_from_sensor: NDArray[np.float64],
+    lidar: Lidar,
+    passes: NDArray[np.bool_],
+    hidden: int | None = None,
+) -> Echoes:
+    """Return the first opaque surface within range of each ray, in a world without the actor `hidden`."""
+
+    def trace(directions: NDArray[np.float32], near_m: NDArray[np.float32] | None):
+        return scene.cast(world_from_sensor, directions, near_m=near_m, far_m=lidar.range_m, hidden=hidden)
+
+    return cast_through_glass(trace, ray_pattern(lidar), passes, scene.surfaces.first, scene.surfaces.material)
+
+
+def measure(
+    scene: Scene,
+    world_from_sensor: NDArray[np.float64],
+    lidar: Lidar,
+    echoes: Echoes,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Return what the detector reports of `echoes`: see `scan`."""
+    rays = len(echoes.distance)
+    chance = rng.random(rays, np.float32)
+    noise = rng.standard_normal(rays, np.float32)
+    sensor_from_instance = (world_from_sensor[:3, :3].T @ scene.world_from_instance).astype(np.float32)
+    points = np.empty((rays, 4), np.float32)
+    actor = np.empty(rays, np.int32)
+    kept = detect(
+        echoes,
+        ray_pattern(lidar),
+        scene.surfaces,
+        sensor_from_instance,
+        np.float32(lidar.sensitivity_m**2 / 0.9),
+        np.float32(1 - lidar.dropout),
+        chance,
+        noise * np.float32(lidar.noise_m),
+        points,
+        actor,
+    )
+    return points[:kept], actor[:kept]
+
+
+def scan(
+    scene: Scene,
+    world_from_sensor: NDArray[np.float64],
+    lidar: Lidar,
+    rng: np.random.Generator,
+    hidden: int | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Return one sweep at the scene's instant, as if the actor `hidden` (the carrier) were not there.
+
+    The first array is (N, 4): x, y, z [m] in the sensor frame and intensity in [0, 1]; the second (N,): the trace's
+    actor each return comes from, -1 for the town.
+    """
+    echoes = cast(scene, world_from_sensor, lidar, draw_passes(lidar, rng), hidden)
+    return measure(scene, world_from_sensor, lidar, echoes, rng)

@@ -1,0 +1,117 @@
+"""The mesh record and the pieces meshes are put together from. Body frame: x forward, y left, z up, metres."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flcav.world.materials import Material
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles, each of one material."""
+
+    vertices: NDArray[np.float32]  # (V, 3) [m]
+    faces: NDArray[np.int32]  # (F, 3) rows of vertices
+    material: NDArray[np.uint8]  # (F,) a Material
+
+    def normals(self) -> NDArray[np.float32]:
+        """Return (F, 3) unit normals, of either sign; zero where a face has no area."""
+        a, b, c = (self.vertices[self.faces[:, i]].astype(np.float64) for i in range(3))
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        return (normal / np.maximum(length, 1e-12)).astype(np.float32)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Return the lowest and the highest x, y, z, (3,) each."""
+        return self.vertices.min(axis=0).astype(np.float64), self.vertices.max(axis=0).astype(np.float64)
+
+
+def join(parts: Sequence[Mesh]) -> Mesh:
+    """Return all `parts` as one mesh."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]).astype(np.float32),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts)]).astype(np.int32),
+        np.concatenate([part.material for part in parts]),
+    )
+
+
+def moved(mesh: Mesh, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Mesh:
+    """Return `mesh` turned by `yaw` [rad] and then shifted."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    return Mesh((mesh.vertices @ turn + (x, y, z)).astype(np.float32), mesh.faces, mesh.material)
+
+
+def mirrored(mesh: Mesh) -> Mesh:
+    """Return `mesh` and its mirror image across the x-z plane, as one mesh."""
+    other = Mesh(mesh.vertices * np.array([1, -1, 1], np.float32), mesh.faces[:, ::-1], mesh.material)
+    return join((mesh, other))
+
+
+def fitted(mesh: Mesh, length: float, width: float, height: float) -> Mesh:
+    """Return `mesh` stretched to those outer dimensions exactly, standing on z = 0 around the origin."""
+    low, high = mesh.bounds()
+    unit = (mesh.vertices - low) / (high - low)
+    vertices = (unit - (0.5, 0.5, 0.0)) * (length, width, height)
+    return Mesh(vertices.astype(np.float32), mesh.faces, mesh.material)
+
+
+def sheet(points: ArrayLike, material: Material | NDArray[np.uint8]) -> Mesh:
+    """Return the surface through a grid of points (A, B, 3); `material` is one, or one per cell (A-1, B-1)."""
+    grid = np.asarray(points, np.float64)
+    rows, columns = grid.shape[:2]
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    faces = np.stack((a, b, c, a, c, d), axis=1).reshape(-1, 3)
+    cells = np.broadcast_to(np.asarray(material, np.uint8), (rows - 1, columns - 1))
+    return Mesh(grid.reshape(-1, 3).astype(np.float32), faces.astype(np.int32), np.repeat(cells.ravel(), 2))
+
+
+_BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_BOX_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], np.int32)
+_BOX_FACES = _BOX_QUADS[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+
+def box(center: ArrayLike, size: ArrayLike, material: Material) -> Mesh:
+    """Return a closed box about `center` (3,), `size` (3,) along x, y, z."""
+    vertices = _BOX_CORNERS * np.asarray(size) + np.asarray(center)
+    return Mesh(vertices.astype(np.float32), _BOX_FACES, np.full(12, material, np.uint8))
+
+
+def tube(
+    start: ArrayLike,
+    end: ArrayLike,
+    radius: float,
+    material: Material,
+    *,
+    end_radius: float | None = None,
+    sides: int = 8,
+    capped: bool = True,
+) -> Mesh:
+    """Return a round bar from `start` (3,) to `end` (3,), as thick as `radius` to `end_radius`."""
+    first, last = np.asarray(start, np.float64), np.asarray(end, np.float64)
+    along = (last - first) / np.linalg.norm(last - first)
+    aside = np.cross(along, (1.0, 0.0, 0.0) if abs(along[2]) > 0.9 else (0.0, 0.0, 1.0))
+    aside /= np.linalg.norm(aside)
+    angle = np.linspace(0, 2 * np.pi, sides + 1)[:, None]
+    circle = np.cos(angle) * aside + np.sin(angle) * np.cross(along, aside)
+    rings = [first + circle * radius, last + circle * (radius if end_radius is None else end_radius)]
+    if capped:
+        rings = [first + circle * 0, *rings, last + circle * 0]
+    return sheet(np.stack(rings), material)
+
+
+def ellipsoid(center: ArrayLike, radii: ArrayLike, material: Material, sides: int = 8) -> Mesh:
+    """Return an ellipsoid about `center` (3,) with half axes `radii` (3,)."""
+    polar = np.linspace(0, np.pi, sides // 2 + 2)[:, None]
+    around = np.linspace(0, 2 * np.pi, sides + 1)[None]
+    unit = np.stack(
+        (np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar) + 0 * around), axis=-1
+    )
+    return sheet(unit * np.asarray(radii) + np.asarray(center), material)

@@ -1,0 +1,194 @@
+"""Embree 4 as a `Raycaster`: two levels, so that a moving solid costs one transform and no rebuild of its mesh.
+
+All handles live on one device per process, whose trees are built by one thread, the same from run to run.
+"""
+
+import ctypes
+import weakref
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.geometry import pose
+from flcav.world.rays import library as c
+from flcav.world.rays.packets import LANES, trace_packets
+from flcav.world.rays.raycaster import Hits
+
+_ARGUMENTS = c.IntersectArguments(flags=c.QUERY_COHERENT, feature_mask=0xFFFFFFFF)
+
+
+class Solid:
+    """A mesh with its search tree, in the mesh's own frame."""
+
+    def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
+        """Build the tree of (V, 3) vertices [m] and (F, 3) faces; raises `ValueError` for an empty mesh."""
+        if not len(faces):
+            raise ValueError("a solid needs at least one face")
+        api, device = c.embree_library(), _device()
+        # Embree reads 16 bytes of the last 12-byte vertex: one more keeps that inside the buffer.
+        self._vertices = np.concatenate((vertices, vertices[-1:])).astype(np.float32)
+        self._faces = np.ascontiguousarray(faces, np.uint32)
+        self.handle: int = api.rtcNewScene(device)
+        api.rtcSetSceneBuildQuality(self.handle, c.BUILD_QUALITY_HIGH)
+        geometry = api.rtcNewGeometry(device, c.GEOMETRY_TRIANGLE)
+        for kind, form, array, count in (
+            (c.BUFFER_VERTEX, c.FORMAT_FLOAT3, self._vertices, len(vertices)),
+            (c.BUFFER_INDEX, c.FORMAT_UINT3, self._faces, len(faces)),
+        ):
+            api.rtcSetSharedGeometryBuffer(geometry, kind, 0, form, array.ctypes.data, 0, 12, count)
+        api.rtcCommitGeometry(geometry)
+        api.rtcAttachGeometry(self.handle, geometry)
+        api.rtcReleaseGeometry(geometry)  # the scene keeps it
+        api.rtcCommitScene(self.handle)
+        _check("building a mesh")
+        weakref.finalize(self, api.rtcReleaseScene, self.handle)
+
+    def trace(
+        self,
+        target_from_rays: NDArray[np.float64],
+        directions: NDArray[np.float32],
+        *,
+        near_m: NDArray[np.float32] | None = None,
+        far_m: float = np.inf,
+        threads: int = 1,
+    ) -> Hits:
+        """Trace rays against the mesh alone: see `Target.trace`."""
+        return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
+
+
+class Assembly:
+    """Solids placed by rigid transforms."""
+
+    def __init__(self, solids: Sequence[Solid]) -> None:
+        """Hold one instance of each of `solids`, none placed yet."""
+        api, device = c.embree_library(), _device()
+        self._solids = tuple(solids)  # alive as long as their instances
+        self.handle: int = api.rtcNewScene(device)
+        api.rtcSetSceneFlags(self.handle, c.SCENE_DYNAMIC)
+        self._instances: list[int] = []
+        for solid in solids:
+            instance = api.rtcNewGeometry(device, c.GEOMETRY_INSTANCE)
+            api.rtcSetGeometryInstancedScene(instance, solid.handle)
+            api.rtcCommitGeometry(instance)
+            api.rtcAttachGeometry(self.handle, instance)
+            api.rtcReleaseGeometry(instance)
+            api.rtcDisableGeometry(instance)
+            self._instances.append(instance)
+        _check("placing meshes")
+        weakref.finalize(self, api.rtcReleaseScene, self.handle)
+
+    def place(self, instance: int, target_from_body: NDArray[np.float64] | None) -> None:
+        """Put a solid at a (4, 4) transform, or nowhere (None); takes effect with `commit`."""
+        api, geometry = c.embree_library(), self._instances[instance]
+        if target_from_body is None:
+            api.rtcDisableGeometry(geometry)
+            return
+        columns = (ctypes.c_float * 12)(*target_from_body[:3].T.ravel())
+        api.rtcSetGeometryTransform(geometry, 0, c.FORMAT_FLOAT3X4_COLUMN_MAJOR, columns)
+        api.rtcEnableGeometry(geometry)
+        api.rtcCommitGeometry(geometry)
+
+    def commit(self) -> None:
+        """Make what was placed visible to the next trace."""
+        c.embree_library().rtcCommitScene(self.handle)
+        _check("placing meshes")
+
+    def trace(
+        self,
+        target_from_rays: NDArray[np.float64],
+        directions: NDArray[np.float32],
+        *,
+        near_m: NDArray[np.float32] | None = None,
+        far_m: float = np.inf,
+        threads: int = 1,
+    ) -> Hits:
+        """Trace rays against everything placed: see `Target.trace`."""
+        return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
+
+
+class Embree:
+    """The engine; making one tests the library: raises `OSError` where it is missing or does not trace rightly."""
+
+    def __init__(self) -> None:
+        _self_test()
+
+    def solid(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> Solid:
+        """Return a mesh with its search tree."""
+        return Solid(vertices, faces)
+
+    def assembly(self, solids: Sequence[Solid]) -> Assembly:
+        """Return an assembly of `solids`, none placed yet."""
+        return Assembly(solids)
+
+
+def _trace(
+    handle: int,
+    target_from_rays: NDArray[np.float64],
+    directions: NDArray[np.float32],
+    near_m: NDArray[np.float32] | None,
+    far_m: float,
+    threads: int,
+) -> Hits:
+    rays = np.ascontiguousarray(directions, np.float32)
+    near = np.zeros(1, np.float32) if near_m is None else np.ascontiguousarray(near_m, np.float32)
+    if near_m is not None and len(near) != len(rays):
+        raise ValueError(f"near_m has {len(near)} values for {len(rays)} rays")
+    hits = Hits(np.empty(len(rays), np.float32), np.empty(len(rays), np.int32), np.empty(len(rays), np.int32))
+    origin = target_from_rays[:3, 3].astype(np.float32)
+    rotation = np.ascontiguousarray(target_from_rays[:3, :3], np.float32)
+    arguments = ctypes.addressof(_ARGUMENTS)
+
+    def part(first: int, last: int) -> None:
+        trace_packets(
+            _intersect_address(), handle, arguments, origin, rotation, rays, near, np.float32(far_m), first, last, *hits
+        )
+
+    if threads == 1 or len(rays) <= LANES:
+        part(0, len(rays))
+        return hits
+    step = -(-len(rays) // (threads * LANES)) * LANES
+    starts = range(0, len(rays), step)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda start: part(start, min(start + step, len(rays))), starts))
+    return hits
+
+
+@lru_cache(maxsize=1)
+def _device() -> int:
+    device = c.embree_library().rtcNewDevice(b"threads=1")
+    if not device:
+        raise OSError("Embree could not start on this machine")
+    return device
+
+
+@lru_cache(maxsize=1)
+def _intersect_address() -> int:
+    return ctypes.cast(c.embree_library().rtcIntersect16, ctypes.c_void_p).value or 0
+
+
+def _check(doing: str) -> None:
+    code = c.embree_library().rtcGetDeviceError(_device())
+    if code:
+        raise OSError(f"Embree failed with error {code} while {doing}")
+
+
+@lru_cache(maxsize=1)
+def _self_test() -> None:
+    """Raise `OSError` unless a known ray meets a known mesh, alone and as a turned and moved instance."""
+    vertices = np.array([[2, -1, -1], [2, 1, -1], [2, 0, 1]], np.float32)
+    faces = np.array([[0, 1, 2]], np.int32)
+    forward = np.array([[1, 0, 0]], np.float32)
+    solid = Solid(vertices, faces)
+    assembly = Assembly([solid, solid])
+    assembly.place(1, pose(10.0, 5.0, 0.0, yaw=np.pi / 2))  # the face, 2 m ahead of the body, now at (10, 7)
+    assembly.commit()
+    alone: Any = solid.trace(np.eye(4), forward)
+    placed: Any = assembly.trace(pose(10.0, 0.0, 0.0, yaw=np.pi / 2), forward)
+    missed = assembly.trace(np.eye(4), forward)
+    found = [float(alone.distance[0]), float(placed.distance[0]), int(placed.instance[0]), int(missed.instance[0])]
+    if not np.allclose(found, [2.0, 7.0, 1, -1], atol=1e-5):
+        raise OSError(f"Embree traced a known scene wrongly ({found}): flcav needs embreex 4.4")

@@ -1,0 +1,82 @@
+"""Rays through Embree in packets of 16, compiled.
+
+The function is called by its address, an ordinary integer argument, so that the compiled code can be cached on disk
+(a kernel that closes over a ctypes function cannot be).
+"""
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
+
+# RTCRayHit16: rows of 16 float32 (or int32)
+ORIGIN, NEAR, DIRECTION, TIME, FAR, MASK, RAY_ID, FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
+FACE, GEOMETRY, INSTANCE, INSTANCE_PRIMITIVE = 17, 18, 19, 20
+ROWS, LANES = 32, 16
+
+
+@intrinsic
+def call_c(typing_context, address, first, second, third, fourth):
+    """Call the C function `void f(void*, void*, void*, void*)` at `address`; all five are integers."""
+
+    def generate(context, builder, signature, arguments):
+        word = ir.IntType(64)
+        function_type = ir.FunctionType(ir.VoidType(), [word] * 4)
+        builder.call(builder.inttoptr(arguments[0], function_type.as_pointer()), arguments[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64, types.int64, types.int64), generate
+
+
+@numba.njit(nogil=True, cache=True)
+def trace_packets(
+    intersect, scene, arguments, origin, rotation, directions, near, far, first_ray, last_ray, distance, instance, face
+):
+    """Trace rays `first_ray` to `last_ray`, and write `distance`, `instance` and `face` of each.
+
+    `intersect`, `scene` and `arguments` are addresses; `origin` (3,) and `rotation` (3, 3) place the rays' frame;
+    `near` is (N,) or (1,) for all.
+    """
+    spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
+    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4  # Embree wants 64-byte alignment
+    packet = spare_floats[skipped : skipped + ROWS * LANES].reshape(ROWS, LANES)
+    packet_words = packet.view(np.int32)
+    spare_words = np.empty(2 * LANES, np.int32)
+    skipped = ((64 - spare_words.ctypes.data % 64) % 64) // 4
+    valid = spare_words[skipped : skipped + LANES]
+    near_step = 1 if len(near) > 1 else 0
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    for axis in range(3):
+        packet[ORIGIN + axis, :] = origin[axis]
+    packet[TIME, :] = 0
+    packet_words[MASK, :] = -1
+    packet_words[RAY_ID, :] = 0
+    packet_words[FLAGS, :] = 0
+    for start in range(first_ray, last_ray, LANES):
+        lanes = min(LANES, last_ray - start)
+        for lane in range(LANES):
+            valid[lane] = -1 if lane < lanes else 0
+            ray = start + min(lane, lanes - 1)
+            x, y, z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+            packet[DIRECTION, lane] = r00 * x + r01 * y + r02 * z
+            packet[DIRECTION + 1, lane] = r10 * x + r11 * y + r12 * z
+            packet[DIRECTION + 2, lane] = r20 * x + r21 * y + r22 * z
+            packet[NEAR, lane] = near[ray * near_step]
+            packet[FAR, lane] = far
+            packet_words[GEOMETRY, lane] = -1
+            packet_words[INSTANCE, lane] = -1
+            packet_words[INSTANCE_PRIMITIVE, lane] = -1
+        call_c(intersect, valid.ctypes.data, scene, packet.ctypes.data, arguments)  # pyright: ignore[reportCallIssue]
+        for lane in range(lanes):
+            ray = start + lane
+            if packet_words[GEOMETRY, lane] < 0:
+                distance[ray] = np.inf
+                instance[ray] = -1
+                face[ray] = -1
+            else:
+                distance[ray] = packet[FAR, lane]
+                instance[ray] = max(packet_words[INSTANCE, lane], 0)
+                face[ray] = packet_words[FACE, lane]

@@ -1,0 +1,61 @@
+"""What the sensors ask of a ray casting engine: meshes to search, and assemblies of placed meshes."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+MISS = -1
+
+
+class Hits(NamedTuple):
+    """The first surface each of N rays meets."""
+
+    distance: NDArray[np.float32]  # (N,) [m] along the unit direction; inf where nothing is met
+    instance: NDArray[np.int32]  # (N,) number of the placed solid; 0 for a solid alone; MISS
+    face: NDArray[np.int32]  # (N,) row of that solid's faces; MISS
+
+
+class Target(Protocol):
+    """Something rays can be traced against."""
+
+    def trace(
+        self,
+        target_from_rays: NDArray[np.float64],
+        directions: NDArray[np.float32],
+        *,
+        near_m: NDArray[np.float32] | None = None,
+        far_m: float = np.inf,
+        threads: int = 1,
+    ) -> Hits:
+        """Return the first hit of each ray beyond `near_m` (N,) and before `far_m`.
+
+        All rays leave the origin of one frame: `target_from_rays` (4, 4) places it, `directions` (N, 3) are unit
+        vectors in it.
+        """
+        ...
+
+
+class Assembly(Target, Protocol):
+    """Solids placed by rigid transforms; placing one again rebuilds no mesh."""
+
+    def place(self, instance: int, target_from_body: NDArray[np.float64] | None) -> None:
+        """Put a solid at a (4, 4) transform, or nowhere (None); takes effect with `commit`."""
+        ...
+
+    def commit(self) -> None:
+        """Make what was placed visible to the next trace. Never while another thread traces."""
+        ...
+
+
+class Raycaster(Protocol):
+    """An engine."""
+
+    def solid(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> Target:
+        """Return a mesh, (V, 3) [m] and (F, 3), with its search structure."""
+        ...
+
+    def assembly(self, solids: Sequence[Target]) -> Assembly:
+        """Return an assembly of this engine's solids, none placed yet; instance i is `solids[i]`."""
+        ...
