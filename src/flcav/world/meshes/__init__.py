@@ -1,16 +1,29 @@
 """Parametric meshes of actors: no third-party assets; every shape has exactly its outer dimensions."""
 
+from collections.abc import Callable
 from functools import lru_cache
 
-from flcav.world.materials import Material
-from flcav.world.meshes.mesh import Mesh, box
-from flcav.world.shapes import SHAPES
+from flcav.world.meshes.cars import car
+from flcav.world.meshes.heavy import bus, truck
+from flcav.world.meshes.mesh import Mesh, fitted
+from flcav.world.meshes.people import bicycle, motorcycle, pedestrian
+from flcav.world.shapes import SHAPES, Shape
 
 __all__ = ["Mesh", "actor_mesh"]
+
+MAKERS: dict[str, Callable[[Shape], Mesh]] = {
+    "car": car,
+    "van": car,
+    "truck": truck,
+    "bus": bus,
+    "motorcycle": motorcycle,
+    "bicycle": bicycle,
+    "pedestrian": pedestrian,
+}
 
 
 @lru_cache(maxsize=64)
 def actor_mesh(category: str, shape: int) -> Mesh:
     """Return the mesh of `SHAPES[category][shape]` in its body frame: ground centre at the origin, x forward."""
     wanted = SHAPES[category][shape]
-    return box((0, 0, wanted.height / 2), wanted[1:], Material.PAINT)
+    return fitted(MAKERS[category](wanted), wanted.length, wanted.width, wanted.height)
