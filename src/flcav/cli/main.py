@@ -6,6 +6,7 @@ import click
 import typer
 
 from flcav import __version__
+from flcav.cli import allocate, birdseye, fit, place, record, validate
 from flcav.config import InputError
 
 app = typer.Typer(
@@ -28,6 +29,10 @@ def _main(
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
     pass
+
+
+for command in (record, validate, birdseye, allocate, place, fit):
+    command.register(app)
 
 
 def run(arguments: list[str] | None = None) -> None:

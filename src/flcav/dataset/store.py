@@ -90,6 +90,14 @@ class Dataset:
             and (spins is None or key.index in spins)
         ]
 
+    def name(self, i: int) -> str:
+        """Return the key of frame `i` as one word: `Frame.key`."""
+        return self._name[i]
+
+    def lidars(self, i: int) -> list[str]:
+        """Return the names of the LiDARs of frame `i`."""
+        return list(self._lidar[i])
+
     def number(self, name: str) -> int:
         """Return the number of the frame with this key; raises `InputError` where there is none."""
         try:

@@ -6,7 +6,8 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,14 @@ def write_scenes(source: Source, scenes: Sequence[str], work: Path, jobs: int, w
             done, pending = wait(pending, timeout=POLL_S, return_when=FIRST_EXCEPTION)
             wrote(written.value)
             for future in done:
-                future.result()
+                _raise_failure(future)
+
+
+def _raise_failure(future: Future[None]) -> None:
+    try:
+        future.result()
+    except BrokenProcessPool:
+        raise OSError("a worker was killed from outside, most often for want of memory: try fewer jobs") from None
 
 
 def _begin(written: Any) -> None:

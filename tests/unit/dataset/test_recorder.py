@@ -103,29 +103,27 @@ def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, jobs: int, unin
     assert digests(tmp_path / "data") == uninterrupted
 
 
+@pytest.mark.parametrize("last", range(0, 17, 4))
 def test_an_interruption_while_files_move_is_made_good(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, str], last: int
 ):
     from flcav.dataset import recorder
 
-    move, moves = recorder._move, len(uninterrupted)
-    for last in range(0, moves, 4):
-        out = tmp_path / str(last)
-        moved = 0
+    assert last < len(uninterrupted)
+    move, moved = recorder._move, []
 
-        def failing(source: Path, target: Path) -> None:
-            nonlocal moved
-            if moved == last:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            moved += 1
-            move(source, target)
+    def failing(source: Path, target: Path) -> None:
+        if len(moved) == last:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        moved.append(target)
+        move(source, target)
 
-        monkeypatch.setattr(recorder, "_move", failing)
-        with pytest.raises(OSError, match="No space left"):
-            record(ToySource(), out)
-        monkeypatch.setattr(recorder, "_move", move)
-        record(ToySource(), out)
-        assert digests(out) == uninterrupted
+    monkeypatch.setattr(recorder, "_move", failing)
+    with pytest.raises(OSError, match="No space left"):
+        record(ToySource(), tmp_path / "data")
+    monkeypatch.setattr(recorder, "_move", move)
+    record(ToySource(), tmp_path / "data")
+    assert digests(tmp_path / "data") == uninterrupted
 
 
 @pytest.mark.parametrize(("jobs", "number"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGINT)])
@@ -159,6 +157,11 @@ if __name__ == "__main__":
     assert not (out / "manifest.json").exists()
     record(ToySource(), out)
     assert digests(out) == uninterrupted
+
+
+def test_a_worker_killed_for_memory_is_said(tmp_path: Path):
+    with pytest.raises(OSError, match="a worker was killed"):
+        record(ToySource(die=True), tmp_path / "data", jobs=2)
 
 
 def group_lives(group: int) -> bool:

@@ -1,5 +1,7 @@
 """A source of small hand-made frames, quick enough for tests of everything around it."""
 
+import os
+import signal
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +18,7 @@ MOUNT = pose(0.1, 0.0, 1.8, yaw=0.01)
 
 @dataclass(frozen=True)
 class ToySource:
-    """Two agents among a few cars; `pause_s` per frame makes it slow, `fail_at` makes one frame fail."""
+    """Two agents among a few cars; it can be slow, fail at a spin as a full disk does, or kill its process."""
 
     seed: int = 0
     scene_count: int = 2
@@ -24,6 +26,7 @@ class ToySource:
     pause_s: float = 0.0
     fail_at: int | None = None
     split: str = "train"
+    die: bool = False
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -44,6 +47,8 @@ class ToySource:
         for index in range(self.spins):
             for agent in ("cav0", "pole3"):
                 time.sleep(self.pause_s)
+                if self.die:
+                    os.kill(os.getpid(), signal.SIGKILL)
                 if self.fail_at == index:
                     raise OSError(28, "No space left on device")
                 yield toy_frame(self.seed, scene, index, agent)

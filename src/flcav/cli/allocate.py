@@ -1,0 +1,67 @@
+"""`flcav allocate`: samples, edge rounds and cloud rounds per task under both uplink budgets (MLGRA)."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from flcav.optimization.allocation import Allocation
+    from flcav.optimization.problem import Problem
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command("allocate")(allocate)
+
+
+def allocate(
+    problem: Path = typer.Argument(..., help="YAML: budgets, sizes, limits and learning curves of every task."),
+    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
+) -> None:
+    """Split both uplink budgets over tasks and training stages so that the weighted error is least."""
+    from flcav.config import read_config
+    from flcav.optimization import allocation
+    from flcav.optimization.problem import Problem
+
+    asked = read_config(Problem, problem)
+    try:
+        plan = allocation.allocate(asked)
+    except allocation.Infeasible as error:
+        if as_json:
+            typer.echo(json.dumps({"status": "infeasible", "message": str(error)}))
+        raise
+    if as_json:
+        typer.echo(json.dumps(_as_json(plan)))
+    else:
+        _show(asked, plan)
+
+
+def _as_json(plan: "Allocation") -> dict:
+    values = dataclasses.asdict(plan)
+    for name in ("used_mb", "marginal_error_per_gb"):
+        values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
+    return values
+
+
+def _show(problem: "Problem", plan: "Allocation") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("task", *("samples", "edge rounds", "cloud rounds", "error", "wireless MB", "wireline MB"))
+    for task in plan.tasks:
+        counts = (str(task.samples), str(task.edge_rounds), str(task.cloud_rounds))
+        table.add_row(
+            task.name, *counts, f"{task.predicted_error:.4f}", f"{task.wireless_mb:.1f}", f"{task.wireline_mb:.1f}"
+        )
+    console = Console()
+    console.print(table)
+    console.print(f"weighted error {plan.objective:.6g}, {plan.status} (proven within {plan.gap:.2%})")
+    budgets = problem.budgets_mb
+    for link, used, budget, rate in (
+        ("wireless", plan.used_mb.wireless_mb, budgets.wireless, plan.marginal_error_per_gb.wireless_mb),
+        ("wireline", plan.used_mb.wireline_mb, budgets.wireline, plan.marginal_error_per_gb.wireline_mb),
+    ):
+        console.print(f"{link}: {used:.1f} of {budget:.6g} MB; 1000 MB more would save about {rate:.4f} of error")

@@ -1,0 +1,40 @@
+"""flcav record: a recipe to a dataset."""
+
+from pathlib import Path
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(record)
+
+
+def record(
+    recipe: Path = typer.Argument(help="Recipe (YAML): town, traffic, vehicles, poles, sensors."),
+    out: Path = typer.Option(..., "--out", help="Folder of the dataset; an interrupted recording goes on."),
+    frames: int | None = typer.Option(None, "--frames", help="Record exactly this many frames instead."),
+    seed: int | None = typer.Option(None, "--seed", help="Seed instead of the recipe's."),
+    jobs: int = typer.Option(1, "--jobs", help="Processes; the dataset is the same whatever their number."),
+) -> None:
+    """Record a dataset: traffic in a town, seen by LiDARs on vehicles and poles, with ground truth."""
+    from flcav import progress
+    from flcav.config import parse_config, read_config
+    from flcav.dataset.layout import read_manifest
+    from flcav.dataset.recorder import record as write
+    from flcav.sources.embedded import EmbeddedSource
+    from flcav.sources.recipe import Recipe
+
+    changes = {name: value for name, value in (("frames", frames), ("seed", seed)) if value is not None}
+    asked = read_config(Recipe, recipe)
+    source = EmbeddedSource(parse_config(Recipe, asked.model_dump() | changes, str(recipe)))
+    with progress.live(f"record {out}") as report:
+        written = write(source, out, jobs=jobs, progress=report)
+    manifest = read_manifest(out)
+    counts = manifest["counts"]
+    done = "recorded" if written else "already recorded, nothing to do:"
+    size_mb = sum(entry["bytes"] for entry in manifest["files"].values()) / 1e6
+    typer.echo(
+        f"{out}: {done} {counts['frames']} frames of {counts['scenes']} scenes, "
+        f"{counts['annotations']} annotations, {counts['points']} points, {size_mb:.1f} MB"
+    )

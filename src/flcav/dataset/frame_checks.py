@@ -1,0 +1,94 @@
+"""What can be wrong inside one frame: each check returns sentences, none where all is well."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from flcav.geometry import points_in_boxes, transform_points, wrap_angle
+from flcav.sensors.frame import Frame
+from flcav.world.trace import CATEGORIES, Trace
+
+MARGIN_M = 0.15  # a return may lie so far outside its actor's box: range noise, mirrors
+INSIDE = 0.95  # share of an actor's returns that must lie in its box, grown by the margin
+EXACT = 1e-6  # of what is stored twice [m], [rad], [m/s]
+
+
+def check_values(frame: Frame) -> Iterator[str]:
+    """Check that numbers are finite and within their range, poses rigid, names known and single."""
+    truth = frame.annotations
+    for name, points in frame.lidar.items():
+        if not np.isfinite(points).all():
+            yield f"{frame.key}: '{name}' has a point that is not finite"
+        elif ((points[:, 3] < 0) | (points[:, 3] > 1)).any():
+            yield f"{frame.key}: '{name}' has an intensity outside 0 to 1"
+    if not _rigid(frame.world_from_agent):
+        yield f"{frame.key}: the pose of {frame.agent} is not a rigid transform"
+    for category in sorted(set(truth.boxes.label.tolist()) - set(CATEGORIES)):
+        yield f"{frame.key}: unknown class '{category}'; known: {', '.join(CATEGORIES)}"
+    tracks, times = np.unique(truth.track, return_counts=True)
+    for track in tracks[times > 1]:
+        yield f"{frame.key}: '{track}' is annotated more than once"
+    if frame.agent in tracks:
+        yield f"{frame.key}: {frame.agent} is annotated in its own frame"
+    numbers = np.column_stack((truth.boxes.array(), truth.velocity, truth.occlusion))
+    for track in truth.track[~np.isfinite(numbers).all(axis=1)]:
+        yield f"{frame.key}: the annotation of '{track}' has a number that is not finite"
+    for track in truth.track[(truth.boxes.size <= 0).any(axis=1)]:
+        yield f"{frame.key}: the box of '{track}' has no volume"
+    for track in truth.track[(truth.returns < 0) | (truth.occlusion < 0) | (truth.occlusion > 1)]:
+        yield f"{frame.key}: the annotation of '{track}' has negative returns, or an occlusion outside 0 to 1"
+
+
+def check_points(frame: Frame) -> Iterator[str]:
+    """Check that each box, grown by the margin, holds as many points as its actor is said to have returned."""
+    boxes, returns = frame.annotations.boxes, frame.annotations.returns
+    clouds = [
+        transform_points(frame.world_from_sensor(name), points[:, :3].astype(np.float64))
+        for name, points in frame.lidar.items()
+    ]
+    seen = np.flatnonzero(returns > 0)
+    inside = points_in_boxes(np.concatenate(clouds), boxes[seen], MARGIN_M).sum(axis=1)
+    for i, count in zip(seen, inside):
+        if count < INSIDE * returns[i]:
+            track, label = frame.annotations.track[i], boxes.label[i]
+            yield f"{frame.key}: points lie outside the box of {label} '{track}': {count} of {returns[i]} within"
+
+
+def check_traffic(frame: Frame, trace: Trace) -> Iterator[str]:
+    """Check that the vehicle and every box are where the traffic run has them at that time."""
+    instant = np.flatnonzero(np.abs(trace.time_s - frame.time_s) < EXACT)
+    if not len(instant):
+        yield f"{frame.key}: the traffic of '{frame.scene}' has no instant at {frame.time_s} s"
+        return
+    t, truth = instant[0], frame.annotations
+    actor = {name: i for i, name in enumerate(trace.actor.tolist()) if trace.present[t, i]}
+    if frame.agent in actor:
+        away = np.linalg.norm(frame.world_from_agent[:3, 3] - trace.position[t, actor[frame.agent]])
+        if not away < EXACT:
+            yield f"{frame.key}: {frame.agent} is {away:.2f} m from where the traffic has it"
+    for i, track in enumerate(truth.track.tolist()):
+        if track not in actor:
+            yield f"{frame.key}: '{track}' is annotated but not in town"
+            continue
+        a = actor[track]
+        away = np.linalg.norm(truth.boxes.center[i] - trace.position[t, a] - (0, 0, trace.size[a, 2] / 2))
+        turned = np.abs(wrap_angle(truth.boxes.yaw[i] - trace.yaw[t, a]))
+        grown = np.abs(truth.boxes.size[i] - trace.size[a]).max()
+        faster = np.abs(truth.velocity[i] - trace.velocity[t, a]).max()
+        if not max(away, turned, grown, faster) < EXACT:
+            yield (
+                f"{frame.key}: the box of '{track}' is not what the traffic has: {away:.2f} m away, "
+                f"{np.degrees(turned):.1f} degrees turned, size {grown:.2f} m and speed {faster:.2f} m/s different"
+            )
+        if truth.boxes.label[i] != trace.category[a]:
+            yield f"{frame.key}: '{track}' is annotated as {truth.boxes.label[i]}, it is a {trace.category[a]}"
+
+
+def _rigid(matrix: np.ndarray) -> bool:
+    rotation = matrix[:3, :3]
+    return bool(
+        np.isfinite(matrix).all()
+        and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+        and np.linalg.det(rotation) > 0
+        and np.array_equal(matrix[3], (0, 0, 0, 1))
+    )
