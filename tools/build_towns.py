@@ -4,8 +4,8 @@ Run with an environment that has `eclipse-sumo` (the extra `towns`):
 
     python tools/build_towns.py            # writes src/flcav/world/towns/<name>/town.net.xml
 
-The nets are committed; a town's other properties stand in `town.yaml` beside its net. Right-hand traffic. An edge lists its
-lanes from the kerb to the middle: sidewalk, bicycle lane, parking lane (closed to all traffic), driving lanes.
+The nets are committed; a town's other properties stand in `town.yaml` beside its net. Right-hand traffic. An edge lists
+its lanes from the kerb to the middle: sidewalk, bicycle lane, parking lane (closed to all traffic), driving lanes.
 """
 
 import math
@@ -171,10 +171,12 @@ def suburb() -> Sketch:
     for name, at in tees.items():
         town.node(name, at, "priority_stop" if name in ("m1", "m2", "m3") else "priority")
     town.node("close", (-75, -130))
-    for pair in ("w_m1", "m1_m3", "m3_m2", "m2_e"):
-        town.street(*pair.split("_"), "main")
-    for pair in ["nw_t1", "t1_t2", "t2_ne", "ne_e", "e_se", "se_b1", "b1_b2", "b2_sw", "sw_w", "w_nw", "t1_m1", "t2_m2", "m3_b1", "b2_close"]:
-        town.street(*pair.split("_"), "side")
+    for start, end in ("w", "m1"), ("m1", "m3"), ("m3", "m2"), ("m2", "e"):
+        town.street(start, end, "main")
+    rim = ("nw", "t1", "t2", "ne", "e", "se", "b1", "b2", "sw", "w")
+    across = ("t1", "m1"), ("t2", "m2"), ("m3", "b1"), ("b2", "close")
+    for start, end in *zip(rim, (*rim[1:], rim[0])), *across:
+        town.street(start, end, "side")
     town.turning_loop("close", "b2", "loop", radius=8.0)
     return town
 
@@ -186,8 +188,9 @@ def grid() -> Sketch:
             "boulevard": Profile(3, 3.2, 2.6, 1.6, 3.0, 8.33, 4),
             "avenue": Profile(3, 3.2, 2.6, 1.6, 2.6, 13.89, 4),
             "street": Profile(2, 3.2, 2.6, 0, 2.4, 13.89, 3),
-            "bend": Profile(2, 3.4, 0, 0, 2.4, 11.11, 3),
-            "loop": Profile(1, 4.2, 0, 0, 2.0, 6.94, 1),
+            "bend": Profile(1, 3.8, 0, 0, 2.4, 8.33, 2),
+            "stub": Profile(1, 3.8, 0, 0, 2.2, 8.33, 2),
+            "loop": Profile(1, 4.2, 0, 0, 2.2, 6.94, 1),
         }
     )
     shear, turn = 0.17, math.radians(23.0)
@@ -196,7 +199,7 @@ def grid() -> Sketch:
         x += shear * y
         return x * math.cos(turn) - y * math.sin(turn), x * math.sin(turn) + y * math.cos(turn)
 
-    columns, rows = (-105.0, 0.0, 98.0), (-92.0, 0.0, 88.0)
+    columns, rows = (-112.0, 0.0, 86.0), (-86.0, 0.0, 82.0)
     for i, x in enumerate(columns):
         for j, y in enumerate(rows):
             town.node(f"x{i}{j}", world(x, y), "traffic_light")
@@ -207,7 +210,7 @@ def grid() -> Sketch:
     for i in range(3):
         for j in range(2):
             town.street(f"x{i}{j}", f"x{i}{j + 1}", "street")
-    reach = 46.0
+    reach = 40.0
     for name, start, (x, y) in (
         ("west", "x01", (columns[0] - reach, rows[1])),
         ("east", "x21", (columns[2] + reach, rows[1])),
@@ -215,10 +218,10 @@ def grid() -> Sketch:
         ("north", "x12", (columns[1], rows[2] + reach)),
     ):
         town.node(name, world(x, y))
-        town.street(start, name, "avenue" if name in ("west", "east") else "street")
+        town.street(start, name, "stub")
         town.turning_loop(name, start, "loop")
     for i, j in ((0, 0), (2, 0), (0, 2), (2, 2)):
-        side, up, radius = i - 1, j - 1, 25.0
+        side, up, radius = i - 1, j - 1, 21.0
         petal = [on_circle((radius, radius), radius, math.radians(angle)) for angle in range(-90, 181, 15)]
         shape = [world(columns[i] + side * x, rows[j] + up * y) for x, y in petal]
         here, middle, half = f"x{i}{j}", f"petal{i}{j}", len(shape) // 2
@@ -237,7 +240,8 @@ def ring() -> Sketch:
             "arm": Profile(1, 3.4, 2.4, 1.5, 2.4, 11.11, 3),
             "outer": Profile(1, 3.4, 2.4, 0, 2.2, 11.11, 2),
             "circle": Profile(1, 5.0, 0, 0, 2.2, 6.94, 5),
-            "loop": Profile(1, 4.2, 0, 0, 2.0, 6.94, 1),
+            "stub": Profile(1, 3.8, 0, 0, 2.2, 8.33, 2),
+            "loop": Profile(1, 4.2, 0, 0, 2.2, 6.94, 1),
         }
     )
     town.roundabout("r", (0, 0), 22.0, {"e": 8.0, "n": 97.0, "w": 196.0, "s": 281.0}, "circle")
@@ -254,7 +258,7 @@ def ring() -> Sketch:
     town.street("x", "ts", "outer", ((131, -25), (126, -62), (108, -92), (72, -114)))
     town.street("ts", "tw", "outer", ((-22, -130), (-66, -126), (-102, -104), (-120, -72)))
     town.street("tw", "tn", "outer", ((-136, 10), (-126, 56), (-96, 92), (-58, 112)))
-    town.street("x", "end", "arm")
+    town.street("x", "end", "stub")
     town.turning_loop("end", "x", "loop")
     return town
 

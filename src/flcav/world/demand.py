@@ -30,23 +30,23 @@ FASTEST_WALK = 1.7  # no pedestrian is [m/s]
 def write_demand(
     net: RoadNet, parameters: TownParameters, *, seed: int, cavs: int, until_s: float, fill_s: float
 ) -> str:
-    """Return the route file's text: CAVs from the start, all others from some instant before `fill_s` [s].
+    """Return the text of the route file: CAVs from the start, all others from some instant before `fill_s` [s].
 
-    Everybody has a tour of random destinations too long to be finished by `until_s`. Vehicles draw destinations by the
-    street type's `traffic`, pedestrians by `footfall`; CAVs draw the approaches of the candidate poles where there are any.
+    Everybody has a tour of random destinations too long to be finished by `until_s`. Vehicles draw destinations by
+    the street type's `traffic`, pedestrians by `footfall`; CAVs draw the approaches of the candidate poles, if any.
     """
     root = Element("routes")
     for category, shapes in SHAPES.items():
         for shape in shapes:
             size = {"length": shape.length, "width": shape.width, "height": shape.height}
             attributes = {name: str(value) for name, value in size.items()}
-            SubElement(root, "vType", id=f"{category}.{shape.name}", **DRIVER[category], **attributes)
+            SubElement(root, "vType", {"id": f"{category}.{shape.name}"} | DRIVER[category] | attributes)
     driven = [edge for edge in net.streets if edge.lanes_of("driving")]
     walked = [edge for edge in net.streets if edge.lanes_of("sidewalk")]
     traffic = np.array([parameters.streets[edge.type].traffic for edge in driven])
     footfall = np.array([parameters.streets[edge.type].footfall for edge in walked])
     watched = pole_approaches(net, parameters)
-    watching = np.array([float(edge.id in watched) for edge in driven])
+    watching = np.array([watched.get(edge.id, 0.0) for edge in driven])
     reach = FASTEST * until_s
     trips: list[tuple[float, Element]] = []
     for i in range(cavs):
@@ -70,13 +70,20 @@ def write_demand(
     return tostring(root, encoding="unicode")
 
 
-def pole_approaches(net: RoadNet, parameters: TownParameters) -> set[str]:
-    """Return the edges that lead past a candidate pole: its own edge, and all that enter the junction it watches."""
-    out = set()
+def pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str, float]:
+    """Return the edges that lead past the candidate poles, weighted so that all poles weigh the same.
+
+    They are both directions of the street a straight pole stands on, and all edges into the junction another watches.
+    """
+    out: dict[str, float] = {}
     for pole in parameters.poles:
-        out.add(pole.edge)
-        if pole.kind != "straight":
-            out |= {edge.id for edge in net.streets if edge.end == net.edges[pole.edge].end}
+        own = net.edges[pole.edge]
+        if pole.kind == "straight":
+            past = [edge.id for edge in net.streets if {edge.start, edge.end} == {own.start, own.end}]
+        else:
+            past = [edge.id for edge in net.streets if edge.end == own.end]
+        for edge in past:
+            out[edge] = out.get(edge, 0.0) + 1.0 / len(past)
     return out
 
 

@@ -61,9 +61,9 @@ class StreetParameters(Config):
     tree_spacing_m: Positive = 18.0
     lamp_spacing_m: Positive = 32.0
     clutter_spacing_m: Positive = 25.0
-    clutter: ClutterMix = {"hedge": 1.0}
+    clutter: ClutterMix = Field(default={"hedge": 1.0})
     parked: Share = 0.0  # share of the parking lane's places that are taken
-    parked_mix: VehicleMix = {"car": 1.0}
+    parked_mix: VehicleMix = Field(default={"car": 1.0})
     traffic: NotNegative = 1.0  # relative weight of its edges as a destination of vehicles
     footfall: NotNegative = 1.0  # and of pedestrians
 
@@ -86,9 +86,7 @@ class TownParameters(Config):
     vehicles: Annotated[int, Field(ge=0)]  # moving at once, CAVs apart
     pedestrians: Annotated[int, Field(ge=0)]
     mix: VehicleMix  # category -> weight among moving vehicles
-    shapes: dict[
-        str, dict[str, float]
-    ] = {}  # category -> shape -> weight; a category left out has all its shapes alike
+    shapes: dict[str, dict[str, float]] = Field(default={})  # category -> shape -> weight; all alike where left out
     streets: dict[str, StreetParameters]  # by the net's edge type
     poles: tuple[PoleParameters, ...] = ()
 

@@ -1,4 +1,4 @@
-"""What stands along the streets of a town: buildings, clutter, trees, lamps, poles, signs. Pure functions of net and parameters."""
+"""What stands along the streets of a town: buildings, clutter, trees, lamps, poles, signs."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Verge:
-    """The line along the middle of a street's sidewalk, walked in driving direction: its right is away from the road."""
+    """The middle of a street's sidewalk, walked in driving direction: its right is away from the road."""
 
     line: LineString
     half_width: float  # of the sidewalk lane [m]

@@ -15,16 +15,24 @@ STEP_S = 0.1
 def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path) -> None:
     """Simulate up to the last of `steps` (ascending, of 0.1 s) and write what was read at each to `out` (.npz).
 
-    Arrays: `id`, `type` (A,); `row` (N, 2) instant and actor index; `state` (N, 4) SUMO's x, y [m], angle [deg clockwise
-    from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of all links of each traffic light.
+    Arrays: `id`, `type` (A,); `row` (N, 2) instant and actor index; `state` (N, 4) SUMO's x, y [m], angle [deg
+    clockwise from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of each light's links.
     """
     import libsumo
 
-    libsumo.start(
-        ["sumo", "--net-file", str(net), "--route-files", str(routes), "--seed", str(seed)]
-        + ["--step-length", str(STEP_S), "--default.action-step-length", "0.5", "--lanechange.duration", "2"]
-        + ["--time-to-teleport", "-1", "--collision.action", "none", "--no-step-log", "true", "--no-warnings", "true"]
-    )
+    options = {
+        "net-file": net,
+        "route-files": routes,
+        "seed": seed,
+        "step-length": STEP_S,
+        "default.action-step-length": 0.5,  # drivers decide twice a second: three times as fast
+        "lanechange.duration": 2,
+        "time-to-teleport": -1,  # nobody vanishes from a jam
+        "collision.action": "none",
+        "no-step-log": "true",
+        "no-warnings": "true",
+    }
+    libsumo.start(["sumo", *(part for name, value in options.items() for part in (f"--{name}", str(value)))])
     index: dict[str, int] = {}
     kinds: list[str] = []
     rows: list[tuple[int, int]] = []

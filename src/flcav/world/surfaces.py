@@ -32,7 +32,7 @@ def surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Surfaces:
         LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
         for edge in net.edges.values()
         for lane in edge.lanes
-        if lane.kind in ("driving", "bicycle", "parking")
+        if lane.kind in ("driving", "bicycle", "parking") and LineString(lane.shape).length > SLIVER_M
     ]
     walked, paved = [], []
     narrowest = min(frontage_m.values(), default=0.0)
@@ -86,8 +86,9 @@ def kerb_lines(ground: Surfaces) -> tuple[Array, ...]:
 
 def _clean(area: BaseGeometry) -> MultiPolygon:
     """Drop slivers, close hairline gaps, thin vertices."""
-    opened = area.buffer(-SLIVER_M / 2, join_style="mitre").buffer(SLIVER_M, join_style="mitre")
-    closed = opened.buffer(-SLIVER_M / 2, join_style="mitre").simplify(0.02)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a mitre divides by the sine of its turn, zero or not
+        opened = area.buffer(-SLIVER_M / 2, join_style="mitre").buffer(SLIVER_M, join_style="mitre")
+        closed = opened.buffer(-SLIVER_M / 2, join_style="mitre").simplify(0.02)
     return MultiPolygon([part for part in _polygons(closed) if part.area > 1.0])
 
 

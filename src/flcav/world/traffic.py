@@ -7,8 +7,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry import Polygon
+from shapely.geometry.base import BaseGeometry
 
+from flcav.config import InputError
 from flcav.geometry import wrap_angle
 from flcav.seeds import child_seed, stream
 from flcav.world.demand import types, write_demand
@@ -16,12 +20,13 @@ from flcav.world.parking import Parked, park
 from flcav.world.roads import read_net
 from flcav.world.shapes import SHAPES
 from flcav.world.sumo_process import STEP_S
-from flcav.world.town import Town
+from flcav.world.town import KERB_M, Town
 from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
 
 FILL_S = 30.0  # everybody is under way by then
+SMOOTHING_STEPS = 4  # half width of the window over which a pose is averaged: SUMO turns and changes lanes in jerks
 
 
 def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray) -> Trace:
@@ -29,17 +34,25 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray) -> Trace:
 
     Actors are "cav<i>" (sedans, under way from the start), "veh<i>", "ped<i>" and "parked<i>"; those absent at all of
     `times_s` are left out. Before `FILL_S` the town is still filling. The same arguments give the same trace.
-    Raises `ValueError` for other times or a negative number of CAVs.
+    Raises `InputError` for other times, and for more CAVs than are on the road by the first of them.
     """
-    steps = np.rint(np.asarray(times_s, dtype=np.float64) / STEP_S).astype(np.int64)
+    times_s = np.asarray(times_s, dtype=np.float64)
+    steps = np.rint(times_s / STEP_S).astype(np.int64)
     if not len(steps) or not np.allclose(steps * STEP_S, times_s, atol=1e-6) or (np.diff(steps, prepend=0) <= 0).any():
-        raise ValueError("times_s must be ascending multiples of 0.1 s above 0")
+        raise InputError(f"times_s = {times_s}: must be ascending multiples of {STEP_S} s above 0")
     if cavs < 0:
-        raise ValueError(f"cavs is {cavs}, must be >= 0")
+        raise InputError(f"cavs = {cavs}: must be 0 or more")
     net = read_net(town.net)
-    demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, until_s=float(steps[-1] * STEP_S), fill_s=FILL_S)
-    raw = _run(town.net, demand, child_seed(seed, "sumo"), steps)
-    return _trace(town.name, steps * STEP_S, raw, park(net, town.parameters, stream(seed, "parked")))
+    demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, until_s=float(times_s[-1]), fill_s=FILL_S)
+    windows = np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
+    read = np.unique(windows)
+    raw = _run(town.net, demand, child_seed(seed, "sumo"), read)
+    parked = park(net, town.parameters, stream(seed, "parked"))
+    trace = _trace(town, np.asarray(times_s.round(1)), raw, np.searchsorted(read, windows), parked)
+    under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
+    if under_way.sum() < cavs * len(times_s):
+        raise InputError(f"not all of {cavs} CAVs are under way at {times_s[0]} s: begin later, or take fewer")
+    return trace
 
 
 def _run(net: Path, demand: str, seed: int, steps: NDArray[np.int64]) -> dict[str, NDArray]:
@@ -56,49 +69,67 @@ def _run(net: Path, demand: str, seed: int, steps: NDArray[np.int64]) -> dict[st
             return dict(arrays)
 
 
-def _trace(town: str, time_s: Array, raw: dict[str, NDArray], parked: list[Parked]) -> Trace:
-    order = sorted(range(len(raw["id"])), key=lambda i: _natural(str(raw["id"][i])))
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
+def _trace(
+    town: Town, time_s: Array, raw: dict[str, NDArray], windows: NDArray[np.int64], parked: list[Parked]
+) -> Trace:
+    state = _smooth(_dense(raw), windows)
+    seen = np.flatnonzero(~np.isnan(state[..., 0]).all(axis=0))
+    order = np.array(sorted(seen, key=lambda i: _natural(str(raw["id"][i]))), dtype=np.int64)
     known = {name: (category, shape) for name, category, shape in types()}
     kinds = [known[str(raw["type"][i])] for i in order] + [(car.category, car.shape) for car in parked]
-    moving, actors = len(order), len(kinds)
     size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], dtype=np.float64).reshape(-1, 3)
+    still = np.array([(car.x, car.y, car.yaw, 0.0) for car in parked], dtype=np.float64).reshape(-1, 4)
+    state = np.concatenate((state[:, order], np.broadcast_to(still, (len(time_s), *still.shape))), axis=1)
 
-    position = np.full((len(time_s), actors, 3), np.nan)
-    yaw = np.full((len(time_s), actors), np.nan)
-    velocity = np.full((len(time_s), actors, 3), np.nan)
-    at = (raw["row"][:, 0], rank[raw["row"][:, 1]])
-    position[at], yaw[at], velocity[at] = _poses(raw["state"], size[at[1], 0])
-    position[:, moving:] = np.array([(car.x, car.y, 0.0) for car in parked]).reshape(-1, 3)
-    yaw[:, moving:] = [car.yaw for car in parked]
-    velocity[:, moving:] = 0.0
-
+    x, y, yaw, speed = np.moveaxis(state, 2, 0)
+    forward = np.stack((np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)), axis=2)
+    pedestrian = np.array([category == "pedestrian" for category, _ in kinds])
+    z = np.where(np.isnan(x), np.nan, KERB_M * (shapely.contains_xy(_pavement(town), x, y) & pedestrian))
+    front_to_centre = np.where(np.arange(len(kinds)) < len(order), size[:, 0] / 2, 0.0)
     lights = [(light, len(letters)) for light, letters in zip(raw["light"], raw["light_state"][0])]
+    letters = [list("".join(row)) for row in raw["light_state"][windows[:, SMOOTHING_STEPS]]]
     return Trace(
-        town=town,
-        time_s=np.round(time_s, 1),
-        actor=np.array([str(raw["id"][i]) for i in order] + [f"parked{i}" for i in range(len(parked))], dtype=np.str_),
+        town=town.name,
+        time_s=time_s,
+        actor=np.array([*(str(raw["id"][i]) for i in order), *(f"parked{i}" for i in range(len(parked)))]),
         category=np.array([category for category, _ in kinds], dtype=np.str_),
         shape=np.array([shape for _, shape in kinds], dtype=np.int64),
         size=size,
         present=~np.isnan(yaw),
-        position=position,
+        position=np.stack((x, y, z), axis=2) - front_to_centre[:, None] * forward,
         yaw=yaw,
-        velocity=velocity,
+        velocity=speed[..., None] * forward,
         light=np.array([f"{light}:{i}" for light, links in lights for i in range(links)], dtype=np.str_),
-        light_state=np.array([list("".join(letters)) for letters in raw["light_state"]], dtype="<U1").reshape(
-            len(time_s), sum(links for _, links in lights)
-        ),
+        light_state=np.array(letters, dtype="<U1").reshape(len(time_s), -1),
     )
 
 
-def _poses(state: Array, length: Array) -> tuple[Array, Array, Array]:
-    """Return ground centres (N, 3), yaws (N,) and velocities (N, 3) from SUMO's x, y of the front, angle, speed."""
-    yaw = wrap_angle(np.pi / 2 - np.radians(state[:, 2]))
-    forward = np.stack((np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))), axis=1)
-    front = np.concatenate((state[:, :2], np.zeros((len(state), 1))), axis=1)
-    return front - length[:, None] / 2 * forward, yaw, state[:, 3, None] * forward
+def _dense(raw: dict[str, NDArray]) -> Array:
+    """Return (S, A, 4) front x, y, unwrapped yaw, speed at all steps read; NaN where absent."""
+    out = np.full((len(raw["light_state"]), len(raw["id"]), 4), np.nan)
+    out[raw["row"][:, 0], raw["row"][:, 1]] = raw["state"]
+    yaw = np.pi / 2 - np.radians(out[..., 2])
+    out[..., 2] = np.where(np.isnan(yaw), np.nan, np.unwrap(np.nan_to_num(yaw), axis=0))
+    return out
+
+
+def _smooth(dense: Array, windows: NDArray[np.int64]) -> Array:
+    """Return (T, A, 4) front x, y, yaw, speed averaged over each window's steps (T, W); NaN where absent midway."""
+    total, count = np.zeros((len(windows), *dense.shape[1:])), np.zeros((len(windows), dense.shape[1], 1))
+    for column in windows.T:
+        there = ~np.isnan(dense[column, :, :1])
+        total += np.where(there, dense[column], 0.0)
+        count += there
+    absent = np.isnan(dense[windows[:, windows.shape[1] // 2], :, :1])
+    out = np.where(absent, np.nan, total / np.maximum(count, 1))
+    out[..., 2] = wrap_angle(out[..., 2])
+    return out
+
+
+def _pavement(town: Town) -> BaseGeometry:
+    pavement = shapely.union_all([Polygon(outline) for outline in town.sidewalks])
+    shapely.prepare(pavement)
+    return pavement
 
 
 def _natural(name: str) -> tuple[str, int]:
