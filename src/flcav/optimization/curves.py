@@ -1,0 +1,84 @@
+"""Learning curves: the error that is left after so many samples, edge rounds and cloud rounds."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from flcav.config import Config
+
+STAGES = ("pretrain", "edge", "cloud")  # measured in samples, edge rounds, cloud rounds
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class Decay(Config):
+    """The error a * (x + x0)^(-b) that is left after x samples or rounds. The default is none at all."""
+
+    a: NonNegative = 0.0
+    b: Positive = 1.0
+    x0: NonNegative = 0.0
+
+    @property
+    def infinite_at_0(self) -> bool:
+        """Return whether the error is infinite before the first sample or round."""
+        return self.a > 0 and self.x0 == 0
+
+    def at(self, resource: ArrayLike) -> NDArray[np.float64]:
+        """Return the error left after `resource` samples or rounds."""
+        shifted = np.asarray(resource, dtype=np.float64) + self.x0
+        with np.errstate(divide="ignore"):
+            return self.a * shifted**-self.b if self.a > 0 else np.zeros_like(shifted)
+
+
+class Additive(Config):
+    """error = floor + the decay of each stage."""
+
+    model: Literal["additive"] = "additive"
+    floor: NonNegative = 0.0
+    pretrain: Decay = Decay()
+    edge: Decay = Decay()
+    cloud: Decay = Decay()
+
+    def decays(self) -> tuple[Decay, Decay, Decay]:
+        """Return the decays in the order of `STAGES`."""
+        return self.pretrain, self.edge, self.cloud
+
+    def error(
+        self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1
+    ) -> NDArray[np.float64]:
+        """Return the error after so much of each stage, elementwise; `k` plays no part in this model."""
+        return self.floor + self.pretrain.at(samples) + self.edge.at(edge_rounds) + self.cloud.at(cloud_rounds)
+
+
+class Effective(Config):
+    """error = floor + a * n^(-b) at n = alpha * samples + beta * group_samples * (1 - 1 / (t + 1)) effective samples.
+
+    t = edge_rounds + k * cloud_rounds; group_samples are those that the vehicles of all groups hold.
+    """
+
+    model: Literal["effective"]
+    floor: NonNegative = 0.0
+    a: Positive
+    b: Positive
+    alpha: Positive
+    beta: NonNegative
+    group_samples: NonNegative
+
+    def error(
+        self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1
+    ) -> NDArray[np.float64]:
+        """Return the error after so much of each stage, elementwise, at `k` edge rounds per cloud round."""
+        return self.floor + self.a * self.effective_samples(samples, edge_rounds, cloud_rounds, k) ** -self.b
+
+    def effective_samples(
+        self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int
+    ) -> NDArray[np.float64]:
+        """Return n, elementwise."""
+        t = np.asarray(edge_rounds) + k * np.asarray(cloud_rounds)
+        return self.alpha * np.asarray(samples) + self.beta * self.group_samples * (1 - 1 / (t + 1.0))
+
+
+Curve = Annotated[Additive | Effective, Field(discriminator="model")]
