@@ -1,0 +1,78 @@
+"""What the article claims, held against one run: sentences computed from the run's numbers.
+
+A claim is about a difference of AP50. Its interval is a paired bootstrap over scenes (95 %): wholly above 0 the claim
+held, wholly below it did not, around 0 the run does not decide.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
+CAVEAT = "Labels of the road sensor come from an ideal road detector: an upper bound."
+
+_IN_WORDS = {
+    HELD: "the interval lies above 0: the claim held in this run",
+    NOT_HELD: "the interval lies below 0: the claim did not hold in this run",
+    UNDECIDED: "the interval contains 0, so this run does not decide",
+}
+
+
+def findings(results: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the three findings about `results`: name, question, verdict and a sentence with the numbers behind it."""
+    pretrained, edge, cloud = (stage["ap50"] for stage in results["stages"])
+    town = results["stages"][0]["town"]
+    differences = results["differences"]
+    return [
+        _finding(
+            "edge",
+            "Does federated learning beat pretraining alone?",
+            f"On {town}, edge FL moved AP50 from {pretrained:.3f} to {edge:.3f}",
+            differences["edge_minus_pretrained"],
+            results,
+        ),
+        _finding(
+            "cloud",
+            "Does cloud FL add to edge FL?",
+            f"On {town}, cloud FL moved AP50 from {edge:.3f} to {cloud:.3f}",
+            differences["cloud_minus_edge"],
+            results,
+        ),
+        _pole_finding(results),
+    ]
+
+
+def verdict(low: float, high: float) -> str:
+    """Return what the interval [low, high] of a difference says of the claim that it is positive."""
+    if low > 0:
+        return HELD
+    return NOT_HELD if high < 0 else UNDECIDED
+
+
+def _pole_finding(results: Mapping[str, Any]) -> dict[str, str]:
+    question = "Does the placed pole beat the pole with the densest traffic?"
+    place = results["placement"]
+    chosen, densest = place["chosen"], place["densest"]
+    if chosen == densest:
+        sentence = (
+            f"Pole {chosen}, which covers most registered errors ({place['covered']} of {place['errors']}), is also "
+            f"the pole with the densest traffic: there is nothing to compare, so this run does not decide."
+        )
+        return {"name": "pole", "question": question, "verdict": UNDECIDED, "sentence": sentence}
+    measured = (
+        f"After edge FL with pole {chosen}, which VRCSP placed ({place['covered']} of {place['errors']} registered "
+        f"errors within {place['range_m']:g} m), AP50 is {place['ap50_chosen']:.3f}; with pole {densest}, where "
+        f"traffic is densest, {place['ap50_densest']:.3f}"
+    )
+    return _finding("pole", question, measured, place["difference"], results)
+
+
+def _finding(
+    name: str, question: str, measured: str, difference: Mapping[str, float], results: Mapping[str, Any]
+) -> dict[str, str]:
+    low, high = difference["low"], difference["high"]
+    decided = verdict(low, high)
+    sentence = (
+        f"{measured} ({difference['mean']:+.3f}, 95 % interval {low:+.3f} to {high:+.3f}, paired, "
+        f"{results['test_frames']} test frames of {results['test_scenes']} scenes); {_IN_WORDS[decided]}. {CAVEAT}"
+    )
+    return {"name": name, "question": question, "verdict": decided, "sentence": sentence}

@@ -1,0 +1,99 @@
+"""A town from above, with what a placement is about."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection, PolyCollection
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+
+from flcav.report import style
+from flcav.world.town import Town
+
+Array = NDArray[np.float64]
+
+MISS: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 4.5,
+    "color": style.MISSED,
+    "markeredgecolor": "white",
+    "markeredgewidth": 0.5,
+}
+FALSE_POSITIVE: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": style.FALSE, "markeredgewidth": 1.3}
+HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
+
+
+@dataclass(frozen=True)
+class ErrorMap:
+    """Where a network erred in a town, and where a roadside sensor is put for it."""
+
+    town: Town
+    errors: Array  # (E, 3) world [m]
+    missed: NDArray[np.bool_]  # (E,) a missed object; else a false positive
+    chosen: Sequence[int]  # ids of the poles that were placed
+    densest: int  # id of the pole with most actors within range
+    range_m: float
+
+
+def draw_town(axes: Axes, town: Town) -> None:
+    """Draw roads, buildings and trees of `town`, and a scale bar."""
+    x_low, y_low, x_high, y_high = town.bounds
+    axes.set(xlim=(x_low, x_high), ylim=(y_low, y_high), aspect="equal")
+    style.bare(axes)
+    axes.add_collection(PolyCollection(list(town.sidewalks), facecolor=style.SIDEWALK, linewidth=0))
+    axes.add_collection(PolyCollection(list(town.roads), facecolor=style.ROAD, edgecolor=style.ROAD, linewidth=0.5))
+    trees = [Circle((x, y), radius) for x, y, _, radius in town.trees]
+    axes.add_collection(PatchCollection(trees, facecolor=style.TREE, linewidth=0))
+    axes.add_collection(PolyCollection(list(rectangles(town.buildings[:, :5])), facecolor=style.BUILDING, linewidth=0))
+    style.scale_bar(axes, 50)
+
+
+def rectangles(rows: Array) -> Array:
+    """Return (N, 4, 2) corners of rectangles given as (N, 5) rows x, y, yaw, length, width."""
+    signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+    along, across = signs[None, :, 0] * rows[:, 3:4], signs[None, :, 1] * rows[:, 4:5]
+    cos, sin = np.cos(rows[:, 2:3]), np.sin(rows[:, 2:3])
+    x = rows[:, 0:1] + along * cos - across * sin
+    y = rows[:, 1:2] + along * sin + across * cos
+    return np.stack((x, y), axis=-1)
+
+
+def draw_errors(axes: Axes, scene: ErrorMap) -> None:
+    """Draw the town, its registered errors, and its poles: the chosen with what they cover, the densest marked."""
+    draw_town(axes, scene.town)
+    poles = scene.town.poles
+    position = {int(number): xyz for number, xyz in zip(poles.id, poles.position, strict=True)}
+    for number in scene.chosen:
+        reach = np.sqrt(max(scene.range_m**2 - position[number][2] ** 2, 0.0))  # of the sphere, at ground level
+        disc = Circle(tuple(position[number][:2]), reach, facecolor=style.BLUE, alpha=0.10, linewidth=0)
+        rim = Circle(tuple(position[number][:2]), reach, fill=False, edgecolor=style.BLUE, linewidth=1.2)
+        axes.add_patch(disc)
+        axes.add_patch(rim)
+    misses, falses = scene.errors[scene.missed], scene.errors[~scene.missed]
+    for xyz, look, label in ((misses, MISS, "object missed"), (falses, FALSE_POSITIVE, "false positive")):
+        axes.plot(*xyz[:, :2].T, linestyle="none", label=f"{label} ({len(xyz)})", **look)
+    for number, (x, y, _) in position.items():
+        _draw_pole(axes, number, x, y, chosen=number in scene.chosen, densest=number == scene.densest)
+
+
+def _draw_pole(axes: Axes, number: int, x: float, y: float, *, chosen: bool, densest: bool) -> None:
+    face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)
+    axes.plot(x, y, "s" if densest else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
+    axes.text(x, y, str(number), ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
+    note = " and ".join(word for word, said in (("placed", chosen), ("densest traffic", densest)) if said)
+    if note:
+        axes.annotate(
+            note,
+            (x, y),
+            (0, 10),
+            textcoords="offset points",
+            ha="center",
+            fontsize=style.SMALL,
+            fontweight="bold",
+            path_effects=HALO,
+            zorder=6,
+        )

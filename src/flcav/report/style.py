@@ -1,0 +1,102 @@
+"""One look for every picture: quiet greys for what is given, the Okabe-Ito colours for what is shown.
+
+Sizes are final: a figure is drawn as wide as it is shown, so that its smallest text stays at 9 pt or more.
+"""
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+
+INK = "#222222"  # text, ground truth
+MUTED = "#6b6b6b"  # axes, notes
+RULE = "#c9c9c9"  # grid, borders
+ROAD = "#dfdfdd"
+SIDEWALK = "#f1f0ee"
+BUILDING = "#cfc9c0"
+TREE = "#cfdccb"
+POINT = "#9a9a9a"
+
+BLUE = "#0072b2"
+SKY = "#56b4e9"
+ORANGE = "#e69f00"
+VERMILLION = "#d55e00"
+GREEN = "#009e73"
+PURPLE = "#cc79a7"
+
+HIT, MISSED, FALSE = BLUE, ORANGE, VERMILLION
+TOWN_COLOURS = {"grid": BLUE, "ring": VERMILLION, "suburb": MUTED}
+STAGE_COLOURS = (RULE, SKY, ORANGE)  # in the order of the run
+
+SMALL, TEXT = 9, 10  # [pt]
+
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": TEXT,
+    "axes.titlesize": TEXT,
+    "axes.labelsize": TEXT,
+    "xtick.labelsize": SMALL,
+    "ytick.labelsize": SMALL,
+    "legend.fontsize": SMALL,
+    "text.color": INK,
+    "axes.labelcolor": MUTED,
+    "axes.edgecolor": RULE,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.major.size": 0,
+    "ytick.major.size": 0,
+    "grid.color": RULE,
+    "grid.linewidth": 0.6,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "svg.hashsalt": "flcav",
+}
+
+styled = matplotlib.rc_context(STYLE)  # decorates a function that draws
+
+
+def canvas(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure of that size [inch]; no window, no global state."""
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def bare(axes: Axes) -> None:
+    """Take away the ticks and the frame: for pictures that are maps."""
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def scale_bar(axes: Axes, length_m: float) -> None:
+    """Draw a bar of `length_m` in the lower right corner of axes in metres."""
+    x_low, x_high = axes.get_xlim()
+    y_low, y_high = axes.get_ylim()
+    right = x_high - 0.03 * (x_high - x_low)
+    y = y_low + 0.03 * (y_high - y_low)
+    axes.plot([right - length_m, right], [y, y], color=INK, linewidth=2, solid_capstyle="butt")
+    axes.annotate(
+        f"{length_m:g} m", (right - length_m / 2, y), (0, 3), textcoords="offset points", ha="center", fontsize=SMALL
+    )
+
+
+def key(owner: FigureBase | Axes, handles: Sequence[Artist], **changes: Any) -> None:
+    """Put the legend of `handles`, which carry labels, in one line below what it explains."""
+    line = {"loc": "outside lower center", "ncols": len(handles), "frameon": False}
+    spacing = {"handlelength": 1.2, "handletextpad": 0.5, "columnspacing": 1.4}
+    owner.legend(handles=handles, **line | spacing | changes)
+
+
+def png(figure: Figure, dpi: int = 200) -> bytes:
+    """Return the figure as a PNG file; equal figures give equal bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()

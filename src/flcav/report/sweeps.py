@@ -1,0 +1,77 @@
+"""A LiDAR sweep from above, with boxes: forward is up, left is left."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from flcav.geometry import Boxes
+from flcav.report import style
+
+Array = NDArray[np.float64]
+Extent = tuple[float, float, float]  # shown behind (negative), ahead, aside [m]
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What one network found in a sweep, matched with the sweep's targets by whoever evaluated it."""
+
+    title: str
+    boxes: Boxes  # (N,) without those of neutral objects
+    hit: NDArray[np.bool_]  # (N,) matched with a target; else a false positive
+    found: NDArray[np.bool_]  # (M,) targets that a detection matched; else missed
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One sweep seen by two networks. One frame for all: x forward, y left, at the sensor or its vehicle."""
+
+    points: NDArray[np.float32]  # (P, >=3) x, y, z [m]
+    targets: Boxes  # (M,)
+    before: Detections
+    after: Detections
+
+
+def outlines(boxes: Boxes) -> Array:
+    """Return (N, 4, 2) ground outlines of `boxes` on the page: across = -y, up = x."""
+    ground = boxes.corners()[:, :4, :2]
+    return np.stack((-ground[..., 1], ground[..., 0]), axis=-1)
+
+
+def draw_points(axes: Axes, points: NDArray[np.float32], extent: Extent) -> None:
+    """Draw the (P, >=3) points within `extent`, and set the axes to it."""
+    behind, ahead, aside = extent
+    shown = points[(points[:, 0] > behind) & (points[:, 0] < ahead) & (np.abs(points[:, 1]) < aside)]
+    axes.scatter(-shown[:, 1], shown[:, 0], s=0.6, color=style.POINT, linewidths=0, rasterized=True)
+    axes.set(xlim=(-aside, aside), ylim=(behind, ahead), aspect="equal")
+
+
+def draw_boxes(axes: Axes, boxes: Boxes, colour: str, *, fill: float = 0.0, dashed: bool = False) -> None:
+    """Draw the ground outlines of `boxes`, filled with opacity `fill`."""
+    face, line = (colour, fill), "--" if dashed else "-"
+    outline = PolyCollection(list(outlines(boxes)), facecolor=face, edgecolor=colour, linewidth=1.3, linestyle=line)
+    axes.add_collection(outline)
+
+
+def draw_detections(axes: Axes, sweep: Sweep, found: Detections, extent: Extent) -> None:
+    """Draw the sweep, its targets and what one network found: hits, misses and false positives told apart."""
+    draw_points(axes, sweep.points, extent)
+    draw_boxes(axes, sweep.targets, style.INK)
+    draw_boxes(axes, sweep.targets[~found.found], style.MISSED, fill=0.6)
+    draw_boxes(axes, found.boxes[found.hit], style.HIT, fill=0.35)
+    draw_boxes(axes, found.boxes[~found.hit], style.FALSE, fill=0.2, dashed=True)
+    axes.plot(0, 0, "^", color=style.INK, markersize=7, clip_on=False, zorder=5)
+    axes.set_title(found.title, fontweight="bold")
+
+
+def key(found: Detections | None = None) -> list[Patch]:
+    """Return legend entries of what `draw_detections` draws, with counts where `found` is given."""
+    entries = (("found", style.HIT, 0.35), ("missed", style.MISSED, 0.6), ("false", style.FALSE, 0.2))
+    counts = ("", "", "") if found is None else (found.found.sum(), (~found.found).sum(), (~found.hit).sum())
+    return [
+        Patch(facecolor=(colour, fill), edgecolor=colour, label=f"{count} {word}".strip())
+        for count, (word, colour, fill) in zip(counts, entries, strict=True)
+    ]
