@@ -12,9 +12,8 @@ from flcav.world.meshes.buildings import building
 from flcav.world.meshes.furniture import clutter, lamp, sensor_mast, sign
 from flcav.world.meshes.mesh import Mesh, join, moved, sheet
 from flcav.world.meshes.plants import tree
-from flcav.world.town import Town
+from flcav.world.town import KERB_M, Town
 
-KERB_M = 0.12  # how far a sidewalk is above the road
 GROUND_M = -0.03  # open ground lies a little below the road
 LAND_M = 150.0  # ground beyond the town's bounds
 
