@@ -84,13 +84,14 @@ class Boxes:
 def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> NDArray[np.bool_]:
     """Return (N, P): whether point p (P, >=3) of the boxes' frame lies in box n grown by `margin_m` on every side."""
     xyz = np.asarray(points)[:, :3].astype(np.float64)
+    x, y = np.ascontiguousarray(xyz[:, :2].T)
     inside = np.zeros((len(boxes), len(xyz)), dtype=bool)
     for i in range(len(boxes)):
-        delta = xyz - boxes.center[i]
         half = boxes.size[i] / 2 + margin_m
-        near = np.flatnonzero(np.abs(delta[:, :2]).max(axis=1) <= np.hypot(half[0], half[1]))
+        reach = np.hypot(half[0], half[1])
+        near = np.flatnonzero((np.abs(x - boxes.center[i, 0]) <= reach) & (np.abs(y - boxes.center[i, 1]) <= reach))
         cos, sin = np.cos(boxes.yaw[i]), np.sin(boxes.yaw[i])
-        dx, dy, dz = delta[near].T
+        dx, dy, dz = (xyz[near] - boxes.center[i]).T
         local = np.stack((dx * cos + dy * sin, dy * cos - dx * sin, dz), axis=1)
         inside[i, near] = (np.abs(local) <= half).all(axis=1)
     return inside

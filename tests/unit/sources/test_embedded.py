@@ -1,0 +1,67 @@
+import pickle
+
+import numpy as np
+import pytest
+
+from flcav.config import InputError
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+
+
+def small(**fields: object) -> EmbeddedSource:
+    settings = {"town": "suburb", "seed": 3, "cavs": 2, "warmup_s": 35.0, "spins_per_scene": 2, "scenes": 2}
+    return EmbeddedSource(Recipe.model_validate(settings | fields))
+
+
+def test_scenes_are_named_by_town_seed_and_number():
+    assert small().scenes() == ["suburb-3-000", "suburb-3-001"]
+
+
+def test_a_number_of_frames_takes_as_many_scenes_as_it_needs():
+    source = small(frames=9)
+    assert source.scenes() == ["suburb-3-000", "suburb-3-001", "suburb-3-002"]
+    assert [source.frame_count(scene) for scene in source.scenes()] == [4, 4, 1]
+    assert small(frames=3).scenes() == ["suburb-3-000"]
+    assert small(frames=8).describe() == small().describe()
+
+
+def test_frames_come_spin_by_spin_vehicles_before_poles():
+    source = small(poles=[1], scenes=1)
+    frames = list(source.frames("suburb-3-000"))
+    assert len(frames) == source.frame_count("suburb-3-000") == 6
+    assert [(frame.index, frame.agent) for frame in frames[:3]] == [(0, "cav0"), (0, "cav1"), (0, "pole1")]
+    assert [frame.time_s for frame in frames[::3]] == [35.0, 36.0]
+    assert all(len(frame.lidar["lidar"]) > 100 for frame in frames)
+
+
+def test_a_scene_is_the_same_whatever_was_asked_before_and_in_a_copy():
+    source = small()
+    last = next(iter(source.frames("suburb-3-001")))
+    list(source.frames("suburb-3-000"))
+    again = next(iter(pickle.loads(pickle.dumps(source)).frames("suburb-3-001")))
+    np.testing.assert_array_equal(last.lidar["lidar"], again.lidar["lidar"])
+    np.testing.assert_array_equal(last.annotations.boxes.array(), again.annotations.boxes.array())
+
+
+def test_scenes_differ_in_traffic_and_in_parked_cars():
+    source = small()
+    first, second = (source.trace(scene) for scene in source.scenes())
+    for kind in ("veh", "parked"):
+        places = [
+            {tuple(row.round(2)) for row in trace.position[0, np.char.startswith(trace.actor, kind)]}
+            for trace in (first, second)
+        ]
+        assert places[0] != places[1], kind
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"town": "atlantis"}, "unknown town 'atlantis'"),
+        ({"poles": [99]}, "field 'poles' = 99: no pole of suburb"),
+        ({"cavs": 0}, "nobody observes"),
+    ],
+)
+def test_what_the_town_does_not_have(fields: dict, message: str):
+    with pytest.raises(InputError, match=message):
+        small(**fields)

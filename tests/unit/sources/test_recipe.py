@@ -1,0 +1,62 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flcav.config import InputError, parse_config, read_config
+from flcav.sensors.rig import RIGS
+from flcav.sources.recipe import Recipe
+
+RECIPES = Path(__file__).parents[3] / "recipes"
+
+
+def parsed(**fields: object) -> Recipe:
+    return parse_config(Recipe, {"town": "grid", **fields}, "recipe.yaml")
+
+
+def test_rigs_by_name_and_written_out():
+    recipe = parsed(vehicle_rig="roadside", pole_rig={"lidars": {"lidar": {"settings": {"channels": 16}}}})
+    assert recipe.vehicle_rig == RIGS["roadside"]
+    assert recipe.pole_rig.lidars["lidar"].settings.channels == 16
+    assert parse_config(Recipe, recipe.model_dump(mode="json"), "resolved") == recipe
+
+
+def test_times_are_exact_tenths_of_a_second():
+    times = parsed(warmup_s=59.9, every_s=0.1, spins_per_scene=300).times_s()
+    assert len(times) == 300
+    assert times.tolist() == [(599 + spin) / 10 for spin in range(300)]
+    assert times.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"speed": 3}, "unknown field 'speed'"),
+        ({"town": 5}, "field 'town' = 5"),
+        ({"seed": -1}, "field 'seed' = -1"),
+        ({"scenes": 0}, "field 'scenes' = 0"),
+        ({"frames": 0}, "field 'frames' = 0"),
+        ({"every_s": 0}, "field 'every_s' = 0: .*greater than 0"),
+        ({"every_s": 0.25}, "field 'every_s' = 0.25: must be a multiple of 0.1 s"),
+        ({"warmup_s": float("inf")}, "field 'warmup_s'"),
+        ({"split": "../test"}, "field 'split'"),
+        ({"poles": "some"}, "field 'poles' = 'some': must be a list of different pole numbers, or 'all'"),
+        ({"poles": [1, 1]}, "field 'poles'"),
+        ({"poles": [True]}, "field 'poles'"),
+        ({"vehicle_rig": "plane"}, "field 'vehicle_rig' = 'plane': unknown rig; known rigs: car, roadside"),
+        ({"vehicle_rig": 3}, "field 'vehicle_rig' = 3"),
+        (
+            {"vehicle_rig": {"lidars": {"lidar": {"settings": {"range_m": -5}}}}},
+            r"field 'vehicle_rig.lidars.lidar.settings.range_m' = -5",
+        ),
+    ],
+)
+def test_bad_values_get_one_sentence(fields: dict, message: str):
+    with pytest.raises(InputError, match=f"^recipe.yaml: {message}") as error:
+        parsed(**fields)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("town", ["suburb", "grid", "ring"])
+def test_the_recipes_we_ship_are_valid(town: str):
+    assert read_config(Recipe, RECIPES / f"{town}.yaml").town == town
