@@ -1,11 +1,11 @@
 """From ray hits to echoes: through panes of glass, and into the detector."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from flcav.world.materials import Material
 from flcav.world.rays.raycaster import Hits
@@ -16,8 +16,16 @@ RETRO_GAIN = 4.0  # how much brighter than a white surface a retro-reflector is
 PAINT = int(Material.PAINT)
 GLASS = int(Material.GLASS)
 AFTER_PANE_M = 0.002
+LEVELS = 4096
+QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of the normal distribution
 
-Trace = Callable[[NDArray[np.float32], NDArray[np.float32] | None], Hits]  # directions, near_m -> hits
+
+class Trace(Protocol):
+    """`Target.trace` with everything but the rays settled."""
+
+    def __call__(self, directions: NDArray[np.float32], *, near_m: NDArray[np.float32] | None = None) -> Hits:
+        """Return the first hits."""
+        ...
 
 
 class Echoes(NamedTuple):
@@ -26,6 +34,7 @@ class Echoes(NamedTuple):
     distance: NDArray[np.float32]  # (N,) [m]; inf where none
     instance: NDArray[np.int32]  # (N,) -1 where none
     face: NDArray[np.int32]  # (N,)
+    material: NDArray[np.uint8]  # (N,) a Material; meaningless where none
     panes: NDArray[np.uint8]  # (N,) panes of glass on the way
 
 
@@ -40,38 +49,45 @@ def cast_through_glass(
 
     Face f of instance i is of `material[first[i] + f]`.
     """
-    hits = trace(directions, None)
-    echoes = Echoes(*hits, np.zeros(len(directions), np.uint8))
-    through = _on_glass(hits.instance, hits.face, first, material, passes)
+    hits = trace(directions)
+    found, through = _look_up(hits.instance, hits.face, first, material, passes)
+    echoes = Echoes(*hits, found, np.zeros(len(directions), np.uint8))
     for _ in range(PANES):
         if not len(through):
             break
-        further = trace(directions[through], echoes.distance[through] + np.float32(AFTER_PANE_M))
-        for known, found in zip(echoes, further):
-            known[through] = found
+        beyond = trace(directions[through], near_m=echoes.distance[through] + np.float32(AFTER_PANE_M))
+        found, again = _look_up(beyond.instance, beyond.face, first, material, passes[through])
+        for known, further in zip(echoes, (*beyond, found)):
+            known[through] = further
         echoes.panes[through] += 1
-        through = through[_on_glass(further.instance, further.face, first, material, passes[through])]
+        through = through[again]
     return echoes
 
 
 @numba.njit(nogil=True, cache=True)
-def _on_glass(instance, face, first, material, passes):
-    """Return the numbers of the rays that meet glass and pass it."""
-    found = np.empty(len(instance), np.int64)
+def _look_up(instance, face, first, material, passes):
+    """Return the materials met, and the numbers of the rays that meet glass and pass it."""
+    found = np.zeros(len(instance), np.uint8)
+    through = np.empty(len(instance), np.int64)
     count = 0
     for ray in range(len(instance)):
-        if instance[ray] >= 0 and passes[ray] and material[first[instance[ray]] + face[ray]] == GLASS:
-            found[count] = ray
-            count += 1
-    return found[:count]
+        if instance[ray] >= 0:
+            found[ray] = material[first[instance[ray]] + face[ray]]
+            if found[ray] == GLASS and passes[ray]:
+                through[count] = ray
+                count += 1
+    return found, through[:count]
 
 
 @numba.njit(nogil=True, cache=True)
-def detect(echoes, directions, surfaces, sensor_from_instance, inverse_threshold, keep, chance, noise_m, points, actor):
+def detect(
+    echoes, directions, surfaces, sensor_from_instance, inverse_threshold, keep, chance, noise, noise_m, points, actor
+):
     """Write the detected echoes' `points` (N, 4) and `actor` (N,) and return their number.
 
     An echo of power P is detected with a probability that rises from 0 at 0.7 P_min to `keep` at 1.3 P_min;
-    `chance` (N,) in [0, 1) decides. `inverse_threshold` is 1 / P_min; `sensor_from_instance` (I, 3, 3) turns normals.
+    `chance` (N,) in [0, 1) decides. `inverse_threshold` is 1 / P_min; `sensor_from_instance` (I, 3, 3) turns normals;
+    `noise` (N,) picks a quantile of the range error, whose standard deviation is `noise_m`.
     """
     count = 0
     for ray in range(len(directions)):
@@ -79,7 +95,7 @@ def detect(echoes, directions, surfaces, sensor_from_instance, inverse_threshold
         if instance < 0:
             continue
         row = surfaces.first[instance] + echoes.face[ray]
-        material = surfaces.material[row]
+        material = echoes.material[ray]
         x, y, z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
         turn = sensor_from_instance[instance]
         nx, ny, nz = surfaces.normal[row, 0], surfaces.normal[row, 1], surfaces.normal[row, 2]
@@ -100,7 +116,7 @@ def detect(echoes, directions, surfaces, sensor_from_instance, inverse_threshold
         margin = (brightness * inverse_threshold / (distance * distance) - np.float32(0.7)) / np.float32(0.6)
         if chance[ray] >= keep * min(margin, np.float32(1.0)):
             continue
-        measured = distance + noise_m[ray]
+        measured = distance + noise_m * QUANTILES[noise[ray]]
         points[count, 0] = x * measured
         points[count, 1] = y * measured
         points[count, 2] = z * measured

@@ -4,14 +4,14 @@ Power received from a surface, relative to a white one face on at 1 m: P = refle
 detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3).
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flcav.config import Config
-from flcav.sensors.echoes import Echoes, cast_through_glass, detect
+from flcav.sensors.echoes import LEVELS, Echoes, cast_through_glass, detect
 from flcav.world.scene import Scene
 
 
@@ -49,16 +49,15 @@ def ray_pattern(lidar: Lidar) -> NDArray[np.float32]:
 
     Within a channel, azimuth runs counter-clockwise once round from straight ahead.
     """
-    if lidar.elevations_deg is None:
-        elevations = np.linspace(lidar.up_deg, lidar.down_deg, lidar.channels)
-    else:
-        elevations = np.sort(lidar.elevations_deg)[::-1]
-    return _ray_pattern(tuple(elevations), lidar.azimuth_steps)
+    return _ray_pattern(lidar.channels, lidar.up_deg, lidar.down_deg, lidar.elevations_deg, lidar.azimuth_steps)
 
 
 @lru_cache(maxsize=16)
-def _ray_pattern(elevations_deg: tuple[float, ...], steps: int) -> NDArray[np.float32]:
-    elevation = np.radians(elevations_deg)[:, None]
+def _ray_pattern(
+    channels: int, up_deg: float, down_deg: float, elevations_deg: tuple[float, ...] | None, steps: int
+) -> NDArray[np.float32]:
+    even = np.linspace(up_deg, down_deg, channels)
+    elevation = np.radians(even if elevations_deg is None else np.sort(elevations_deg)[::-1])[:, None]
     azimuth = np.arange(steps)[None] * (2 * np.pi / steps)
     level = np.cos(elevation)
     x, y, z = level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth
@@ -80,10 +79,7 @@ def cast(
     hidden: int | None = None,
 ) -> Echoes:
     """Return the first opaque surface within range of each ray, in a world without the actor `hidden`."""
-
-    def trace(directions: NDArray[np.float32], near_m: NDArray[np.float32] | None):
-        return scene.cast(world_from_sensor, directions, near_m=near_m, far_m=lidar.range_m, hidden=hidden)
-
+    trace = partial(scene.cast, world_from_sensor, far_m=lidar.range_m, hidden=hidden)
     return cast_through_glass(trace, ray_pattern(lidar), passes, scene.surfaces.first, scene.surfaces.material)
 
 
@@ -97,8 +93,8 @@ def measure(
     """Return what the detector reports of `echoes`: see `scan`."""
     rays = len(echoes.distance)
     chance = rng.random(rays, np.float32)
-    noise = rng.standard_normal(rays, np.float32)
-    sensor_from_instance = (world_from_sensor[:3, :3].T @ scene.world_from_instance).astype(np.float32)
+    noise = rng.integers(LEVELS, size=rays, dtype=np.uint16)
+    sensor_from_instance = (world_from_sensor[:3, :3].T @ scene.world_from_instance()).astype(np.float32)
     points = np.empty((rays, 4), np.float32)
     actor = np.empty(rays, np.int32)
     kept = detect(
@@ -109,7 +105,8 @@ def measure(
         np.float32(lidar.sensitivity_m**2 / 0.9),
         np.float32(1 - lidar.dropout),
         chance,
-        noise * np.float32(lidar.noise_m),
+        noise,
+        np.float32(lidar.noise_m),
         points,
         actor,
     )

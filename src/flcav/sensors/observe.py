@@ -1,6 +1,7 @@
 """One agent's frame: what its sensors see, and the truth about everything within their range."""
 
 import re
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from flcav import seeds
 from flcav.config import InputError
 from flcav.geometry import Boxes, pose
 from flcav.sensors.frame import Annotations, Frame
-from flcav.sensors.lidar import cast, draw_passes, measure
+from flcav.sensors.lidar import Lidar, cast, draw_passes, measure
 from flcav.sensors.rig import Rig
 from flcav.sensors.visibility import unoccluded_rays
 from flcav.world.scene import Scene
@@ -24,22 +25,16 @@ def observe(scene: Scene, rig: Rig, agent: str, index: int, *, scene_name: str, 
     scene.move_to(index)
     own, world_from_agent = _carrier(scene, agent)
     agent_from_sensor = {name: lidar.mount.agent_from_sensor() for name, lidar in rig.lidars.items()}
-    actors = _within_range(
-        scene, rig, {name: world_from_agent @ sensor for name, sensor in agent_from_sensor.items()}, own
-    )
-    count = len(scene.trace.actor)
-    returns, visible, unoccluded = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
-    sweeps: dict[str, NDArray[np.float32]] = {}
-    for name, lidar in rig.lidars.items():
-        world_from_sensor = world_from_agent @ agent_from_sensor[name]
-        rng = seeds.stream(seed, scene_name, index, agent, name)
-        passes = draw_passes(lidar.settings, rng)
-        echoes = cast(scene, world_from_sensor, lidar.settings, passes, own)
-        sweeps[name], actor = measure(scene, world_from_sensor, lidar.settings, echoes, rng)
-        returns += np.bincount(actor + 1, minlength=count + 1)[1:]
-        visible += np.bincount(echoes.instance + 1, minlength=count + 2)[2:]
-        unoccluded[actors] += unoccluded_rays(scene, world_from_sensor, lidar.settings, passes, actors)
-    occlusion = 1 - visible[actors] / np.maximum(unoccluded[actors], 1)
+    sweeps = {
+        name: _sweep(
+            scene,
+            lidar.settings,
+            world_from_agent @ agent_from_sensor[name],
+            own,
+            seeds.stream(seed, scene_name, index, agent, name),
+        )
+        for name, lidar in rig.lidars.items()
+    }
     return Frame(
         scene=scene_name,
         index=index,
@@ -47,15 +42,66 @@ def observe(scene: Scene, rig: Rig, agent: str, index: int, *, scene_name: str, 
         agent=agent,
         world_from_agent=world_from_agent,
         agent_from_sensor=agent_from_sensor,
-        lidar=sweeps,
-        annotations=Annotations(
-            track=scene.trace.actor[actors],
-            boxes=_boxes(scene, actors),
-            velocity=scene.trace.velocity[index, actors],
-            returns=returns[actors],
-            occlusion=np.clip(occlusion, 0.0, 1.0),
-        ),
+        lidar={name: sweep.points for name, sweep in sweeps.items()},
+        annotations=_annotate(scene, list(sweeps.values()), own),
     )
+
+
+class _Sweep(NamedTuple):
+    lidar: Lidar
+    world_from_sensor: NDArray[np.float64]
+    passes: NDArray[np.bool_]  # see `draw_passes`
+    points: NDArray[np.float32]  # (N, 4) see `scan`
+    returns: NDArray[np.int64]  # (A,) points of each actor
+    visible: NDArray[np.int64]  # (A,) rays that come back from it, detected or not
+
+
+def _sweep(
+    scene: Scene,
+    lidar: Lidar,
+    world_from_sensor: NDArray[np.float64],
+    own: int | None,
+    rng: np.random.Generator,
+) -> _Sweep:
+    passes = draw_passes(lidar, rng)
+    echoes = cast(scene, world_from_sensor, lidar, passes, own)
+    points, actor = measure(scene, world_from_sensor, lidar, echoes, rng)
+    count = len(scene.trace.actor)
+    returns = np.bincount(actor + 1, minlength=count + 1)[1:]
+    visible = np.bincount(echoes.instance + 1, minlength=count + 2)[2:]  # without what is missed, and the town
+    return _Sweep(lidar, world_from_sensor, passes, points, returns, visible)
+
+
+def _annotate(scene: Scene, sweeps: list[_Sweep], own: int | None) -> Annotations:
+    trace, index = scene.trace, scene.index
+    actors = _within_range(scene, sweeps, own)
+    visible = np.sum([sweep.visible[actors] for sweep in sweeps], axis=0)
+    unoccluded = np.zeros(len(actors), np.int64)
+    seen = np.flatnonzero(visible)  # of the others nothing is visible, whatever they would show
+    for sweep in sweeps:
+        unoccluded[seen] += unoccluded_rays(scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, actors[seen])
+    size = trace.size[actors]
+    center = trace.position[index, actors] + size * (0, 0, 0.5)
+    return Annotations(
+        track=trace.actor[actors],
+        boxes=Boxes(center, size, trace.yaw[index, actors], trace.category[actors]),
+        velocity=trace.velocity[index, actors],
+        returns=np.sum([sweep.returns[actors] for sweep in sweeps], axis=0),
+        occlusion=1 - visible / np.maximum(np.maximum(unoccluded, visible), 1),
+    )
+
+
+def _within_range(scene: Scene, sweeps: list[_Sweep], own: int | None) -> NDArray[np.int64]:
+    """Return the actors present whose box centre lies within the range of a sensor, but `own`."""
+    trace = scene.trace
+    center = trace.position[scene.index] + trace.size * (0, 0, 0.5)
+    within = np.zeros(len(trace.actor), bool)
+    for sweep in sweeps:
+        away = np.linalg.norm(center - sweep.world_from_sensor[:3, 3], axis=1)
+        within |= trace.present[scene.index] & (away <= sweep.lidar.range_m)
+    if own is not None:
+        within[own] = False
+    return np.flatnonzero(within)
 
 
 def _carrier(scene: Scene, agent: str) -> tuple[int | None, NDArray[np.float64]]:
@@ -75,25 +121,3 @@ def _carrier(scene: Scene, agent: str) -> tuple[int | None, NDArray[np.float64]]
     if not scene.trace.present[scene.index, actor]:
         raise InputError(f"agent '{agent}' is not in town at {scene.trace.time_s[scene.index]:.1f} s")
     return actor, scene.world_from_actor(actor)
-
-
-def _within_range(
-    scene: Scene, rig: Rig, world_from_sensor: dict[str, NDArray[np.float64]], own: int | None
-) -> NDArray[np.int64]:
-    """Return the actors present whose box centre lies within the range of a sensor, but `own`."""
-    trace = scene.trace
-    center = trace.position[scene.index] + trace.size * (0, 0, 0.5)
-    within = np.zeros(len(trace.actor), bool)
-    for name, lidar in rig.lidars.items():
-        away = np.linalg.norm(center - world_from_sensor[name][:3, 3], axis=1)
-        within |= trace.present[scene.index] & (away <= lidar.settings.range_m)
-    if own is not None:
-        within[own] = False
-    return np.flatnonzero(within)
-
-
-def _boxes(scene: Scene, actors: NDArray[np.int64]) -> Boxes:
-    trace = scene.trace
-    size = trace.size[actors]
-    center = trace.position[scene.index, actors] + size * (0, 0, 0.5)
-    return Boxes(center, size, trace.yaw[scene.index, actors], trace.category[actors])

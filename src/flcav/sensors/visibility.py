@@ -1,10 +1,12 @@
 """How much of each actor a sensor would see if nothing stood in the way: its rays, traced against it alone."""
 
+from functools import partial
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import inverse, wrap_angle
+from flcav.geometry import inverse
 from flcav.sensors.echoes import cast_through_glass
 from flcav.sensors.lidar import Lidar, ray_pattern
 from flcav.world.scene import Scene
@@ -31,49 +33,32 @@ def _alone(
     actor: int,
 ) -> int:
     body_from_sensor = inverse(scene.world_from_actor(actor)) @ world_from_sensor
-    size = scene.trace.size[actor]
-    first_column, columns = _azimuth_window(body_from_sensor, size, lidar.azimuth_steps)
     directions = ray_pattern(lidar)
-    rays = _rays_into_box(directions, lidar.azimuth_steps, first_column, columns, body_from_sensor, size, BOX_MARGIN_M)
+    rays = rays_into_box(directions, lidar.azimuth_steps, body_from_sensor, scene.trace.size[actor], BOX_MARGIN_M)
     if not len(rays):
         return 0
-
-    def trace(directions: NDArray[np.float32], near_m: NDArray[np.float32] | None):
-        return scene.cast_alone(actor, body_from_sensor, directions, near_m=near_m, far_m=lidar.range_m)
-
+    trace = partial(scene.cast_alone, actor, body_from_sensor, far_m=lidar.range_m)
     surfaces = scene.surfaces
     first = surfaces.first[actor + 1 : actor + 2]
     echoes = cast_through_glass(trace, directions[rays], passes[rays], first, surfaces.material)
     return int(np.count_nonzero(echoes.instance >= 0))
 
 
-def _azimuth_window(body_from_sensor: NDArray[np.float64], size: NDArray[np.float64], steps: int) -> tuple[int, int]:
-    """Return the first column and the number of columns of the pattern that can meet the actor's box."""
-    sensor_from_body = inverse(body_from_sensor)
-    half = size / 2 + BOX_MARGIN_M
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half + (0, 0, size[2] / 2)
-    points = corners @ sensor_from_body[:3, :3].T + sensor_from_body[:3, 3]
-    center = points.mean(axis=0)
-    if np.hypot(*center[:2]) <= np.linalg.norm(half):  # the spin axis may pass through the box
-        return 0, steps
-    middle = np.arctan2(center[1], center[0])
-    aside = wrap_angle(np.arctan2(points[:, 1], points[:, 0]) - middle)
-    step = 2 * np.pi / steps
-    first = int(np.floor((middle + aside.min()) / step))
-    last = int(np.ceil((middle + aside.max()) / step))
-    return first % steps, min(last - first + 1, steps)
-
-
 @numba.njit(nogil=True, cache=True)
-def _rays_into_box(directions, steps, first_column, columns, body_from_sensor, size, margin):
-    """Return the numbers of the rays of those columns that enter the box standing on the body's ground centre."""
+def rays_into_box(directions, steps, body_from_sensor, size, margin):
+    """Return the numbers of the rays of a spinning pattern (channels * steps, 3) that enter a box.
+
+    The box of `size` (3,), grown by `margin` [m], stands on the body's origin. Only the columns between its corners'
+    azimuths are tried.
+    """
     low = np.array([-size[0] / 2, -size[1] / 2, 0.0]) - margin
     high = np.array([size[0] / 2, size[1] / 2, size[2]]) + margin
+    first, columns = _columns(low, high, body_from_sensor, steps)
     channels = len(directions) // steps
     found = np.empty(channels * columns, np.int64)
     count = 0
     for channel in range(channels):
-        for column in range(first_column, first_column + columns):
+        for column in range(first, first + columns):
             ray = channel * steps + column % steps
             enter, leave = 0.0, np.inf
             for axis in range(3):
@@ -92,3 +77,27 @@ def _rays_into_box(directions, steps, first_column, columns, body_from_sensor, s
                 found[count] = ray
                 count += 1
     return found[:count]
+
+
+@numba.njit(nogil=True, cache=True)
+def _columns(low, high, body_from_sensor, steps):
+    """Return the first column and the number of columns of the pattern that can meet the box; the first is >= 0."""
+    origin = body_from_sensor[:3, 3]
+    ahead, left = body_from_sensor[:3, 0].copy(), body_from_sensor[:3, 1].copy()  # the sensor's axes
+    middle = (low + high) / 2 - origin
+    x, y = np.dot(ahead, middle), np.dot(left, middle)
+    if np.hypot(x, y) <= np.linalg.norm(high - low) / 2:  # the spin axis may pass through the box
+        return 0, steps
+    azimuth = np.arctan2(y, x)
+    least, most = 0.0, 0.0
+    for corner in range(8):
+        offset = -origin
+        for axis in range(3):
+            offset[axis] += high[axis] if corner >> axis & 1 else low[axis]
+        x, y = np.dot(ahead, offset), np.dot(left, offset)
+        aside = (np.arctan2(y, x) - azimuth + np.pi) % (2 * np.pi) - np.pi
+        least, most = min(least, aside), max(most, aside)
+    step = 2 * np.pi / steps
+    first = int(np.floor((azimuth + least) / step))
+    last = int(np.ceil((azimuth + most) / step))
+    return first % steps, min(last - first + 1, steps)

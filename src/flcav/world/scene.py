@@ -2,7 +2,6 @@
 
 import pickle
 import zlib
-from collections import OrderedDict
 from functools import lru_cache
 from hashlib import sha256
 from typing import NamedTuple
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import pose
-from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
+from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO
 from flcav.world.meshes import Mesh, actor_mesh
 from flcav.world.rays.embree import Assembly, Embree, Solid
 from flcav.world.rays.raycaster import Hits
@@ -39,31 +38,30 @@ class Scene:
         self.town = town
         self.trace = trace
         self.index = 0
-        self._hidden: int | None = None
         shapes = [(str(category), int(shape)) for category, shape in zip(trace.category, trace.shape)]
-        meshes = [_town(town), *(_actor(*shape) for shape in shapes)]
-        self._solids = [solid for _, solid in meshes]
+        models = [_town_model(town), *(_actor_model(*shape) for shape in shapes)]
+        self.surfaces = _surfaces(models, [str(name) for name in trace.actor])
+        self._solids = [model.solid for model in models]
         self._assembly = Assembly(self._solids)
         self._assembly.place(0, np.eye(4))
-        self.surfaces = _surfaces([mesh for mesh, _ in meshes], [str(name) for name in trace.actor])
-        self.move_to(0)
+        self._placed = np.full((len(trace.actor), 4), np.nan)  # x, y, z, yaw; NaN where an actor is nowhere
+        self._hidden: int | None = None
+        self._place()
 
     def move_to(self, index: int) -> None:
         """Put every actor where it is at instant `index` of the trace."""
         self.index = index
         self._place()
 
-    @property
+    def world_from_actor(self, actor: int) -> NDArray[np.float64]:
+        """Return the (4, 4) pose of an actor that is present; its origin is the ground centre."""
+        return pose(*self._poses()[actor])
+
     def world_from_instance(self) -> NDArray[np.float64]:
-        """(I, 3, 3) rotations of the instances; the identity for the town and for absent actors."""
+        """Return the instances' (I, 3, 3) rotations; the identity for the town and for absent actors."""
         yaw = np.concatenate(([0.0], np.nan_to_num(self.trace.yaw[self.index])))
         cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
         return np.array([[cos, -sin, zero], [sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
-
-    def world_from_actor(self, actor: int) -> NDArray[np.float64]:
-        """Return the (4, 4) pose of an actor that is present; its origin is the ground centre."""
-        x, y, z = self.trace.position[self.index, actor]
-        return pose(x, y, z, float(self.trace.yaw[self.index, actor]))
 
     def cast(
         self,
@@ -73,12 +71,13 @@ class Scene:
         near_m: NDArray[np.float32] | None = None,
         far_m: float = np.inf,
         hidden: int | None = None,
+        threads: int = 1,
     ) -> Hits:
         """Return what each ray (N, 3) meets first, as if the actor `hidden` were not there: see `Target.trace`."""
         if hidden != self._hidden:
             self._hidden = hidden
             self._place()
-        return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m)
+        return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m, threads=threads)
 
     def cast_alone(
         self,
@@ -92,42 +91,59 @@ class Scene:
         """Return what each ray meets of one actor in an empty world; rays are placed in the actor's body frame."""
         return self._solids[actor + 1].trace(body_from_rays, directions, near_m=near_m, far_m=far_m)
 
+    def _poses(self) -> NDArray[np.float64]:
+        """Return (A, 4) x, y, z, yaw."""
+        return np.concatenate((self.trace.position[self.index], self.trace.yaw[self.index, :, None]), axis=1)
+
     def _place(self) -> None:
-        for actor, present in enumerate(self.trace.present[self.index]):
-            visible = present and actor != self._hidden
-            self._assembly.place(actor + 1, self.world_from_actor(actor) if visible else None)
+        wanted = np.where(self.trace.present[self.index, :, None], self._poses(), np.nan)
+        if self._hidden is not None:
+            wanted[self._hidden] = np.nan
+        for actor in np.flatnonzero(
+            ~((wanted == self._placed) | np.isnan(wanted) & np.isnan(self._placed)).all(axis=1)
+        ):
+            nowhere = np.isnan(wanted[actor]).any()
+            self._assembly.place(int(actor) + 1, None if nowhere else pose(*wanted[actor]))
+        self._placed = wanted
         self._assembly.commit()
 
 
-def _surfaces(meshes: list[Mesh], names: list[str]) -> Surfaces:
-    distinct = {id(mesh): mesh for mesh in meshes}
-    starts = np.cumsum([0, *(len(mesh.faces) for mesh in distinct.values())])
+class _Model(NamedTuple):
+    mesh: Mesh
+    normal: NDArray[np.float32]
+    solid: Solid
+
+
+def _model(mesh: Mesh) -> _Model:
+    return _Model(mesh, mesh.normals(), Embree().solid(mesh.vertices, mesh.faces))
+
+
+def _surfaces(models: list[_Model], names: list[str]) -> Surfaces:
+    distinct = {id(model): model for model in models}
+    starts = np.cumsum([0, *(len(model.mesh.faces) for model in distinct.values())])
     first = dict(zip(distinct, starts))
-    paint = [REFLECTIVITY[Material.PAINT]] + [
-        PAINT_REFLECTIVITY[zlib.crc32(name.encode()) % len(PAINT_REFLECTIVITY)] for name in names
-    ]
+    paint = [PAINT_REFLECTIVITY[zlib.crc32(name.encode()) % len(PAINT_REFLECTIVITY)] for name in names]
     return Surfaces(
-        np.concatenate([mesh.normals() for mesh in distinct.values()]),
-        np.concatenate([mesh.material for mesh in distinct.values()]),
-        np.array([first[id(mesh)] for mesh in meshes], np.int64),
-        np.array(paint, np.float32),
+        np.concatenate([model.normal for model in distinct.values()]),
+        np.concatenate([model.mesh.material for model in distinct.values()]),
+        np.array([first[id(model)] for model in models], np.int64),
+        np.array([1.0, *paint], np.float32),
     )
 
 
 @lru_cache(maxsize=64)
-def _actor(category: str, shape: int) -> tuple[Mesh, Solid]:
-    mesh = actor_mesh(category, shape)
-    return mesh, Embree().solid(mesh.vertices, mesh.faces)
+def _actor_model(category: str, shape: int) -> _Model:
+    return _model(actor_mesh(category, shape))
 
 
-_TOWNS: OrderedDict[str, tuple[Mesh, Solid]] = OrderedDict()  # the last few, by content
+_TOWNS: dict[str, _Model] = {}  # the last few, by content
+TOWNS_KEPT = 4
 
 
-def _town(town: Town) -> tuple[Mesh, Solid]:
+def _town_model(town: Town) -> _Model:
     key = sha256(pickle.dumps(town)).hexdigest()
     if key not in _TOWNS:
-        mesh = town_mesh(town)
-        _TOWNS[key] = mesh, Embree().solid(mesh.vertices, mesh.faces)
-        while len(_TOWNS) > 3:
-            _TOWNS.popitem(last=False)
+        while len(_TOWNS) >= TOWNS_KEPT:
+            del _TOWNS[next(iter(_TOWNS))]
+        _TOWNS[key] = _model(town_mesh(town))
     return _TOWNS[key]
