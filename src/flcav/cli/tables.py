@@ -37,5 +37,7 @@ def numbers(table: pa.Table, columns: Sequence[str], path: Path) -> np.ndarray:
             except ValueError:
                 out[row, i] = np.nan
             if not np.isfinite(out[row, i]):
-                raise InputError(f"{path}: row {row + 1}: {column} = {value} is not a finite number")
+                raise InputError(
+                    f"{path}: row {row + 1}: {column} = {'nan' if value is None else value} is not a finite number"
+                )
     return out

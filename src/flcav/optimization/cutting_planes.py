@@ -16,6 +16,8 @@ from scipy.sparse import coo_array, csr_array
 
 Array = NDArray[np.float64]
 
+LARGE = 1e4  # the objective in the solver's eyes, whose tolerances are absolute, around 1e-6
+
 
 class Line(NamedTuple):
     """A lower bound of a term: value + slope . x[of]."""
@@ -58,6 +60,7 @@ class Cuts:
     def __init__(self, program: Program) -> None:
         self.program = program
         self._lines: dict[tuple[int, Line], None] = {}
+        self._scale = LARGE / max(program.value(program.low), 1e-12)
 
     def add(self, x: Array) -> bool:
         """Add the lines at x (n,); return whether any was new."""
@@ -71,7 +74,11 @@ class Cuts:
         matrix, limit = self._rows()
         bounds = np.stack((self._low(), self._high()), axis=1)
         result = linprog(self._objective(), A_ub=matrix, b_ub=limit, bounds=bounds, method="highs")
-        return result.x[: len(self.program.low)], float(result.fun), -result.ineqlin.marginals[:2]
+        return (
+            result.x[: len(self.program.low)],
+            float(result.fun) / self._scale,
+            -result.ineqlin.marginals[:2] / self._scale,
+        )
 
     def solve(self, gap: float) -> tuple[Array, float]:
         """Return the optimum over whole x to a relative `gap`, and the proven bound."""
@@ -84,7 +91,7 @@ class Cuts:
             constraints=LinearConstraint(matrix, ub=limit),  # pyright: ignore[reportArgumentType]
             options={"mip_rel_gap": gap},
         )
-        return np.round(result.x[: len(self.program.low)]), float(result.mip_dual_bound)
+        return np.round(result.x[: len(self.program.low)]), float(result.mip_dual_bound) / self._scale
 
     def _objective(self) -> Array:
         return np.r_[np.zeros(len(self.program.low)), np.ones(len(self.program.terms))]
@@ -103,8 +110,8 @@ class Cuts:
         for row, (number, line) in enumerate(self._lines, start=2):
             rows += [row] * (len(line.of) + 1)
             columns += [*line.of, n + number]
-            values += [*line.slope, -1.0]
-        limit = np.r_[1.0, 1.0, [-line.value for _, line in self._lines]]
+            values += [*(self._scale * slope for slope in line.slope), -1.0]
+        limit = np.r_[1.0, 1.0, [-self._scale * line.value for _, line in self._lines]]
         return coo_array((values, (rows, columns)), shape=(len(limit), n + len(program.terms))).tocsr(), limit
 
 

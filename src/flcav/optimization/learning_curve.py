@@ -37,7 +37,9 @@ def fit_power(resource: ArrayLike, accuracy: ArrayLike) -> Decay:
     """Return the article's curve accuracy = 1 - a x^(-b) by plain least squares on the accuracies (n,)."""
     resources = np.asarray(resource, dtype=np.float64)
     rows = np.stack((resources, np.zeros_like(resources), np.zeros_like(resources)), axis=1)
-    return _best(rows, 1 - np.asarray(accuracy, dtype=np.float64), np.ones(len(rows)), _Shape((0,), False, ())).pretrain
+    return _best(
+        rows, 1 - np.asarray(accuracy, dtype=np.float64), np.ones(len(rows)), _Shape((0,), False, ()), robust=False
+    ).pretrain
 
 
 def fit_additive(
@@ -63,7 +65,12 @@ def fit_additive(
         _Shape(stages, floor, tuple(stage for stage, shifted in zip(stages, shifts) if shifted))
         for floor, *shifts in product((False, True), repeat=1 + len(stages))
     ]
-    fits = [_measured(_best(resources, error, weights, shape), resources, error, weights, shape) for shape in shapes]
+    fits = [
+        _measured(
+            _best(resources, error, weights, shape, robust=len(error) >= ROBUST_FROM), resources, error, weights, shape
+        )
+        for shape in shapes
+    ]
     return min(fits, key=lambda fit: fit.aicc)
 
 
@@ -79,8 +86,8 @@ class _Shape:
         return 2 * len(self.stages) + self.floor + len(self.shifted)
 
 
-def _best(resources: Array, error: Array, weight: Array, shape: _Shape) -> Additive:
-    """Return the curve of least squares from several starts; of least robust loss where the points allow it."""
+def _best(resources: Array, error: Array, weight: Array, shape: _Shape, *, robust: bool) -> Additive:
+    """Return the curve of least squares from several starts; then, if `robust`, of least soft L1 loss."""
     middle = np.exp([np.log(np.maximum(resources[:, s], 1)).mean() for s in shape.stages])
     rest = np.where(resources.min(axis=0) == 0, 1.0, 0.0)
     n = len(shape.stages)
@@ -100,18 +107,20 @@ def _best(resources: Array, error: Array, weight: Array, shape: _Shape) -> Addit
     most = [np.inf] * n + [STEEPEST] * n + [1.0] * shape.floor + [1e3 * shift for shift in shifts]
     level = max(float(np.median(error)), 1e-3)
 
-    def solved(start: ArrayLike, **robust: object) -> tuple[float, Array]:
-        result = least_squares(residual, start, bounds=(least, most), xtol=1e-14, ftol=1e-14, gtol=1e-14, **robust)
+    def solved(start: ArrayLike, loss: str = "linear", f_scale: float = 1.0) -> tuple[float, Array]:
+        result = least_squares(
+            residual, start, bounds=(least, most), xtol=1e-14, ftol=1e-14, gtol=1e-14, loss=loss, f_scale=f_scale
+        )
         return float(result.cost), result.x
 
     starts = [[level / n] * n + [b] * n + [level / 10] * shape.floor + list(shifts) for b in STARTS]
     _, p = min((solved(start) for start in starts), key=lambda found: found[0])
-    if len(error) >= ROBUST_FROM:
+    if robust:
         spread = 1.4826 * float(np.median(np.abs(residual(p))))
         _, p = solved(p, loss="soft_l1", f_scale=max(3 * spread, 1e-6))
     fitted = [Decay(a=float(h * (m + x0) ** b), b=float(b), x0=x0) for m, (h, b, x0) in zip(middle, decays(p))]
     named = {STAGES[stage]: decay for stage, decay in zip(shape.stages, fitted)}
-    return Additive(floor=float(p[2 * n]) if shape.floor else 0.0, **named)
+    return Additive.model_validate({"floor": float(p[2 * n]) if shape.floor else 0.0, **named})
 
 
 def _measured(curve: Additive, resources: Array, error: Array, weight: Array, shape: _Shape) -> Fit:
@@ -128,7 +137,7 @@ def _measured(curve: Additive, resources: Array, error: Array, weight: Array, sh
 def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
     """Return (n, 3) samples, edge rounds and cloud rounds of rows that give only their own stage's resource (n,).
 
-    Stages follow each other: a row stands at the largest resource of the stages before its own, and at 0 of those after.
+    Stages follow each other: a row stands at the largest resource of the earlier stages, and at 0 of the later ones.
     """
     amounts, number = np.asarray(resource, dtype=np.float64), np.array([STAGES.index(name) for name in stage])
     largest = [amounts[number == s].max(initial=0.0) for s in range(3)]

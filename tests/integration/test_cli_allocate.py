@@ -1,0 +1,81 @@
+"""`flcav allocate` and `flcav fit` from files to JSON."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from flcav.cli.main import run
+
+RECIPES = sorted((Path(__file__).parents[2] / "recipes" / "allocation").glob("*.yaml"))
+TASK_KEYS = {"name", "samples", "edge_rounds", "cloud_rounds", "predicted_error", "wireless_mb", "wireline_mb"}
+
+
+def called(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        run([str(argument) for argument in arguments])
+    return int(stopped.value.code or 0)
+
+
+@pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
+def test_every_recipe_gives_a_plan_within_its_budgets(recipe, capsys):
+    assert called("allocate", recipe, "--json") == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert set(plan) == {
+        "status", "objective", "lower_bound", "gap", "tasks", "used_mb", "marginal_error_per_gb",
+    }  # fmt: skip
+    assert all(set(task) == TASK_KEYS for task in plan["tasks"])
+    budgets = yaml.safe_load(recipe.read_text())["budgets_mb"]
+    for link in ("wireless", "wireline"):
+        assert plan["used_mb"][link] <= budgets[link] + 1e-6
+        assert plan["used_mb"][link] == pytest.approx(sum(task[f"{link}_mb"] for task in plan["tasks"]))
+        assert plan["marginal_error_per_gb"][link] >= 0
+    assert called("allocate", recipe) == 0
+    assert plan["tasks"][0]["name"] in capsys.readouterr().out
+
+
+def test_infeasible_is_exit_2_a_sentence_and_json(tmp_path, capsys):
+    values = yaml.safe_load(RECIPES[0].read_text())
+    values["budgets_mb"]["wireless"] = 100
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))
+    assert called("allocate", tmp_path / "problem.yaml", "--json") == 2
+    out, err = capsys.readouterr()
+    answer = json.loads(out)
+    assert answer["status"] == "infeasible"
+    assert "60 MB more than budgets_mb.wireless = 100" in answer["message"]
+    assert answer["message"] in err
+
+
+def test_fit_reads_a_history_and_writes_what_allocate_takes(tmp_path, capsys):
+    points = {50: 0.659, 200: 0.710, 500: 0.716, 1000: 0.721, 2500: 0.793}
+    rows = "".join(f"objects,pretrain,{x},{accuracy}\n" for x, accuracy in points.items())
+    (tmp_path / "history.csv").write_text("task,stage,resource,accuracy\n" + rows)
+    assert called("fit", tmp_path / "history.csv", "--json") == 0
+    (curve,) = json.loads(capsys.readouterr().out)["curves"]
+    assert (curve["task"], curve["model"], curve["floor"], curve["points"]) == ("objects", "additive", 0, 5)
+    assert curve["pretrain"]["a"] == pytest.approx(0.51, rel=0.03)
+    values = yaml.safe_load(RECIPES[0].read_text())
+    values["tasks"][0]["curve"] = {key: curve[key] for key in ("model", "floor", "pretrain", "edge", "cloud")}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))
+    assert called("allocate", tmp_path / "problem.yaml") == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("task,stage,resource\na,edge,1\n", "accuracy"),
+        ("task,stage,resource,accuracy\na,dream,1,0.5\n", "dream"),
+        ("task,stage,resource,accuracy\na,edge,1,1.5\n", "accuracy = 1.5"),
+        ("task,stage,resource,accuracy\na,edge,nan,0.5\n", "resource"),
+        ("task,stage,resource,accuracy\na,edge,1,0.5\n", "at least 2"),
+        ("task,stage,resource,accuracy\n", "no rows"),
+        ("", "history.csv"),
+    ],
+)
+def test_bad_history_is_one_sentence(text, named, tmp_path, capsys):
+    (tmp_path / "history.csv").write_text(text)
+    assert called("fit", tmp_path / "history.csv") == 2
+    err = capsys.readouterr().err
+    assert named in err
+    assert err.count("\n") == 1
