@@ -26,7 +26,9 @@ def birdseye(
     from flcav.geometry import inverse, transform_points
     from flcav.report import style
     from flcav.report.birdseye import View, birdseye
+    from flcav.world.shapes import SHAPES
 
+    sedan = next(shape for shape in SHAPES["car"] if shape.name == "sedan")
     dataset = Dataset.open(folder)
     seen = dataset.frame(0 if frame is None else dataset.number(frame))
     agent_from_world = inverse(seen.world_from_agent)
@@ -38,7 +40,7 @@ def birdseye(
         returns=seen.annotations.returns,
         title=f"{seen.key} · {seen.time_s:.1f} s",
         range_m=range_m,
-        agent_size=(4.7, 1.84) if seen.agent.startswith("cav") else None,
+        agent_size=(sedan.length, sedan.width) if seen.agent.startswith("cav") else None,
     )
     write_bytes(out, style.png(birdseye(view)))
     typer.echo(f"{out}: {seen.key}, {sum(map(len, points))} points, {len(seen.annotations)} annotated actors")

@@ -1,0 +1,103 @@
+"""KITTI's 3D object benchmark: point clouds, labels and calibration of one frame.
+
+KITTI labels boxes in its rectified camera frame (x right, y down, z ahead): the location is the middle of a box's
+bottom face, the rotation about y is zero along x. Nothing outside this module sees that frame: what is returned lies
+in KITTI's LiDAR frame (x ahead, y left, z up). Geiger et al., Are we ready for autonomous driving?, CVPR 2012, and the
+benchmark's development kit.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.geometry import Boxes, inverse, transform_points, wrap_angle
+
+POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
+LABEL_FIELDS = 15  # a 16th is the score of a detection
+MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where the left colour camera is, seen from the LiDAR."""
+
+    camera_from_lidar: NDArray[np.float64]  # (4, 4), rectified camera frame
+    image_from_camera: NDArray[np.float64]  # (3, 4) projection to pixels
+
+
+def read_points(path: Path) -> NDArray[np.float32]:
+    """Return (N, 4) x, y, z [m] and reflectance of a point cloud, LiDAR frame.
+
+    Raises `InputError` where the file is missing, empty, cut off in a point, or holds a number that is not finite.
+    """
+    try:
+        data = path.read_bytes()
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: no such file") from None
+    if not data:
+        raise InputError(f"{path}: empty; a point cloud holds {POINT_BYTES} bytes for each point")
+    if len(data) % POINT_BYTES:
+        raise InputError(
+            f"{path}: truncated; {len(data)} bytes are not a multiple of {POINT_BYTES}, the size of a point"
+        )
+    points = np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4)
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: point {int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])} is not finite")
+    return points
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Return the calibration of a frame; raises `InputError` where one of its matrices is missing or no matrix."""
+    rows = dict(line.split(":", 1) for line in _lines(path) if ":" in line)
+    matrices = {}
+    for name, (height, width) in MATRICES.items():
+        try:
+            matrices[name] = np.array(rows[name].split(), dtype=np.float64).reshape(height, width)
+        except (KeyError, ValueError):
+            raise InputError(f"{path}: needs {height * width} numbers after '{name}:'") from None
+    rectified, camera = np.eye(4), np.eye(4)
+    rectified[:3, :3] = matrices["R0_rect"]
+    camera[:3] = matrices["Tr_velo_to_cam"]
+    return Calibration(camera_from_lidar=rectified @ camera, image_from_camera=matrices["P2"])
+
+
+def read_labels(path: Path, calibration: Calibration) -> Boxes:
+    """Return the labelled objects as boxes in the LiDAR frame, with KITTI's class names; DontCare regions left out.
+
+    A box stays upright in the LiDAR frame: the degree or so by which the camera tilts against it is dropped from its
+    orientation, not from its place. Scores are kept where every row has one. Raises `InputError` for other text.
+    """
+    label, rows = [], []
+    for number, line in enumerate(_lines(path), 1):
+        kind, *fields = line.split()
+        try:
+            values = [float(field) for field in fields]
+        except ValueError:
+            values = []
+        if len(values) + 1 not in (LABEL_FIELDS, LABEL_FIELDS + 1) or not np.isfinite(values).all():
+            raise InputError(f"{path}: line {number} is no KITTI label: a class and {LABEL_FIELDS - 1} numbers or 15")
+        if kind != "DontCare":
+            label.append(kind)
+            rows.append(values[7:])
+    if not rows:
+        return Boxes.empty()
+    height, width, length, x, y, z, rotation = np.array([row[:7] for row in rows]).T
+    lidar_from_camera = inverse(calibration.camera_from_lidar)
+    center = transform_points(lidar_from_camera, np.stack((x, y - height / 2, z), axis=1))
+    ahead = np.stack((np.cos(rotation), np.zeros_like(rotation), -np.sin(rotation)), axis=1)  # camera frame
+    ahead = ahead @ lidar_from_camera[:3, :3].T
+    yaw = wrap_angle(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    scores = np.array([row[7] for row in rows]) if all(len(row) == 8 for row in rows) else None
+    return Boxes(center, np.stack((length, width, height), axis=1), yaw, np.array(label, dtype=np.str_), scores)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: no such file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file") from None
