@@ -31,7 +31,7 @@ def _main(
     pass
 
 
-for command in (record, validate, birdseye, allocate, place, fit):
+for command in (record, validate, birdseye, train, evaluate, infer, allocate, place, fit):
     command.register(app)
 
 

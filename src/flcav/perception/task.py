@@ -48,3 +48,7 @@ class Task(Protocol[NetworkT, SampleT]):
     def evaluate(self, network: NetworkT, frames: Iterable[Frame], *, total: int, progress: Report) -> dict[str, Any]:
         """Return the task's numbers on `frames`, as JSON knows them."""
         ...
+
+    def infer(self, network: NetworkT, path: Path, threshold: float) -> list[dict[str, Any]]:
+        """Return one entry {"path": ..., ...} per input that `path` names; raises `InputError` for a bad one."""
+        ...

@@ -62,10 +62,16 @@ def on_neutral(detections: Boxes, neutral: Boxes) -> NDArray[np.bool_]:
     By the detection's own area, not by IoU: a car found on a bus covers a small part of the bus.
     """
     out = np.zeros(len(detections), dtype=bool)
-    rows = torch.from_numpy(detections.array())
-    for box in torch.from_numpy(neutral.array()):
-        shared = intersection_area(rows, box.expand(len(rows), -1))
-        out |= (shared >= 0.5 * rows[:, 3] * rows[:, 4]).numpy()
+    if not len(neutral):
+        return out
+    radius = np.hypot(detections.size[:, :1], detections.size[:, 1:2]) + np.hypot(
+        neutral.size[:, 0], neutral.size[:, 1]
+    )
+    distance = np.linalg.norm(detections.center[:, None, :2] - neutral.center[None, :, :2], axis=2)
+    of, on = np.nonzero(distance < radius / 2)
+    rows, boxes = torch.from_numpy(detections.array()[of]), torch.from_numpy(neutral.array()[on])
+    shared = intersection_area(rows, boxes).numpy()
+    out[of[shared >= 0.5 * detections.size[of, 0] * detections.size[of, 1]]] = True
     return out
 
 

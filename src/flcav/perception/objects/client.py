@@ -1,10 +1,9 @@
 """One federation client of the detector: its samples, and local steps on weights that come as arrays."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
@@ -41,7 +40,7 @@ class ObjectsClient:
         self.config, self.samples = config, samples
         self.batch, self.augmentation = batch, augmentation
 
-    def train(self, weights: dict[str, NDArray[np.generic]], *, steps: int, learning_rate: float, seed: int) -> Trained:
+    def train(self, weights: Mapping[str, NDArray[Any]], *, steps: int, learning_rate: float, seed: int) -> Trained:
         """Return the weights after `steps` local steps from `weights`; the same arguments give the same result."""
         network = second(self.config)
         from_arrays(network, weights)

@@ -8,16 +8,14 @@ import math
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from flcav.config import InputError
 from flcav.perception.objects.config import ANCHORS, Anchor, SecondConfig
-from flcav.perception.ops.norm import RowBatchNorm
+from flcav.perception.ops.norm import NormReLU
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d
 from flcav.perception.ops.voxels import grid_shape, voxelize
 
-EPSILON, MOMENTUM = 1e-3, 0.1  # of every batch normalisation
 HEADINGS = 2  # anchors per class and place: along x, along y
 
 
@@ -35,12 +33,12 @@ class SparseBlock(nn.Module):
     def __init__(self, convolution: SubmanifoldConv3d | StridedConv3d, channels: int) -> None:
         super().__init__()
         self.convolution = convolution
-        self.norm = RowBatchNorm(channels, EPSILON, MOMENTUM)
+        self.norm = NormReLU(channels)
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Return the block's output voxels."""
         x = self.convolution(x)
-        return x.with_features(F.relu(self.norm(x.features), inplace=True))
+        return x.with_features(self.norm(x.features))
 
 
 def sparse_backbone(channels: tuple[int, int, int, int], out_channels: int) -> nn.Sequential:
@@ -66,8 +64,7 @@ def head_shape(config: SecondConfig) -> tuple[int, int]:
 
 
 def _normalized(convolution: nn.Conv2d | nn.ConvTranspose2d) -> list[nn.Module]:
-    norm = nn.BatchNorm2d(convolution.out_channels, EPSILON, MOMENTUM)
-    return [convolution, norm, nn.ReLU(inplace=True)]
+    return [convolution, NormReLU(convolution.out_channels)]
 
 
 def _scale(inputs: int, outputs: int, stride: int, layers: int) -> nn.Sequential:

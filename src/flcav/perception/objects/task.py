@@ -7,7 +7,9 @@ from typing import Any
 import torch
 
 from flcav.config import InputError
+from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import evaluate
+from flcav.perception.objects.infer import box_rows, point_clouds
 from flcav.perception.objects.model import NETWORKS, Second
 from flcav.perception.objects.samples import Sample, sample_from_frame
 from flcav.perception.objects.train import Checkpointing, train
@@ -72,3 +74,10 @@ class ObjectsTask:
     ) -> dict[str, Any]:
         """Return AP per class, kind of overlap and IoU, with intervals over scenes."""
         return evaluate(network, frames, total=total, progress=progress).summary()
+
+    def infer(self, network: Second, path: Path, threshold: float = 0.3) -> list[dict[str, Any]]:
+        """Return {"path", "boxes": [...]} for each point cloud of `path`, see `infer.point_clouds`."""
+        return [
+            {"path": str(origin), "boxes": box_rows(detect(network, points, score_threshold=threshold))}
+            for origin, points in point_clouds(path)
+        ]

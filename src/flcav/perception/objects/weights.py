@@ -46,20 +46,15 @@ def load_weights(network: Second, path: Path) -> None:
 
 
 def to_arrays(network: Second) -> dict[str, NDArray[Any]]:
-    """Return copies of parameters and buffers by name, without the batch counters nobody averages."""
-    return {
-        name: tensor.detach().cpu().numpy().copy()
-        for name, tensor in network.state_dict().items()
-        if not name.endswith("num_batches_tracked")
-    }
+    """Return copies of parameters and buffers by name."""
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in network.state_dict().items()}
 
 
 def from_arrays(network: Second, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Set parameters and buffers from what `to_arrays` returned; raises `InputError` where they do not fit."""
     state = network.state_dict()
-    wanted = {name for name in state if not name.endswith("num_batches_tracked")}
-    if set(arrays) != wanted:
-        odd = sorted(set(arrays) ^ wanted)
+    if set(arrays) != set(state):
+        odd = sorted(set(arrays) ^ set(state))
         raise InputError(f"weights of another network: {len(odd)} arrays missing or unknown, the first is '{odd[0]}'")
     for name, array in arrays.items():
         if array.shape != tuple(state[name].shape):

@@ -7,45 +7,44 @@ with Submanifold Sparse Convolutional Networks", CVPR 2018, names the two kinds 
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from flcav.perception.ops import pairs
+
 Triple = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The pairs of each of some rows, one row's after another's."""
+
+    order: Tensor  # (P,) int32 pair numbers
+    begins: Tensor  # (rows,) int32 where each row's pairs begin
 
 
 @dataclass(frozen=True)
 class Rules:
     """P pairs (source voxel, target voxel), grouped by kernel offset; within an offset, targets ascend."""
 
-    source: Tensor  # (P,) int64 row of the input
-    target: Tensor  # (P,) int64 row of the output
+    source: Tensor  # (P,) int32 row of the input
+    target: Tensor  # (P,) int32 row of the output
     counts: tuple[int, ...]  # pairs per kernel offset, z-major
-    sources: int  # input voxels
-    targets: int  # output voxels
-    mirrored: bool  # pairs of offset k are those of offset K-1-k with the roles exchanged, in the same order
-
-    @cached_property
-    def by_target(self) -> tuple[Tensor, Tensor]:
-        """Return the pairs sorted by target: (P,) pair numbers and (targets,) where each target's pairs begin."""
-        return _grouped(self.target, self.counts, self.targets)
-
-    @cached_property
-    def by_source(self) -> tuple[Tensor, Tensor]:
-        """Return the pairs sorted by source: (P,) pair numbers and (sources,) where each source's pairs begin."""
-        return _grouped(self.source, self.counts, self.sources)
+    by_target: Groups
+    by_source: Groups | None  # None where the pairs of offset k are those of offset K-1-k with the roles exchanged
 
 
-def _grouped(row: Tensor, counts: tuple[int, ...], rows: int) -> tuple[Tensor, Tensor]:
-    pairs = torch.arange(len(row), device=row.device, dtype=torch.int32)
+def _grouped(row: Tensor, counts: tuple[int, ...], rows: int) -> Groups:
+    number = torch.arange(len(row), device=row.device, dtype=torch.int32)
     offset = torch.repeat_interleave(torch.tensor(counts, device=row.device), output_size=len(row))
     table = torch.full((rows, len(counts)), -1, device=row.device, dtype=torch.int32)
-    table.view(-1)[row * len(counts) + offset] = pairs  # a row meets each offset once at most
+    table.view(-1)[row.long() * len(counts) + offset] = number  # a row meets each offset once at most
     used = table >= 0
     per_row = used.sum(1, dtype=torch.int32)
-    return table[used], per_row.cumsum(0, dtype=torch.int32) - per_row
+    return Groups(table[used], per_row.cumsum(0, dtype=torch.int32) - per_row)
 
 
 def keys_of(cells: Tensor, shape: Triple) -> Tensor:
@@ -71,6 +70,15 @@ def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
     differ in x only share one search, because their keys are consecutive.
     """
     _, height, width = (extent + 2 for extent in shape)
+    if keys.device.type == "cpu":
+        steps = [(z * height + y) * width + x for z, y, x in product((-1, 0, 1), repeat=3)]
+        source, target, counts, *groups = pairs.submanifold_pairs(keys.numpy(), np.array(steps[14:]))
+        by_target = Groups(*map(torch.from_numpy, groups))
+        return Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), by_target, None)
+    return _submanifold_rules(keys, height, width)
+
+
+def _submanifold_rules(keys: Tensor, height: int, width: int) -> Rules:
     count = len(keys)
     later = torch.cat((keys, keys.new_full((3,), -1)))  # so that looking up to 3 rows past the end finds no key
     lines = keys.new_tensor([width, (height - 1) * width, height * width, (height + 1) * width])
@@ -90,14 +98,10 @@ def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
     far = torch.stack(where)[offset, near]
     itself = torch.arange(count, device=keys.device)
     near_parts, far_parts = near.split(counts)[::-1], far.split(counts)[::-1]
-    return Rules(
-        source=torch.cat((*near_parts, itself, far)),
-        target=torch.cat((*far_parts, itself, near)),
-        counts=(*counts[::-1], count, *counts),
-        sources=count,
-        targets=count,
-        mirrored=True,
-    )
+    source = torch.cat((*near_parts, itself, far)).int()
+    target = torch.cat((*far_parts, itself, near)).int()
+    counts = (*counts[::-1], count, *counts)
+    return Rules(source, target, counts, _grouped(target, counts, count), None)
 
 
 def strided_rules(
@@ -108,7 +112,22 @@ def strided_rules(
     The outputs are the cells whose window holds an input voxel. Axes are independent: an input cell c reaches output
     (c + padding - k) / stride through kernel index k, where that is whole and inside.
     """
-    out_shape = tuple((n + 2 * p - k) // s + 1 for n, k, s, p in zip(shape, kernel, stride, padding, strict=True))
+    depth, height, width = ((n + 2 * p - k) // s + 1 for n, k, s, p in zip(shape, kernel, stride, padding, strict=True))
+    out_shape = (depth, height, width)
+    if keys.device.type == "cpu":
+        triples = (np.array(triple) for triple in (shape, kernel, stride, padding, out_shape))
+        source, target, counts, out_keys = pairs.strided_pairs(keys.numpy(), samples, *triples)
+        groups = (pairs.grouped(rows, n) for rows, n in ((target, len(out_keys)), (source, len(keys))))
+        by_target, by_source = (Groups(*map(torch.from_numpy, group)) for group in groups)
+        rules = Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), by_target, by_source)
+        return rules, torch.from_numpy(out_keys), out_shape
+    rules, out_keys = _strided_rules(keys, shape, kernel, stride, padding, out_shape, samples)
+    return rules, out_keys, out_shape
+
+
+def _strided_rules(
+    keys: Tensor, shape: Triple, kernel: Triple, stride: Triple, padding: Triple, out_shape: Triple, samples: int
+) -> tuple[Rules, Tensor]:
     depth, height, width = (extent + 2 for extent in out_shape)
     cells = cells_of(keys, shape)
     reaches: list[list[tuple[Tensor, Tensor]]] = []
@@ -134,7 +153,7 @@ def strided_rules(
     occupied = torch.zeros(samples * depth * height * width, dtype=torch.bool, device=keys.device)
     occupied[all_keys] = True
     out_keys = occupied.nonzero()[:, 0]
-    target = torch.searchsorted(out_keys, all_keys)
-    counts = tuple(len(source) for source in sources)
-    rules = Rules(torch.cat(sources), target, counts, len(keys), len(out_keys), mirrored=False)
-    return rules, out_keys, (out_shape[0], out_shape[1], out_shape[2])
+    source, target = torch.cat(sources).int(), torch.searchsorted(out_keys, all_keys).int()
+    counts = tuple(len(part) for part in sources)
+    by_target, by_source = _grouped(target, counts, len(out_keys)), _grouped(source, counts, len(keys))
+    return Rules(source, target, counts, by_target, by_source), out_keys

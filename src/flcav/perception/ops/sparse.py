@@ -5,6 +5,7 @@ scattered rows. Both directions are written out, and only the input features are
 """
 
 import math
+import threading
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from flcav.perception.ops.rules import Rules, Triple, cells_of, strided_rules, submanifold_rules
+from flcav.perception.ops.rules import Groups, Rules, Triple, cells_of, strided_rules, submanifold_rules
 
 
 @dataclass(frozen=True)
@@ -62,47 +63,61 @@ class _SparseConvolution(torch.autograd.Function):
     def forward(ctx: Any, features: Tensor, weight: Tensor, rules: Rules) -> Tensor:
         ctx.save_for_backward(features, weight)
         ctx.rules = rules
-        gathered = features.index_select(0, rules.source)
-        return _sum(_products(gathered, weight, rules.counts), *rules.by_target)
+        products = _scratch("products", len(rules.source), weight.shape[2], features)
+        parts = zip(rules.source.split(rules.counts), products.split(rules.counts), weight, strict=True)
+        for source, product, kernel in parts:
+            torch.mm(_gathered(features, source, "sent"), kernel, out=product)
+        return _sum(products, rules.by_target)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
         features, weight = ctx.saved_tensors
         rules: Rules = ctx.rules
-        gradient = grad_outputs[0].contiguous()
-        wants_features, wants_weight = ctx.needs_input_grad[:2]
-        if rules.mirrored:  # the transpose of a submanifold convolution is one, with the kernel turned round
-            arrived = gradient.index_select(0, rules.source)
-            by_offset = arrived.split(rules.counts)[::-1]
-        else:
-            arrived = gradient.index_select(0, rules.target)
-            by_offset = arrived.split(rules.counts)
-        grad_weight = grad_features = None
-        if wants_weight:
-            grad_weight = torch.zeros_like(weight)
-            sent = features.index_select(0, rules.source).split(rules.counts)
-            for k, (left, right) in enumerate(zip(sent, by_offset, strict=True)):
-                torch.mm(left.t(), right, out=grad_weight[k])
-        if wants_features:
-            back = weight.transpose(1, 2)
-            if rules.mirrored:
-                grad_features = _sum(_products(arrived, back.flip(0), rules.counts), *rules.by_target)
-            else:
-                grad_features = _sum(_products(arrived, back, rules.counts), *rules.by_source)
-        return grad_features, grad_weight, None
+        gradient = gradients[0].contiguous()
+        wants_features = ctx.needs_input_grad[0]
+        grad_weight = torch.empty_like(weight)
+        products = _scratch("products", len(rules.source), weight.shape[1], features)
+        slots = products.split(rules.counts)
+        if rules.by_source is None:  # grouped by the mirrored pairs' targets, which are these pairs' sources
+            slots = slots[::-1]
+        pairs = zip(rules.source.split(rules.counts), rules.target.split(rules.counts), slots, strict=True)
+        for k, (source, target, product) in enumerate(pairs):
+            arrived = _gathered(gradient, target, "arrived")
+            torch.mm(_gathered(features, source, "sent").t(), arrived, out=grad_weight[k])
+            if wants_features:
+                torch.mm(arrived, weight[k].t(), out=product)
+        if not wants_features:
+            return None, grad_weight, None
+        return _sum(products, rules.by_source or rules.by_target), grad_weight, None
 
 
-def _products(rows: Tensor, weight: Tensor, counts: tuple[int, ...]) -> Tensor:
-    out = rows.new_empty(len(rows), weight.shape[2])
-    for part, into, kernel in zip(rows.split(counts), out.split(counts), weight, strict=True):
-        torch.mm(part, kernel, out=into)
-    return out
+_buffers = threading.local()
 
 
-def _sum(rows: Tensor, order: Tensor, begins: Tensor) -> Tensor:
+def _scratch(name: str, rows: int, columns: int, like: Tensor) -> Tensor:
+    """Return an uninitialised (rows, columns) view of a buffer that this thread's next call of that name reuses.
+
+    Fresh memory of this size would cost the CPU more in page faults than the arithmetic on it.
+    """
+    if like.device.type != "cpu":
+        return like.new_empty(rows, columns)
+    buffer = getattr(_buffers, name, None)
+    if buffer is None or buffer.dtype != like.dtype or buffer.numel() < rows * columns:
+        with torch.inference_mode(False):  # else training could not reuse it
+            buffer = like.new_empty(rows * columns * 5 // 4)
+        setattr(_buffers, name, buffer)
+    return buffer[: rows * columns].view(rows, columns)
+
+
+def _gathered(rows: Tensor, index: Tensor, name: str) -> Tensor:
+    """Return rows[index] for one kernel offset: few enough rows to stay in the cache for the product that follows."""
+    return torch.index_select(rows, 0, index, out=_scratch(name, len(index), rows.shape[1], rows))
+
+
+def _sum(rows: Tensor, groups: Groups) -> Tensor:
     if not len(rows):
-        return rows.new_zeros(len(begins), rows.shape[1])
-    return F.embedding_bag(order, rows, begins, mode="sum")
+        return rows.new_zeros(len(groups.begins), rows.shape[1])
+    return F.embedding_bag(groups.order, rows, groups.begins, mode="sum")
 
 
 class SubmanifoldConv3d(nn.Module):

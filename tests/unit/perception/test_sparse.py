@@ -1,0 +1,107 @@
+"""Sparse convolution against the dense one, in float64; the compiled rules against the tensor ones."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from flcav.perception.ops import rules as rules_module
+from flcav.perception.ops.rules import cells_of, keys_of, strided_rules, submanifold_rules
+from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d
+
+GRIDS = [((9, 14, 11), 2, 0.15), ((5, 20, 7), 3, 0.4), ((4, 3, 3), 1, 1.0), ((6, 9, 8), 2, 0.01)]
+STRIDED = [
+    ((3, 3, 3), (2, 2, 2), (1, 1, 1)),
+    ((3, 3, 3), (2, 2, 2), (0, 1, 1)),
+    ((3, 1, 1), (2, 1, 1), (0, 0, 0)),
+]
+
+
+def scene(shape, samples, share, channels=5):
+    """Return an occupancy, float64 features of the occupied cells, and the cells as a sparse tensor."""
+    generator = torch.Generator().manual_seed(7)
+    occupied = torch.rand(samples, *shape, generator=generator) < share
+    cells = occupied.nonzero()
+    features = torch.randn(len(cells), channels, dtype=torch.float64, generator=generator, requires_grad=True)
+    return occupied, cells, features, SparseTensor(features, keys_of(cells, shape), shape, samples)
+
+
+def dense_of(features, cells, shape, samples):
+    grid = torch.zeros(samples, *shape, features.shape[1], dtype=features.dtype)
+    return grid.index_put(tuple(cells.t()), features).permute(0, 4, 1, 2, 3)
+
+
+def assert_same(dense, sparse, features, weight):
+    assert dense.shape == sparse.shape
+    assert (dense - sparse).abs().max() < 1e-9
+    weights = torch.randn(dense.shape, dtype=torch.float64)
+    ours = torch.autograd.grad((sparse * weights).sum(), (features, weight))
+    theirs = torch.autograd.grad((dense * weights).sum(), (features, weight))
+    for one, other in zip(ours, theirs, strict=True):
+        assert (one - other).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize(("shape", "samples", "share"), GRIDS)
+def test_submanifold_is_the_dense_convolution_on_its_voxels(shape, samples, share):
+    occupied, cells, features, x = scene(shape, samples, share)
+    layer = SubmanifoldConv3d(5, 6).double()
+    kernel = layer.weight.view(3, 3, 3, 5, 6).permute(4, 3, 0, 1, 2)
+    dense = F.conv3d(dense_of(features, cells, shape, samples), kernel, padding=1) * occupied[:, None]
+    assert_same(dense, layer(x).dense(), features, layer.weight)
+
+
+@pytest.mark.parametrize(("kernel", "stride", "padding"), STRIDED)
+@pytest.mark.parametrize(("shape", "samples", "share"), GRIDS)
+def test_strided_is_the_dense_convolution(shape, samples, share, kernel, stride, padding):
+    _, cells, features, x = scene(shape, samples, share)
+    layer = StridedConv3d(5, 6, kernel, stride, padding).double()
+    weight = layer.weight.view(*kernel, 5, 6).permute(4, 3, 0, 1, 2)
+    dense = F.conv3d(dense_of(features, cells, shape, samples), weight, stride=stride, padding=padding)
+    assert_same(dense, layer(x).dense(), features, layer.weight)
+
+
+def test_features_that_need_no_gradient_get_none():
+    _, _, _, x = scene((5, 6, 7), 1, 0.3)
+    layer = SubmanifoldConv3d(5, 6).double()
+    layer(x.with_features(x.features.detach())).features.sum().backward()
+    assert layer.weight.grad is not None
+
+
+def test_birds_eye_stacks_layers_as_channels():
+    _, cells, features, x = scene((3, 5, 4), 2, 0.3)
+    stacked = dense_of(features, cells, (3, 5, 4), 2)  # (B, C, D, H, W)
+    assert torch.equal(x.birds_eye(), stacked.permute(0, 2, 1, 3, 4).flatten(1, 2))
+
+
+def test_keys_and_cells_are_inverse():
+    _, cells, _, x = scene((4, 5, 6), 3, 0.5)
+    assert torch.equal(cells_of(x.keys, x.shape), cells)
+    assert (x.keys.diff() > 0).all()
+
+
+def rows(rules):
+    grouped = [(group.order, group.begins) for group in (rules.by_target, rules.by_source) if group is not None]
+    return [rules.source, rules.target, *(tensor for group in grouped for tensor in group)]
+
+
+@pytest.mark.parametrize(("shape", "samples", "share"), GRIDS)
+def test_compiled_rules_equal_the_tensor_rules(shape, samples, share):
+    x = scene(shape, samples, share)[3]
+    compiled = submanifold_rules(x.keys, shape)
+    plain = rules_module._submanifold_rules(x.keys, shape[1] + 2, shape[2] + 2)
+    assert compiled.counts == plain.counts
+    assert all(torch.equal(a, b) for a, b in zip(rows(compiled), rows(plain), strict=True))
+    for kernel, stride, padding in STRIDED:
+        compiled, keys, out_shape = strided_rules(x.keys, shape, kernel, stride, padding, samples)
+        plain, plain_keys = rules_module._strided_rules(x.keys, shape, kernel, stride, padding, out_shape, samples)
+        assert torch.equal(keys, plain_keys)
+        assert compiled.counts == plain.counts
+        assert all(torch.equal(a, b) for a, b in zip(rows(compiled), rows(plain), strict=True))
+
+
+def test_training_after_inference_reuses_the_buffers():
+    _, _, _, x = scene((5, 6, 7), 1, 0.3)
+    layer = SubmanifoldConv3d(5, 6).double()
+    with torch.inference_mode():
+        layer(x)
+    layer(x).features.sum().backward()
+    assert layer.weight.grad is not None
