@@ -6,7 +6,7 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import allocate, birdseye, fit, place, record, validate
+from flcav.cli import allocate, birdseye, evaluate, fit, infer, place, record, train, validate
 from flcav.config import InputError
 
 app = typer.Typer(
