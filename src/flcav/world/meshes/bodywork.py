@@ -45,7 +45,7 @@ def vehicle_body(profile: Profile, length: float, width: float, height: float) -
     ]
     parts += [_driver(profile, lower, length, height)]
     for axle in profile.axles:
-        parts += [mirrored(_arch(axle * length, profile.wheel_radius, half_width))]
+        parts += [mirrored(_arch(axle * length, profile, half_width))]
         parts += [mirrored(moved(wheel(profile.wheel_radius, 0.22), axle * length, half_width - 0.13))]
     foot = profile.roof[-1][0] * length - 0.35
     mirror = (foot, half_width + MIRROR_M / 2 - 0.03, np.interp(foot, lower.x, lower.belt) + 0.07)
@@ -133,15 +133,15 @@ def _end(lower: _Lower, *, front: bool) -> Mesh:
     return sheet(points, material)
 
 
-def _arch(x: float, wheel_radius: float, half_width: float) -> Mesh:
-    """Return the liner that keeps rays from passing behind a wheel."""
+def _arch(x: float, profile: Profile, half_width: float) -> Mesh:
+    """Return the liner that keeps rays from passing behind a wheel, down to the floor."""
+    radius, hub = profile.wheel_radius * ARCH, profile.wheel_radius
     angle = np.linspace(0, np.pi, 7)
-    inner = half_width - 0.38
-    circle = np.stack((np.cos(angle), 0 * angle, np.sin(angle)), axis=1) * wheel_radius * ARCH
-    center = np.array((x, 0.0, wheel_radius))
-    rows = [center + circle + (0, half_width * 0.95, 0), center + circle + (0, inner, 0), center + 0 * circle]
-    rows[2] = rows[2] + (0, inner, 0)
-    return sheet(np.stack(rows), Material.TRIM)
+    circle = np.stack((np.cos(angle), 0 * angle, np.sin(angle)), axis=1) * radius
+    feet = np.array([[radius, 0, profile.clearance - hub], [-radius, 0, profile.clearance - hub]])
+    circle = np.concatenate((feet[:1], circle, feet[1:]))
+    outer, inner = (np.array((x, y, hub)) for y in (half_width * 0.95, half_width - 0.38))
+    return sheet(np.stack((outer + circle, inner + circle, inner + 0 * circle)), Material.TRIM)
 
 
 def _cabin_side(profile: Profile, lower: _Lower, length: float, height: float) -> Mesh:

@@ -6,8 +6,8 @@ from numpy.typing import ArrayLike
 from flcav.world.materials import Material
 from flcav.world.meshes.mesh import Mesh, join, tube
 
-LEAVES = 220  # of a tree
-LEAF_M = 0.42  # leaves stand for clusters of leaves
+LEAVES = 360  # of a tree; each stands for a cluster
+LEAF = 0.38  # size of a cluster over the crown's radius: about two rays in three are caught
 
 
 def tree(height: float, crown_radius: float, rng: np.random.Generator) -> Mesh:
@@ -16,7 +16,7 @@ def tree(height: float, crown_radius: float, rng: np.random.Generator) -> Mesh:
     middle = np.array((0.0, 0.0, (height + crown_foot) / 2))
     radii = np.array((crown_radius, crown_radius, (height - crown_foot) / 2))
     trunk = tube((0, 0, 0), middle, 0.05 + 0.018 * height, Material.BARK, end_radius=0.05, sides=6, capped=False)
-    return join((trunk, leaves(middle, radii, LEAVES, LEAF_M, rng)))
+    return join((trunk, leaves(middle, radii, LEAVES, LEAF * crown_radius, rng)))
 
 
 def leaves(center: ArrayLike, radii: ArrayLike, count: int, size_m: float, rng: np.random.Generator) -> Mesh:
