@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from typing import Any
 
 HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
-CAVEAT = "Labels of the road sensor come from an ideal road detector: an upper bound."
+CAVEAT = "ideal road detector, upper bound"
 
 _IN_WORDS = {
-    HELD: "the interval lies above 0: the claim held in this run",
-    NOT_HELD: "the interval lies below 0: the claim did not hold in this run",
+    HELD: "the interval lies above 0, so the claim held in this run",
+    NOT_HELD: "the interval lies below 0, so the claim did not hold in this run",
     UNDECIDED: "the interval contains 0, so this run does not decide",
 }
 
@@ -54,14 +54,13 @@ def _pole_finding(results: Mapping[str, Any]) -> dict[str, str]:
     chosen, densest = place["chosen"], place["densest"]
     if chosen == densest:
         sentence = (
-            f"Pole {chosen}, which covers most registered errors ({place['covered']} of {place['errors']}), is also "
-            f"the pole with the densest traffic: there is nothing to compare, so this run does not decide."
+            f"Pole {chosen}, placed by VRCSP, is also the pole where traffic is densest: there is nothing to compare, "
+            f"so this run does not decide."
         )
         return {"name": "pole", "question": question, "verdict": UNDECIDED, "sentence": sentence}
     measured = (
-        f"After edge FL with pole {chosen}, which VRCSP placed ({place['covered']} of {place['errors']} registered "
-        f"errors within {place['range_m']:g} m), AP50 is {place['ap50_chosen']:.3f}; with pole {densest}, where "
-        f"traffic is densest, {place['ap50_densest']:.3f}"
+        f"Edge FL reached AP50 {place['ap50_chosen']:.3f} with pole {chosen}, placed by VRCSP, and "
+        f"{place['ap50_densest']:.3f} with pole {densest}, where traffic is densest"
     )
     return _finding("pole", question, measured, place["difference"], results)
 
@@ -69,10 +68,14 @@ def _pole_finding(results: Mapping[str, Any]) -> dict[str, str]:
 def _finding(
     name: str, question: str, measured: str, difference: Mapping[str, float], results: Mapping[str, Any]
 ) -> dict[str, str]:
-    low, high = difference["low"], difference["high"]
+    mean, low, high = difference["mean"], difference["low"], difference["high"]
     decided = verdict(low, high)
     sentence = (
-        f"{measured} ({difference['mean']:+.3f}, 95 % interval {low:+.3f} to {high:+.3f}, paired, "
-        f"{results['test_frames']} test frames of {results['test_scenes']} scenes); {_IN_WORDS[decided]}. {CAVEAT}"
+        f"{measured}: {_signed(mean)}, 95 % interval {_signed(low)} to {_signed(high)} over {results['test_frames']} "
+        f"test frames of {results['test_scenes']} scenes; {_IN_WORDS[decided]} ({CAVEAT})."
     )
     return {"name": name, "question": question, "verdict": decided, "sentence": sentence}
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.3f}".replace("-", "−")

@@ -16,40 +16,36 @@ STAGES = ("pretraining", "edge FL", "cloud FL")  # what `rounds` call them, in t
 def draw_ap_by_round(axes: Axes, rounds: Sequence[Row], stages: Sequence[Row]) -> None:
     """Draw AP50 after every round, a line per town, and the tested values with their intervals where stages end.
 
-    `rounds` has rows stage, round, town, ap50, each town's in the order of the run; `stages` has one tested row for
-    each of `STAGES` and town, a town's in that order.
+    `rounds` has rows stage, round, town, ap50; `stages` has one tested row for each of `STAGES` and town, a town's in
+    that order. Every stage is equally wide, however many rounds it has.
     """
-    known = {(row["stage"], row["round"]) for row in rounds}
-    places = {key: x for x, key in enumerate(sorted(known, key=lambda key: (STAGES.index(key[0]), key[1])))}
-    spans = _spans(places)
-    tested_towns = list(dict.fromkeys(row["town"] for row in stages))
+    numbers = {stage: sorted({row["round"] for row in rounds if row["stage"] == stage}) for stage in STAGES}
+    numbers = {stage: known for stage, known in numbers.items() if known}
+    places = {
+        (stage, number): start + (rank + 0.5) / len(known)
+        for start, (stage, known) in enumerate(numbers.items())
+        for rank, number in enumerate(known)
+    }
     for town in dict.fromkeys(row["town"] for row in rounds):
         colour = style.TOWN_COLOURS.get(town, style.GREEN)
         line = sorted((places[row["stage"], row["round"]], row["ap50"]) for row in rounds if row["town"] == town)
         axes.plot(*zip(*line, strict=True), color=colour, linewidth=1.6, marker="o", markersize=2.5)
         axes.annotate(town, line[-1], (9, 0), textcoords="offset points", color=colour, va="center", fontweight="bold")
-    for number, town in enumerate(tested_towns):
-        aside = 0.16 * (
-            number - (len(tested_towns) - 1) / 2
-        )  # so that intervals of several towns do not hide each other
+    towns = list(dict.fromkeys(row["town"] for row in stages))
+    for number, town in enumerate(towns):
+        aside = 0.04 * (number - (len(towns) - 1) / 2)  # so that the intervals of two towns do not hide each other
         for stage, row in zip(STAGES, (row for row in stages if row["town"] == town), strict=True):
-            if stage in spans:
-                _draw_interval(axes, spans[stage][1] + aside, row, style.TOWN_COLOURS.get(town, style.GREEN))
-    for stage, (start, end) in spans.items():
-        if start > 0:
-            axes.axvline(start - 0.5, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
-        axes.text((start + end) / 2, 1.02, stage, transform=axes.get_xaxis_transform(), ha="center")
-    ends = {x: number for (_, number), x in places.items() if any(x in span for span in spans.values())}
+            if stage in numbers:
+                end = places[stage, numbers[stage][-1]]
+                _draw_interval(axes, end + aside, row, style.TOWN_COLOURS.get(town, style.GREEN))
+    for start, stage in enumerate(numbers):
+        axes.text(start + 0.5, 1.02, stage, transform=axes.get_xaxis_transform(), ha="center")
+        if start:
+            axes.axvline(start, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
+    ends = {places[stage, number]: number for stage, known in numbers.items() for number in (known[0], known[-1])}
     axes.set_xticks(list(ends), [str(number) for number in ends.values()])
-    axes.set(xlabel="round of the stage", ylabel="AP50", ylim=(0, None), xlim=(-0.5, len(places) + 0.5))
+    axes.set(xlabel="round of the stage", ylabel="AP50", ylim=(0, None), xlim=(0, len(numbers) + 0.12))
     axes.grid(axis="y")
-
-
-def _spans(places: Mapping[tuple[str, int], int]) -> dict[str, tuple[int, int]]:
-    spans: dict[str, tuple[int, int]] = {}
-    for (stage, _), x in places.items():
-        spans[stage] = (spans.get(stage, (x, x))[0], x)
-    return spans
 
 
 def _draw_interval(axes: Axes, x: float, row: Row, colour: str) -> None:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from flcav.report import charts, maps, style, sweeps
 from flcav.report.charts import Row
 
-WIDTH = 4.8  # [inch] one column of the page, the whole width of a phone
+WIDTH = 3.8  # [inch] hardly more than a phone shows; a desktop enlarges it
 EXTENT: sweeps.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: where the tiny detector looks
 
 
@@ -28,7 +28,8 @@ def before_after(sweep: sweeps.Sweep, extent: sweeps.Extent = EXTENT) -> Figure:
     figure = style.canvas(WIDTH, 2 * WIDTH)
     for axes, found in zip(figure.subplots(2), (sweep.before, sweep.after), strict=True):
         sweeps.draw_detections(axes, sweep, found, extent)
-        style.key(axes, sweeps.key(found), loc="lower right", bbox_to_anchor=(1, 1))
+        axes.set_title(found.title, fontweight="bold", pad=20)
+        style.key(axes, sweeps.key(found), loc="lower left", bbox_to_anchor=(-0.02, 0.98))
         axes.set(xlabel="metres to the right", ylabel="metres ahead")
     return figure
 
@@ -69,11 +70,15 @@ def overview(scene: maps.ErrorMap, sweep: sweeps.Sweep, rounds: Sequence[Row], s
     left, middle, right = (figure.add_subfigure(grid[column]) for column in range(3))
     axes = left.add_subplot()
     maps.draw_errors(axes, scene)
+    axes.set_title(f"{scene.town.name}: mistakes, and the pole placed for them", fontweight="bold")
     style.key(left, axes.get_legend_handles_labels()[0])
     for axes, found in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
         sweeps.draw_detections(axes, sweep, found, EXTENT)
+        axes.set_title(found.title, fontweight="bold")
         axes.set(xticks=[], yticks=[0, 20, 40])
     middle.supylabel("metres ahead", fontsize=style.TEXT, color=style.MUTED)
     style.key(middle, sweeps.key(), columnspacing=0.8)
-    charts.draw_ap_by_round(right.add_subplot(), rounds, stages)
+    axes = right.add_subplot()
+    charts.draw_ap_by_round(axes, rounds, stages)
+    axes.set_title("AP50 through the stages", fontweight="bold", pad=22)
     return figure

@@ -23,7 +23,7 @@ MISS: dict[str, Any] = {
     "markeredgecolor": "white",
     "markeredgewidth": 0.5,
 }
-FALSE_POSITIVE: dict[str, Any] = {"marker": "x", "markersize": 4.5, "color": style.FALSE, "markeredgewidth": 1.3}
+FALSE_POSITIVE: dict[str, Any] = {"marker": "x", "markersize": 5, "color": style.FALSE, "markeredgewidth": 1.3}
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 

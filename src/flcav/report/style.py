@@ -90,9 +90,9 @@ def scale_bar(axes: Axes, length_m: float) -> None:
 
 def key(owner: FigureBase | Axes, handles: Sequence[Artist], **changes: Any) -> None:
     """Put the legend of `handles`, which carry labels, in one line below what it explains."""
-    line = {"loc": "outside lower center", "ncols": len(handles), "frameon": False}
-    spacing = {"handlelength": 1.2, "handletextpad": 0.5, "columnspacing": 1.4}
-    owner.legend(handles=handles, **line | spacing | changes)
+    options: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "handlelength": 1.2}
+    spacing: dict[str, Any] = {"handletextpad": 0.5, "columnspacing": 1.4, "ncols": len(handles)}
+    owner.legend(handles=handles, **{**options, **spacing, **changes})
 
 
 def png(figure: Figure, dpi: int = 200) -> bytes:

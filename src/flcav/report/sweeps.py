@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
@@ -35,10 +35,9 @@ class Sweep:
     after: Detections
 
 
-def outlines(boxes: Boxes) -> Array:
-    """Return (N, 4, 2) ground outlines of `boxes` on the page: across = -y, up = x."""
-    ground = boxes.corners()[:, :4, :2]
-    return np.stack((-ground[..., 1], ground[..., 0]), axis=-1)
+def on_page(xy: Array) -> Array:
+    """Return (..., 2) x ahead, y left as picture coordinates: across, up."""
+    return np.stack((-xy[..., 1], xy[..., 0]), axis=-1)
 
 
 def draw_points(axes: Axes, points: NDArray[np.float32], extent: Extent) -> None:
@@ -49,11 +48,19 @@ def draw_points(axes: Axes, points: NDArray[np.float32], extent: Extent) -> None
     axes.set(xlim=(-aside, aside), ylim=(behind, ahead), aspect="equal")
 
 
-def draw_boxes(axes: Axes, boxes: Boxes, colour: str, *, fill: float = 0.0, dashed: bool = False) -> None:
-    """Draw the ground outlines of `boxes`, filled with opacity `fill`."""
-    face, line = (colour, fill), "--" if dashed else "-"
-    outline = PolyCollection(list(outlines(boxes)), facecolor=face, edgecolor=colour, linewidth=1.3, linestyle=line)
-    axes.add_collection(outline)
+def draw_boxes(
+    axes: Axes, boxes: Boxes, colour: str, *, fill: float = 0.0, width: float = 1.2, dashed: bool = False
+) -> None:
+    """Draw the ground outlines of `boxes`, filled with opacity `fill`, each with a tick through its front."""
+    ahead = np.stack((np.cos(boxes.yaw), np.sin(boxes.yaw)), axis=1)
+    tip = boxes.center[:, :2] + ahead * (boxes.size[:, :1] / 2 + 0.6)
+    ticks = on_page(np.stack((boxes.center[:, :2], tip), axis=1))
+    outlines = on_page(boxes.corners()[:, :4, :2])
+    dash = (0, (3, 2)) if dashed else "solid"
+    axes.add_collection(
+        PolyCollection(list(outlines), facecolor=(colour, fill), edgecolor=colour, linewidth=width, linestyle=[dash])
+    )
+    axes.add_collection(LineCollection(list(ticks), colors=colour, linewidths=width))
 
 
 def draw_detections(axes: Axes, sweep: Sweep, found: Detections, extent: Extent) -> None:
@@ -64,7 +71,6 @@ def draw_detections(axes: Axes, sweep: Sweep, found: Detections, extent: Extent)
     draw_boxes(axes, found.boxes[found.hit], style.HIT, fill=0.35)
     draw_boxes(axes, found.boxes[~found.hit], style.FALSE, fill=0.2, dashed=True)
     axes.plot(0, 0, "^", color=style.INK, markersize=7, clip_on=False, zorder=5)
-    axes.set_title(found.title, fontweight="bold")
 
 
 def key(found: Detections | None = None) -> list[Patch]:
