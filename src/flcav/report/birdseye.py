@@ -37,7 +37,7 @@ class View:
 @style.styled
 def birdseye(view: View) -> Figure:
     """Return the view as a figure with its legend and height scale."""
-    figure = style.canvas(7.2, 8.5)
+    figure = style.canvas(7.2, 8.25)
     axes = figure.add_subplot()
     draw_view(axes, view)
     axes.set_title(view.title)

@@ -47,12 +47,12 @@ def test_everything_in_the_view_shows(plain: np.ndarray, change: dict):
 
 def test_ahead_is_up_and_left_is_left():
     axes = birdseye(view(points=np.array([[30.0, 10.0, 2.0]]))).axes[0]
-    offsets = [np.asarray(points.get_offsets()) for points in axes.collections if len(points.get_offsets()) == 1]
-    assert any(np.allclose(offset, [[-10.0, 30.0]]) for offset in offsets)
+    offsets = [np.asarray(points.get_offsets()) for points in axes.collections]
+    assert any(offset.shape == (1, 2) and np.allclose(offset, [[-10.0, 30.0]]) for offset in offsets)
 
 
 def test_heading_ticks_leave_through_the_front():
     axes = birdseye(view()).axes[0]
-    tips = [path.vertices[-1] for lines in axes.collections for path in lines.get_paths() if len(path.vertices) == 2]
+    paths = [np.asarray(path.vertices) for lines in axes.collections for path in lines.get_paths()]
     expected = np.array([20, 10]) + 2.6 * np.array([np.cos(0.3), np.sin(0.3)])
-    assert any(np.allclose(tip, [-expected[1], expected[0]]) for tip in tips)
+    assert any(len(path) == 2 and np.allclose(path[-1], [-expected[1], expected[0]]) for path in paths)
