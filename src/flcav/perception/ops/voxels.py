@@ -31,5 +31,5 @@ def voxelize(
     points = points[inside]
     keys, order = keys_of(torch.stack((sample[inside], z, y, x), 1), shape).sort(stable=True)
     keys, count = torch.unique_consecutive(keys, return_counts=True)
-    means = torch.segment_reduce(points[order], "mean", lengths=count, axis=0)
+    means = torch.segment_reduce(points[order], "mean", lengths=count, axis=0, unsafe=True)  # unchecked: may be empty
     return means, keys

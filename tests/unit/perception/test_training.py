@@ -1,0 +1,130 @@
+"""Training: the same for a seed, wherever it stopped; and it learns."""
+
+import numpy as np
+import pytest
+import torch
+
+from flcav.config import InputError
+from flcav.geometry import Boxes
+from flcav.perception.objects import detect_all, train_steps
+from flcav.perception.objects.client import ObjectsClient
+from flcav.perception.objects.evaluate import Truth, score_detections
+from flcav.perception.objects.task import ObjectsTask
+from flcav.perception.objects.train import Checkpointing, batch_loss, batches, one_cycle, train
+from flcav.perception.objects.weights import to_arrays
+
+from .toy import spin, toy_sample
+
+RAYS = spin(beams=16, azimuths=300, field_of_view_deg=180)
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return [toy_sample(seed, RAYS) for seed in range(5)]
+
+
+def fresh():
+    return ObjectsTask().network("tiny", seed=1)
+
+
+def same(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(to_arrays(one).values(), to_arrays(other).values(), strict=True))
+
+
+def test_one_seed_one_result(samples):
+    networks = [fresh(), fresh(), fresh()]
+    for network, seed in zip(networks, (3, 3, 4), strict=True):
+        train_steps(network, samples, steps=2, learning_rate=1e-3, seed=seed)
+    assert same(networks[0], networks[1])
+    assert not same(networks[0], networks[2])
+
+
+class Killed(Exception):
+    """Stands for SIGKILL: nothing is caught, nothing is written after it."""
+
+
+def test_a_killed_run_goes_on_to_the_same_weights(samples, tmp_path):
+    settings = {"steps": 5, "seed": 3, "learning_rate": 1e-3}
+    whole, cut = fresh(), fresh()
+    losses = train(whole, samples, **settings)
+    checkpointing = Checkpointing(tmp_path / "checkpoint.pt", every=2)
+
+    def kill(done, total, note):
+        if done == 3:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(cut, samples, checkpointing=checkpointing, progress=kill, **settings)
+    resumed = fresh()
+    seen = []
+    again = train(
+        resumed, samples, checkpointing=checkpointing, progress=lambda done, *_: seen.append(done), **settings
+    )
+    assert seen == [3, 4, 5]
+    assert np.array_equal(losses, again)
+    assert same(whole, resumed)
+
+
+def test_a_checkpoint_of_another_run_is_refused(samples, tmp_path):
+    checkpointing = Checkpointing(tmp_path / "checkpoint.pt", every=1)
+    train(fresh(), samples, steps=1, seed=0, checkpointing=checkpointing)
+    with pytest.raises(InputError, match="other settings"):
+        train(fresh(), samples, steps=1, seed=1, checkpointing=checkpointing)
+    checkpointing.path.write_bytes(b"garbage")
+    with pytest.raises(InputError, match="not a checkpoint"):
+        train(fresh(), samples, steps=1, seed=0, checkpointing=checkpointing)
+
+
+def test_no_samples_and_unknown_schedules_are_refused(samples):
+    with pytest.raises(InputError, match="0 samples"):
+        train(fresh(), [], steps=1, seed=0)
+    with pytest.raises(InputError, match="one_cycle"):
+        train(fresh(), samples, steps=1, seed=0, schedule="spiral")
+    with pytest.raises(InputError, match="0 samples"):
+        ObjectsClient(fresh().config, [])
+
+
+def test_batches_are_shuffled_passes():
+    order = batches(5, 2, 10, seed=0)
+    assert order.shape == (10, 2)
+    for part in order.reshape(4, 5):
+        assert sorted(part) == [0, 1, 2, 3, 4]
+    assert batches(1, 4, 3, seed=0).tolist() == [[0], [0], [0]]
+
+
+def test_one_cycle_rises_then_falls():
+    rates = [one_cycle(i / 100) for i in range(101)]
+    assert rates[0] == pytest.approx(1 / 25)
+    assert max(rates) == rates[30] == pytest.approx(1)
+    assert rates[100] == pytest.approx(1e-4)
+
+
+def test_scenes_without_objects_train(samples):
+    empty = type(samples[0])(samples[0].points, Boxes.empty())
+    loss = batch_loss(fresh(), [empty, samples[1]])
+    loss.backward()
+    assert torch.isfinite(loss)
+
+
+def test_a_client_returns_its_update_and_keeps_nothing(samples):
+    client = ObjectsClient(fresh().config, samples)
+    weights = to_arrays(fresh())
+    first = client.train(weights, steps=2, learning_rate=1e-3, seed=5)
+    again = client.train(weights, steps=2, learning_rate=1e-3, seed=5)
+    assert list(first.weights) == list(weights)
+    assert all(np.array_equal(first.weights[name], again.weights[name]) for name in weights)
+    assert any(not np.array_equal(first.weights[name], weights[name]) for name in weights)
+    assert first.samples == 4
+    assert first.loss == again.loss > 0
+
+
+@pytest.mark.slow
+def test_it_learns_the_toy():
+    rays = spin(beams=32, azimuths=900, field_of_view_deg=90)
+    network = ObjectsTask().network("tiny", seed=0)
+    losses = train(network, [toy_sample(seed, rays) for seed in range(60)], steps=200, seed=0)
+    test = [toy_sample(10**6 + seed, rays) for seed in range(24)]
+    truths = [Truth(f"s{i // 3}", sample.boxes, sample.ignore, Boxes.empty()) for i, sample in enumerate(test)]
+    found = detect_all(network, [sample.points for sample in test], score_threshold=0.05)
+    assert losses[-20:].mean() < 0.5 * losses[:20].mean()
+    assert score_detections(found, truths, ("Car",)).score("Car", "3d", 0.5).ap > 0.6
