@@ -52,7 +52,7 @@ def standing() -> Callable[..., Trace]:
         position = np.array([[x, y, 0.0] for *_, x, y, _ in actors]).reshape(-1, 3)
         return Trace(
             town="small",
-            time_s=np.arange(instants) * 0.1,
+            time_s=np.arange(instants, dtype=np.float64) / 10,
             actor=np.array([actor[0] for actor in actors], dtype=np.str_),
             category=np.array([actor[1] for actor in actors], dtype=np.str_),
             shape=np.array([actor[2] for actor in actors], dtype=np.int64),

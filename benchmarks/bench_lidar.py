@@ -1,0 +1,98 @@
+"""The whole LiDAR sensor against bare Embree tracing of the same rays, in one run and one thread.
+
+The reference traces the sweep's rays, and those that pass glass again behind each pane; the sensor also looks up
+materials, applies the power equation, noise and dropout, and writes points.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from flcav.sensors.echoes import AFTER_PANE_M, PANES
+from flcav.sensors.lidar import cast, draw_passes, ray_pattern, scan
+from flcav.sensors.observe import observe
+from flcav.sensors.rig import RIGS
+from flcav.world.materials import Material
+from flcav.world.scene import Scene
+from flcav.world.town import load_town
+from flcav.world.traffic import simulate
+
+
+def cpu_ms(work: Callable[[], object], repeats: int) -> float:
+    work()
+    taken = []
+    for _ in range(repeats):
+        start = time.process_time()
+        work()
+        taken.append(time.process_time() - start)
+    return 1e3 * float(np.median(taken))
+
+
+def measure(scene: Scene, rig_name: str, agent: str, repeats: int) -> dict[str, float]:
+    """Return the figures of one agent's sensor at the scene's instant; times are CPU-ms of one thread."""
+    rig, index = RIGS[rig_name], scene.index
+    lidar = rig.lidars["lidar"].settings
+    at = observe(scene, rig, agent, index, scene_name="bench", seed=0).world_from_sensor("lidar")
+    hidden = np.flatnonzero(scene.trace.actor == agent)
+    own = int(hidden[0]) if len(hidden) else None
+    rays, rng = ray_pattern(lidar), np.random.default_rng(0)
+    passes = draw_passes(lidar, rng)
+
+    def trace(directions: np.ndarray, near_m: np.ndarray | None) -> object:
+        return scene.cast(at, directions, near_m=near_m, far_m=lidar.range_m, hidden=own)
+
+    queries: list[tuple[np.ndarray, np.ndarray | None]] = [(rays, None)]
+    hits, through = scene.cast(at, rays, far_m=lidar.range_m, hidden=own), np.arange(len(rays))
+    for _ in range(PANES):
+        rows = scene.surfaces.first[np.maximum(hits.instance, 0)] + np.maximum(hits.face, 0)
+        on_glass = (hits.instance >= 0) & (scene.surfaces.material[rows] == Material.GLASS) & passes[through]
+        if not on_glass.any():
+            break
+        through, near = through[on_glass], hits.distance[on_glass] + np.float32(AFTER_PANE_M)
+        queries.append((np.ascontiguousarray(rays[through]), near))
+        hits = scene.cast(at, *queries[-1][:1], near_m=near, far_m=lidar.range_m, hidden=own)
+
+    first = cpu_ms(lambda: trace(*queries[0]), repeats)
+    bare = cpu_ms(lambda: [trace(*query) for query in queries], repeats)
+    sensor = cpu_ms(lambda: scan(scene, at, lidar, rng, own), repeats)
+    whole = cpu_ms(lambda: observe(scene, rig, agent, index, scene_name="bench", seed=0), repeats)
+    echoes = cast(scene, at, lidar, passes, own)
+    return {
+        "rays": len(rays),
+        "rays_through_glass": int(np.count_nonzero(echoes.panes)),
+        "first_trace_mray_per_s": len(rays) / first / 1e3,
+        "bare_ms": bare,
+        "sensor_ms": sensor,
+        "observe_ms": whole,
+        "bare_over_sensor": bare / sensor,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--town", default="suburb")
+    parser.add_argument("--repeats", type=int, default=50)
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    town = load_town(arguments.town)
+    scene = Scene(town, simulate(town, seed=1, cavs=1, times_s=np.array([60.0])))
+    agents = {"car": "cav0", "roadside": f"pole{town.poles.id[0]}"}
+    figures = {name: measure(scene, name, agent, arguments.repeats) for name, agent in agents.items()}
+    if arguments.json:
+        print(json.dumps(figures, indent=1))
+        return
+    print(f"{town.name}, {len(scene.trace.actor)} actors; CPU-ms of one thread, median of {arguments.repeats}")
+    for name, row in figures.items():
+        print(
+            f"{name:9} {row['rays']:6.0f} rays ({row['rays_through_glass']:.0f} through glass): "
+            f"bare {row['bare_ms']:.2f} ms ({row['first_trace_mray_per_s']:.1f} Mray/s), "
+            f"sensor {row['sensor_ms']:.2f} ms, ratio {row['bare_over_sensor']:.2f} (aim 0.50), "
+            f"annotated frame {row['observe_ms']:.2f} ms"
+        )
+
+
+if __name__ == "__main__":
+    main()
