@@ -89,38 +89,40 @@ def detect(
     `chance` (N,) in [0, 1) decides. `inverse_threshold` is 1 / P_min; `sensor_from_instance` (I, 3, 3) turns normals;
     `noise` (N,) picks a quantile of the range error, whose standard deviation is `noise_m`.
     """
+    distance, instance, face, materials, panes = echoes
+    turn = sensor_from_instance.reshape(-1, 9)
     count = 0
     for ray in range(len(directions)):
-        instance = echoes.instance[ray]
-        if instance < 0:
+        i = instance[ray]
+        if i < 0:
             continue
-        row = surfaces.first[instance] + echoes.face[ray]
-        material = echoes.material[ray]
+        row = surfaces.first[i] + face[ray]
+        material = materials[ray]
         x, y, z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        turn = sensor_from_instance[instance]
         nx, ny, nz = surfaces.normal[row, 0], surfaces.normal[row, 1], surfaces.normal[row, 2]
         cosine = abs(
-            x * (turn[0, 0] * nx + turn[0, 1] * ny + turn[0, 2] * nz)
-            + y * (turn[1, 0] * nx + turn[1, 1] * ny + turn[1, 2] * nz)
-            + z * (turn[2, 0] * nx + turn[2, 1] * ny + turn[2, 2] * nz)
+            x * (turn[i, 0] * nx + turn[i, 1] * ny + turn[i, 2] * nz)
+            + y * (turn[i, 3] * nx + turn[i, 4] * ny + turn[i, 5] * nz)
+            + z * (turn[i, 6] * nx + turn[i, 7] * ny + turn[i, 8] * nz)
         )
+        brightness = surfaces.reflectivity[material]
         if surfaces.retro[material]:
-            brightness = np.float32(RETRO_GAIN) * surfaces.reflectivity[material]
+            brightness *= np.float32(RETRO_GAIN)
         else:
-            brightness = surfaces.reflectivity[material] * cosine
+            brightness *= cosine
         if material == PAINT:
-            brightness *= surfaces.paint[instance]
-        for _ in range(echoes.panes[ray]):
+            brightness *= surfaces.paint[i]
+        for _ in range(panes[ray]):
             brightness *= np.float32(PANE_TRANSMISSION)
-        distance = echoes.distance[ray]
-        margin = (brightness * inverse_threshold / (distance * distance) - np.float32(0.7)) / np.float32(0.6)
+        power = brightness / (distance[ray] * distance[ray])
+        margin = (power * inverse_threshold - np.float32(0.7)) / np.float32(0.6)
         if chance[ray] >= keep * min(margin, np.float32(1.0)):
             continue
-        measured = distance + noise_m * QUANTILES[noise[ray]]
+        measured = distance[ray] + noise_m * QUANTILES[noise[ray]]
         points[count, 0] = x * measured
         points[count, 1] = y * measured
         points[count, 2] = z * measured
         points[count, 3] = min(brightness, np.float32(1.0))
-        actor[count] = instance - 1
+        actor[count] = i - 1
         count += 1
     return count
