@@ -35,5 +35,8 @@ def detections(*rows, label="Car"):
 def cloud_in(boxes, each=6):
     """Return a point cloud with `each` points inside every box."""
     unit = np.random.default_rng(0).uniform(-0.3, 0.3, (len(boxes), each, 3))
-    points = [transform_points(pose(*c, y), u * s) for c, s, y, u in zip(boxes.center, boxes.size, boxes.yaw, unit)]
+    points = [
+        transform_points(pose(c[0], c[1], c[2], y), u * s)
+        for c, s, y, u in zip(boxes.center, boxes.size, boxes.yaw, unit)
+    ]
     return np.pad(np.concatenate(points), ((0, 0), (0, 1))).astype(np.float32)

@@ -20,7 +20,7 @@ def tiny():
     network = second_tiny()
     with torch.no_grad():  # lively scores from random weights
         network.head.weight.normal_(0, 0.05)
-        network.head.bias.zero_()
+        network.head.bias.zero_()  # pyright: ignore[reportOptionalMemberAccess]
     return network.eval()
 
 
@@ -55,7 +55,7 @@ def test_a_cloud_in_a_batch_is_seen_as_alone(tiny, cloud):
 
 
 def test_the_order_of_points_does_not_matter(tiny, cloud):
-    shuffled = np.random.default_rng(0).permutation(cloud)
+    shuffled = cloud[np.random.default_rng(0).permutation(len(cloud))]
     one, other = detect(tiny, cloud, score_threshold=0.5), detect(tiny, shuffled, score_threshold=0.5)
     assert np.allclose(one.array(), other.array(), atol=1e-3)
 
