@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -15,8 +14,8 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes
 from flcav.report import style
+from flcav.report.sweeps import GROUND_M, draw_boxes, on_page
 
-GROUND_M = 0.25  # points below are drawn as ground
 HEIGHTS_M = Normalize(0.0, 4.0, clip=True)
 HEIGHT_COLOURS = ListedColormap(colormaps["turbo"](np.linspace(0.08, 0.92, 64)))
 
@@ -57,17 +56,12 @@ def draw_view(axes: Axes, view: View) -> None:
     _draw_rings(axes, view.range_m)
     _draw_points(axes, view.points)
     seen = view.returns > 0
-    _draw_boxes(axes, view.truth[~seen], style.MUTED, dash=(0, (3, 2)))
-    _draw_boxes(axes, view.truth[seen], style.INK)
+    draw_boxes(axes, view.truth[~seen], style.MUTED, width=0.8, dashed=True)
+    draw_boxes(axes, view.truth[seen], style.INK, width=0.8)
     if view.predictions is not None:
-        _draw_boxes(axes, view.predictions, style.PURPLE, width=1.6)
+        draw_boxes(axes, view.predictions, style.PURPLE, width=1.6)
     _draw_agent(axes, view.agent_size)
     style.scale_bar(axes, 10)
-
-
-def _up(xy: NDArray) -> NDArray:
-    """Return (..., 2) agent coordinates x ahead, y left as picture coordinates."""
-    return np.stack((-xy[..., 1], xy[..., 0]), axis=-1)
 
 
 def _draw_rings(axes: Axes, range_m: float) -> None:
@@ -90,22 +84,11 @@ def _draw_rings(axes: Axes, range_m: float) -> None:
 
 def _draw_points(axes: Axes, points: NDArray) -> None:
     ground = points[:, 2] < GROUND_M
-    axes.scatter(*_up(points[ground, :2]).T, s=0.35, color=style.POINT, linewidths=0, zorder=1)
+    axes.scatter(*on_page(points[ground, :2]).T, s=0.35, color=style.POINT, linewidths=0, zorder=1)
     raised = points[~ground]
     raised = raised[np.argsort(raised[:, 2], kind="stable")]
     colours = HEIGHT_COLOURS(HEIGHTS_M(raised[:, 2]))
-    axes.scatter(*_up(raised[:, :2]).T, s=2.2, c=colours, linewidths=0, zorder=4)
-
-
-def _draw_boxes(axes: Axes, boxes: Boxes, colour: str, width: float = 0.8, dash: str | tuple = "solid") -> None:
-    """Draw footprints, each with a tick from its centre through the middle of its front."""
-    corners = boxes.corners()[:, :4, :2]
-    outlines = list(_up(corners[:, [0, 1, 2, 3, 0]]))
-    axes.add_collection(LineCollection(outlines, colors=colour, linewidths=width, linestyles=[dash], zorder=3))
-    ahead = np.stack((np.cos(boxes.yaw), np.sin(boxes.yaw)), axis=1)
-    tip = boxes.center[:, :2] + ahead * (boxes.size[:, :1] / 2 + 0.6)
-    ticks = np.stack((boxes.center[:, :2], tip), axis=1)
-    axes.add_collection(LineCollection(list(_up(ticks)), colors=colour, linewidths=width, zorder=3))
+    axes.scatter(*on_page(raised[:, :2]).T, s=2.2, c=colours, linewidths=0, zorder=4)
 
 
 def _draw_agent(axes: Axes, size: tuple[float, float] | None) -> None:
@@ -114,7 +97,7 @@ def _draw_agent(axes: Axes, size: tuple[float, float] | None) -> None:
         return
     length, width = size[0] / 2, size[1] / 2
     outline = np.array([[length, 0], [length - 1, width], [-length, width], [-length, -width], [length - 1, -width]])
-    axes.add_patch(Polygon(_up(outline), facecolor=style.INK, edgecolor="white", linewidth=0.6, zorder=5))
+    axes.add_patch(Polygon(on_page(outline), facecolor=style.INK, edgecolor="white", linewidth=0.6, zorder=5))
 
 
 def _legend(view: View) -> list[Line2D]:

@@ -76,14 +76,20 @@ def draw_megabytes(axes: Axes, ledger_by_stage: Sequence[Row], budgets: Mapping[
 
 
 def draw_arms(axes: Axes, rows: Sequence[Row]) -> None:
-    """Draw a forest plot: one line per row (arm, ap50, low, high), its interval and its number."""
+    """Draw a forest plot: one line per row (arm, town, ap50, low, high), with its numbers."""
     for y, row in enumerate(rows):
-        axes.plot([row["low"], row["high"]], [y, y], color=style.BLUE, linewidth=2)
-        axes.plot(row["ap50"], y, "s", color=style.BLUE, markersize=6)
+        colour = style.TOWN_COLOURS.get(row["town"], style.GREEN)
+        axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=2)
+        axes.plot(row["ap50"], y, "s", color=colour, markersize=6)
         axes.annotate(
-            f"{row['ap50']:.3f}", (1.0, y), (4, 0), xycoords=axes.get_yaxis_transform(), textcoords="offset points",
-            va="center", fontsize=style.SMALL,
-        )  # fmt: skip
+            f"{row['ap50']:.3f}  ({row['low']:.3f}–{row['high']:.3f})",
+            (1.0, y),
+            (6, 0),
+            xycoords=axes.get_yaxis_transform(),
+            textcoords="offset points",
+            va="center",
+            fontsize=style.SMALL,
+        )
     axes.set_yticks(range(len(rows)), [row["arm"] for row in rows])
     axes.set(ylim=(len(rows) - 0.5, -0.5))
     axes.grid(axis="x")

@@ -11,6 +11,7 @@ from matplotlib.collections import PatchCollection, PolyCollection
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
+from flcav.geometry import Boxes
 from flcav.report import style
 from flcav.world.town import Town
 
@@ -18,7 +19,7 @@ Array = NDArray[np.float64]
 
 MISS: dict[str, Any] = {
     "marker": "o",
-    "markersize": 4.5,
+    "markersize": 5,
     "color": style.MISSED,
     "markeredgecolor": "white",
     "markeredgewidth": 0.5,
@@ -48,18 +49,11 @@ def draw_town(axes: Axes, town: Town) -> None:
     axes.add_collection(PolyCollection(list(town.roads), facecolor=style.ROAD, edgecolor=style.ROAD, linewidth=0.5))
     trees = [Circle((x, y), radius) for x, y, _, radius in town.trees]
     axes.add_collection(PatchCollection(trees, facecolor=style.TREE, linewidth=0))
-    axes.add_collection(PolyCollection(list(rectangles(town.buildings[:, :5])), facecolor=style.BUILDING, linewidth=0))
+    x, y, yaw, length, width, height = town.buildings.T
+    houses = Boxes.from_array(np.c_[x, y, height / 2, length, width, height, yaw], "building")
+    outlines = houses.corners()[:, :4, :2]
+    axes.add_collection(PolyCollection(list(outlines), facecolor=style.BUILDING, linewidth=0))
     style.scale_bar(axes, 50)
-
-
-def rectangles(rows: Array) -> Array:
-    """Return (N, 4, 2) corners of rectangles given as (N, 5) rows x, y, yaw, length, width."""
-    signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
-    along, across = signs[None, :, 0] * rows[:, 3:4], signs[None, :, 1] * rows[:, 4:5]
-    cos, sin = np.cos(rows[:, 2:3]), np.sin(rows[:, 2:3])
-    x = rows[:, 0:1] + along * cos - across * sin
-    y = rows[:, 1:2] + along * sin + across * cos
-    return np.stack((x, y), axis=-1)
 
 
 def draw_errors(axes: Axes, scene: ErrorMap) -> None:

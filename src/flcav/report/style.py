@@ -19,7 +19,8 @@ ROAD = "#dfdfdd"
 SIDEWALK = "#f1f0ee"
 BUILDING = "#cfc9c0"
 TREE = "#cfdccb"
-POINT = "#9a9a9a"
+POINT = "#7d7d7d"  # a LiDAR return
+GROUND = "#c4c4c4"  # a LiDAR return from the ground
 
 BLUE = "#0072b2"
 SKY = "#56b4e9"

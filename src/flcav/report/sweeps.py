@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flcav.geometry import Boxes
 from flcav.report import style
 
-Array = NDArray[np.float64]
+GROUND_M = 0.25  # returns less than this above the ground are drawn as ground
 Extent = tuple[float, float, float]  # shown behind (negative), ahead, aside [m]
 
 
@@ -30,21 +30,24 @@ class Sweep:
     """One sweep seen by two networks. One frame for all: x forward, y left, at the sensor or its vehicle."""
 
     points: NDArray[np.float32]  # (P, >=3) x, y, z [m]
+    ground_m: float  # z of the ground there
     targets: Boxes  # (M,)
     before: Detections
     after: Detections
 
 
-def on_page(xy: Array) -> Array:
+def on_page(xy: NDArray) -> NDArray:
     """Return (..., 2) x ahead, y left as picture coordinates: across, up."""
     return np.stack((-xy[..., 1], xy[..., 0]), axis=-1)
 
 
-def draw_points(axes: Axes, points: NDArray[np.float32], extent: Extent) -> None:
-    """Draw the (P, >=3) points within `extent`, and set the axes to it."""
+def draw_points(axes: Axes, points: NDArray[np.float32], ground_m: float, extent: Extent) -> None:
+    """Draw the (P, >=3) points within `extent`, what stands on the ground darker than it, and set the axes to it."""
     behind, ahead, aside = extent
     shown = points[(points[:, 0] > behind) & (points[:, 0] < ahead) & (np.abs(points[:, 1]) < aside)]
-    axes.scatter(-shown[:, 1], shown[:, 0], s=0.6, color=style.POINT, linewidths=0, rasterized=True)
+    low = shown[:, 2] < ground_m + GROUND_M
+    for part, colour, size in ((shown[low], style.GROUND, 0.5), (shown[~low], style.POINT, 1.0)):
+        axes.scatter(*on_page(part[:, :2]).T, s=size, color=colour, linewidths=0, rasterized=True)
     axes.set(xlim=(-aside, aside), ylim=(behind, ahead), aspect="equal")
 
 
@@ -56,16 +59,15 @@ def draw_boxes(
     tip = boxes.center[:, :2] + ahead * (boxes.size[:, :1] / 2 + 0.6)
     ticks = on_page(np.stack((boxes.center[:, :2], tip), axis=1))
     outlines = on_page(boxes.corners()[:, :4, :2])
+    look = {"edgecolor": colour, "linewidth": width, "zorder": 3}
     dash = (0, (3, 2)) if dashed else "solid"
-    axes.add_collection(
-        PolyCollection(list(outlines), facecolor=(colour, fill), edgecolor=colour, linewidth=width, linestyle=[dash])
-    )
-    axes.add_collection(LineCollection(list(ticks), colors=colour, linewidths=width))
+    axes.add_collection(PolyCollection(list(outlines), facecolor=(colour, fill), linestyle=[dash], **look))
+    axes.add_collection(LineCollection(list(ticks), **look))
 
 
 def draw_detections(axes: Axes, sweep: Sweep, found: Detections, extent: Extent) -> None:
     """Draw the sweep, its targets and what one network found: hits, misses and false positives told apart."""
-    draw_points(axes, sweep.points, extent)
+    draw_points(axes, sweep.points, sweep.ground_m, extent)
     draw_boxes(axes, sweep.targets, style.INK)
     draw_boxes(axes, sweep.targets[~found.found], style.MISSED, fill=0.6)
     draw_boxes(axes, found.boxes[found.hit], style.HIT, fill=0.35)

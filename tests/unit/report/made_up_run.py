@@ -131,6 +131,7 @@ def sweep() -> Sweep:
     after = Boxes.from_array(near[[0, 1, 2, 4]], "Car", [0.9, 0.9, 0.6, 0.5])
     return Sweep(
         points=np.concatenate((ground, *on_boxes)).astype(np.float32),
+        ground_m=-1.7,
         targets=targets,
         before=Detections("Pretrained", before, np.array([True, True, False]), np.array([1, 1, 0, 0, 0], dtype=bool)),
         after=Detections("Edge + cloud FL", after, np.ones(4, dtype=bool), np.array([1, 1, 1, 0, 1], dtype=bool)),

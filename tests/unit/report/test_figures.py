@@ -1,0 +1,118 @@
+from collections.abc import Callable
+from dataclasses import replace
+
+import made_up_run
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.text import Text
+
+from flcav.report import figures, style
+
+RESULTS = made_up_run.results()
+TESTED = RESULTS["stages"] + RESULTS["ring"]
+BUDGETS = {link: row["budget_mb"] for link, row in RESULTS["ledger"].items()}
+ARMS = [
+    {"arm": arm, "town": town, "ap50": ap50, "low": ap50 - 0.03, "high": ap50 + 0.04}
+    for town in ("grid", "ring")
+    for arm, ap50 in (("pretrained", 0.41), ("edge FL", 0.5), ("oracle", 0.57))
+]
+
+DRAWN: dict[str, Callable[[], Figure]] = {
+    "town_map": lambda: figures.town_map(made_up_run.error_map()),
+    "before_after": lambda: figures.before_after(made_up_run.sweep()),
+    "ap_by_round": lambda: figures.ap_by_round(RESULTS["rounds"], TESTED),
+    "megabytes": lambda: figures.megabytes(RESULTS["ledger_by_stage"], BUDGETS),
+    "arms": lambda: figures.arms(ARMS),
+    "overview": lambda: figures.overview(made_up_run.error_map(), made_up_run.sweep(), RESULTS["rounds"], TESTED),
+}
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_pictures_are_legible_repeatable_and_leave_no_state(name: str) -> None:
+    before = dict(matplotlib.rcParams)
+    figure = DRAWN[name]()
+    picture = style.png(figure, dpi=50)
+    assert dict(matplotlib.rcParams) == before
+    assert picture.startswith(b"\x89PNG")
+    assert style.png(DRAWN[name](), dpi=50) == picture
+    shown = [text for text in figure.findobj(Text) if isinstance(text, Text) and text.get_visible() and text.get_text()]
+    assert min(float(text.get_fontsize()) for text in shown) >= 9
+
+
+def test_the_map_shows_every_error_once_and_the_reach_of_the_chosen_pole() -> None:
+    scene = made_up_run.error_map()
+    axes = figures.town_map(scene).axes[0]
+    by_label = {str(line.get_label()): line for line in axes.get_lines()}
+    misses, falses = scene.missed.sum(), (~scene.missed).sum()
+    for label, own in ((f"object missed ({misses})", scene.missed), (f"false positive ({falses})", ~scene.missed)):
+        np.testing.assert_allclose(np.column_stack(by_label[label].get_data()), scene.errors[own, :2])
+    rim = next(patch for patch in axes.patches if isinstance(patch, Circle) and not patch.get_fill())
+    x, y, z = scene.town.poles.position[list(scene.town.poles.id).index(2)]
+    assert rim.get_center() == pytest.approx((x, y))
+    assert rim.get_radius() == pytest.approx(np.sqrt(scene.range_m**2 - z**2))
+    words = {text.get_text() for text in axes.texts}
+    assert {str(number) for number in scene.town.poles.id} <= words
+    assert {"placed", "densest traffic"} <= words
+
+
+def test_a_chosen_pole_that_is_also_the_densest_says_both() -> None:
+    axes = figures.town_map(replace(made_up_run.error_map(), densest=2)).axes[0]
+    assert "placed and densest traffic" in {text.get_text() for text in axes.texts}
+
+
+def test_sweeps_count_what_was_found_missed_and_false() -> None:
+    before, after = figures.before_after(made_up_run.sweep()).axes
+    counts = [[text.get_text() for text in axes.get_legend().get_texts()] for axes in (before, after)]  # type: ignore
+    assert counts == [["2 found", "3 missed", "1 false"], ["4 found", "1 missed", "0 false"]]
+
+
+def test_ahead_is_up_and_left_is_left() -> None:
+    sweep = made_up_run.sweep()
+    axes = figures.before_after(sweep).axes[0]
+    centres = [
+        np.asarray(path.vertices)[:4].mean(axis=0)
+        for boxes in axes.collections
+        for path in boxes.get_paths()
+        if len(np.asarray(path.vertices)) == 5
+    ]
+    for x, y, _ in sweep.targets.center:
+        assert np.isclose(centres, (-y, x)).all(axis=1).any()
+
+
+def test_tested_values_stand_at_the_ends_of_their_stages() -> None:
+    axes = figures.ap_by_round(RESULTS["rounds"], TESTED).axes[0]
+    assert _tested(axes) == {0: {0.412, 0.381}, 1: {0.503, 0.447}, 2: {0.511, 0.468}}
+
+
+def test_a_stage_without_rounds_takes_its_tested_values_with_it() -> None:
+    rounds = [row for row in RESULTS["rounds"] if row["stage"] != "edge FL"]
+    axes = figures.ap_by_round(rounds, TESTED).axes[0]
+    assert _tested(axes) == {0: {0.412, 0.381}, 1: {0.511, 0.468}}
+    assert {"pretraining", "cloud FL"} <= {text.get_text() for text in axes.texts}
+
+
+def _tested(axes) -> dict[int, set[float]]:
+    """Return the values with error bars by the place of their stage on the x axis."""
+    out: dict[int, set[float]] = {}
+    for bars in axes.containers:
+        x, y = bars[0].get_data()
+        out.setdefault(int(x[0]), set()).add(round(float(y[0]), 3))
+    return out
+
+
+def test_bars_add_up_to_the_ledger_and_budgets_stand_where_they_are() -> None:
+    axes = figures.megabytes(RESULTS["ledger_by_stage"], BUDGETS).axes[0]
+    for y, link in enumerate(BUDGETS):
+        width = sum(bar.get_width() for bar in axes.patches if bar.get_y() < y < bar.get_y() + bar.get_height())  # type: ignore
+        assert width == pytest.approx(sum(row["mb"] for row in RESULTS["ledger_by_stage"] if row["link"] == link))
+    assert [line.get_xdata()[0] for line in axes.get_lines()] == list(BUDGETS.values())  # type: ignore
+
+
+def test_arms_stand_in_a_panel_per_town_with_their_intervals() -> None:
+    grid, ring = figures.arms(ARMS).axes
+    assert [grid.get_title(loc="left"), ring.get_title(loc="left")] == ["grid", "ring"]
+    assert [label.get_text() for label in ring.get_yticklabels()] == ["pretrained", "edge FL", "oracle"]
+    assert "0.500  (0.470–0.540)" in {text.get_text() for text in ring.texts}
