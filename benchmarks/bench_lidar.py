@@ -7,7 +7,7 @@ materials, applies the power equation, noise and dropout, and writes points.
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,14 +21,15 @@ from flcav.world.town import load_town
 from flcav.world.traffic import simulate
 
 
-def cpu_ms(work: Callable[[], object], repeats: int) -> float:
-    work()
-    taken = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        taken.append(time.process_time() - start)
-    return 1e3 * float(np.median(taken))
+def cpu_ms(works: Sequence[Callable[[], object]], repeats: int) -> list[float]:
+    """Return the median CPU-ms of each of `works`, run in turns so that a busy machine slows them alike."""
+    taken = np.empty((repeats, len(works)))
+    for repeat in range(-1, repeats):
+        for number, work in enumerate(works):
+            start = time.process_time()
+            work()
+            taken[repeat, number] = time.process_time() - start
+    return [1e3 * float(value) for value in np.median(taken, axis=0)]
 
 
 def measure(scene: Scene, rig_name: str, agent: str, repeats: int) -> dict[str, float]:
@@ -55,10 +56,15 @@ def measure(scene: Scene, rig_name: str, agent: str, repeats: int) -> dict[str, 
         queries.append((np.ascontiguousarray(rays[through]), near))
         hits = scene.cast(at, *queries[-1][:1], near_m=near, far_m=lidar.range_m, hidden=own)
 
-    first = cpu_ms(lambda: trace(*queries[0]), repeats)
-    bare = cpu_ms(lambda: [trace(*query) for query in queries], repeats)
-    sensor = cpu_ms(lambda: scan(scene, at, lidar, rng, own), repeats)
-    whole = cpu_ms(lambda: observe(scene, rig, agent, index, scene_name="bench", seed=0), repeats)
+    first, bare, sensor, whole = cpu_ms(
+        (
+            lambda: trace(*queries[0]),
+            lambda: [trace(*query) for query in queries],
+            lambda: scan(scene, at, lidar, rng, own),
+            lambda: observe(scene, rig, agent, index, scene_name="bench", seed=0),
+        ),
+        repeats,
+    )
     echoes = cast(scene, at, lidar, passes, own)
     return {
         "rays": len(rays),
