@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 
-from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.trainable import Update, Weights
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"
 SAMPLES, LOSS = "num-examples", "loss"
@@ -40,7 +40,7 @@ def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
     return {name: array.numpy() for name, array in arrays.items()}
 
 
-def reply(message: Message, update: LocalUpdate) -> Message:
+def reply(message: Message, update: Update) -> Message:
     """Return the answer to a training message."""
     metrics = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
     return Message(RecordDict({ARRAYS: to_arrays(update.weights), METRICS: metrics}), reply_to=message)

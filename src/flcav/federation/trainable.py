@@ -9,18 +9,37 @@ from numpy.typing import NDArray
 Weights = Mapping[str, NDArray[Any]]  # name -> array, parameters and buffers, in a fixed order
 
 
-@dataclass(frozen=True)
-class LocalUpdate:
+class Update(Protocol):
     """What one client's local training produced."""
 
+    @property
+    def weights(self) -> Weights:
+        """Return the weights it ended with."""
+        ...
+
+    @property
+    def samples(self) -> int:
+        """Return how many distinct samples it trained on: its weight in the average."""
+        ...
+
+    @property
+    def loss(self) -> float:
+        """Return the mean training loss over the local steps."""
+        ...
+
+
+@dataclass(frozen=True)
+class LocalUpdate:
+    """A plain `Update`."""
+
     weights: Weights
-    samples: int  # distinct samples it trained on: its weight in the average
-    loss: float  # mean training loss over the local steps
+    samples: int
+    loss: float
 
 
 class Trainable(Protocol):
     """One client's copy of a task: its own data and a network to train. The network that drives is another one."""
 
-    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> Update:
         """Return the update of `steps` local steps from `weights`; the same arguments give the same update."""
         ...

@@ -1,0 +1,179 @@
+"""Stages II and III as steps: who trains on what, from which weights, on whose account."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.numpy import load_file, save_file
+
+from flcav.dataset.store import Dataset
+from flcav.experiments.pretraining import LEDGER, WEIGHTS, train_on
+from flcav.experiments.protocol import REGIONS, TASK, Protocol
+from flcav.experiments.recording import opened
+from flcav.experiments.steps import Work
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.stages import EdgeServer, OnRound, Schedule, federate
+from flcav.federation.trainable import Trainable, Weights
+from flcav.files import atomic_path, write_json
+from flcav.fusion.labels import label_sample
+from flcav.fusion.road import RoadView, road_view
+from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.perception.objects.client import ObjectsClient
+from flcav.perception.objects.detect import detect_all
+from flcav.perception.objects.model import Second, second
+from flcav.perception.objects.samples import Sample, sample_from_frame
+from flcav.perception.objects.weights import from_arrays, load_network, save_network, to_arrays
+from flcav.seeds import child_seed
+
+ROUND = "round.json"
+
+
+def edge_fl(work: Work, town: str, sensor: str, protocol: dict[str, Any]) -> dict[str, Any]:
+    """Stage II in one region; `sensor`: the pole that helps label, "chosen" | "densest" | "none"."""
+    setting = Protocol.model_validate(protocol)
+    torch.set_num_threads(1)
+    rounds = int(work.result("plan")["tasks"][0]["edge_rounds"])
+    book = _share_of(Ledger.load(work.inputs["pretrain"] / LEDGER), setting, town)
+    pole = None if sensor == "none" else int(work.result(f"{town}-place")[sensor])
+    clients = region(work, town, pole, setting, book)
+    network = load_network(work.inputs["pretrain"] / WEIGHTS)
+    schedule = _schedule(setting, rounds, "edge", town)
+    account = Account(book, "edge", TASK, "wireless")
+    start, done = _resumed(work, to_arrays(network), book)
+    federate(clients, start, schedule, account, done=done, on_round=_checkpoint(work, book, schedule.rounds))
+    return _finish(work, network, book, rounds) | {"pole": pole}
+
+
+def cloud_fl(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
+    """Stage III: the edge servers of all regions federate with the cloud."""
+    setting = Protocol.model_validate(protocol)
+    torch.set_num_threads(1)
+    rounds, k = int(work.result("plan")["tasks"][0]["cloud_rounds"]), setting.edge_rounds_per_cloud_round
+    book = Ledger(Budget(setting.wireless_mb, setting.wireline_mb), _spent(work))
+    wireless, wireline = (Account(book, "cloud", TASK, link) for link in ("wireless", "wireline"))
+    network = load_network(work.inputs["pretrain"] / WEIGHTS)
+    start, done = _resumed(work, to_arrays(network), book)
+    servers: dict[str, Trainable] = {}
+    for town in REGIONS:
+        own = to_arrays(load_network(work.inputs[f"{town}-edge-chosen"] / WEIGHTS))
+        clients = region(work, town, int(work.result(f"{town}-place")["chosen"]), setting, None)
+        servers[town] = EdgeServer(clients, k, wireless, own, cloud_rounds_done=done)
+    schedule = _schedule(setting, rounds, "cloud", "")
+    federate(servers, start, schedule, wireline, done=done, on_round=_checkpoint(work, book, rounds))
+    return _finish(work, network, book, rounds)
+
+
+def more_training(work: Work, source: str, protocol: dict[str, Any]) -> dict[str, Any]:
+    """Centralised training from the pretrained weights, as many steps as stage II takes in `grid`, on ground truth.
+
+    `source` "suburb": more pretraining on the uploaded samples. "grid": the oracle, on the frames of stage II.
+    """
+    setting = Protocol.model_validate(protocol)
+    torch.set_num_threads(1)
+    network = load_network(work.inputs["pretrain"] / WEIGHTS)
+    if source == "suburb":
+        data, chosen = opened(work, "suburb-pool"), work.result("pretrain")["uploaded"]
+    else:
+        data = opened(work, "grid-edge")
+        chosen = [i for i, key in enumerate(data.keys) if key.agent.startswith("cav")]
+    samples = [sample_from_frame(data.frame(i), network.config) for i in chosen]
+    rounds = int(work.result("plan")["tasks"][0]["edge_rounds"])
+    train_on(
+        network, samples, setting.training, rounds, setting.vehicles["grid"], child_seed(setting.seed, "more", source)
+    )
+    save_network(network, work.folder / WEIGHTS)
+    return {"samples": len(samples), "rounds": rounds}
+
+
+def region(work: Work, town: str, pole: int | None, setting: Protocol, book: Ledger | None) -> dict[str, ObjectsClient]:
+    """Return a region's vehicles with their frames, labelled without ground truth.
+
+    The road's views are booked as downlink where a `book` is given (once: the labels are kept through the stages).
+    """
+    frozen = load_network(work.inputs["pretrain"] / WEIGHTS)
+    threshold = work.result("pretrain")["threshold"]
+    data = opened(work, f"{town}-edge")
+    views = _views(data, pole)
+    samples: dict[str, list[Sample]] = {}
+    vehicles = [i for i, key in enumerate(data.keys) if key.agent.startswith("cav")]
+    for done, i in enumerate(vehicles):
+        key, frame = data.keys[i], data.frame(i)
+        detections = detect_all(frozen, [frame.lidar["lidar"]], score_threshold=threshold)[0]
+        told = [views[key.scene, key.index]] if pole is not None else []
+        name = f"{town}/{key.agent}"
+        samples.setdefault(name, []).append(label_sample(frame, detections, told, frozen.config))
+        for view in told if book else ():
+            book.enter(LedgerEntry("edge", TASK, "wireless", "down", 0, name, len(view.message())))  # type: ignore[union-attr]
+        work.report(done, len(vehicles), "labels")
+    batch = setting.training.batch
+    return {name: ObjectsClient(frozen.config, samples[name], batch=batch) for name in sorted(samples)}
+
+
+def _views(data: Dataset, pole: int | None) -> dict[tuple[str, int], RoadView]:
+    seen = [(i, key) for i, key in enumerate(data.keys) if key.agent == f"pole{pole}"]
+    return {(key.scene, key.index): road_view(data.frame(i)) for i, key in seen}
+
+
+def _schedule(setting: Protocol, rounds: int, *names: str) -> Schedule:
+    training = setting.training
+    rates = training.local_learning_rate, training.final_learning_rate
+    return Schedule(rounds, training.local_steps, *rates, child_seed(setting.seed, *names))
+
+
+def _share_of(stage_one: Ledger, setting: Protocol, town: str) -> Ledger:
+    """Return a region's own ledger: after stage I, its share of the wireless budget by its number of vehicles."""
+    share = setting.vehicles[town] / sum(setting.vehicles.values())
+    return Ledger(Budget(share * stage_one.left_mb("wireless"), 0.0))
+
+
+def _spent(work: Work) -> list[LedgerEntry]:
+    """Return what the chosen arm's earlier stages have spent, in their order."""
+    ledgers = ["pretrain", *(f"{town}-edge-chosen" for town in REGIONS)]
+    return [entry for name in ledgers for entry in Ledger.load(work.inputs[name] / LEDGER).entries]
+
+
+def _checkpoint(work: Work, book: Ledger, rounds: int) -> OnRound:
+    """Keep each round's weights, and what the ledger held then, so that a killed step goes on after it."""
+
+    def keep(round_: int, weights: Weights, loss: float) -> None:
+        with atomic_path(work.folder / f"round{round_}.safetensors") as temporary:
+            save_file(dict(weights), temporary)
+        write_json(work.folder / f"round{round_}.json", {"loss": loss})
+        book.save(work.folder / LEDGER)
+        write_json(work.folder / ROUND, {"round": round_, "entries": len(book.entries)})
+        work.report(round_, rounds, f"loss {loss:.3f}")
+
+    return keep
+
+
+def _resumed(work: Work, weights: Mapping[str, Any], book: Ledger) -> tuple[Weights, int]:
+    """Return the weights to go on from and the rounds done, with the ledger as it was then."""
+    if not (work.folder / ROUND).exists():
+        return weights, 0
+    state = json.loads((work.folder / ROUND).read_text())
+    kept = Ledger.load(work.folder / LEDGER).entries[: state["entries"]]
+    for entry in kept[len(book.entries) :]:
+        book.enter(entry)
+    return load_file(round_path(work.folder, state["round"])), state["round"]
+
+
+def round_path(folder: Path, round_: int) -> Path:
+    """Return where a federation's weights after a round are kept."""
+    return folder / f"round{round_}.safetensors"
+
+
+def round_network(config_of: Second, folder: Path, round_: int) -> Second:
+    """Return the network of `config_of` with a federation's weights after a round."""
+    network = second(config_of.config)
+    from_arrays(network, load_file(round_path(folder, round_)))
+    return network.eval()
+
+
+def _finish(work: Work, network: Second, book: Ledger, rounds: int) -> dict[str, Any]:
+    if rounds:
+        network = round_network(network, work.folder, rounds)
+    save_network(network, work.folder / WEIGHTS)
+    book.save(work.folder / LEDGER)
+    return {"rounds": rounds}
