@@ -141,11 +141,11 @@ def test_a_full_disk_exits_1_and_leaves_no_dataset(
     recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     def full(path: Path, data: bytes) -> int:
-        raise OSError(28, "No space left on device", str(path))
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
     assert flcav("record", recipe, "--out", tmp_path / "data") == 1
-    assert "No space left on device" in capsys.readouterr().err
+    assert capsys.readouterr().err.endswith(f"flcav: {tmp_path / 'data'}: No space left on device\n")
     monkeypatch.undo()
     assert flcav("validate", tmp_path / "data") == 2
 

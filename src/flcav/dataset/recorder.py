@@ -42,13 +42,25 @@ def record(source: Source, out: Path, *, jobs: int = 1, progress: Report = silen
     if jobs < 1:
         raise InputError(f"jobs = {jobs}: must be at least 1")
     header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))
-    if not _claim(out, header):
-        return False
+    try:
+        if not _claim(out, header):
+            return False
+        _write(source, out, jobs, progress)
+        _assemble(out, list(source.scenes()), header)
+    except OSError as error:
+        if error.strerror and error.filename is None:  # a write does not know its file
+            error.filename = str(out)
+        raise
+    return True
+
+
+def _write(source: Source, out: Path, jobs: int, progress: Report) -> None:
+    """Write the scenes that are not there yet below `.recording`."""
     work = out / WORK
-    scenes = list(source.scenes())
-    counts = {scene: source.frame_count(scene) for scene in scenes}
-    pending = [scene for scene in scenes if not (work / scene).is_dir()]
-    total, kept = sum(counts.values()), sum(counts.values()) - sum(counts[scene] for scene in pending)
+    counts = {scene: source.frame_count(scene) for scene in source.scenes()}
+    pending = [scene for scene in counts if not (work / scene).is_dir()]
+    total = sum(counts.values())
+    kept = total - sum(counts[scene] for scene in pending)
     start = time.perf_counter()
 
     def wrote(count: int) -> None:
@@ -56,8 +68,6 @@ def record(source: Source, out: Path, *, jobs: int = 1, progress: Report = silen
         progress(kept + count, total, f"{rate:.1f} frames/s")
 
     write_scenes(source, pending, work, jobs, wrote)
-    _assemble(out, scenes, header)
-    return True
 
 
 def _claim(out: Path, header: dict[str, Any]) -> bool:
@@ -73,7 +83,8 @@ def _claim(out: Path, header: dict[str, Any]) -> bool:
         _refuse_other(out, "holds the unfinished recording of another", json.loads(begun.read_text()), header)
     elif out.exists() and any(path.name != WORK for path in out.iterdir()):
         raise InputError(f"{out}: holds other files; record into a new or empty folder")
-    write_json(begun, header)
+    else:
+        write_json(begun, header)
     return True
 
 
