@@ -20,7 +20,7 @@ def tiny():
     network = second_tiny()
     with torch.no_grad():  # lively scores from random weights
         network.head.weight.normal_(0, 0.05)
-        network.head.bias.zero_()  # pyright: ignore[reportOptionalMemberAccess]
+        network.head.bias.zero_()
     return network.eval()
 
 

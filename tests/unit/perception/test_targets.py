@@ -8,8 +8,10 @@ import pytest
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects import Sample, second_tiny
 from flcav.perception.objects.anchors import anchor_boxes
-from flcav.perception.objects.augment import Augmentation, augment, transformed
+from flcav.perception.objects.augment import augment, transformed
+from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.model import head_shape
+from flcav.perception.objects.samples import near_range
 from flcav.perception.objects.targets import assign, decode, direction_of, encode, free_cells
 
 CONFIG = second_tiny().config
@@ -107,3 +109,15 @@ def test_augmentation_is_undone_by_its_inverse():
 def test_samples_are_immutable():
     with pytest.raises(dataclasses.FrozenInstanceError):
         Sample(NO_POINTS, Boxes.empty()).points = NO_POINTS  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_no_point_is_left_out_that_an_augmentation_brings_into_range():
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-60, -60, -4, 0), (60, 60, 2, 1), (4000, 4)).astype(np.float32)
+    kept = {tuple(point) for point in near_range(points, CONFIG)}
+    low, high = CONFIG.range_m[:3], CONFIG.range_m[3:]
+    for seed in range(20):
+        moved = augment(Sample(points, Boxes.empty()), Augmentation(), np.random.default_rng(seed)).points[:, :3]
+        inside = ((moved >= low) & (moved < high)).all(1)
+        assert {tuple(point) for point in points[inside]} <= kept
+    assert len(kept) < 0.5 * len(points)

@@ -1,20 +1,12 @@
 """Random mirrorings, turns and scales of a whole sample: the global augmentations of SECOND, sec. 3.2.1."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from flcav.geometry import Boxes
+from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.samples import Sample
-
-
-@dataclass(frozen=True)
-class Augmentation:
-    """How far to go."""
-
-    flip: bool = True  # left-right, in one of two samples
-    turn_rad: float = 0.3  # uniform to either side
-    scale: float = 0.03  # uniform in 1 -/+ scale
 
 
 def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Sample:

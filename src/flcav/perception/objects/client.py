@@ -7,8 +7,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.perception.objects.augment import Augmentation
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.config import Augmentation, SecondConfig
 from flcav.perception.objects.model import second
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.train import GLOBAL, train_steps

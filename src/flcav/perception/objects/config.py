@@ -1,4 +1,4 @@
-"""Which network: the record that rebuilds one, stored beside its weights."""
+"""Which network, and how it is trained: the first is stored beside the weights and rebuilds it."""
 
 import math
 from typing import Annotated
@@ -64,3 +64,12 @@ ANCHORS = {
     ),
     "Cyclist": Anchor(name="Cyclist", length_m=1.76, width_m=0.6, height_m=1.73, matched_iou=0.5, unmatched_iou=0.35),
 }
+
+
+@dataclass(frozen=True, config=STRICT)
+class Augmentation:
+    """How far training mirrors, turns and scales its samples."""
+
+    flip: bool = True  # left-right, in one of two samples
+    turn_rad: float = 0.3  # uniform to either side
+    scale: float = 0.03  # uniform in 1 -/+ scale

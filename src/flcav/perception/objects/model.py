@@ -63,15 +63,19 @@ def head_shape(config: SecondConfig) -> tuple[int, int]:
     return rows, columns
 
 
-def _normalized(convolution: nn.Conv2d | nn.ConvTranspose2d) -> list[nn.Module]:
-    return [convolution, NormReLU(convolution.out_channels)]
+class Pointwise(nn.Linear):
+    """1x1 convolution of (B, C, H, W) maps, as the one matrix product it is."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Return (B, C', H, W)."""
+        return super().forward(input.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 def _scale(inputs: int, outputs: int, stride: int, layers: int) -> nn.Sequential:
     """Return one scale of the bird's-eye network: a 3x3 convolution with the stride, then `layers` more."""
-    modules = _normalized(nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False))
+    modules: list[nn.Module] = [nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), NormReLU(outputs)]
     for _ in range(layers):
-        modules += _normalized(nn.Conv2d(outputs, outputs, 3, padding=1, bias=False))
+        modules += [nn.Conv2d(outputs, outputs, 3, padding=1, bias=False), NormReLU(outputs)]
     return nn.Sequential(*modules)
 
 
@@ -83,8 +87,8 @@ class BirdsEye(nn.Module):
         (near, far), (near_up, far_up) = config.bev_channels, config.bev_up_channels
         self.near = _scale(inputs, near, 1, config.bev_layers[0])
         self.far = _scale(near, far, 2, config.bev_layers[1])
-        self.near_up = nn.Sequential(*_normalized(nn.Conv2d(near, near_up, 1, bias=False)))
-        self.far_up = nn.Sequential(*_normalized(nn.ConvTranspose2d(far, far_up, 2, 2, bias=False)))
+        self.near_up = nn.Sequential(Pointwise(near, near_up, bias=False), NormReLU(near_up))
+        self.far_up = nn.Sequential(nn.ConvTranspose2d(far, far_up, 2, 2, bias=False), NormReLU(far_up))
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (B, sum of bev_up_channels, H, W) from (B, C, H, W)."""
@@ -108,11 +112,11 @@ class Second(nn.Module):
         self.birds_eye = BirdsEye(config.sparse_out * layers, config).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         classes = len(config.classes)
         self.anchors_per_cell = classes * HEADINGS
-        self.head = nn.Conv2d(sum(config.bev_up_channels), self.anchors_per_cell * (classes + 7 + 2), 1)
+        self.head = Pointwise(sum(config.bev_up_channels), self.anchors_per_cell * (classes + 7 + 2))
         nn.init.normal_(self.head.weight, 0, 0.001)
-        nn.init.zeros_(self.head.bias)  # pyright: ignore[reportArgumentType]
+        nn.init.zeros_(self.head.bias)
         with torch.no_grad():  # a foreground probability of .01 (Lin et al., "Focal Loss", sec. 3.3)
-            self.head.bias[: self.anchors_per_cell * classes] = -math.log(99)  # pyright: ignore[reportOptionalSubscript]
+            self.head.bias[: self.anchors_per_cell * classes] = -math.log(99)
 
     def voxels(self, points: Tensor, sample: Tensor, samples: int) -> SparseTensor:
         """Return the input voxels of points (N, 4) [LiDAR frame] of samples (N,), coordinates scaled to [-1, 1]."""

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.config import InputError
-from flcav.perception.objects.augment import Augmentation, augment
+from flcav.perception.objects.augment import augment
 from flcav.perception.objects.checkpoint import load_checkpoint, save_checkpoint
+from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.loss import second_loss
 from flcav.perception.objects.model import HeadOutput, Second
 from flcav.perception.objects.samples import Sample
