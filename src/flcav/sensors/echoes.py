@@ -2,18 +2,17 @@
 
 from typing import NamedTuple, Protocol
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from flcav.world.materials import Material
+from flcav.world.rays.compiled import compiled
 from flcav.world.rays.raycaster import Hits
 
 PANES = 6  # more panes than these stop a ray
 PANE_TRANSMISSION = 0.8  # of the power, there and back
 RETRO_GAIN = 4.0  # how much brighter than a white surface a retro-reflector is
-PAINT = int(Material.PAINT)
 GLASS = int(Material.GLASS)
 AFTER_PANE_M = 0.002
 LEVELS = 4096
@@ -50,13 +49,13 @@ def cast_through_glass(
     Face f of instance i is of `material[first[i] + f]`.
     """
     hits = trace(directions)
-    found, through = _look_up(hits.instance, hits.face, first, material, passes)
+    found, through = _look_up(hits.instance, hits.face, first, material, passes, GLASS)
     echoes = Echoes(*hits, found, np.zeros(len(directions), np.uint8))
     for _ in range(PANES):
         if not len(through):
             break
         beyond = trace(directions[through], near_m=echoes.distance[through] + np.float32(AFTER_PANE_M))
-        found, again = _look_up(beyond.instance, beyond.face, first, material, passes[through])
+        found, again = _look_up(beyond.instance, beyond.face, first, material, passes[through], GLASS)
         for known, further in zip(echoes, (*beyond, found)):
             known[through] = further
         echoes.panes[through] += 1
@@ -64,8 +63,8 @@ def cast_through_glass(
     return echoes
 
 
-@numba.njit(nogil=True, cache=True)
-def _look_up(instance, face, first, material, passes):
+@compiled
+def _look_up(instance, face, first, material, passes, glass):
     """Return the materials met, and the numbers of the rays that meet glass and pass it."""
     found = np.zeros(len(instance), np.uint8)
     through = np.empty(len(instance), np.int64)
@@ -73,13 +72,13 @@ def _look_up(instance, face, first, material, passes):
     for ray in range(len(instance)):
         if instance[ray] >= 0:
             found[ray] = material[first[instance[ray]] + face[ray]]
-            if found[ray] == GLASS and passes[ray]:
+            if found[ray] == glass and passes[ray]:
                 through[count] = ray
                 count += 1
     return found, through[:count]
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def detect(
     echoes, directions, surfaces, sensor_from_instance, inverse_threshold, keep, chance, noise, noise_m, points, actor
 ):
@@ -105,13 +104,11 @@ def detect(
             + y * (turn[i, 3] * nx + turn[i, 4] * ny + turn[i, 5] * nz)
             + z * (turn[i, 6] * nx + turn[i, 7] * ny + turn[i, 8] * nz)
         )
-        brightness = surfaces.reflectivity[material]
+        brightness = surfaces.reflectivity[i, material]
         if surfaces.retro[material]:
             brightness *= np.float32(RETRO_GAIN)
         else:
             brightness *= cosine
-        if material == PAINT:
-            brightness *= surfaces.paint[i]
         for _ in range(panes[ray]):
             brightness *= np.float32(PANE_TRANSMISSION)
         power = brightness / (distance[ray] * distance[ray])

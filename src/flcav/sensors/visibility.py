@@ -2,13 +2,13 @@
 
 from functools import partial
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import inverse
 from flcav.sensors.echoes import cast_through_glass
 from flcav.sensors.lidar import Lidar, ray_pattern
+from flcav.world.rays.compiled import compiled
 from flcav.world.scene import Scene
 
 BOX_MARGIN_M = 0.01
@@ -44,7 +44,7 @@ def _alone(
     return int(np.count_nonzero(echoes.instance >= 0))
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def rays_into_box(directions, steps, body_from_sensor, size, margin):
     """Return the numbers of the rays of a spinning pattern (channels * steps, 3) that enter a box.
 
@@ -79,7 +79,7 @@ def rays_into_box(directions, steps, body_from_sensor, size, margin):
     return found[:count]
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _columns(low, high, body_from_sensor, steps):
     """Return the first column and the number of columns of the pattern that can meet the box; the first is >= 0."""
     origin = body_from_sensor[:3, 3]

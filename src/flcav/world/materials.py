@@ -35,7 +35,7 @@ class Material(IntEnum):
 class Optics(NamedTuple):
     """How a material answers a pulse."""
 
-    reflectivity: float  # share of the light sent back, diffusely; of PAINT it is multiplied by the actor's paint
+    reflectivity: float  # share of the light sent back, diffusely
     retro: bool = False  # sends light back where it came from, whatever the incidence
 
 
@@ -49,7 +49,7 @@ OPTICS: dict[Material, Optics] = {
     Material.LEAF: Optics(0.45),
     Material.METAL: Optics(0.40),
     Material.SIGN: Optics(0.95, retro=True),
-    Material.PAINT: Optics(1.0),
+    Material.PAINT: Optics(0.30),  # each actor has its own, of PAINT_REFLECTIVITY
     Material.GLASS: Optics(0.03),
     Material.TYRE: Optics(0.05),
     Material.RIM: Optics(0.45),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import pose
-from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO
+from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
 from flcav.world.rays.embree import Assembly, Embree, Solid
 from flcav.world.rays.raycaster import Hits
@@ -25,8 +25,7 @@ class Surfaces(NamedTuple):
     normal: NDArray[np.float32]  # (S, 3) unit, of either sign, body frame
     material: NDArray[np.uint8]  # (S,)
     first: NDArray[np.int64]  # (I,) first row of each instance's mesh
-    paint: NDArray[np.float32]  # (I,) reflectivity of its PAINT
-    reflectivity: NDArray[np.float32] = REFLECTIVITY  # (M,) by material
+    reflectivity: NDArray[np.float32]  # (I, M) of each instance by material: actors differ in their paint
     retro: NDArray[np.bool_] = RETRO  # (M,) by material
 
 
@@ -122,12 +121,14 @@ def _surfaces(models: list[_Model], names: list[str]) -> Surfaces:
     distinct = {id(model): model for model in models}
     starts = np.cumsum([0, *(len(model.mesh.faces) for model in distinct.values())])
     first = dict(zip(distinct, starts))
-    paint = [PAINT_REFLECTIVITY[zlib.crc32(name.encode()) % len(PAINT_REFLECTIVITY)] for name in names]
+    reflectivity = np.tile(REFLECTIVITY, (len(models), 1))
+    paints = [zlib.crc32(name.encode()) % len(PAINT_REFLECTIVITY) for name in names]
+    reflectivity[1:, Material.PAINT] = PAINT_REFLECTIVITY[np.array(paints, np.int64)]
     return Surfaces(
         np.concatenate([model.normal for model in distinct.values()]),
         np.concatenate([model.mesh.material for model in distinct.values()]),
         np.array([first[id(model)] for model in models], np.int64),
-        np.array([1.0, *paint], np.float32),
+        reflectivity,
     )
 
 

@@ -1,13 +1,18 @@
 import importlib.util
+from typing import Any
 
+import numba
+import numba.core.caching
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import inverse, pose, transform_points
+from flcav.world.rays.compiled import compiled
 from flcav.world.rays.embree import Assembly, Embree, Solid
 from flcav.world.rays.library import embree_library
+from flcav.world.rays.packets import trace_packets
 from flcav.world.rays.raycaster import MISS
 
 FORWARD = np.array([[1.0, 0.0, 0.0]], np.float32)
@@ -139,3 +144,14 @@ def test_says_where_there_is_no_library(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("platform.machine", lambda: "aarch64")
     with pytest.raises(OSError, match=r"embreex is not installed .* aarch64"):
         embree_library.__wrapped__()
+
+
+def test_compiled_code_is_kept_on_disk():
+    Solid(*soup(np.random.default_rng(0), 5)).trace(np.eye(4), FORWARD)
+    stats: Any = trace_packets.stats  # pyright: ignore[reportFunctionMemberAccess]
+    assert sum(stats.cache_hits.values()) + sum(stats.cache_misses.values()) > 0
+
+
+def test_compiles_where_nothing_can_be_kept(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
+    assert compiled(lambda x: x + 1)(2) == 3

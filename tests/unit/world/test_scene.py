@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flcav.geometry import pose
+from flcav.world.materials import PAINT_REFLECTIVITY, Material
 from flcav.world.scene import Scene
 from flcav.world.town import Town
 from flcav.world.trace import Trace
@@ -54,8 +55,8 @@ def test_surfaces_tell_face_and_paint(scene: Scene):
     row = surfaces.first[hits.instance[0]] + hits.face[0]
     assert abs(surfaces.normal[row] @ AHEAD[0]) > 0.7  # the truck's tail
     assert surfaces.first[1] == surfaces.first[2]  # one mesh, two actors
-    assert len(surfaces.paint) == 3
-    assert (surfaces.paint[1:] < 1).all()
+    assert surfaces.reflectivity.shape == (3, len(Material))
+    assert surfaces.reflectivity[1, Material.PAINT] in PAINT_REFLECTIVITY
 
 
 def test_one_actor_alone_is_seen_in_its_own_frame(scene: Scene):

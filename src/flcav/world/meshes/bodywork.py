@@ -139,9 +139,11 @@ def _arch(x: float, profile: Profile, half_width: float) -> Mesh:
     angle = np.linspace(0, np.pi, 7)
     circle = np.stack((np.cos(angle), 0 * angle, np.sin(angle)), axis=1) * radius
     feet = np.array([[radius, 0, profile.clearance - hub], [-radius, 0, profile.clearance - hub]])
-    circle = np.concatenate((feet[:1], circle, feet[1:]))
+    rim = np.concatenate((feet[:1], circle, feet[1:]))
     outer, inner = (np.array((x, y, hub)) for y in (half_width * 0.95, half_width - 0.38))
-    return sheet(np.stack((outer + circle, inner + circle, inner + 0 * circle)), Material.TRIM)
+    closed = np.concatenate((rim, rim[:1]))
+    liner = sheet(np.stack((outer + rim, inner + rim)), Material.TRIM)
+    return join((liner, sheet(np.stack((inner + closed, inner + 0 * closed)), Material.TRIM)))
 
 
 def _cabin_side(profile: Profile, lower: _Lower, length: float, height: float) -> Mesh:

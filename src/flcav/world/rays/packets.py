@@ -4,11 +4,12 @@ The function is called by its address, an ordinary integer argument, so that the
 (a kernel that closes over a ctypes function cannot be).
 """
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
+
+from flcav.world.rays.compiled import compiled
 
 # RTCRayHit16: rows of 16 float32 (or int32)
 ORIGIN, NEAR, DIRECTION, TIME, FAR, MASK, RAY_ID, FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
@@ -29,7 +30,7 @@ def call_c(typing_context, address, first, second, third, fourth):
     return types.void(types.int64, types.int64, types.int64, types.int64, types.int64), generate
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def trace_packets(
     intersect, scene, arguments, origin, rotation, directions, near, far, first_ray, last_ray, distance, instance, face
 ):
