@@ -185,7 +185,7 @@ def grid() -> Sketch:
     """Multi-lane cross-roads in three rows and three columns, sheared and turned in the world."""
     town = Sketch(
         {
-            "boulevard": Profile(3, 3.2, 2.6, 1.6, 3.0, 8.33, 4),
+            "boulevard": Profile(2, 3.4, 2.6, 1.6, 3.0, 11.11, 3),
             "avenue": Profile(3, 3.2, 2.6, 1.6, 2.6, 13.89, 4),
             "street": Profile(2, 3.2, 2.6, 0, 2.4, 13.89, 3),
             "bend": Profile(1, 3.8, 0, 0, 2.4, 8.33, 2),
@@ -205,7 +205,7 @@ def grid() -> Sketch:
             town.node(f"x{i}{j}", world(x, y), "traffic_light")
     for j in range(3):
         for i in range(2):
-            kind = ("boulevard" if i == 0 else "avenue") if j == 1 else "street"
+            kind = "avenue" if j == 1 else "boulevard" if (i, j) == (0, 2) else "street"
             town.street(f"x{i}{j}", f"x{i + 1}{j}", kind)
     for i in range(3):
         for j in range(2):
