@@ -19,40 +19,53 @@ def draw_ap_by_round(axes: Axes, rounds: Sequence[Row], stages: Sequence[Row]) -
     `rounds` has rows stage, round, town, ap50; `stages` has one tested row for each of `STAGES` and town, a town's in
     that order. Every stage is equally wide, however many rounds it has.
     """
-    numbers = {stage: sorted({row["round"] for row in rounds if row["stage"] == stage}) for stage in STAGES}
-    numbers = {stage: known for stage, known in numbers.items() if known}
-    places = {
-        (stage, number): start + (rank + 0.5) / len(known)
-        for start, (stage, known) in enumerate(numbers.items())
-        for rank, number in enumerate(known)
+    places = _places(rounds)
+    lines = {
+        town: sorted((places[row["stage"]][row["round"]], row["ap50"]) for row in rounds if row["town"] == town)
+        for town in dict.fromkeys(row["town"] for row in rounds)
     }
-    for town in dict.fromkeys(row["town"] for row in rounds):
+    for town, line in lines.items():
         colour = style.TOWN_COLOURS.get(town, style.GREEN)
-        line = sorted((places[row["stage"], row["round"]], row["ap50"]) for row in rounds if row["town"] == town)
         axes.plot(*zip(*line, strict=True), color=colour, linewidth=1.6, marker="o", markersize=2.5)
-        axes.annotate(town, line[-1], (9, 0), textcoords="offset points", color=colour, va="center", fontweight="bold")
+        beside = [other[-1] for other in lines.values() if other is not line and other[-1][0] == line[-1][0]]
+        side = "center" if not beside else "bottom" if line[-1] > max(beside) else "top"  # two names stay apart
+        axes.annotate(town, line[-1], (9, 0), textcoords="offset points", color=colour, va=side, fontweight="bold")
     towns = list(dict.fromkeys(row["town"] for row in stages))
     for number, town in enumerate(towns):
         aside = 0.04 * (number - (len(towns) - 1) / 2)  # so that the intervals of two towns do not hide each other
         for stage, row in zip(STAGES, (row for row in stages if row["town"] == town), strict=True):
-            if stage in numbers:
-                end = places[stage, numbers[stage][-1]]
-                _draw_interval(axes, end + aside, row, style.TOWN_COLOURS.get(town, style.GREEN))
-    for start, stage in enumerate(numbers):
-        axes.text(start + 0.5, 1.02, stage, transform=axes.get_xaxis_transform(), ha="center")
-        if start:
-            axes.axvline(start, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
-    ends = {places[stage, number]: number for stage, known in numbers.items() for number in (known[0], known[-1])}
-    axes.set_xticks(list(ends), [str(number) for number in ends.values()])
-    axes.set(xlabel="round of the stage", ylabel="AP50", ylim=(0, None), xlim=(0, len(numbers) + 0.12))
+            if stage in places:
+                _draw_tested(axes, max(places[stage].values()) + aside, row)
+    _mark_stages(axes, places)
+    axes.set(xlabel="round of the stage", ylabel="AP50", ylim=(0, None))
     axes.grid(axis="y")
 
 
-def _draw_interval(axes: Axes, x: float, row: Row, colour: str) -> None:
-    below, above = row["ap50"] - row["ap50_low"], row["ap50_high"] - row["ap50"]
-    axes.errorbar(
-        x, row["ap50"], [[below], [above]], fmt="o", color=colour, markersize=6, markeredgecolor="white", capsize=3
-    )
+def _places(rounds: Sequence[Row]) -> dict[str, dict[int, float]]:
+    """Return the place on the x axis of every round that was taken, by stage; stage n spans n to n + 1."""
+    numbers = {stage: sorted({row["round"] for row in rounds if row["stage"] == stage}) for stage in STAGES}
+    taken = {stage: known for stage, known in numbers.items() if known}
+    return {
+        stage: {number: start + (rank + 0.5) / len(known) for rank, number in enumerate(known)}
+        for start, (stage, known) in enumerate(taken.items())
+    }
+
+
+def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
+    """Name the stages above, draw their borders, and number the first and last round of each."""
+    for start, stage in enumerate(places):
+        axes.text(start + 0.5, 1.02, stage, transform=axes.get_xaxis_transform(), ha="center")
+        if start:
+            axes.axvline(start, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
+    ends = {known[number]: number for known in places.values() for number in (min(known), max(known))}
+    axes.set_xticks(list(ends), [str(number) for number in ends.values()])
+    axes.set_xlim(0, len(places) + 0.12)
+
+
+def _draw_tested(axes: Axes, x: float, row: Row) -> None:
+    colour = style.TOWN_COLOURS.get(row["town"], style.GREEN)
+    axes.plot([x, x], [row["ap50_low"], row["ap50_high"]], color=colour, marker="_", markersize=7)
+    axes.plot(x, row["ap50"], "o", color=colour, markersize=6, markeredgecolor="white")
 
 
 def draw_megabytes(axes: Axes, ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> None:

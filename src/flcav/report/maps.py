@@ -25,6 +25,7 @@ MISS: dict[str, Any] = {
     "markeredgewidth": 0.5,
 }
 FALSE_POSITIVE: dict[str, Any] = {"marker": "x", "markersize": 5, "color": style.FALSE, "markeredgewidth": 1.3}
+NOTE_M = 15.0  # about where a note stands above its pole
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
@@ -71,23 +72,18 @@ def draw_errors(axes: Axes, scene: ErrorMap) -> None:
     for xyz, look, label in ((misses, MISS, "object missed"), (falses, FALSE_POSITIVE, "false positive")):
         axes.plot(*xyz[:, :2].T, linestyle="none", label=f"{label} ({len(xyz)})", **look)
     for number, (x, y, _) in position.items():
-        _draw_pole(axes, number, x, y, chosen=number in scene.chosen, densest=number == scene.densest)
+        chosen, densest = number in scene.chosen, number == scene.densest
+        face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)
+        axes.plot(x, y, "s" if densest else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
+        axes.text(x, y, str(number), ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
+        if note := " and ".join(word for word, said in (("placed", chosen), ("densest traffic", densest)) if said):
+            others = np.array([xyz[:2] for other, xyz in position.items() if other != number]).reshape(-1, 2)
+            _write_beside(axes, note, np.array([x, y]), others)
 
 
-def _draw_pole(axes: Axes, number: int, x: float, y: float, *, chosen: bool, densest: bool) -> None:
-    face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)
-    axes.plot(x, y, "s" if densest else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
-    axes.text(x, y, str(number), ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
-    note = " and ".join(word for word, said in (("placed", chosen), ("densest traffic", densest)) if said)
-    if note:
-        axes.annotate(
-            note,
-            (x, y),
-            (0, 10),
-            textcoords="offset points",
-            ha="center",
-            fontsize=style.SMALL,
-            fontweight="bold",
-            path_effects=HALO,
-            zorder=6,
-        )
+def _write_beside(axes: Axes, note: str, at: Array, others: Array) -> None:
+    """Write `note` above or below the pole `at`, whichever is farther from the `others` (N, 2)."""
+    above, below = (np.hypot(*(others - at - (0, side * NOTE_M)).T).min(initial=np.inf) for side in (1, -1))
+    look = {"fontsize": style.SMALL, "fontweight": "bold", "path_effects": HALO, "zorder": 6}
+    offset, align = (10, "bottom") if above >= below else (-10, "top")
+    axes.annotate(note, (at[0], at[1]), (0, offset), textcoords="offset points", ha="center", va=align, **look)

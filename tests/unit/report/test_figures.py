@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
 from flcav.report import figures, style
@@ -95,19 +95,23 @@ def test_a_stage_without_rounds_takes_its_tested_values_with_it() -> None:
 
 
 def _tested(axes) -> dict[int, set[float]]:
-    """Return the values with error bars by the place of their stage on the x axis."""
+    """Return the values drawn as single dots by the place of their stage on the x axis."""
     out: dict[int, set[float]] = {}
-    for bars in axes.containers:
-        x, y = bars[0].get_data()
-        out.setdefault(int(x[0]), set()).add(round(float(y[0]), 3))
+    for line in axes.get_lines():
+        if len(line.get_xdata()) == 1:
+            out.setdefault(int(line.get_xdata()[0]), set()).add(round(float(line.get_ydata()[0]), 3))
     return out
 
 
 def test_bars_add_up_to_the_ledger_and_budgets_stand_where_they_are() -> None:
     axes = figures.megabytes(RESULTS["ledger_by_stage"], BUDGETS).axes[0]
+    bars = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
     for y, link in enumerate(BUDGETS):
-        width = sum(bar.get_width() for bar in axes.patches if bar.get_y() < y < bar.get_y() + bar.get_height())  # type: ignore
-        assert width == pytest.approx(sum(row["mb"] for row in RESULTS["ledger_by_stage"] if row["link"] == link))
+        own = [bar for bar in bars if bar.get_y() < y < bar.get_y() + bar.get_height()]
+        total = sum(row["mb"] for row in RESULTS["ledger_by_stage"] if row["link"] == link)
+        assert sum(bar.get_width() for bar in own) == pytest.approx(total)
+        assert max(bar.get_x() + bar.get_width() for bar in own) == pytest.approx(total)
+    assert "215 of 230 MB" in {text.get_text() for text in axes.texts}
     assert [line.get_xdata()[0] for line in axes.get_lines()] == list(BUDGETS.values())  # type: ignore
 
 

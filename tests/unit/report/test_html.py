@@ -7,7 +7,7 @@ from jinja2 import UndefinedError
 from flcav.report.html import render
 
 PIXEL = b"\x89PNG made up"
-PICTURES = dict.fromkeys(("town_map", "before_after", "ap_by_round", "megabytes"), PIXEL)
+PICTURES: dict[str, bytes] = dict.fromkeys(("town_map", "before_after", "ap_by_round", "megabytes"), PIXEL)
 
 
 def results() -> dict:
