@@ -6,7 +6,7 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import allocate, birdseye, evaluate, fit, infer, place, record, train, validate
+from flcav.cli import allocate, birdseye, demo, evaluate, fit, infer, place, record, reproduce, train, validate
 from flcav.config import InputError
 
 app = typer.Typer(
@@ -31,7 +31,7 @@ def _main(
     pass
 
 
-for command in (record, validate, birdseye, train, evaluate, infer, allocate, place, fit):
+for command in (demo, record, validate, birdseye, train, evaluate, infer, allocate, place, fit, reproduce):
     command.register(app)
 
 

@@ -43,7 +43,7 @@ def edge_fl(work: Work, town: str, sensor: str, protocol: dict[str, Any]) -> dic
     account = Account(book, "edge", TASK, "wireless")
     start, done = _resumed(work, to_arrays(network), book)
     federate(clients, start, schedule, account, done=done, on_round=_checkpoint(work, book, schedule.rounds))
-    return _finish(work, network, book, rounds) | {"pole": pole}
+    return _finish(work, network, book, rounds) | {"pole": pole, "samples": _held(clients)}
 
 
 def cloud_fl(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
@@ -56,13 +56,15 @@ def cloud_fl(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
     network = load_network(work.inputs["pretrain"] / WEIGHTS)
     start, done = _resumed(work, to_arrays(network), book)
     servers: dict[str, Trainable] = {}
+    held = 0
     for town in REGIONS:
         own = to_arrays(load_network(work.inputs[f"{town}-edge-chosen"] / WEIGHTS))
         clients = region(work, town, int(work.result(f"{town}-place")["chosen"]), setting, None)
         servers[town] = EdgeServer(clients, k, wireless, own, cloud_rounds_done=done)
+        held += _held(clients)
     schedule = _schedule(setting, rounds, "cloud", "")
     federate(servers, start, schedule, wireline, done=done, on_round=_checkpoint(work, book, rounds))
-    return _finish(work, network, book, rounds)
+    return _finish(work, network, book, rounds) | {"samples": held}
 
 
 def more_training(work: Work, source: str, protocol: dict[str, Any]) -> dict[str, Any]:
@@ -109,6 +111,10 @@ def region(work: Work, town: str, pole: int | None, setting: Protocol, book: Led
         work.report(done, len(vehicles), "labels")
     batch = setting.training.batch
     return {name: ObjectsClient(frozen.config, samples[name], batch=batch) for name in sorted(samples)}
+
+
+def _held(clients: Mapping[str, ObjectsClient]) -> int:
+    return sum(len(client.samples) for client in clients.values())
 
 
 def _views(data: Dataset, pole: int | None) -> dict[tuple[str, int], RoadView]:
@@ -171,7 +177,7 @@ def round_network(config_of: Second, folder: Path, round_: int) -> Second:
     return network.eval()
 
 
-def _finish(work: Work, network: Second, book: Ledger, rounds: int) -> dict[str, Any]:
+def _finish(work: Work, network: Second, book: Ledger, rounds: int) -> dict[str, int]:
     if rounds:
         network = round_network(network, work.folder, rounds)
     save_network(network, work.folder / WEIGHTS)

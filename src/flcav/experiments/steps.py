@@ -8,6 +8,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
@@ -87,12 +88,28 @@ def run_steps(steps: Sequence[Step], folder: Path, *, jobs: int, notify: Notify)
                 for future in finished:
                     step = running.pop(future)
                     values[step.name] = future.result()
-                    notify(step.name, 1, 1, "")
+                    notify(step.name, 1, 1, "done")
         except BaseException:
             for process in set(multiprocessing.active_children()) - others:
                 process.terminate()
             raise
     return values
+
+
+def stopwatch(folder: Path) -> Callable[[], float]:
+    """Return a clock of the seconds spent on the run in `folder`, those of its earlier, interrupted starts included.
+
+    A start's seconds count up to the last time that the clock was read.
+    """
+    path, start = folder / "elapsed.json", time.monotonic()
+    earlier = json.loads(path.read_text())["elapsed_s"] if path.exists() else 0.0
+
+    def clock() -> float:
+        elapsed = earlier + time.monotonic() - start
+        write_json(path, {"elapsed_s": elapsed})
+        return elapsed
+
+    return clock
 
 
 def _drain(queue: Any, notify: Notify) -> None:
