@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flcav.geometry import pose
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
-from flcav.world.rays.embree import Assembly, Embree, Solid
+from flcav.world.rays.embree import Embree, Solid
 from flcav.world.rays.raycaster import Hits
 from flcav.world.static import town_mesh
 from flcav.world.town import Town
@@ -41,7 +41,7 @@ class Scene:
         models = [_town_model(town), *(_actor_model(*shape) for shape in shapes)]
         self.surfaces = _surfaces(models, [str(name) for name in trace.actor])
         self._solids = [model.solid for model in models]
-        self._assembly = Assembly(self._solids)
+        self._assembly = Embree().assembly(self._solids)
         self._assembly.place(0, np.eye(4))
         self._placed = np.full((len(trace.actor), 4), np.nan)  # x, y, z, yaw; NaN where an actor is nowhere
         self._hidden: int | None = None

@@ -1,7 +1,7 @@
 """What the sensors ask of a ray casting engine: meshes to search, and assemblies of placed meshes."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,13 +49,16 @@ class Assembly(Target, Protocol):
         ...
 
 
-class Raycaster(Protocol):
-    """An engine."""
+SolidT = TypeVar("SolidT", bound=Target)
 
-    def solid(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> Target:
+
+class Raycaster(Protocol[SolidT]):
+    """An engine, and its own kind of solid."""
+
+    def solid(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> SolidT:
         """Return a mesh, (V, 3) [m] and (F, 3), with its search structure."""
         ...
 
-    def assembly(self, solids: Sequence[Target]) -> Assembly:
-        """Return an assembly of this engine's solids, none placed yet; instance i is `solids[i]`."""
+    def assembly(self, solids: Sequence[SolidT]) -> Assembly:
+        """Return an assembly of `solids`, none placed yet; instance i is solid i."""
         ...
