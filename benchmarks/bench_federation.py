@@ -7,30 +7,21 @@ once as nodes of the in-process federation.
 import statistics
 import time
 
-import numpy as np
 import torch
 
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.strategies.fedavg import average
-from flcav.geometry import Boxes
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.client import ObjectsClient
 from flcav.perception.objects.model import second_tiny
-from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.samples import sample_from_frame
 from flcav.perception.objects.weights import to_arrays
 from flcav.seeds import child_seed
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
 
-STEPS, REPEATS = 20, 5
-
-
-def sweep(rng: np.random.Generator) -> Sample:
-    """Return 12,000 returns of flat ground with a few boxes on it."""
-    ground = np.c_[rng.uniform(0, 48, 12_000), rng.uniform(-24, 24, 12_000), rng.normal(-1.8, 0.02, 12_000)]
-    boxes = np.c_[rng.uniform(5, 45, (5, 1)), rng.uniform(-20, 20, (5, 1)), np.full((5, 1), -1.0)]
-    rows = np.c_[boxes, np.tile([4.4, 1.8, 1.6, 0.3], (5, 1))]
-    points = np.c_[ground, rng.uniform(0, 1, 12_000)].astype(np.float32)
-    return Sample(points, Boxes.from_array(rows, "Car"))
+STEPS, REPEATS = 20, 3
 
 
 def bare(clients: dict[str, ObjectsClient], weights, schedule: Schedule) -> None:
@@ -44,10 +35,11 @@ def bare(clients: dict[str, ObjectsClient], weights, schedule: Schedule) -> None
 
 def main() -> None:
     torch.set_num_threads(1)
-    rng = np.random.default_rng(0)
     network = second_tiny()
+    source = EmbeddedSource(Recipe(town="suburb", seed=1, cavs=2, spins_per_scene=4))
+    samples = [sample_from_frame(frame, network.config) for frame in source.frames(source.scenes()[0])]
     weights = to_arrays(network)
-    clients = {f"cav{i}": ObjectsClient(network.config, [sweep(rng) for _ in range(4)]) for i in range(2)}
+    clients = {f"cav{i}": ObjectsClient(network.config, samples[i::2]) for i in range(2)}
     schedule = Schedule(rounds=1, steps=STEPS, learning_rate=1e-3, final_learning_rate=1e-3, seed=0)
     account = Account(Ledger(Budget(1e6, 1e6)), "edge", "objects", "wireless")
     federate(clients, weights, schedule, account)  # warm-up

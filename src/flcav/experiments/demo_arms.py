@@ -16,7 +16,7 @@ from flcav.experiments.demo import demo_protocol
 from flcav.experiments.pipeline import central_step, cloud_step, edge_step, plan_step, shared_steps, test_step
 from flcav.experiments.pretraining import LEDGER
 from flcav.experiments.protocol import Protocol
-from flcav.experiments.steps import Notify, Step, run_steps
+from flcav.experiments.steps import Notify, Step, run_side_by_side
 from flcav.experiments.testing import difference
 from flcav.network.ledger import LINKS, Ledger
 from flcav.report import figures, style
@@ -64,11 +64,10 @@ def arm_steps(protocol: Protocol) -> list[Step]:
 
 def run_arms(protocols: Sequence[Protocol], out: Path, *, jobs: int, notify: Notify) -> dict[str, Any]:
     """Run or finish all arms of each seed in folders below `out` and return the results."""
-    seeds = []
-    for protocol in protocols:
-        folder = out / f"seed{protocol.seed}"
-        values = run_steps(arm_steps(protocol), folder, jobs=jobs, notify=notify)
-        seeds.append(_one_seed(protocol, folder, values))
+    folders = [out / f"seed{protocol.seed}" for protocol in protocols]
+    runs = {folder: arm_steps(protocol) for folder, protocol in zip(folders, protocols, strict=True)}
+    values = run_side_by_side(runs, jobs=jobs, notify=notify)
+    seeds = [_one_seed(protocol, folder, values[folder]) for protocol, folder in zip(protocols, folders, strict=True)]
     return {
         "protocol": protocols[0].model_dump(mode="json", exclude={"seed"}),
         "seeds": seeds,

@@ -11,7 +11,7 @@ from pathlib import Path
 from flcav.experiments.pipeline import cloud_step, edge_step, rounds_step, shared_steps, test_step
 from flcav.experiments.planning import HISTORY, fixed_plan
 from flcav.experiments.protocol import REGIONS, Protocol, Split
-from flcav.experiments.steps import Step, run_steps
+from flcav.experiments.steps import Step, run_side_by_side
 from flcav.files import atomic_path
 
 PLANS = ((101, 320, 6, 3), (102, 80, 6, 3), (103, 160, 0, 0), (104, 40, 0, 0))  # seed, samples, edge, cloud rounds
@@ -43,10 +43,10 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args(arguments)
+    runs = {options.out / str(plan[0]): steps_for(*plan) for plan in PLANS}
+    results = run_side_by_side(runs, jobs=options.jobs, notify=_print)
     rows: list[tuple[float, ...]] = []
-    for seed, samples, edge_rounds, cloud_rounds in PLANS:
-        steps = steps_for(seed, samples, edge_rounds, cloud_rounds)
-        values = run_steps(steps, options.out / str(seed), jobs=options.jobs, notify=_print)
+    for (seed, samples, edge_rounds, _), values in zip(PLANS, results.values(), strict=True):
         rows.append((seed, samples, 0, 0, values["test-pretrain-grid"]["ap50"]))
         for row in values.get("rounds-grid-edge-chosen-grid", []):
             rows.append((seed, samples, row["round"], 0, row["ap50"]))

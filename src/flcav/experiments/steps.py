@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty
@@ -94,6 +94,19 @@ def run_steps(steps: Sequence[Step], folder: Path, *, jobs: int, notify: Notify)
                 process.terminate()
             raise
     return values
+
+
+def run_side_by_side(runs: Mapping[Path, Sequence[Step]], *, jobs: int, notify: Notify) -> dict[Path, dict[str, Any]]:
+    """Run the steps of each folder, up to `jobs` folders at a time in a process each; return `run_steps` of each."""
+
+    def run(folder: Path) -> dict[str, Any]:
+        def named(step: str, done: int, total: int, note: str) -> None:
+            notify(f"{folder.name}/{step}", done, total, note)
+
+        return run_steps(runs[folder], folder, jobs=max(1, jobs // len(runs)), notify=named)
+
+    with ThreadPoolExecutor(jobs) as threads:
+        return dict(zip(runs, threads.map(run, runs), strict=True))
 
 
 def stopwatch(folder: Path) -> Callable[[], float]:

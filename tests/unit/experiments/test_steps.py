@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flcav.config import InputError
-from flcav.experiments.steps import Step, Work, run_steps
+from flcav.experiments.steps import Step, Work, run_side_by_side, run_steps
 
 
 def count(work: Work, start: int) -> int:
@@ -84,3 +84,12 @@ def test_a_killed_run_goes_on_from_its_last_finished_step(tmp_path):
     process.wait()
     assert run_steps(STEPS, tmp_path / "out", jobs=1, notify=quiet)["sum"] == 3
     assert (tmp_path / "out" / "a" / "calls").read_text() == "x"
+
+
+def test_runs_side_by_side_keep_to_their_own_folders(tmp_path):
+    seen = []
+    runs = {tmp_path / "one": STEPS, tmp_path / "two": STEPS[:1]}
+    values = run_side_by_side(runs, jobs=2, notify=lambda *event: seen.append(event[0]))
+    assert values[tmp_path / "one"]["sum"] == 3
+    assert values[tmp_path / "two"] == {"a": 1}
+    assert {"one/sum", "two/a"} <= set(seen)
