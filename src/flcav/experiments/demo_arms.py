@@ -103,11 +103,17 @@ def _one_seed(protocol: Protocol, folder: Path, values: dict[str, Any]) -> dict[
             if arm not in ("pretrained", "oracle")
         },
         "used_mb": {
-            arm: {link: Ledger.load(folder / step / LEDGER).used_mb(link) for link in LINKS}
-            for arm, step in ARMS["grid"].items()
-            if (folder / step / LEDGER).exists()
+            arm: _used_mb(folder, step) for arm, step in ARMS["grid"].items() if (folder / step / LEDGER).exists()
         },
     }
+
+
+def _used_mb(folder: Path, step: str) -> dict[str, float]:
+    """Return what an arm has spent; stage II books in ledgers of its own, which stage I came before."""
+    books = [Ledger.load(folder / step / LEDGER)]
+    if step.startswith("grid-edge-"):
+        books.append(Ledger.load(folder / "pretrain" / LEDGER))
+    return {link: sum(book.used_mb(link) for book in books) for link in LINKS}
 
 
 def summarise(seeds: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from flcav.dataset.store import Dataset
 from flcav.experiments.pretraining import LEDGER, WEIGHTS, train_on
@@ -16,7 +16,7 @@ from flcav.experiments.steps import Work
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, OnRound, Schedule, federate
 from flcav.federation.trainable import Trainable, Weights
-from flcav.files import atomic_path, write_json
+from flcav.files import write_bytes, write_json
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, road_view
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
@@ -144,8 +144,7 @@ def _checkpoint(work: Work, book: Ledger, rounds: int) -> OnRound:
     """Keep each round's weights, and what the ledger held then, so that a killed step goes on after it."""
 
     def keep(round_: int, weights: Weights, loss: float) -> None:
-        with atomic_path(work.folder / f"round{round_}.safetensors") as temporary:
-            save_file(dict(weights), temporary)
+        write_bytes(round_path(work.folder, round_), save(dict(weights)))
         write_json(work.folder / f"round{round_}.json", {"loss": loss})
         book.save(work.folder / LEDGER)
         write_json(work.folder / ROUND, {"round": round_, "entries": len(book.entries)})

@@ -10,13 +10,15 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, FIRST_EXCEPTION, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty
 from typing import Any
 
 from flcav.config import InputError
+from flcav.dataset.workers import end_with_parent
 from flcav.files import write_json
 from flcav.progress import Report
 
@@ -55,7 +57,8 @@ class Step:
 def run_steps(steps: Sequence[Step], folder: Path, *, jobs: int, notify: Notify) -> dict[str, Any]:
     """Run `steps` (in an order where each comes after what it needs) and return their values by name.
 
-    `jobs` processes of one thread each. Raises `InputError` where `folder` holds steps of other arguments.
+    `jobs` processes of one thread each, which end with this one however it ends. Raises `InputError` where `folder`
+    holds steps of other arguments, `OSError` where one of them was killed.
     """
     prints: dict[str, str] = {}
     for step in steps:
@@ -74,7 +77,6 @@ def run_steps(steps: Sequence[Step], folder: Path, *, jobs: int, notify: Notify)
         return values
     context = multiprocessing.get_context("spawn")
     queue = context.Queue()
-    others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start, initargs=(queue,)) as pool:
         running: dict[Future, Step] = {}
         try:
@@ -89,8 +91,10 @@ def run_steps(steps: Sequence[Step], folder: Path, *, jobs: int, notify: Notify)
                     step = running.pop(future)
                     values[step.name] = future.result()
                     notify(step.name, 1, 1, "done")
+        except BrokenProcessPool:
+            raise OSError("a step's process was killed from outside, most often for want of memory") from None
         except BaseException:
-            for process in set(multiprocessing.active_children()) - others:
+            for process in list(pool._processes.values()):  # not those of a run beside this one
                 process.terminate()
             raise
     return values
@@ -106,7 +110,16 @@ def run_side_by_side(runs: Mapping[Path, Sequence[Step]], *, jobs: int, notify: 
         return run_steps(runs[folder], folder, jobs=max(1, jobs // len(runs)), notify=named)
 
     with ThreadPoolExecutor(jobs) as threads:
-        return dict(zip(runs, threads.map(run, runs), strict=True))
+        started = {folder: threads.submit(run, folder) for folder in runs}
+        try:
+            for future in wait(started.values(), return_when=FIRST_EXCEPTION).done:
+                future.result()
+        except BaseException:
+            threads.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+    return {folder: future.result() for folder, future in started.items()}
 
 
 def stopwatch(folder: Path) -> Callable[[], float]:
@@ -139,6 +152,7 @@ _queue: Any = None
 def _start(queue: Any) -> None:
     global _queue
     _queue = queue
+    end_with_parent()
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ[name] = "1"
 

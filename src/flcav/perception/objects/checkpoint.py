@@ -1,5 +1,6 @@
 """Where a training run left off."""
 
+import io
 import pickle
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from flcav.config import InputError
-from flcav.files import atomic_path
+from flcav.files import write_bytes
 
 
 def save_checkpoint(
@@ -28,8 +29,9 @@ def save_checkpoint(
         "optimizer": optimizer.state_dict(),
         "losses": torch.from_numpy(losses),
     }
-    with atomic_path(path) as temporary:
-        torch.save(state, temporary)
+    data = io.BytesIO()
+    torch.save(state, data)
+    write_bytes(path, data.getvalue())
 
 
 def load_checkpoint(

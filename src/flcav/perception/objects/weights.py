@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from flcav.config import InputError
-from flcav.files import atomic_path
+from flcav.files import write_bytes
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import Second, second
 
@@ -24,8 +24,7 @@ def save_network(network: Second, path: Path) -> None:
     """Write the network's configuration and weights to a safetensors file, atomically."""
     tensors = {name: tensor.contiguous().cpu() for name, tensor in network.state_dict().items()}
     metadata = {CONFIG_KEY: _CONFIG.dump_json(network.config).decode()}
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata)
+    write_bytes(path, save(tensors, metadata))
 
 
 def load_network(path: Path) -> Second:
