@@ -37,9 +37,9 @@ def demo_protocol(seed: int) -> Protocol:
         pool=Split(scenes=16, spins=5, cavs=4),
         validation=Split(scenes=8, spins=2, cavs=3),
         registry=Split(scenes=8, spins=3, cavs=4),
-        edge=Split(scenes=10, spins=3, cavs=4),
+        edge=Split(scenes=16, spins=5, cavs=4),
         test=Split(scenes=30, spins=1, cavs=4),
-        training=Training(max_blocks=6, local_steps=12, cooldown=(0.3, 0.05)),
+        training=Training(max_blocks=6),
     )
 
 

@@ -8,22 +8,18 @@ from typing import Any
 import torch
 from safetensors.numpy import load_file, save
 
-from flcav.dataset.store import Dataset
 from flcav.experiments.pretraining import LEDGER, WEIGHTS, train_on
 from flcav.experiments.protocol import REGIONS, TASK, Protocol
 from flcav.experiments.recording import opened
 from flcav.experiments.steps import Work
+from flcav.experiments.vehicles import grouped, held, region
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, OnRound, Schedule, federate
 from flcav.federation.trainable import Trainable, Weights
 from flcav.files import write_bytes, write_json
-from flcav.fusion.labels import label_sample
-from flcav.fusion.road import RoadView, road_view
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
-from flcav.perception.objects.client import ObjectsClient
-from flcav.perception.objects.detect import detect_all
 from flcav.perception.objects.model import Second, second
-from flcav.perception.objects.samples import Sample, sample_from_frame
+from flcav.perception.objects.samples import sample_from_frame
 from flcav.perception.objects.weights import from_arrays, load_network, save_network, to_arrays
 from flcav.seeds import child_seed
 
@@ -43,7 +39,7 @@ def edge_fl(work: Work, town: str, sensor: str, protocol: dict[str, Any]) -> dic
     account = Account(book, "edge", TASK, "wireless")
     start, done = _resumed(work, to_arrays(network), book)
     federate(clients, start, schedule, account, done=done, on_round=_checkpoint(work, book, schedule.rounds))
-    return _finish(work, network, book, rounds) | {"pole": pole, "samples": _held(clients)}
+    return _finish(work, network, book, rounds) | {"pole": pole, "samples": held(clients)}
 
 
 def cloud_fl(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
@@ -56,15 +52,15 @@ def cloud_fl(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
     network = load_network(work.inputs["pretrain"] / WEIGHTS)
     start, done = _resumed(work, to_arrays(network), book)
     servers: dict[str, Trainable] = {}
-    held = 0
+    sweeps = 0
     for town in REGIONS:
         own = to_arrays(load_network(work.inputs[f"{town}-edge-chosen"] / WEIGHTS))
-        clients = region(work, town, int(work.result(f"{town}-place")["chosen"]), setting, None)
+        clients = region(work, town, int(work.result(f"{town}-place")["chosen"]), setting)
         servers[town] = EdgeServer(clients, k, wireless, own, cloud_rounds_done=done)
-        held += _held(clients)
+        sweeps += held(clients)
     schedule = _schedule(setting, rounds, "cloud", "")
     federate(servers, start, schedule, wireline, done=done, on_round=_checkpoint(work, book, rounds))
-    return _finish(work, network, book, rounds) | {"samples": held}
+    return _finish(work, network, book, rounds) | {"samples": sweeps}
 
 
 def more_training(work: Work, source: str, protocol: dict[str, Any]) -> dict[str, Any]:
@@ -78,8 +74,7 @@ def more_training(work: Work, source: str, protocol: dict[str, Any]) -> dict[str
     if source == "suburb":
         data, chosen = opened(work, "suburb-pool"), work.result("pretrain")["uploaded"]
     else:
-        data = opened(work, "grid-edge")
-        chosen = [i for i, key in enumerate(data.keys) if key.agent.startswith("cav")]
+        data, chosen = opened(work, "grid-edge"), grouped(work, "grid", setting)
     samples = [sample_from_frame(data.frame(i), network.config) for i in chosen]
     rounds = int(work.result("plan")["tasks"][0]["edge_rounds"])
     train_on(
@@ -87,39 +82,6 @@ def more_training(work: Work, source: str, protocol: dict[str, Any]) -> dict[str
     )
     save_network(network, work.folder / WEIGHTS)
     return {"samples": len(samples), "rounds": rounds}
-
-
-def region(work: Work, town: str, pole: int | None, setting: Protocol, book: Ledger | None) -> dict[str, ObjectsClient]:
-    """Return a region's vehicles with their frames, labelled without ground truth.
-
-    The road's views are booked as downlink where a `book` is given (once: the labels are kept through the stages).
-    """
-    frozen = load_network(work.inputs["pretrain"] / WEIGHTS)
-    threshold = work.result("pretrain")["threshold"]
-    data = opened(work, f"{town}-edge")
-    views = _views(data, pole)
-    samples: dict[str, list[Sample]] = {}
-    vehicles = [i for i, key in enumerate(data.keys) if key.agent.startswith("cav")]
-    for done, i in enumerate(vehicles):
-        key, frame = data.keys[i], data.frame(i)
-        detections = detect_all(frozen, [frame.lidar["lidar"]], score_threshold=threshold)[0]
-        told = [views[key.scene, key.index]] if pole is not None else []
-        name = f"{town}/{key.agent}"
-        samples.setdefault(name, []).append(label_sample(frame, detections, told, frozen.config))
-        for view in told if book else ():
-            book.enter(LedgerEntry("edge", TASK, "wireless", "down", 0, name, len(view.message())))  # type: ignore[union-attr]
-        work.report(done, len(vehicles), "labels")
-    batch = setting.training.batch
-    return {name: ObjectsClient(frozen.config, samples[name], batch=batch) for name in sorted(samples)}
-
-
-def _held(clients: Mapping[str, ObjectsClient]) -> int:
-    return sum(len(client.samples) for client in clients.values())
-
-
-def _views(data: Dataset, pole: int | None) -> dict[tuple[str, int], RoadView]:
-    seen = [(i, key) for i, key in enumerate(data.keys) if key.agent == f"pole{pole}"]
-    return {(key.scene, key.index): road_view(data.frame(i)) for i, key in seen}
 
 
 def _schedule(setting: Protocol, rounds: int, *names: str) -> Schedule:

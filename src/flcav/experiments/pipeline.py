@@ -50,7 +50,7 @@ def cloud_step(protocol: Protocol) -> Step:
 
 def central_step(protocol: Protocol, name: str, source: str) -> Step:
     """Return an arm that goes on training centrally, on ground truth of `source` ("suburb" or "grid")."""
-    needs = ("plan", "pretrain", "suburb-pool", "grid-edge")
+    needs = ("plan", "pretrain", "suburb-pool", "grid-edge", "grid-place")
     return Step(name, more_training, {"source": source, "protocol": protocol.model_dump(mode="json")}, needs=needs)
 
 

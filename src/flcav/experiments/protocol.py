@@ -38,7 +38,7 @@ class Training(Config):
     patience: int = Field(default=3, ge=1)  # blocks without `min_gain` after which validation AP has levelled off
     min_gain: float = Field(default=0.01, ge=0)
     learning_rate: float = Field(default=2e-3, gt=0)
-    cooldown: tuple[float, ...] = (0.5, 0.2, 0.05)  # learning rate factors of the blocks after that
+    cooldown: tuple[float, ...] = (0.3, 0.05)  # learning rate factors of the blocks after that
     local_steps: int = Field(default=16, ge=1)
     local_learning_rate: float = Field(default=1e-3, gt=0)
     final_learning_rate: float = Field(default=2e-4, gt=0)
@@ -54,12 +54,13 @@ class Protocol(Config):
     edge_rounds_per_cloud_round: int = Field(default=1, ge=1)
     max_rounds: tuple[int, int] = (6, 3)  # edge, cloud: what there is time for
     placement_range_m: float = Field(default=40.0, gt=0)
+    group_range_m: float = Field(default=60.0, gt=0)  # a group: vehicles this near to one of the compared poles
     grid_vehicles: int = Field(default=4, ge=1, le=8)
     ring_vehicles: int = Field(default=3, ge=1, le=8)
     pool: Split = Split(scenes=20, spins=5, cavs=4)  # suburb: what stage I may choose from
     validation: Split = Split(scenes=10, spins=2, cavs=3)  # suburb
     registry: Split = Split(scenes=10, spins=3, cavs=4)  # grid and ring each
-    edge: Split = Split(scenes=12, spins=4, cavs=4)  # grid; the ring drives its own number of vehicles
+    edge: Split = Split(scenes=24, spins=5, cavs=4)  # grid; the ring drives its own number of vehicles
     test: Split = Split(scenes=40, spins=2, cavs=4)  # grid and ring each
     training: Training = Training()
 

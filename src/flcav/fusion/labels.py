@@ -1,7 +1,9 @@
 """Labels for a vehicle that has no ground truth: its frozen network's own detections, and what the road tells it.
 
 A box of the road sensor wins over the vehicle's own; what the road looked at and did not label is no object. Where
-neither saw free ground nor the road anything at all, nothing is known and an anchor there is ignored.
+neither saw free ground nor the road anything at all, nothing is known and an anchor there is ignored. A vehicle's own
+detection says that there is an object, not how large: its box is what the network would answer anyway, and to learn it
+would only hold the network back from what the road's boxes teach.
 """
 
 from collections.abc import Sequence
@@ -45,7 +47,9 @@ def label_sample(
         looked |= view.at(view.ground, cells_world) | view.at(view.occupied, cells_world)
     own = detections[~_contradicted(detections, told, cells, looked)]
     known = _free_ground(points, height, cells) | looked
-    return Sample(points, concatenate([road[targets], own]), road[ignored], cells[known].astype(np.float32))
+    boxes = concatenate([road[targets], own])
+    exact = np.arange(len(boxes)) < targets.sum()
+    return Sample(points, boxes, road[ignored], cells[known].astype(np.float32), exact)
 
 
 def _distinct(boxes: Boxes) -> NDArray[np.int64]:

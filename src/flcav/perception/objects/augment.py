@@ -30,4 +30,4 @@ def transformed(sample: Sample, mirror: float, turn_rad: float, scale: float) ->
         return replace(boxes, center=center, size=boxes.size * scale, yaw=boxes.yaw * mirror + turn_rad)
 
     free = None if sample.free is None else (sample.free @ plane).astype(np.float32)
-    return Sample(points, moved(sample.boxes), moved(sample.ignore), free)
+    return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact)

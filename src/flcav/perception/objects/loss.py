@@ -20,12 +20,15 @@ SMOOTH_L1_BETA = 1 / 9
 
 
 def second_loss(output: HeadOutput, targets: Sequence[Targets], config: SecondConfig) -> Tensor:
-    """Return the scalar loss, averaged over samples; each sample's sums are divided by its positive anchors."""
+    """Return the scalar loss, averaged over samples; each sample's sums are divided by its positive anchors.
+
+    Only anchors of boxes that are exact enter the box and direction terms.
+    """
     device = output.score.device
     samples, anchors, classes = output.score.shape
     count = torch.tensor([max(len(target.positive), 1) for target in targets], device=device)
     positive = torch.cat([target.positive + i * anchors for i, target in enumerate(targets)]).to(device)
-    share = (1 / count).repeat_interleave(torch.tensor([len(target.positive) for target in targets], device=device))
+    share = torch.cat([target.exact / target.exact.sum().clamp(min=1) for target in targets]).to(device)
     weight = torch.stack([target.weight for target in targets]).to(device) / count[:, None]
     kind = torch.tensor(anchor_classes(config), device=device)[positive % anchors]
 

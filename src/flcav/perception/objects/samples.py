@@ -30,6 +30,7 @@ class Sample:
     boxes: Boxes  # objects to find; label = detection class
     ignore: Boxes = field(default_factory=Boxes.empty)  # objects that are neither positive nor negative
     free: NDArray[np.float32] | None = None  # (K, 2) x, y [m] known to be free of objects; None: wherever no box is
+    exact: NDArray[np.bool_] | None = None  # (B,) whether `boxes` say size and pose, not only "here is one"; None: all
 
 
 def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Sample:

@@ -30,6 +30,7 @@ class Targets:
     positive: Tensor  # (P,) int64 anchor indices
     weight: Tensor  # (A,) float32: 1 where the anchor counts in the classification loss, else 0
     residual: Tensor  # (P, 7) float32
+    exact: Tensor  # (P,) float32: 1 where residual and direction are to be learned, else 0
     direction: Tensor  # (P,) int64: 1 where the heading is in [-3/4 pi, pi/4) turned by half, see `direction_of`
 
 
@@ -85,6 +86,7 @@ def assign(sample: Sample, config: SecondConfig) -> Targets:
     anchors, classes = anchor_boxes(config), anchor_classes(config)
     inside = in_range(sample.boxes, config)
     boxes, labels = sample.boxes.array()[inside], sample.boxes.label[inside]
+    exact = np.ones(len(boxes), dtype=bool) if sample.exact is None else sample.exact[inside]
     counts = np.ones(len(anchors), dtype=bool)
     if sample.free is not None:
         counts &= np.repeat(free_cells(sample.free, config).ravel(), HEADINGS * len(config.classes))
@@ -111,6 +113,7 @@ def assign(sample: Sample, config: SecondConfig) -> Targets:
     return Targets(
         positive=torch.from_numpy(positive),
         weight=torch.from_numpy(counts.astype(np.float32)),
+        exact=torch.from_numpy(exact[owner[positive]].astype(np.float32)),
         residual=torch.from_numpy(encode(targets, anchors[positive]).astype(np.float32)),
         direction=torch.from_numpy(direction_of(targets[:, 6])),
     )
