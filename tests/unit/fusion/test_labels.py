@@ -120,3 +120,12 @@ def test_a_view_answers_outside_its_grid_and_weighs_what_it_sends():
     view = RoadView(boxes(SEEN), np.zeros(2), np.ones((4, 4), bool), np.zeros((4, 4), bool))
     np.testing.assert_array_equal(view.at(view.ground, np.array([[0.1, 0.1], [-1, 0], [9, 9]])), [True, False, False])
     assert 7 * 4 < len(view.message()) < 1000
+
+
+def test_only_the_roads_boxes_are_to_be_learned_exactly():
+    ego, road, detections = scene()
+    alone, helped = (label_sample(ego, detections, views, CONFIG) for views in ([], [road_view(road)]))
+    assert alone.exact is not None
+    assert not alone.exact.any()
+    assert helped.exact is not None
+    assert helped.exact.all()  # both objects that the vehicle sees are labelled by the road

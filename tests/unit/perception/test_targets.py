@@ -4,12 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects import Sample, second_tiny
 from flcav.perception.objects.anchors import anchor_boxes
 from flcav.perception.objects.augment import augment, transformed
 from flcav.perception.objects.config import Augmentation
+from flcav.perception.objects.loss import second_loss
 from flcav.perception.objects.model import head_shape
 from flcav.perception.objects.samples import near_range
 from flcav.perception.objects.targets import assign, decode, direction_of, encode, free_cells
@@ -121,3 +123,24 @@ def test_no_point_is_left_out_that_an_augmentation_brings_into_range():
         inside = ((moved >= low) & (moved < high)).all(1)
         assert {tuple(point) for point in points[inside]} <= kept
     assert len(kept) < 0.5 * len(points)
+
+
+def test_a_box_that_is_not_exact_is_found_but_not_learned():
+    boxes = cars((20.0, 4.0, 0.1), (30.0, -8.0, 0.2))
+    inexact = Sample(NO_POINTS, boxes, exact=np.array([True, False]))
+    targets, everything = assign(inexact, CONFIG), assign(Sample(NO_POINTS, boxes), CONFIG)
+    assert torch.equal(targets.positive, everything.positive)
+    assert 0 < targets.exact.sum() < everything.exact.sum() == len(everything.positive)
+
+    output = second_tiny().train()(_nothing_seen())
+    moved = output._replace(box=output.box.detach().requires_grad_(True))
+    second_loss(moved, [targets], CONFIG).backward()
+    assert moved.box.grad is not None
+    touched = moved.box.grad[0].abs().sum(1) > 0
+    assert touched[targets.positive[targets.exact > 0]].any()
+    assert not touched[targets.positive[targets.exact == 0]].any()
+
+
+def _nothing_seen():
+    points = torch.tensor([[20.0, 4.0, -1.0, 0.3], [20.1, 4.0, -1.0, 0.3], [30.0, -8.0, -1.0, 0.3]])
+    return second_tiny().voxels(points, torch.zeros(3, dtype=torch.int64), 1)
