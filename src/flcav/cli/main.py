@@ -9,6 +9,8 @@ from flcav import __version__
 from flcav.cli import allocate, birdseye, demo, evaluate, fit, infer, place, record, reproduce, train, validate
 from flcav.config import InputError
 
+INTERRUPTED = 130
+
 app = typer.Typer(
     name="flcav",
     help="Design and verify federated learning for connected autonomous vehicle perception.",
@@ -39,11 +41,11 @@ def run(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its code: the only place where exceptions become exit codes."""
     try:
         code = app(args=arguments, standalone_mode=False)
-    except click.exceptions.Abort:
-        code = 130
-    except KeyboardInterrupt:
+        if code == INTERRUPTED:  # what typer makes of Ctrl-C
+            raise KeyboardInterrupt
+    except (click.exceptions.Abort, KeyboardInterrupt):
         print("flcav: interrupted; the same command goes on where it stopped", file=sys.stderr)
-        code = 130
+        code = INTERRUPTED
     except click.ClickException as error:
         error.show()
         code = 2

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from flwr.app import ArrayRecord
 
+from flcav.config import InputError
 from flcav.federation.client import CLIENT, client_app
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.runtimes.embedded import EmbeddedGrid
@@ -70,8 +71,11 @@ def federate(
     """Run rounds `done + 1 .. schedule.rounds` of one federation from `weights` and return what it ends with.
 
     Every message is booked on `account`; raises `BudgetExceeded` where one cannot be paid, `ClientFailed` where a
-    client raised. To resume, pass the weights and the number of the last round that `on_round` was given.
+    client raised, `InputError` without clients. To resume, pass the weights and the number of the last round that
+    `on_round` was given.
     """
+    if not clients:
+        raise InputError("a federation of 0 clients: nobody trains")
     if schedule.rounds <= done:
         return LocalUpdate(weights, 0, 0.0)
     nodes = {name: {CLIENT: name} for name in clients}

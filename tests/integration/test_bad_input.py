@@ -1,0 +1,224 @@
+"""What a user can get wrong, or the machine: one sentence on stderr, the right exit code, nothing half-written."""
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+import torch
+import yaml
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from flcav.cli.main import run
+from flcav.dataset.recorder import record
+from flcav.perception.objects.model import second_paper, second_tiny
+from flcav.perception.objects.weights import CONFIG_KEY, save_network
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+
+COMMAND = (sys.executable, "-c", "from flcav.cli.main import run; run()")
+COARSE = {"lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 16, "azimuth_steps": 360}}}}
+RECIPE = {"town": "suburb", "cavs": 2, "warmup_s": 30.0, "spins_per_scene": 1, "vehicle_rig": COARSE}
+BUDGET_B = 200_000  # bytes that a file may have where the disk is said to be full
+PROBLEM = {
+    "budgets_mb": {"wireless": 50, "wireline": 500},
+    "tasks": [
+        {
+            "name": "objects",
+            "sample_mb": 1.0,
+            "model_mb": 5.0,
+            "edge_groups": [2, 2],
+            "limits": {"samples": [40, 400], "edge_rounds": [1, 9], "cloud_rounds": [1, 9]},
+            "curve": {"model": "additive", "pretrain": {"a": 1.0, "b": 0.3}},
+        }
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("recorded") / "data"
+    record(EmbeddedSource(Recipe.model_validate(RECIPE)), out)
+    return out
+
+
+@pytest.fixture
+def data(recorded: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / "data"))
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    save_network(second_tiny(), tmp_path / "tiny.safetensors")
+    return tmp_path / "tiny.safetensors"
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run a command that is to fail; return its sentence."""
+
+    def call(*arguments: object, code: int = 2) -> str:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            run([str(argument) for argument in arguments])
+        told = capsys.readouterr()
+        assert (ended.value.code, told.out) == (code, "")
+        return one_sentence(told.err)
+
+    return call
+
+
+def one_sentence(said: str) -> str:
+    """Return the only sentence on stderr, beside what a display of progress leaves there."""
+    (line,) = [line for line in said.splitlines() if "━" not in line]
+    assert line.startswith("flcav: ")
+    return line.removeprefix("flcav: ")
+
+
+def shell(*arguments: object, file_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own, whose files may have `file_bytes` at most."""
+
+    def limit() -> None:
+        if file_bytes is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
+
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    command = [*COMMAND, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=limit, env=environment)
+
+
+def left_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_negative_range_and_an_unknown_town_from_the_shell(tmp_path: Path) -> None:
+    backwards = {"lidars": {"lidar": {"settings": {"range_m": -1}}}}
+    for change, named in (({"vehicle_rig": backwards}, "range_m' = -1"), ({"town": "atlantis"}, "atlantis")):
+        (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(RECIPE | change))
+        done = shell("record", tmp_path / "recipe.yaml", "--out", tmp_path / "data")
+        assert (done.returncode, done.stdout) == (2, "")
+        assert named in one_sentence(done.stderr)
+    assert left_in(tmp_path) == ["recipe.yaml"]
+
+
+@pytest.mark.parametrize("text", ["town: [", "- a list\n", "", b"\xff\xfe"])
+def test_a_recipe_that_is_no_mapping(text: str | bytes, tmp_path: Path, refused: Callable[..., str]) -> None:
+    path = tmp_path / "recipe.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    assert str(path) in refused("record", path, "--out", tmp_path / "data")
+    assert str(tmp_path) in refused("record", tmp_path, "--out", tmp_path / "data")
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "infer", "birdseye"])
+def test_a_truncated_point_cloud_in_a_dataset(
+    command: str, data: Path, weights: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    cloud = sorted(data.rglob("*.bin"))[0]
+    os.truncate(cloud, cloud.stat().st_size - 6)
+    out = tmp_path / "out"
+    sentence = {
+        "train": lambda: refused("train", "objects", "--data", data, "--out", out, "--epochs", 1),
+        "evaluate": lambda: refused("evaluate", "objects", "--data", data, "--weights", weights),
+        "infer": lambda: refused("infer", "objects", data, "--weights", weights),
+        "birdseye": lambda: refused("birdseye", data, "--out", out / "frame.png"),
+    }[command]()
+    assert str(cloud) in sentence
+    assert "bytes where" in sentence
+    assert not out.exists()
+
+
+def test_a_truncated_cloud_from_the_shell(weights: Path, tmp_path: Path) -> None:
+    (tmp_path / "cloud.bin").write_bytes(bytes(33))
+    done = shell("infer", "objects", tmp_path / "cloud.bin", "--weights", weights, "--json")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "truncated" in one_sentence(done.stderr)
+
+
+def test_an_empty_dataset(data: Path, weights: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
+    for path in data.glob("*.parquet"):
+        pq.write_table(pq.read_table(path).slice(0, 0), path)
+    commands = {
+        "train": ("--data", data, "--out", tmp_path / "out"),
+        "evaluate": ("--data", data, "--weights", weights),
+        "infer": (data, "--weights", weights),
+    }
+    for command, options in commands.items():
+        assert "the dataset is empty, it holds no frames" in refused(command, "objects", *options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_weights_of_another_network(data: Path, weights: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
+    save_file({"layer": torch.zeros(3)}, tmp_path / "foreign.safetensors")
+    with safe_open(weights, framework="pt") as file:
+        config = {CONFIG_KEY: file.metadata()[CONFIG_KEY]}
+    tensors = {name: tensor.contiguous() for name, tensor in second_paper().state_dict().items()}
+    save_file(tensors, tmp_path / "mixed.safetensors", config)
+    whole = weights.read_bytes()
+    (tmp_path / "cut.safetensors").write_bytes(whole[: len(whole) // 2])
+    for name, said in (("foreign", "another network"), ("mixed", "another network"), ("cut", "damaged")):
+        path = tmp_path / f"{name}.safetensors"
+        for command in (("evaluate", "objects", "--data", data), ("infer", "objects", data)):
+            sentence = refused(*command, "--weights", path)
+            assert said in sentence
+            assert str(path) in sentence
+
+
+def test_a_plan_over_budget_from_the_shell(tmp_path: Path) -> None:
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(PROBLEM))
+    done = shell("allocate", tmp_path / "problem.yaml", "--json")
+    assert done.returncode == 2
+    sentence = one_sentence(done.stderr)
+    assert json.loads(done.stdout) == {"status": "infeasible", "message": sentence}
+    assert "costs 80 MB of wireless uplink" in sentence  # 40 samples, 2 rounds of 4 vehicles
+    assert "budgets_mb.wireless = 50" in sentence
+
+
+def test_output_below_a_file(data: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
+    (tmp_path / "file").write_text("kept")
+    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(RECIPE))
+    below = tmp_path / "file" / "out"
+    for command in (
+        ("record", tmp_path / "recipe.yaml", "--out", below),
+        ("train", "objects", "--data", data, "--out", below, "--epochs", 1),
+        ("birdseye", data, "--out", below / "frame.png"),
+    ):
+        assert refused(*command, code=1).startswith(str(below)), command[0]
+    done = shell("demo", "--out", below)
+    assert done.returncode == 1
+    assert one_sentence(done.stderr).startswith(str(below))
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_a_full_disk_while_weights_are_written(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = shell("train", "objects", "--data", data, "--out", out, "--epochs", 1, file_bytes=BUDGET_B)
+    assert done.returncode == 1
+    assert one_sentence(done.stderr) == f"{out / 'weights.safetensors'}: File too large"
+    assert left_in(out) == []
+
+
+def test_a_full_disk_while_a_picture_is_written(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out" / "frame.png"
+    done = shell("birdseye", data, "--out", out, file_bytes=10_000)
+    assert done.returncode == 1
+    assert one_sentence(done.stderr) == f"{out}: File too large"
+    assert left_in(out.parent) == []
+
+
+def test_a_demo_into_the_folder_of_another(tmp_path: Path) -> None:
+    step = tmp_path / "work" / "suburb-pool"
+    step.mkdir(parents=True)
+    (step / "done.json").write_text(json.dumps({"fingerprint": "of another seed", "value": {}}))
+    done = shell("demo", "--out", tmp_path)
+    assert done.returncode == 2
+    assert one_sentence(done.stderr).startswith(f"{tmp_path / 'work'}: holds the steps of another")
+    assert left_in(tmp_path) == ["work/suburb-pool/done.json"]

@@ -1,0 +1,50 @@
+"""Every example runs as it stands, and is short."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run(name: str, *arguments: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+    runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_an_example_is_short(path: Path):
+    assert len(path.read_text().splitlines()) <= 80
+
+
+@pytest.mark.slow
+def test_observe_a_town(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    run("01_observe_a_town.py", tmp_path, monkeypatch=monkeypatch)
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 2 * 3 + 1  # spins x agents, and the picture
+    assert any("pole8" in line for line in said)
+    with Image.open(tmp_path / "frame.png") as picture:
+        assert min(picture.size) > 300
+
+
+def test_allocate_a_budget(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    run("02_allocate_a_budget.py", monkeypatch=monkeypatch)
+    assert "8000 MB per link" in capsys.readouterr().out
+
+
+def test_place_a_sensor(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    run("03_place_a_sensor.py", monkeypatch=monkeypatch)
+    assert "exact: poles" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_federate_a_detector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    run("04_federate_a_detector.py", tmp_path, monkeypatch=monkeypatch)
+    said = capsys.readouterr().out
+    assert said.count("mean loss") == 2
+    assert said.count(" up cav1") == said.count("down cav0") == 2
+    assert "of 6 MB" in said
+    assert (tmp_path / "weights.safetensors").is_file()
