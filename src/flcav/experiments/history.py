@@ -15,9 +15,9 @@ from flcav.experiments.protocol import REGIONS
 from flcav.experiments.steps import Step, run_side_by_side
 from flcav.files import atomic_path
 
-PLANS = ((101, 320, 6, 3), (102, 80, 6, 3))  # seed, samples, edge, cloud rounds
+PLANS = ((101, 320, 6, 3), (102, 80, 6, 3), (101, 80, 0, 0), (102, 320, 0, 0))  # seed, samples, edge, cloud rounds
 COLUMNS = ("seed", "samples", "edge_rounds", "cloud_rounds", "accuracy")
-FRAMES = 60  # test frames of each point
+FRAMES = 10_000  # every test frame, so that all points are on the same ones
 
 
 def steps_for(seed: int, samples: int, edge_rounds: int, cloud_rounds: int) -> list[Step]:
@@ -26,6 +26,9 @@ def steps_for(seed: int, samples: int, edge_rounds: int, cloud_rounds: int) -> l
     protocol = demo_protocol(seed).model_copy(update=update)
     chosen = {"samples": samples, "edge_rounds": edge_rounds, "cloud_rounds": cloud_rounds}
     steps = shared_steps(protocol, Step("plan", fixed_plan, chosen))
+    if not edge_rounds:
+        used = ("plan", "pretrain", "suburb-pool", "suburb-validation", "grid-test")
+        return [*(step for step in steps if step.name in used), test_step("pretrain", "grid")]
     steps += [edge_step(protocol, town, "chosen") for town in REGIONS] + [cloud_step(protocol)]
     return [
         *steps,
@@ -41,14 +44,14 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args(arguments)
-    runs = {options.out / str(plan[0]): steps_for(*plan) for plan in PLANS}
+    runs = {options.out / f"{plan[0]}-{plan[1]}": steps_for(*plan) for plan in PLANS}
     results = run_side_by_side(runs, jobs=options.jobs, notify=_print)
     rows: list[tuple[float, ...]] = []
     for (seed, samples, edge_rounds, _), values in zip(PLANS, results.values(), strict=True):
         rows.append((seed, samples, 0, 0, values["test-pretrain-grid"]["ap50"]))
-        for row in values["rounds-grid-edge-chosen-grid"]:
+        for row in values.get("rounds-grid-edge-chosen-grid", []):
             rows.append((seed, samples, row["round"], 0, row["ap50"]))
-        for row in values["rounds-cloud-grid"]:
+        for row in values.get("rounds-cloud-grid", []):
             rows.append((seed, samples, edge_rounds, row["round"], row["ap50"]))
     with atomic_path(Path(str(HISTORY))) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
