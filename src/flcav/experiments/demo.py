@@ -190,12 +190,12 @@ def _sweep(work: Path, value: dict[str, Any]) -> sweeps.Sweep:
     lidar = only_lidar(frame)
     before, after = (
         sweeps.Detections(
-            name,
+            seen["name"],
             Boxes.from_array(np.array(seen["boxes"]), "Car"),
             np.array(seen["hit"], dtype=bool),
             np.array(seen["found"], dtype=bool),
         )
-        for name, seen in value["seen"].items()
+        for seen in value["seen"]
     )
     ground_m = -float(frame.world_from_sensor(lidar)[2, 3])
     targets = Boxes.from_array(np.array(value["targets"]), "Car")

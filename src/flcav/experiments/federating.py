@@ -107,7 +107,6 @@ def _checkpoint(work: Work, book: Ledger, rounds: int) -> OnRound:
 
     def keep(round_: int, weights: Weights, loss: float) -> None:
         write_bytes(round_path(work.folder, round_), save(dict(weights)))
-        write_json(work.folder / f"round{round_}.json", {"loss": loss})
         book.save(work.folder / LEDGER)
         write_json(work.folder / ROUND, {"round": round_, "entries": len(book.entries)})
         work.report(round_, rounds, f"loss {loss:.3f}")

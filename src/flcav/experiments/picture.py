@@ -28,10 +28,10 @@ def look(work: Work, town: str, arms: dict[str, str]) -> dict[str, Any]:
     best = int(np.argmax([len(truth.targets) for truth in truths]))
     frame, truth = data.frame(best), truths[best]
     points = frame.lidar[only_lidar(frame)]
-    seen = {
-        name: _matched(detect(network, points, score_threshold=SHOWN_SCORE), truth)
+    seen = [
+        {"name": name, **_matched(detect(network, points, score_threshold=SHOWN_SCORE), truth)}
         for name, network in networks.items()
-    }
+    ]
     return {"frame": best, "key": frame.key, "targets": truth.targets.array().tolist(), "seen": seen}
 
 
