@@ -1,9 +1,10 @@
 """Labels for a vehicle that has no ground truth: its frozen network's own detections, and what the road tells it.
 
 A box of the road sensor wins over the vehicle's own; what the road looked at and did not label is no object. Where
-neither saw free ground nor the road anything at all, nothing is known and an anchor there is ignored. A vehicle's own
-detection says that there is an object, not how large: its box is what the network would answer anyway, and to learn it
-would only hold the network back from what the road's boxes teach.
+neither saw free ground nor the road anything at all, nothing is known and an anchor there is ignored. Beside a road
+sensor a vehicle's own detection says that there is an object, not how large: its box is what the network would answer
+anyway, and to learn it would hold the network back from what the road's boxes teach. Without a road sensor it is all
+there is, and keeps the boxes from drifting.
 """
 
 from collections.abc import Sequence
@@ -48,7 +49,7 @@ def label_sample(
     own = detections[~_contradicted(detections, told, cells, looked)]
     known = _free_ground(points, height, cells) | looked
     boxes = concatenate([road[targets], own])
-    exact = np.arange(len(boxes)) < targets.sum()
+    exact = np.arange(len(boxes)) < targets.sum() if views else None
     return Sample(points, boxes, road[ignored], cells[known].astype(np.float32), exact)
 
 

@@ -122,10 +122,12 @@ def test_a_view_answers_outside_its_grid_and_weighs_what_it_sends():
     assert 7 * 4 < len(view.message()) < 1000
 
 
-def test_only_the_roads_boxes_are_to_be_learned_exactly():
+def test_beside_a_road_sensor_only_its_boxes_are_to_be_learned_exactly():
     ego, road, detections = scene()
-    alone, helped = (label_sample(ego, detections, views, CONFIG) for views in ([], [road_view(road)]))
-    assert alone.exact is not None
-    assert not alone.exact.any()
+    unseen = RoadView(Boxes.empty(), np.array([500.0, 500.0]), np.zeros((1, 1), bool), np.zeros((1, 1), bool))
+    alone, helped, beside = (label_sample(ego, detections, v, CONFIG) for v in ([], [road_view(road)], [unseen]))
+    assert alone.exact is None  # its own boxes are all there is
     assert helped.exact is not None
     assert helped.exact.all()  # both objects that the vehicle sees are labelled by the road
+    assert beside.exact is not None
+    assert not beside.exact.any()
