@@ -15,7 +15,7 @@ def silent(done: int, total: int, note: str = "") -> None:
 
 @contextlib.contextmanager
 def live(title: str) -> Iterator[Report]:
-    """Yield a `Report` that draws a bar with the time left on stderr."""
+    """Yield a `Report` that draws a bar with the time left on stderr, where that is a terminal."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -23,6 +23,7 @@ def live(title: str) -> Iterator[Report]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bars:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
         task = bars.add_task(title, total=None, note="")
         yield lambda done, total, note="": bars.update(task, completed=done, total=total, note=note)

@@ -77,8 +77,8 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 def one_sentence(said: str) -> str:
-    """Return the only sentence on stderr, beside what a display of progress leaves there."""
-    (line,) = [line for line in said.splitlines() if "━" not in line]
+    """Return the only sentence on stderr."""
+    (line,) = said.splitlines()
     assert line.startswith("flcav: ")
     return line.removeprefix("flcav: ")
 

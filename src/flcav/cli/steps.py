@@ -11,7 +11,7 @@ from flcav.experiments.steps import Notify
 
 @contextlib.contextmanager
 def live_steps(title: str) -> Iterator[Notify]:
-    """Yield a `Notify` that draws one bar per running step below a line of the finished ones' number."""
+    """Yield a `Notify` that draws one bar per running step; without a terminal, one line per finished step."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
@@ -19,7 +19,7 @@ def live_steps(title: str) -> Iterator[Notify]:
         TextColumn("{task.fields[note]}", markup=False),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console) as bars:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
         whole = bars.add_task(title, total=None, note="")
         rows: dict[str, TaskID] = {}
         finished = 0
