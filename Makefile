@@ -1,6 +1,8 @@
 # Every target builds .venv first if it is missing or older than what it is built from.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
+# One thread per process: parallel work is in processes, and threads that wait for each other on shared cores crawl.
 export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
 STAMP := .venv/.installed
 BIN := .venv/bin
 
