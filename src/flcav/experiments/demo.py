@@ -13,7 +13,7 @@ from flcav.experiments.picture import look
 from flcav.experiments.pipeline import cloud_step, edge_step, plan_step, rounds_step, shared_steps, test_step
 from flcav.experiments.placing import ERRORS
 from flcav.experiments.pretraining import LEDGER
-from flcav.experiments.protocol import REGIONS, Protocol, Split
+from flcav.experiments.protocol import REGIONS, Protocol, Split, Training
 from flcav.experiments.recording import DATA
 from flcav.experiments.steps import Notify, Step, run_steps
 from flcav.experiments.testing import difference
@@ -39,6 +39,7 @@ def demo_protocol(seed: int) -> Protocol:
         registry=Split(scenes=8, spins=3, cavs=4),
         edge=Split(scenes=16, spins=5, cavs=4),
         test=Split(scenes=30, spins=1, cavs=4),
+        training=Training(max_blocks=9),
     )
 
 

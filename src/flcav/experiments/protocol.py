@@ -34,7 +34,7 @@ class Training(Config):
 
     batch: int = Field(default=2, ge=1)
     block_steps: int = Field(default=100, ge=1)  # pretraining goes in blocks, validated after each
-    max_blocks: int = Field(default=6, ge=1)
+    max_blocks: int = Field(default=12, ge=1)
     patience: int = Field(default=3, ge=1)  # blocks without `min_gain` after which validation AP has levelled off
     min_gain: float = Field(default=0.01, ge=0)
     learning_rate: float = Field(default=2e-3, gt=0)
