@@ -47,7 +47,8 @@ def run(arguments: list[str] | None = None) -> None:
         print("flcav: interrupted; the same command goes on where it stopped", file=sys.stderr)
         code = INTERRUPTED
     except click.ClickException as error:
-        error.show()
+        if message := error.format_message():  # empty where the help was asked for, and shown
+            print(f"flcav: {message}", file=sys.stderr)
         code = 2
     except InputError as error:
         print(f"flcav: {error}", file=sys.stderr)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from flcav.config import InputError
 from flcav.experiments.federating import round_network
 from flcav.experiments.pretraining import WEIGHTS
 from flcav.experiments.recording import opened
@@ -27,6 +28,8 @@ def test_arm(work: Work, arm: str, town: str) -> dict[str, Any]:
     frames = (data.frame(i) for i in range(len(data)))
     result = evaluate(network, frames, total=len(data), progress=work.report)
     _save_matches(work.folder / MATCHES, result)
+    if not result.targets["Car"]:
+        raise InputError(f"{town}: its {result.frames} test frames hold no car to find; take more scenes")
     half, strict, bev = result.score("Car"), result.score("Car", "3d", 0.7), result.score("Car", "bev", 0.5)
     return {
         "ap50": half.ap,
