@@ -1,0 +1,197 @@
+"""Weather as continuous parameters; presets and the classes of the weather task are a point and a region of them."""
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator, Field, field_validator, model_validator
+
+from flcav.config import Config
+
+NO_FOG_M = 20_000.0  # from this visibility on the air is taken as clear
+NIGHT_DEG = -6.0  # end of civil twilight: street lamps and headlamps are on
+
+
+class Weather(Config):
+    """The weather of one instant."""
+
+    sun_elevation_deg: float = Field(default=45.0, ge=-90, le=90)
+    sun_azimuth_deg: float = 160.0  # clockwise from north
+    cloud_cover: float = Field(default=0.1, ge=0, le=1)  # share of the sky
+    rain_mm_h: float = Field(default=0.0, ge=0, le=300)
+    visibility_m: float = Field(default=NO_FOG_M, ge=5, le=1e6)  # meteorological optical range, of haze and fog alone
+    wetness: float = Field(default=0.0, ge=0, le=1)  # of the road: 0 dry, 1 under water
+
+    @property
+    def night(self) -> bool:
+        """Return whether it is too dark to see without lamps."""
+        return self.sun_elevation_deg < NIGHT_DEG
+
+    @property
+    def fog_per_m(self) -> float:
+        """Return the extinction coefficient of fog [1/m], ln 20 / visibility (ICAO's 5 % contrast); 0 in clear air."""
+        return np.log(20.0) / self.visibility_m if self.visibility_m < NO_FOG_M else 0.0
+
+
+WEATHERS: dict[str, Weather] = {
+    "clear": Weather(),
+    "cloudy": Weather(cloud_cover=0.5),
+    "overcast": Weather(cloud_cover=0.97, sun_elevation_deg=40.0),
+    "light_rain": Weather(cloud_cover=0.9, rain_mm_h=3.0, wetness=0.5, visibility_m=10_000.0),
+    "heavy_rain": Weather(cloud_cover=1.0, rain_mm_h=35.0, wetness=0.95, visibility_m=4000.0, sun_elevation_deg=35.0),
+    "fog": Weather(cloud_cover=0.9, visibility_m=120.0, wetness=0.15, sun_elevation_deg=30.0),
+    "sunset": Weather(sun_elevation_deg=4.0, sun_azimuth_deg=265.0, cloud_cover=0.25),
+    "night": Weather(sun_elevation_deg=-25.0, sun_azimuth_deg=330.0, cloud_cover=0.3),
+    "rainy_night": Weather(sun_elevation_deg=-25.0, cloud_cover=1.0, rain_mm_h=12.0, wetness=0.9, visibility_m=6000.0),
+    "foggy_night": Weather(sun_elevation_deg=-20.0, cloud_cover=0.9, visibility_m=90.0, wetness=0.2),
+    "hard_sun": Weather(sun_elevation_deg=14.0, sun_azimuth_deg=90.0, cloud_cover=0.0),
+    "wet_sun": Weather(cloud_cover=0.3, wetness=0.8),
+}
+
+Region = Mapping[str, tuple[float, float]]  # parameter -> lowest and highest value; what is not named is free
+
+_DAY = {"sun_elevation_deg": (20.0, 75.0)}
+_DRY = {"rain_mm_h": (0.0, 0.0), "wetness": (0.0, 0.2)}
+_FAR = {"visibility_m": (10_000.0, NO_FOG_M)}
+_WET_FAR = {"visibility_m": (3000.0, NO_FOG_M)}
+
+WEATHER_CLASSES: dict[str, Region] = {
+    "clear": {**_DAY, **_DRY, **_FAR, "cloud_cover": (0.0, 0.2)},
+    "cloudy": {**_DAY, **_DRY, **_FAR, "cloud_cover": (0.4, 0.65)},
+    "overcast": {**_DAY, **_DRY, **_FAR, "cloud_cover": (0.85, 1.0)},
+    "light_rain": {**_DAY, **_WET_FAR, "cloud_cover": (0.75, 1.0), "rain_mm_h": (1.0, 5.0), "wetness": (0.3, 0.7)},
+    "heavy_rain": {**_DAY, **_WET_FAR, "cloud_cover": (0.9, 1.0), "rain_mm_h": (20.0, 60.0), "wetness": (0.85, 1.0)},
+    "fog": {**_DAY, **_DRY, "cloud_cover": (0.5, 1.0), "visibility_m": (50.0, 400.0)},
+    "sunset": {**_DRY, **_FAR, "sun_elevation_deg": (1.0, 7.0), "cloud_cover": (0.0, 0.5)},
+    "night": {**_DRY, **_FAR, "sun_elevation_deg": (-60.0, -10.0), "cloud_cover": (0.0, 1.0)},
+}
+# Any two classes are at least so far apart in one of these parameters.
+MARGINS: dict[str, float] = {
+    "sun_elevation_deg": 10.0,
+    "cloud_cover": 0.2,
+    "rain_mm_h": 1.0,
+    "visibility_m": 5000.0,
+}
+
+
+def weather_class(weather: Weather) -> str | None:
+    """Return the class of WEATHER_CLASSES whose region holds `weather`; None between and beyond them."""
+    for name, region in WEATHER_CLASSES.items():
+        if all(low <= getattr(weather, parameter) <= high for parameter, (low, high) in region.items()):
+            return name
+    return None
+
+
+def draw_weather(name: str | None, rng: np.random.Generator) -> Weather:
+    """Return a weather drawn from the region of the class `name`, or from the whole space where it is None.
+
+    Rain and visibility are drawn evenly over their logarithm, everything else evenly; the sun's azimuth is free.
+    """
+    region = _anywhere(rng) if name is None else WEATHER_CLASSES[name]
+    drawn = {parameter: _draw(parameter, *limits, rng) for parameter, limits in region.items()}
+    return Weather(**{**drawn, "sun_azimuth_deg": float(rng.uniform(0.0, 360.0))})
+
+
+def interpolate(one: Weather, other: Weather, share: float) -> Weather:
+    """Return the weather `share` (0..1) of the way from `one` to `other`.
+
+    Each parameter changes linearly, the visibility by its reciprocal (which is what fog does to light), the sun's
+    azimuth the short way round.
+    """
+    parts = {name: (getattr(one, name), getattr(other, name)) for name in Weather.model_fields}
+    mixed = {name: (1 - share) * a + share * b for name, (a, b) in parts.items()}
+    a, b = parts["visibility_m"]
+    mixed["visibility_m"] = 1 / ((1 - share) / a + share / b)
+    a, b = parts["sun_azimuth_deg"]
+    mixed["sun_azimuth_deg"] = (a + share * ((b - a + 180.0) % 360.0 - 180.0)) % 360.0
+    return Weather(**mixed)
+
+
+def _named(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    if value not in WEATHERS:
+        raise ValueError(f"unknown weather; known weathers: {', '.join(WEATHERS)}")
+    return WEATHERS[value]
+
+
+class Keyframe(Config):
+    """The weather at one time."""
+
+    at_s: float = Field(ge=0)  # after the scene's first spin
+    weather: Annotated[Weather, BeforeValidator(_named)]
+
+
+class WeatherSchedule(Config):
+    """The weather over a scene: keyframes, or classes one of which is drawn for each scene.
+
+    In a recipe it may also be written as the name of a preset, as one weather, or as the list of keyframes alone.
+    """
+
+    keyframes: tuple[Keyframe, ...] = ()
+    classes: tuple[str, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_short_forms(cls, value: Any) -> Any:
+        if isinstance(value, list | tuple):
+            return {"keyframes": value}
+        one = isinstance(value, str | Weather)
+        if one or (isinstance(value, dict) and not {"keyframes", "classes"} & set(value)):
+            return {"keyframes": [{"at_s": 0.0, "weather": value}]}
+        return value
+
+    @field_validator("classes")
+    @classmethod
+    def _known_classes(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if unknown := [name for name in value if name not in WEATHER_CLASSES]:
+            raise ValueError(f"no weather class '{unknown[0]}'; the classes are {', '.join(WEATHER_CLASSES)}")
+        return value
+
+    @model_validator(mode="after")
+    def _one_of_both_in_order(self) -> "WeatherSchedule":
+        if bool(self.keyframes) == bool(self.classes):
+            raise ValueError("give a weather, a list of keyframes, or classes to draw from")
+        times = [keyframe.at_s for keyframe in self.keyframes]
+        if any(later <= earlier for earlier, later in pairwise(times)):
+            raise ValueError(f"the keyframes' at_s must ascend, not {times}")
+        return self
+
+    def draw(self, rng: np.random.Generator) -> "WeatherSchedule":
+        """Return the schedule of one scene: itself, or a weather of one of its classes."""
+        if not self.classes:
+            return self
+        weather = draw_weather(self.classes[int(rng.integers(len(self.classes)))], rng)
+        return WeatherSchedule(keyframes=(Keyframe(at_s=0.0, weather=weather),))
+
+    def at(self, time_s: float) -> Weather:
+        """Return the weather `time_s` after the scene's first spin; before and after all keyframes it stands still.
+
+        Raises `ValueError` where classes were given and none was drawn.
+        """
+        if not self.keyframes:
+            raise ValueError("no weather was drawn from the classes: see WeatherSchedule.draw")
+        after = int(np.searchsorted([keyframe.at_s for keyframe in self.keyframes], time_s, side="right"))
+        if after == 0 or after == len(self.keyframes):
+            return self.keyframes[max(after - 1, 0)].weather
+        one, other = self.keyframes[after - 1 : after + 1]
+        return interpolate(one.weather, other.weather, (time_s - one.at_s) / (other.at_s - one.at_s))
+
+
+def _draw(parameter: str, low: float, high: float, rng: np.random.Generator) -> float:
+    if parameter in ("rain_mm_h", "visibility_m") and low > 0:
+        return float(np.clip(np.exp(rng.uniform(np.log(low), np.log(high))), low, high))
+    return float(rng.uniform(low, high))
+
+
+def _anywhere(rng: np.random.Generator) -> Region:
+    """Return limits around weathers that occur: rain comes from clouds and wets the road, fog is the exception."""
+    rains, foggy, dries = rng.random(3) < (0.4, 0.25, 0.7)
+    return {
+        "sun_elevation_deg": (-60.0, 75.0),
+        "cloud_cover": (0.6, 1.0) if rains else (0.0, 1.0),
+        "rain_mm_h": (0.3, 60.0) if rains else (0.0, 0.0),
+        "visibility_m": (50.0, 3000.0) if foggy else (3000.0, NO_FOG_M),
+        "wetness": (0.3, 1.0) if rains else (0.0, 0.2 if dries else 0.9),
+    }
