@@ -73,10 +73,23 @@ class Scene:
         threads: int = 1,
     ) -> Hits:
         """Return what each ray (N, 3) meets first, as if the actor `hidden` were not there: see `Target.trace`."""
-        if hidden != self._hidden:
-            self._hidden = hidden
-            self._place()
+        self._hide(hidden)
         return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m, threads=threads)
+
+    def blocked(
+        self,
+        origins: NDArray[np.float32],
+        directions: NDArray[np.float32],
+        far_m: NDArray[np.float32],
+        *,
+        hidden: int | None = None,
+    ) -> NDArray[np.bool_]:
+        """Return for each ray, world frame, whether anything but the actor `hidden` lies before its end `far_m` (N,).
+
+        `directions` are unit vectors (N, 3), or (1, 3) for all. Never blocked where `far_m` is not positive.
+        """
+        self._hide(hidden)
+        return self._assembly.blocked(origins, directions, far_m)
 
     def cast_alone(
         self,
@@ -89,6 +102,11 @@ class Scene:
     ) -> Hits:
         """Return what each ray meets of one actor in an empty world; rays are placed in the actor's body frame."""
         return self._solids[actor + 1].trace(body_from_rays, directions, near_m=near_m, far_m=far_m)
+
+    def _hide(self, hidden: int | None) -> None:
+        if hidden != self._hidden:
+            self._hidden = hidden
+            self._place()
 
     def _poses(self) -> NDArray[np.float64]:
         """Return (A, 4) x, y, z, yaw."""

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from flcav.geometry import pose
 from flcav.world.rays import library as c
-from flcav.world.rays.packets import LANES, trace_packets
+from flcav.world.rays.packets import LANES, block_packets, trace_packets
 from flcav.world.rays.raycaster import Hits
 
 _ARGUMENTS = c.IntersectArguments(flags=c.QUERY_COHERENT, feature_mask=0xFFFFFFFF)
+_BLOCK_ARGUMENTS = c.OccludedArguments(flags=c.QUERY_COHERENT, feature_mask=0xFFFFFFFF)
 
 
 class Solid:
@@ -109,6 +110,22 @@ class Assembly:
         """Trace rays against everything placed: see `Target.trace`."""
         return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
 
+    def blocked(
+        self, origins: NDArray[np.float32], directions: NDArray[np.float32], far_m: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Return for each ray whether anything lies before its end: see `Assembly.blocked`."""
+        out = np.empty(len(far_m), np.bool_)
+        block_packets(
+            _address("rtcOccluded16"),
+            self.handle,
+            ctypes.addressof(_BLOCK_ARGUMENTS),
+            np.ascontiguousarray(origins, np.float32),
+            np.ascontiguousarray(directions, np.float32),
+            np.ascontiguousarray(far_m, np.float32),
+            out,
+        )
+        return out
+
 
 class Embree:
     """The engine; making one tests the library: raises `OSError` where it is missing or does not trace rightly."""
@@ -144,7 +161,17 @@ def _trace(
 
     def part(first: int, last: int) -> None:
         trace_packets(
-            _intersect_address(), handle, arguments, origin, rotation, rays, near, np.float32(far_m), first, last, *hits
+            _address("rtcIntersect16"),
+            handle,
+            arguments,
+            origin,
+            rotation,
+            rays,
+            near,
+            np.float32(far_m),
+            first,
+            last,
+            *hits,
         )
 
     if threads == 1 or len(rays) <= LANES:
@@ -165,9 +192,9 @@ def _device() -> int:
     return device
 
 
-@lru_cache(maxsize=1)
-def _intersect_address() -> int:
-    return ctypes.cast(c.embree_library().rtcIntersect16, ctypes.c_void_p).value or 0
+@lru_cache(maxsize=2)
+def _address(function: str) -> int:
+    return ctypes.cast(getattr(c.embree_library(), function), ctypes.c_void_p).value or 0
 
 
 def _check(doing: str) -> None:

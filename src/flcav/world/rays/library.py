@@ -42,6 +42,7 @@ SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "rtcSetGeometryInstancedScene": (None, [c_void_p, c_void_p]),
     "rtcSetGeometryTransform": (None, [c_void_p, c_uint, c_int, POINTER(c_float)]),
     "rtcIntersect16": (None, [c_void_p, c_void_p, c_void_p, c_void_p]),
+    "rtcOccluded16": (None, [c_void_p, c_void_p, c_void_p, c_void_p]),
 }
 
 
@@ -54,6 +55,19 @@ class IntersectArguments(ctypes.Structure):
         ("context", c_void_p),
         ("filter", c_void_p),
         ("intersect", c_void_p),
+        ("min_width_distance_factor", c_float),
+    )
+
+
+class OccludedArguments(ctypes.Structure):
+    """`RTCOccludedArguments`."""
+
+    _fields_ = (
+        ("flags", c_uint),
+        ("feature_mask", c_uint),
+        ("context", c_void_p),
+        ("filter", c_void_p),
+        ("occluded", c_void_p),
         ("min_width_distance_factor", c_float),
     )
 

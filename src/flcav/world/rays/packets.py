@@ -81,3 +81,42 @@ def trace_packets(
                 distance[ray] = packet[FAR, lane]
                 instance[ray] = max(packet_words[INSTANCE, lane], 0)
                 face[ray] = packet_words[FACE, lane]
+
+
+@compiled
+def block_packets(occluded, scene, arguments, origins, directions, far, blocked):
+    """Write for each ray whether anything lies before its end `far` (N,); where that is not positive: nothing does.
+
+    `occluded`, `scene` and `arguments` are addresses; `origins` is (N, 3) and `directions` (N, 3), or (1, 3) for all.
+    """
+    spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
+    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4
+    packet = spare_floats[skipped : skipped + ROWS * LANES].reshape(ROWS, LANES)
+    packet_words = packet.view(np.int32)
+    spare_words = np.empty(2 * LANES, np.int32)
+    skipped = ((64 - spare_words.ctypes.data % 64) % 64) // 4
+    valid = spare_words[skipped : skipped + LANES]
+    rays = np.empty(LANES, np.int64)
+    direction_step = 1 if len(directions) > 1 else 0
+    packet[NEAR, :] = 0
+    packet[TIME, :] = 0
+    packet_words[MASK, :] = -1
+    packet_words[RAY_ID, :] = 0
+    packet_words[FLAGS, :] = 0
+    lanes = 0
+    for ray in range(len(far)):
+        blocked[ray] = False
+        if far[ray] > 0:
+            for axis in range(3):
+                packet[ORIGIN + axis, lanes] = origins[ray, axis]
+                packet[DIRECTION + axis, lanes] = directions[ray * direction_step, axis]
+            packet[FAR, lanes] = far[ray]
+            rays[lanes] = ray
+            lanes += 1
+        if lanes == LANES or (ray == len(far) - 1 and lanes > 0):
+            for lane in range(LANES):
+                valid[lane] = -1 if lane < lanes else 0
+            call_c(occluded, valid.ctypes.data, scene, packet.ctypes.data, arguments)  # pyright: ignore[reportCallIssue]
+            for lane in range(lanes):
+                blocked[rays[lane]] = packet[FAR, lane] < 0
+            lanes = 0

@@ -48,6 +48,15 @@ class Assembly(Target, Protocol):
         """Make what was placed visible to the next trace. Never while another thread traces."""
         ...
 
+    def blocked(
+        self, origins: NDArray[np.float32], directions: NDArray[np.float32], far_m: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Return for each ray whether anything lies before its end `far_m` (N,); never where that is not positive.
+
+        `origins` (N, 3) and unit `directions` (N, 3), or (1, 3) for all, are in the assembly's frame.
+        """
+        ...
+
 
 SolidT = TypeVar("SolidT", bound=Target)
 
