@@ -1,6 +1,7 @@
 """An allocation problem as a user writes it: budgets, message sizes, limits and learning curves per task."""
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -28,6 +29,13 @@ class Limits(Config):
         return self
 
 
+class Uplink(Config):
+    """What one vehicle can send [Mbit/s]."""
+
+    wireless: Positive
+    wireline: Positive | None = None  # what its edge server passes on for it; None: as much as it sends
+
+
 class Task(Config):
     """One task: what its messages weigh, who takes part, and what its training brings."""
 
@@ -36,8 +44,25 @@ class Task(Config):
     sample_mb: Positive
     model_mb: Positive
     edge_groups: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]  # vehicles per edge server
+    uplink_mbps: Mapping[str, Uplink] | None = None  # by vehicle, in the order of the edge groups
+    samples_held: Mapping[str, Count] = {}  # by vehicle; one that is not named holds as many as are asked for
+    data_quality: Mapping[str, Positive] = {}  # by vehicle: what a sample of its is worth; 1 if not named
     limits: Limits
     curve: Curve
+
+    @model_validator(mode="after")
+    def _vehicles(self) -> Self:
+        known = self.uplink_mbps or {}
+        if self.uplink_mbps is not None and len(known) != sum(self.edge_groups):
+            raise ValueError(
+                f"uplink_mbps of task {self.name!r} names {len(known)} vehicles, edge_groups have "
+                f"{sum(self.edge_groups)}"
+            )
+        for field in ("samples_held", "data_quality"):
+            for vehicle in getattr(self, field):
+                if vehicle not in known:
+                    raise ValueError(f"{field} of task {self.name!r} names {vehicle!r}, which uplink_mbps does not")
+        return self
 
     @model_validator(mode="after")
     def _finite(self) -> Self:
@@ -66,7 +91,19 @@ class Problem(Config):
 
     budgets_mb: Budgets
     edge_rounds_per_cloud_round: Count = 1  # k: each cloud round runs, and pays, k edge rounds in every region
+    horizon_s: Positive | None = None  # how long each vehicle's own link may be busy with the plan
     tasks: Annotated[tuple[Task, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _one_link_per_vehicle(self) -> Self:
+        links: dict[str, Uplink] = {}
+        for task in self.tasks:
+            for vehicle, link in (task.uplink_mbps or {}).items():
+                if links.setdefault(vehicle, link) != link:
+                    raise ValueError(
+                        f"uplink_mbps of task {task.name!r} gives vehicle {vehicle!r} another link than an earlier task"
+                    )
+        return self
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
