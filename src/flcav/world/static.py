@@ -1,6 +1,11 @@
-"""A town's static content as one mesh."""
+"""A town's static content as one mesh, and which of its faces belong to what."""
 
+import pickle
 from collections.abc import Iterator
+from enum import IntEnum
+from hashlib import sha256
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -9,18 +14,90 @@ from numpy.typing import NDArray
 from flcav.seeds import stream
 from flcav.world.materials import Material
 from flcav.world.meshes.buildings import building
-from flcav.world.meshes.furniture import clutter, lamp, sensor_mast, sign
+from flcav.world.meshes.furniture import clutter, lamp, sensor_mast, sign_plate, sign_post
 from flcav.world.meshes.mesh import Mesh, join, moved, sheet
 from flcav.world.meshes.plants import tree
 from flcav.world.town import KERB_M, Town
 
 GROUND_M = -0.03  # open ground lies a little below the road
 LAND_M = 150.0  # ground beyond the town's bounds
+TOWNS_KEPT = 4
+
+
+class Part(IntEnum):
+    """What a face of the town is a part of."""
+
+    GROUND = 0
+    ROAD = 1
+    SIDEWALK = 2
+    BUILDING = 3
+    TREE = 4
+    CLUTTER = 5
+    LAMP = 6
+    POST = 7  # of a sign or a signal
+    MAST = 8  # of a roadside sensor
+    SIGN = 9
+    SIGNAL = 10
+
+
+class StaticWorld(NamedTuple):
+    """A town's mesh and the owners of its faces."""
+
+    mesh: Mesh  # world frame
+    part: NDArray[np.uint8]  # (F,) a Part
+    row: NDArray[np.int32]  # (F,) of the town's field that the part comes from; clutter counts through all kinds
+
+
+class Things(NamedTuple):
+    """The K signs and signal heads of a town: the signs first, in the town's order."""
+
+    kind: tuple[str, ...]  # (K,) stop | yield | speed_30 | speed_60 | speed_90 | signal
+    position: NDArray[np.float64]  # (K, 3) centre of the plate or head, world [m]
+    yaw: NDArray[np.float64]  # (K,) where it faces [rad]
+    link: tuple[str, ...]  # (K,) the entry of `Trace.light` that a signal shows; empty for signs
+    face: NDArray[np.int32]  # (F,) the thing each face of the town's mesh belongs to, -1 for none
+
+    def __len__(self) -> int:
+        return len(self.kind)
 
 
 def town_mesh(town: Town) -> Mesh:
     """Return everything of `town` that stands still, world frame. The same town gives the same mesh."""
-    return join([_ground(town), *_roads(town), *_sidewalks(town), *_buildings(town), *_plants(town), *_furniture(town)])
+    return static_world(town).mesh
+
+
+def town_things(town: Town) -> Things:
+    """Return the signs and signal heads of `town`, and which faces of `town_mesh` are theirs; posts are not."""
+    world = static_world(town)
+    thing = np.where(world.part == Part.SIGN, world.row, -1)
+    return Things(town.signs.kind, town.signs.position, town.signs.yaw, ("",) * len(town.signs.kind), thing)
+
+
+_WORLDS: dict[str, StaticWorld] = {}  # the last few, by content
+
+
+def static_world(town: Town) -> StaticWorld:
+    """Return the mesh of `town` with its faces' owners; made once per process."""
+    key = sha256(pickle.dumps(town)).hexdigest()
+    if key not in _WORLDS:
+        while len(_WORLDS) >= TOWNS_KEPT:
+            del _WORLDS[next(iter(_WORLDS))]
+        owned = list(_parts(town))
+        faces = [len(mesh.faces) for _, _, mesh in owned]
+        _WORLDS[key] = StaticWorld(
+            join([mesh for _, _, mesh in owned]),
+            np.repeat([part for part, _, _ in owned], faces).astype(np.uint8),
+            np.repeat([row for _, row, _ in owned], faces).astype(np.int32),
+        )
+    return _WORLDS[key]
+
+
+Owned = tuple[Part, int, Mesh]
+
+
+def _parts(town: Town) -> Iterator[Owned]:
+    yield Part.GROUND, 0, _ground(town)
+    yield from chain(_roads(town), _sidewalks(town), _buildings(town), _plants(town), _furniture(town))
 
 
 def _ground(town: Town) -> Mesh:
@@ -31,16 +108,17 @@ def _ground(town: Town) -> Mesh:
     return sheet(points, Material.GROUND)
 
 
-def _roads(town: Town) -> Iterator[Mesh]:
-    return (_plate(polygon, 0.0, Material.ROAD) for polygon in town.roads)
+def _roads(town: Town) -> Iterator[Owned]:
+    return ((Part.ROAD, row, _plate(polygon, 0.0, Material.ROAD)) for row, polygon in enumerate(town.roads))
 
 
-def _sidewalks(town: Town) -> Iterator[Mesh]:
-    for polygon in town.sidewalks:
-        yield _plate(polygon, KERB_M, Material.SIDEWALK)
+def _sidewalks(town: Town) -> Iterator[Owned]:
+    for row, polygon in enumerate(town.sidewalks):
+        yield Part.SIDEWALK, row, _plate(polygon, KERB_M, Material.SIDEWALK)
         ring = np.concatenate((polygon, polygon[:1]))
         heights = (GROUND_M, KERB_M)
-        yield sheet(np.stack([np.c_[ring, np.full(len(ring), z)] for z in heights]), Material.SIDEWALK)
+        kerb = sheet(np.stack([np.c_[ring, np.full(len(ring), z)] for z in heights]), Material.SIDEWALK)
+        yield Part.SIDEWALK, row, kerb
 
 
 def _plate(polygon: NDArray[np.float64], z: float, material: Material) -> Mesh:
@@ -52,25 +130,26 @@ def _plate(polygon: NDArray[np.float64], z: float, material: Material) -> Mesh:
     return Mesh(vertices, faces, np.full(len(faces), material, np.uint8))
 
 
-def _buildings(town: Town) -> Iterator[Mesh]:
+def _buildings(town: Town) -> Iterator[Owned]:
     rng = stream(0, "facades", town.name)
-    for x, y, yaw, length, width, height in town.buildings:
-        yield moved(building(length, width, height, rng), x, y, 0.0, yaw)
+    for row, (x, y, yaw, length, width, height) in enumerate(town.buildings):
+        yield Part.BUILDING, row, moved(building(length, width, height, rng), x, y, 0.0, yaw)
 
 
-def _plants(town: Town) -> Iterator[Mesh]:
+def _plants(town: Town) -> Iterator[Owned]:
     rng = stream(0, "leaves", town.name)
-    for x, y, height, radius in town.trees:
-        yield moved(tree(height, radius, rng), x, y)
+    for row, (x, y, height, radius) in enumerate(town.trees):
+        yield Part.TREE, row, moved(tree(height, radius, rng), x, y)
 
 
-def _furniture(town: Town) -> Iterator[Mesh]:
-    for kind, rows in town.clutter:
-        for x, y, yaw, length, width, height in rows:
-            yield moved(clutter(kind, length, width, height), x, y, 0.0, yaw)
-    for x, y, height in town.lamps:
-        yield moved(lamp(height), x, y)
-    for (x, y, z), yaw, kind in zip(town.signs.position, town.signs.yaw, town.signs.kind):
-        yield moved(sign(kind, z), x, y, 0.0, yaw)
-    for (x, y, z), yaw in zip(town.poles.position, town.poles.yaw):
-        yield moved(sensor_mast(z), x, y, 0.0, yaw)
+def _furniture(town: Town) -> Iterator[Owned]:
+    pieces = [(kind, *values) for kind, rows in town.clutter for values in rows]
+    for row, (kind, x, y, yaw, length, width, height) in enumerate(pieces):
+        yield Part.CLUTTER, row, moved(clutter(kind, length, width, height), x, y, 0.0, yaw)
+    for row, (x, y, height) in enumerate(town.lamps):
+        yield Part.LAMP, row, moved(lamp(height), x, y)
+    for row, ((x, y, z), yaw, kind) in enumerate(zip(town.signs.position, town.signs.yaw, town.signs.kind)):
+        yield Part.SIGN, row, moved(sign_plate(kind, z), x, y, 0.0, yaw)
+        yield Part.POST, row, moved(sign_post(z), x, y, 0.0, yaw)
+    for row, ((x, y, z), yaw) in enumerate(zip(town.poles.position, town.poles.yaw)):
+        yield Part.MAST, row, moved(sensor_mast(z), x, y, 0.0, yaw)

@@ -17,9 +17,11 @@ def clutter(kind: str, length: float, width: float, height: float) -> Mesh:
 
 
 def lamp(height: float) -> Mesh:
-    """Return a street lamp."""
+    """Return a street lamp; the underside of its head is what shines."""
     post = tube((0, 0, 0), (0, 0, height), 0.08, Material.METAL, end_radius=0.05, sides=6)
-    return join((post, box((0, 0, height), (0.9, 0.9, 0.12), Material.METAL)))
+    head = box((0, 0, height), (0.9, 0.9, 0.12), Material.METAL)
+    head.material[head.vertices[head.faces, 2].max(axis=1) < height] = Material.LAMP
+    return join((post, head))
 
 
 def sensor_mast(height: float) -> Mesh:
@@ -30,7 +32,12 @@ def sensor_mast(height: float) -> Mesh:
 
 
 def sign(kind: str, height: float) -> Mesh:
-    """Return a sign whose plate, `height` above the origin, faces +x: stop 8 corners, yield 3, others round."""
+    """Return a sign and its post; the plate, `height` above the origin, faces +x."""
+    return join((sign_plate(kind, height), sign_post(height)))
+
+
+def sign_plate(kind: str, height: float) -> Mesh:
+    """Return the plate of a sign, front and back: stop 8 corners, yield 3, others round."""
     corners, start = {"stop": (8, np.pi / 8), "yield": (3, -np.pi / 2)}.get(kind, (16, 0.0))
     angle = start + np.arange(corners + 1) * 2 * np.pi / corners
     rim = np.stack((0 * angle, np.cos(angle), np.sin(angle)), axis=1) * SIGN_RADIUS_M
@@ -40,8 +47,12 @@ def sign(kind: str, height: float) -> Mesh:
         index = np.arange(corners)
         faces = np.stack((index, (index + 1) % corners, np.full(corners, corners)), axis=1)
         plates.append(Mesh(vertices.astype(np.float32), faces.astype(np.int32), np.full(corners, material, np.uint8)))
-    post = tube((-0.05, 0, 0), (-0.05, 0, height + 0.2), 0.035, Material.METAL, sides=6)
-    return join((*plates, post))
+    return join(plates)
+
+
+def sign_post(height: float) -> Mesh:
+    """Return the post behind the plate of a sign."""
+    return tube((-0.05, 0, 0), (-0.05, 0, height + 0.2), 0.035, Material.METAL, sides=6)
 
 
 def _box(length: float, width: float, height: float) -> Mesh:
