@@ -61,6 +61,8 @@ def standing() -> Callable[..., Trace]:
             position=np.broadcast_to(position, (*shape, 3)).copy(),
             yaw=np.broadcast_to([actor[5] for actor in actors], shape).astype(float),
             velocity=np.zeros((*shape, 3)),
+            acceleration=np.zeros((*shape, 3)),
+            yaw_rate=np.zeros(shape),
             light=np.zeros(0, dtype=np.str_),
             light_state=np.zeros((instants, 0), dtype=np.str_),
         )

@@ -18,6 +18,8 @@ from flcav.world.static import town_mesh
 from flcav.world.town import Town
 from flcav.world.trace import Trace
 
+OFFSET_S = 0.1  # how far from an instant actors are moved on: one step of the traffic
+
 
 class Surfaces(NamedTuple):
     """What the faces of a scene's instances are like; row `first[instance] + face`."""
@@ -37,6 +39,7 @@ class Scene:
         self.town = town
         self.trace = trace
         self.index = 0
+        self.offset_s = 0.0
         shapes = [(str(category), int(shape)) for category, shape in zip(trace.category, trace.shape)]
         models = [_town_model(town), *(_actor_model(*shape) for shape in shapes)]
         self.surfaces = _surfaces(models, [str(name) for name in trace.actor])
@@ -47,9 +50,14 @@ class Scene:
         self._hidden: int | None = None
         self._place()
 
-    def move_to(self, index: int) -> None:
-        """Put every actor where it is at instant `index` of the trace."""
-        self.index = index
+    def move_to(self, index: int, offset_s: float = 0.0) -> None:
+        """Put every actor where it is at instant `index` of the trace, or `offset_s` (-0.1 to 0.1) later.
+
+        Between instants it goes on from its velocity, acceleration and yaw rate. Raises `ValueError` beyond that.
+        """
+        if abs(offset_s) > OFFSET_S:
+            raise ValueError(f"offset_s = {offset_s}: must lie within -{OFFSET_S} and {OFFSET_S}")
+        self.index, self.offset_s = index, offset_s
         self._place()
 
     def world_from_actor(self, actor: int) -> NDArray[np.float64]:
@@ -58,7 +66,7 @@ class Scene:
 
     def world_from_instance(self) -> NDArray[np.float64]:
         """Return the instances' (I, 3, 3) rotations; the identity for the town and for absent actors."""
-        yaw = np.concatenate(([0.0], np.nan_to_num(self.trace.yaw[self.index])))
+        yaw = np.concatenate(([0.0], np.nan_to_num(self._poses()[:, 3])))
         cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
         return np.array([[cos, -sin, zero], [sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
 
@@ -110,7 +118,12 @@ class Scene:
 
     def _poses(self) -> NDArray[np.float64]:
         """Return (A, 4) x, y, z, yaw."""
-        return np.concatenate((self.trace.position[self.index], self.trace.yaw[self.index, :, None]), axis=1)
+        trace, i, dt = self.trace, self.index, self.offset_s
+        position, yaw = trace.position[i], trace.yaw[i]
+        if dt:
+            position = position + dt * trace.velocity[i] + dt**2 / 2 * trace.acceleration[i]
+            yaw = yaw + dt * trace.yaw_rate[i]
+        return np.concatenate((position, yaw[:, None]), axis=1)
 
     def _place(self) -> None:
         wanted = np.where(self.trace.present[self.index, :, None], self._poses(), np.nan)

@@ -16,7 +16,12 @@ Array = NDArray[np.float64]
 
 CATEGORIES = ("car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian")
 METADATA = b"flcav.trace"
-STATE = ("x", "y", "z", "yaw", "velocity_x", "velocity_y", "velocity_z")
+STATE = (
+    *("x", "y", "z", "yaw"),
+    *("velocity_x", "velocity_y", "velocity_z"),
+    *("acceleration_x", "acceleration_y", "acceleration_z"),
+    "yaw_rate",
+)
 
 
 @dataclass(frozen=True)
@@ -33,13 +38,16 @@ class Trace:
     position: Array  # (T, A, 3) ground centre [m]; NaN where absent
     yaw: Array  # (T, A) [rad]; NaN where absent
     velocity: Array  # (T, A, 3) [m/s]; NaN where absent
+    acceleration: Array  # (T, A, 3) [m/s^2]; NaN where absent
+    yaw_rate: Array  # (T, A) [rad/s]; NaN where absent
     light: NDArray[np.str_]  # (L,) traffic light ids (junction:link index)
     light_state: NDArray[np.str_]  # (T, L) one SUMO state letter: G g y r ...
 
     def save(self, path: Path) -> None:
         """Write the trace as one Parquet file: a row per instant and present actor, the rest in the file's metadata."""
         instant, actor = np.nonzero(self.present)
-        state = np.concatenate((self.position, self.yaw[..., None], self.velocity), axis=2)[instant, actor]
+        motion = (self.position, self.yaw[..., None], self.velocity, self.acceleration, self.yaw_rate[..., None])
+        state = np.concatenate(motion, axis=2)[instant, actor]
         columns = {"instant": instant.astype(np.int32), "actor": actor.astype(np.int32)}
         columns |= {name: state[:, i] for i, name in enumerate(STATE)}
         changed = [0, *(np.flatnonzero((self.light_state[1:] != self.light_state[:-1]).any(axis=1)) + 1).tolist()]
@@ -70,6 +78,8 @@ class Trace:
         if METADATA not in metadata:
             raise InputError(f"{path}: not a trace (Parquet without the metadata {METADATA.decode()!r})")
         rest = json.loads(metadata[METADATA])
+        if missing := [name for name in STATE if name not in table.column_names]:
+            raise InputError(f"{path}: a trace of another version (no column '{missing[0]}'); record it again")
         instants, actors, lights = len(rest["time_s"]), len(rest["actor"]), len(rest["light"])
         at = (table["instant"].to_numpy(), table["actor"].to_numpy())
         state = np.full((instants, actors, len(STATE)), np.nan)
@@ -89,7 +99,9 @@ class Trace:
             present=present,
             position=state[..., :3],
             yaw=state[..., 3],
-            velocity=state[..., 4:],
+            velocity=state[..., 4:7],
+            acceleration=state[..., 7:10],
+            yaw_rate=state[..., 10],
             light=np.array(rest["light"], dtype=np.str_),
             light_state=light_state,
         )

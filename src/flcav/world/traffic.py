@@ -44,15 +44,21 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray) -> Trace:
         raise InputError(f"cavs = {cavs}: must be 0 or more")
     net = read_net(town.net)
     demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, until_s=float(times_s[-1]), fill_s=FILL_S)
-    windows = np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
-    read = np.unique(windows)
+    before, now, after = (_windows(steps + offset) for offset in (-1, 0, 1))
+    read = np.unique((before, now, after))
     raw = _run(town.net, demand, child_seed(seed, "sumo"), read)
     parked = park(net, town.parameters, stream(seed, "parked"))
-    trace = _trace(town, np.asarray(times_s.round(1)), raw, np.searchsorted(read, windows), parked)
+    rows = tuple(np.searchsorted(read, window) for window in (before, now, after))
+    trace = _trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
     under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
     if under_way.sum() < cavs * len(times_s):
         raise InputError(f"not all of {cavs} CAVs are under way at {times_s[0]} s: begin later, or take fewer")
     return trace
+
+
+def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (T, W) the steps over which the state at each of `steps` (T,) is averaged."""
+    return np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
 
 
 def _run(net: Path, demand: str, seed: int, steps: NDArray[np.int64]) -> dict[str, NDArray]:
@@ -70,9 +76,15 @@ def _run(net: Path, demand: str, seed: int, steps: NDArray[np.int64]) -> dict[st
 
 
 def _trace(
-    town: Town, time_s: Array, raw: dict[str, NDArray], windows: NDArray[np.int64], parked: list[Parked]
+    town: Town,
+    time_s: Array,
+    raw: dict[str, NDArray],
+    windows: tuple[NDArray[np.int64], ...],
+    parked: list[Parked],
 ) -> Trace:
-    state = _smooth(_dense(raw), windows)
+    before, now, after = windows
+    state = _smooth(raw, now)
+    rates = _rates(_smooth(raw, before), state, _smooth(raw, after))
     seen = np.flatnonzero(~np.isnan(state[..., 0]).all(axis=0))
     order = np.array(sorted(seen, key=lambda i: _natural(str(raw["id"][i]))), dtype=np.int64)
     known = {name: (category, shape) for name, category, shape in types()}
@@ -80,6 +92,7 @@ def _trace(
     size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], dtype=np.float64).reshape(-1, 3)
     still = np.array([(car.x, car.y, car.yaw, 0.0) for car in parked], dtype=np.float64).reshape(-1, 4)
     state = np.concatenate((state[:, order], np.broadcast_to(still, (len(time_s), *still.shape))), axis=1)
+    rates = np.concatenate((rates[:, order], np.zeros((len(time_s), *still.shape))), axis=1)
 
     x, y, yaw, speed = np.moveaxis(state, 2, 0)
     forward = np.stack((np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)), axis=2)
@@ -87,7 +100,7 @@ def _trace(
     z = np.where(np.isnan(x), np.nan, KERB_M * (shapely.contains_xy(_pavement(town), x, y) & pedestrian))
     front_to_centre = np.where(np.arange(len(kinds)) < len(order), size[:, 0] / 2, 0.0)
     lights = [(light, len(letters)) for light, letters in zip(raw["light"], raw["light_state"][0])]
-    letters = [list("".join(row)) for row in raw["light_state"][windows[:, SMOOTHING_STEPS]]]
+    letters = [list("".join(row)) for row in raw["light_state"][now[:, SMOOTHING_STEPS]]]
     return Trace(
         town=town.name,
         time_s=time_s,
@@ -99,22 +112,17 @@ def _trace(
         position=np.stack((x, y, z), axis=2) - front_to_centre[:, None] * forward,
         yaw=yaw,
         velocity=speed[..., None] * forward,
+        acceleration=rates[..., :3],
+        yaw_rate=rates[..., 3],
         light=np.array([f"{light}:{i}" for light, links in lights for i in range(links)], dtype=np.str_),
         light_state=np.array(letters, dtype="<U1").reshape(len(time_s), -1),
     )
 
 
-def _dense(raw: dict[str, NDArray]) -> Array:
-    """Return (S, A, 4) front x, y, unwrapped yaw, speed at all steps read; NaN where absent."""
-    out = np.full((len(raw["light_state"]), len(raw["id"]), 4), np.nan)
-    out[raw["row"][:, 0], raw["row"][:, 1]] = raw["state"]
-    yaw = np.pi / 2 - np.radians(out[..., 2])
-    out[..., 2] = np.where(np.isnan(yaw), np.nan, np.unwrap(np.nan_to_num(yaw), axis=0))
-    return out
-
-
-def _smooth(dense: Array, windows: NDArray[np.int64]) -> Array:
-    """Return (T, A, 4) front x, y, yaw, speed averaged over each window's steps (T, W); NaN where absent midway."""
+def _smooth(raw: dict[str, NDArray], windows: NDArray[np.int64]) -> Array:
+    """Return (T, A, 4) front x, y, yaw, speed averaged over the rows of each window (T, W); NaN where absent midway."""
+    rows = np.unique(windows)
+    dense, windows = _dense(raw, rows), np.searchsorted(rows, windows)
     total, count = np.zeros((len(windows), *dense.shape[1:])), np.zeros((len(windows), dense.shape[1], 1))
     for column in windows.T:
         there = ~np.isnan(dense[column, :, :1])
@@ -124,6 +132,33 @@ def _smooth(dense: Array, windows: NDArray[np.int64]) -> Array:
     out = np.where(absent, np.nan, total / np.maximum(count, 1))
     out[..., 2] = wrap_angle(out[..., 2])
     return out
+
+
+def _dense(raw: dict[str, NDArray], rows: NDArray[np.int64]) -> Array:
+    """Return (R, A, 4) front x, y, unwrapped yaw, speed at `rows` (R,) of the steps read; NaN where absent."""
+    out = np.full((len(raw["light_state"]), len(raw["id"]), 4), np.nan)
+    out[raw["row"][:, 0], raw["row"][:, 1]] = raw["state"]
+    out = out[rows]
+    yaw = np.pi / 2 - np.radians(out[..., 2])
+    out[..., 2] = np.where(np.isnan(yaw), np.nan, np.unwrap(np.nan_to_num(yaw), axis=0))
+    return out
+
+
+def _rates(before: Array, now: Array, after: Array) -> Array:
+    """Return (T, A, 4) acceleration [m/s^2] and yaw rate [rad/s] from the states a step before, now, a step after.
+
+    One-sided where an actor has just come or is about to leave; NaN where it is absent now.
+    """
+
+    def motion(state: Array) -> Array:
+        _, _, yaw, speed = np.moveaxis(state, 2, 0)
+        return np.stack((speed * np.cos(yaw), speed * np.sin(yaw), 0 * speed, yaw), axis=2)
+
+    changes = np.stack((motion(now) - motion(before), motion(after) - motion(now)))
+    changes[..., 3] = wrap_angle(changes[..., 3])
+    known = ~np.isnan(changes)
+    mean = np.where(known, changes, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(np.isnan(now), np.nan, mean / STEP_S)
 
 
 def _pavement(town: Town) -> BaseGeometry:

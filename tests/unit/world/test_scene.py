@@ -36,6 +36,21 @@ def test_actors_are_where_the_trace_says(scene: Scene):
     assert ahead(scene) == (pytest.approx(20.0 - 3.9, abs=0.2), 1)
 
 
+def test_between_instants_actors_go_on(scene: Scene):
+    trace = scene.trace
+    trace.velocity[0, 0], trace.acceleration[0, 0], trace.yaw_rate[0, 0] = (10.0, 0, 0), (4.0, 2, 0), 0.5
+    scene.move_to(0, 0.1)
+    np.testing.assert_allclose(scene.world_from_actor(0), pose(21.02, 0.01, 0.0, 0.05))
+    np.testing.assert_allclose(scene.world_from_instance()[1], pose(0, 0, 0, 0.05)[:3, :3])
+    assert ahead(scene) == (pytest.approx(21.02 - 3.9, abs=0.2), 1)
+    scene.move_to(0, -0.05)
+    np.testing.assert_allclose(scene.world_from_actor(0)[0, 3], 20 - 0.5 + 0.005)
+    scene.move_to(0)
+    np.testing.assert_array_equal(scene.world_from_actor(0), pose(20.0, 0.0))
+    with pytest.raises(ValueError, match=r"offset_s = 0\.2"):
+        scene.move_to(0, 0.2)
+
+
 def test_absent_actors_are_nowhere(scene: Scene):
     scene.move_to(2)
     assert ahead(scene) == (pytest.approx(40.0 - 3.9, abs=0.2), 2)

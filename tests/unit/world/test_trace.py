@@ -27,6 +27,8 @@ def make_trace(instants: int = 7, actors: int = 5, lights: int = 3) -> Trace:
         position=random.normal(size=(instants, actors, 3)) + absent[..., None],
         yaw=random.normal(size=(instants, actors)) + absent,
         velocity=random.normal(size=(instants, actors, 3)) + absent[..., None],
+        acceleration=random.normal(size=(instants, actors, 3)) + absent[..., None],
+        yaw_rate=random.normal(size=(instants, actors)) + absent,
         light=np.array([f"x:{i}" for i in range(lights)], dtype=np.str_),
         light_state=random.choice(["G", "r", "y"], (instants, lights)).astype("<U1"),
     )
@@ -57,6 +59,10 @@ def test_files_that_are_no_trace_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a trace"):
         Trace.load(tmp_path / "other.parquet")
     make_trace().save(tmp_path / "whole.parquet")
+    older = pq.read_table(tmp_path / "whole.parquet").drop_columns(["yaw_rate"])
+    pq.write_table(older, tmp_path / "older.parquet")
+    with pytest.raises(InputError, match="another version.*'yaw_rate'"):
+        Trace.load(tmp_path / "older.parquet")
     cut = (tmp_path / "whole.parquet").read_bytes()[:-100]
     (tmp_path / "cut.parquet").write_bytes(cut)
     with pytest.raises(InputError, match=r"cut\.parquet"):

@@ -68,6 +68,29 @@ def test_motion_agrees_with_velocity(run: tuple[Town, Trace]) -> None:
     assert np.nanmax(turned) < np.radians(15)
 
 
+def test_acceleration_and_yaw_rate_are_those_of_the_neighbouring_steps(run: tuple[Town, Trace]) -> None:
+    _, trace = run
+    moving = named(trace, "cav", "veh")
+    velocity, yaw = trace.velocity[:, moving], trace.yaw[:, moving]
+    measured = (velocity[2:] - velocity[:-2]) / 0.2
+    there = ~np.isnan(measured)
+    np.testing.assert_allclose(trace.acceleration[1:-1, moving][there], measured[there], atol=1e-9)
+    turned = wrap_angle(yaw[2:] - yaw[:-2]) / 0.2
+    there = ~np.isnan(turned)
+    np.testing.assert_allclose(trace.yaw_rate[1:-1, moving][there], turned[there], atol=1e-9)
+    assert np.nanmax(np.abs(turned)) > 0.3
+    np.testing.assert_array_equal(np.isnan(trace.yaw_rate), ~trace.present)
+    assert (trace.acceleration[:, named(trace, "parked")] == 0).all()
+
+
+def test_a_step_on_from_its_rates_an_actor_is_where_it_really_goes(run: tuple[Town, Trace]) -> None:
+    _, trace = run
+    on = trace.position[:-1] + 0.1 * trace.velocity[:-1] + 0.005 * trace.acceleration[:-1]
+    error = np.linalg.norm(on - trace.position[1:], axis=2)
+    assert np.nanmean(error) < 0.02
+    assert np.nanpercentile(error, 99) < 0.15
+
+
 def test_parked_vehicles_stand_still_at_the_side_of_the_road(run: tuple[Town, Trace]) -> None:
     town, trace = run
     parked = named(trace, "parked")
@@ -129,6 +152,8 @@ def test_sampling_does_not_change_the_run() -> None:
     sparse = simulate(town, seed=2, cavs=1, times_s=np.array([30.0, 32.0]))
     kept = np.flatnonzero(np.isin(dense.actor, sparse.actor))
     np.testing.assert_array_equal(dense.position[[0, 20]][:, kept], sparse.position)
+    np.testing.assert_allclose(dense.acceleration[[0, 20]][:, kept], sparse.acceleration, atol=1e-9)
+    np.testing.assert_allclose(dense.yaw_rate[[0, 20]][:, kept], sparse.yaw_rate, atol=1e-9)
 
 
 def test_pole_8_of_grid_is_the_densest() -> None:
