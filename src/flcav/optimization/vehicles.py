@@ -1,0 +1,183 @@
+"""Which vehicle uploads how many samples and joins which rounds, so that each stays within its own link.
+
+A plan charges the links of a whole fleet. Here it is split: x samples and y rounds for every task and vehicle, whole
+numbers with sum(x) = the planned samples, at most the held ones, and in every round at least one vehicle of each edge
+group. All that a vehicle sends, over all its tasks, must be through within the horizon. Among such splits the first is
+taken by: most rounds joined (stragglers drop out of rounds only where their links cannot carry them), then samples of
+most worth, both weighted by data quality, then the earliest end. For IID data, where every sample is worth the same,
+throughput alone decides. Three small mixed-integer programs for HiGHS.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import coo_array, csr_array, vstack
+
+from flcav.optimization.allocation import Infeasible, TaskPlan
+from flcav.optimization.problem import Problem, Task, Uplink
+
+Array = NDArray[np.float64]
+
+BITS_PER_BYTE = 8
+TIE = 1e-7  # relative: what an earlier aim may lose to a later one, against rounding
+END_GAP = 1e-4  # relative: the earliest end is proven to this
+
+
+@dataclass(frozen=True)
+class VehicleShare:
+    """What one vehicle does for one task."""
+
+    vehicle: str
+    samples: int  # uploads in stage I
+    rounds: tuple[int, ...]  # joins, of 1 ... edge_rounds + k * cloud_rounds, in the order of the run
+    wireless_mb: float
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One task on one vehicle: two neighbouring variables, samples and rounds."""
+
+    task: Task
+    group: int
+    vehicle: str
+    link: Uplink
+    held: int
+    rounds: int
+    quality: float
+
+
+def vehicle_shares(problem: Problem, plans: Sequence[TaskPlan]) -> dict[str, tuple[VehicleShare, ...]]:
+    """Return the shares of every task that names its vehicles, by task, for `plans` in the order of the tasks.
+
+    Raises `Infeasible` where the vehicles hold too few samples, or their links need longer than `horizon_s`.
+    """
+    planned = [(task, plan) for task, plan in zip(problem.tasks, plans, strict=True) if task.uplink_mbps]
+    if not planned:
+        return {}
+    for task, plan in planned:
+        held = sum(_held(task, plan, vehicle) for vehicle in task.uplink_mbps or ())
+        if held < plan.samples:
+            raise Infeasible(
+                f"task {task.name!r}: its vehicles hold {held} samples (samples_held), and the plan uploads "
+                f"{plan.samples}"
+            )
+    parts = [part for task, plan in planned for part in _parts(problem, task, plan)]
+    counts = _split(parts, [plan for _, plan in planned], problem.horizon_s)
+    shares: dict[str, tuple[VehicleShare, ...]] = {}
+    for task, _ in planned:
+        own = [(part, row) for part, row in zip(parts, counts) if part.task is task]
+        joined = _rounds([part.group for part, _ in own], [int(row[1]) for _, row in own], own[0][0].rounds)
+        shares[task.name] = tuple(
+            VehicleShare(
+                part.vehicle, int(row[0]), rounds, float(row[0] * task.sample_mb + len(rounds) * task.model_mb)
+            )
+            for (part, row), rounds in zip(own, joined)
+        )
+    return shares
+
+
+def _held(task: Task, plan: TaskPlan, vehicle: str) -> int:
+    return min(task.samples_held.get(vehicle, plan.samples), plan.samples)
+
+
+def _parts(problem: Problem, task: Task, plan: TaskPlan) -> list[_Part]:
+    groups = np.repeat(np.arange(len(task.edge_groups)), task.edge_groups)
+    rounds = plan.edge_rounds + problem.edge_rounds_per_cloud_round * plan.cloud_rounds
+    return [
+        _Part(task, int(group), name, link, _held(task, plan, name), rounds, float(task.data_quality.get(name, 1.0)))
+        for group, (name, link) in zip(groups, (task.uplink_mbps or {}).items(), strict=True)
+    ]
+
+
+def _split(parts: Sequence[_Part], plans: Sequence[TaskPlan], horizon_s: float | None) -> Array:
+    """Return the samples and rounds (P, 2) of every part."""
+    size = 2 * len(parts) + 1  # the last variable is the time at which every link is through [s]
+    needs, least = _needs(parts, plans)
+    fixed = [LinearConstraint(needs, least[:, 0], least[:, 1]), LinearConstraint(_links(parts), ub=0.0)]  # pyright: ignore[reportArgumentType]
+    high = np.array([count for part in parts for count in (part.held, part.rounds)] + [horizon_s or np.inf])
+    quality = np.array([part.quality for part in parts])
+    joined, worth, end = np.zeros(size), np.zeros(size), np.zeros(size)
+    joined[1:-1:2], worth[0:-1:2], end[-1] = -quality, -quality, 1.0
+    found = None
+    for aim, gap in ((joined, 0.0), (worth, 0.0), (end, END_GAP)):
+        found = _least(aim, fixed, high, gap)
+        if found is None:
+            raise _too_slow(end, fixed, high)
+        value = float(aim @ found)
+        fixed.append(LinearConstraint(csr_array(aim[None]), ub=value + TIE * max(abs(value), 1.0)))  # pyright: ignore[reportArgumentType]
+    assert found is not None
+    return np.round(found[:-1]).reshape(-1, 2)
+
+
+def _needs(parts: Sequence[_Part], plans: Sequence[TaskPlan]) -> tuple[csr_array, Array]:
+    """Return rows and (rows, 2) bounds: all samples are uploaded, and someone of each group joins each round."""
+    wanted = {plan.name: plan.samples for plan in plans}
+    names: dict[tuple[str, int], int] = {}
+    rows, columns, bounds = [], [], []
+    for number, part in enumerate(parts):
+        for row_of, column, bound in (
+            ((part.task.name, -1), 2 * number, (wanted[part.task.name],) * 2),
+            ((part.task.name, part.group), 2 * number + 1, (part.rounds, np.inf)),
+        ):
+            if row_of not in names:
+                names[row_of] = len(names)
+                bounds.append(bound)
+            rows.append(names[row_of])
+            columns.append(column)
+    shape = (len(names), 2 * len(parts) + 1)
+    return csr_array(coo_array((np.ones(len(rows)), (rows, columns)), shape=shape)), np.array(bounds, dtype=np.float64)
+
+
+def _links(parts: Sequence[_Part]) -> csr_array:
+    """Return a row per vehicle and link: the seconds that it is busy, less the time at which all are through."""
+    lines: dict[tuple[str, str], Array] = {}
+    for number, part in enumerate(parts):
+        for link, mbps in (("wireless", part.link.wireless), ("wireline", part.link.wireline)):
+            if mbps is None:
+                continue
+            line = lines.setdefault((part.vehicle, link), np.zeros(2 * len(parts) + 1))
+            line[2 * number] = BITS_PER_BYTE * part.task.sample_mb / mbps
+            if link == "wireless":
+                line[2 * number + 1] = BITS_PER_BYTE * part.task.model_mb / mbps
+            line[-1] = -1.0
+    return csr_array(vstack([csr_array(line[None]) for line in lines.values()]))
+
+
+def _least(aim: Array, constraints: Sequence[LinearConstraint], high: Array, gap: float) -> Array | None:
+    """Return the variables of the least `aim`, None where there are none."""
+    whole = np.r_[np.ones(len(high) - 1), 0.0]
+    result = milp(
+        aim,
+        integrality=whole,
+        bounds=Bounds(0.0, high),  # pyright: ignore[reportArgumentType]
+        constraints=constraints,
+        options={"mip_rel_gap": gap},
+    )
+    return result.x
+
+
+def _too_slow(end: Array, constraints: Sequence[LinearConstraint], high: Array) -> Infeasible:
+    horizon_s = high[-1]
+    found = _least(end, constraints, np.r_[high[:-1], np.inf], END_GAP)
+    assert found is not None
+    return Infeasible(
+        f"the vehicles' own links need {found[-1]:.6g} s for the plan even if stragglers leave out rounds, "
+        f"{found[-1] - horizon_s:.6g} s more than horizon_s = {horizon_s:g}"
+    )
+
+
+def _rounds(groups: Sequence[int], counts: Sequence[int], rounds: int) -> list[tuple[int, ...]]:
+    """Return which of `rounds` rounds each vehicle joins: within a group one goes on where the last one ended.
+
+    So every round is joined, and by numbers of vehicles that differ by at most one.
+    """
+    ends = np.cumsum(counts, dtype=np.int64) - np.array(
+        [sum(c for c, h in zip(counts, groups) if h < g) for g in groups]
+    )
+    return [
+        tuple(sorted((start + i) % rounds + 1 for i in range(count)))
+        for count, start in zip(counts, (int(end) - count for end, count in zip(ends, counts)))
+    ]
