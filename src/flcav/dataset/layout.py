@@ -8,7 +8,7 @@ from typing import Any
 
 from flcav.config import InputError
 
-FORMAT = 1
+FORMAT = 2
 MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
 CALIBRATION = "calibration.json"  # agent -> sensor -> agent_from_sensor, row by row
 TRACES = "traces"

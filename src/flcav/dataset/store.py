@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.layout import CALIBRATION, FrameKey, points_path, read_manifest, table_path
 from flcav.dataset.tables import SCHEMAS, annotations_of, read_table
-from flcav.sensors.frame import Frame
+from flcav.sensors.frame import Calibration, Frame
 
 POINT_BYTES = 16  # four float32
 
@@ -26,7 +26,7 @@ class Dataset:
         self.folder = folder
         self.manifest = manifest
         self.calibration = {
-            agent: {sensor: np.array(matrix).reshape(4, 4) for sensor, matrix in mounts.items()}
+            agent: Calibration({sensor: np.array(matrix).reshape(4, 4) for sensor, matrix in mounts.items()})
             for agent, mounts in calibration.items()
         }
         frames = tables["frames"].to_pydict()
@@ -65,7 +65,8 @@ class Dataset:
             time_s=key.time_s,
             agent=key.agent,
             world_from_agent=self._poses[i],
-            agent_from_sensor=self.calibration[key.agent],
+            calibration=self.calibration[key.agent],
+            assumed=self.calibration[key.agent],
             lidar={lidar: self._points(i, lidar) for lidar in self._lidar[i]},
             annotations=annotations_of(self._label_rows(i)),
         )

@@ -17,6 +17,7 @@ from flcav.sensors.frame import Annotations, Frame
 ROWS_PER_GROUP = 65_536
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 VELOCITY_COLUMNS = ("vx", "vy", "vz")
+ACCELERATION_COLUMNS = ("ax", "ay", "az")
 
 SCHEMAS: dict[str, pa.Schema] = {
     "frames": pa.schema(
@@ -44,6 +45,7 @@ SCHEMAS: dict[str, pa.Schema] = {
             ("category", pa.string()),
             *((name, pa.float64()) for name in BOX_COLUMNS),  # geometric centre, world frame [m], [rad]
             *((name, pa.float64()) for name in VELOCITY_COLUMNS),  # world frame [m/s]
+            *((name, pa.float64()) for name in ACCELERATION_COLUMNS),  # world frame [m/s^2]
             ("returns", pa.int64()),
             ("occlusion", pa.float64()),
         ]
@@ -81,6 +83,7 @@ def annotation_table(frame: Frame) -> pa.Table:
         "category": truth.boxes.label.tolist(),
         **dict(zip(BOX_COLUMNS, truth.boxes.array().T)),
         **dict(zip(VELOCITY_COLUMNS, truth.velocity.T)),
+        **dict(zip(ACCELERATION_COLUMNS, truth.acceleration.T)),
         "returns": truth.returns,
         "occlusion": truth.occlusion,
     }
@@ -100,6 +103,7 @@ def annotations_of(rows: pa.Table) -> Annotations:
         track=text("track"),
         boxes=Boxes.from_array(numbers(BOX_COLUMNS), text("category")),
         velocity=numbers(VELOCITY_COLUMNS),
+        acceleration=numbers(ACCELERATION_COLUMNS),
         returns=rows["returns"].to_numpy().copy(),
         occlusion=rows["occlusion"].to_numpy().copy(),
     )

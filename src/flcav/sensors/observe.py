@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from flcav import seeds
 from flcav.config import InputError
 from flcav.geometry import Boxes, pose
-from flcav.sensors.frame import Annotations, Frame
+from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.sensors.lidar import Lidar, cast, draw_passes, measure
 from flcav.sensors.rig import Rig
 from flcav.sensors.visibility import unoccluded_rays
@@ -24,12 +24,12 @@ def observe(scene: Scene, rig: Rig, agent: str, index: int, *, scene_name: str, 
     """
     scene.move_to(index)
     own, world_from_agent = _carrier(scene, agent)
-    agent_from_sensor = {name: lidar.mount.agent_from_sensor() for name, lidar in rig.lidars.items()}
+    calibration = Calibration({name: lidar.mount.agent_from_sensor() for name, lidar in rig.lidars.items()})
     sweeps = {
         name: _sweep(
             scene,
             lidar.settings,
-            world_from_agent @ agent_from_sensor[name],
+            world_from_agent @ calibration.agent_from_sensor[name],
             own,
             seeds.stream(seed, scene_name, index, agent, name),
         )
@@ -41,7 +41,8 @@ def observe(scene: Scene, rig: Rig, agent: str, index: int, *, scene_name: str, 
         time_s=float(scene.trace.time_s[index]),
         agent=agent,
         world_from_agent=world_from_agent,
-        agent_from_sensor=agent_from_sensor,
+        calibration=calibration,
+        assumed=calibration,
         lidar={name: sweep.points for name, sweep in sweeps.items()},
         annotations=_annotate(scene, list(sweeps.values()), own),
     )
@@ -86,6 +87,7 @@ def _annotate(scene: Scene, sweeps: list[_Sweep], own: int | None) -> Annotation
         track=trace.actor[actors],
         boxes=Boxes(center, size, trace.yaw[index, actors], trace.category[actors]),
         velocity=trace.velocity[index, actors],
+        acceleration=trace.acceleration[index, actors],
         returns=np.sum([sweep.returns[actors] for sweep in sweeps], axis=0),
         occlusion=1 - visible / np.maximum(np.maximum(unoccluded, visible), 1),
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from flcav.geometry import Boxes, pose
 from flcav.seeds import stream
-from flcav.sensors.frame import Annotations, Frame
+from flcav.sensors.frame import Annotations, Calibration, Frame
 
 MOUNT = pose(0.1, 0.0, 1.8, yaw=0.01)
 
@@ -81,9 +81,9 @@ def toy_frame(seed: int, scene: str, index: int, agent: str) -> Frame:
         track=np.array(["veh0", "veh1", "ped0", "veh2"]),
         boxes=truth,
         velocity=generator.normal(size=(4, 3)),
+        acceleration=generator.normal(size=(4, 3)),
         returns=returns,
         occlusion=np.array([0.0, 0.2, 0.5, 1.0]),
     )
-    return Frame(
-        scene, index, 10 + 0.5 * index, agent, world_from_agent, {"lidar": MOUNT}, {"lidar": lidar}, annotations
-    )
+    mounts = Calibration({"lidar": MOUNT})
+    return Frame(scene, index, 10 + 0.5 * index, agent, world_from_agent, mounts, mounts, {"lidar": lidar}, annotations)

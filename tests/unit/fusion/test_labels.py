@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, road_view
 from flcav.geometry import Boxes, pose
 from flcav.perception.objects.model import second_tiny
-from flcav.sensors.frame import Annotations, Frame
+from flcav.sensors.frame import Annotations, Calibration, Frame
 
 CONFIG = second_tiny().config
 CAR = (4.4, 1.8, 1.6)
@@ -35,9 +37,15 @@ def frame(agent, world_from_agent, mount_z, points, actors, returns):
     sweep = np.c_[lidar, np.full(len(lidar), 0.3)].astype(np.float32)
     n = len(actors)
     truth = Annotations(
-        np.array([f"veh{i}" for i in range(n)]), actors, np.zeros((n, 3)), np.array(returns), np.zeros(n)
+        np.array([f"veh{i}" for i in range(n)]),
+        actors,
+        np.zeros((n, 3)),
+        np.zeros((n, 3)),
+        np.array(returns),
+        np.zeros(n),
     )
-    return Frame("s", 0, 0.0, agent, world_from_agent, {"lidar": agent_from_lidar}, {"lidar": sweep}, truth)
+    mounts = Calibration({"lidar": agent_from_lidar})
+    return Frame("s", 0, 0.0, agent, world_from_agent, mounts, mounts, {"lidar": sweep}, truth)
 
 
 def scene():
@@ -111,8 +119,8 @@ def test_two_poles_that_label_one_car_give_one_label():
 def test_an_ideal_detector_labels_what_its_own_lidar_has_ten_returns_from():
     _, road, _ = scene()
     truth = road.annotations
-    fewer = Annotations(truth.track, truth.boxes, truth.velocity, np.array([9, 10, 0, 30]), truth.occlusion)
-    view = road_view(Frame(**{**vars(road), "annotations": fewer}))
+    fewer = replace(truth, returns=np.array([9, 10, 0, 30]))
+    view = road_view(replace(road, annotations=fewer))
     assert list(view.boxes.label) == ["van", "truck"]
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from flcav.geometry import Boxes, pose, transform_points
-from flcav.sensors.frame import Annotations, Frame
+from flcav.sensors.frame import Annotations, Calibration, Frame
 
 SENSOR_HEIGHT_M = 1.8
 
@@ -18,12 +18,13 @@ def frame(objects, *, points=None, scene="s0", index=0, agent="cav0", at=(0.0, 0
         track=np.array([track for track, *_ in objects], dtype=np.str_),
         boxes=boxes.transformed(world_from_agent),
         velocity=np.zeros((len(objects), 3)),
+        acceleration=np.zeros((len(objects), 3)),
         returns=np.array([returns for *_, returns in objects], dtype=np.int64),
         occlusion=np.full(len(objects), 0.25),
     )
     cloud = np.zeros((1, 4), dtype=np.float32) if points is None else points
-    mount = pose(0, 0, SENSOR_HEIGHT_M)
-    return Frame(scene, index, 0.1 * index, agent, world_from_agent, {"top": mount}, {"top": cloud}, annotations)
+    mounts = Calibration({"top": pose(0, 0, SENSOR_HEIGHT_M)})
+    return Frame(scene, index, 0.1 * index, agent, world_from_agent, mounts, mounts, {"top": cloud}, annotations)
 
 
 def detections(*rows, label="Car"):
