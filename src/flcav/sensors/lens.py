@@ -1,0 +1,121 @@
+"""Which way the light comes that falls on a pixel: pinhole cameras with Brown-Conrady distortion.
+
+Optical frame: x right, y down, z forward along the optical axis. Pixel (column u, row v); the centre of the first pixel
+is at (0, 0), as in OpenCV. With a = x / z, b = y / z and r^2 = a^2 + b^2 (Brown 1966, OpenCV's order of coefficients):
+
+    a' = a (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 a b + p2 (r^2 + 2 a^2),      u = fx a' + cx
+    b' = b (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 b^2) + 2 p2 a b,      v = fy b' + cy
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from flcav.config import Config
+
+Array = NDArray[np.float64]
+
+BODY_FROM_OPTICAL: Array = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+NEWTON_STEPS = 12
+
+
+class Lens(Config):
+    """The geometry of an image."""
+
+    width: int = Field(default=640, ge=16, le=8192)  # [px]
+    height: int = Field(default=384, ge=16, le=8192)  # [px]
+    fov_deg: float = Field(default=90.0, gt=1, lt=170)  # horizontal; without effect where fx is given
+    fx: float | None = Field(default=None, gt=0)  # focal lengths [px]; fy is fx where it is not given
+    fy: float | None = Field(default=None, gt=0)
+    cx: float | None = None  # principal point [px]; the image's centre where it is not given
+    cy: float | None = None
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    @model_validator(mode="after")
+    def _check_distortion(self) -> "Lens":
+        corners = unproject(self, [(u, v) for u in (0, self.width - 1) for v in (0, self.height - 1)])
+        if not np.isfinite(corners).all():
+            raise ValueError("this distortion folds the image over: no direction falls on its corners")
+        return self
+
+    def intrinsics(self) -> Array:
+        """Return the (3, 3) matrix that takes undistorted a, b, 1 to pixels."""
+        focal = self.width / 2 / np.tan(np.radians(self.fov_deg) / 2) if self.fx is None else self.fx
+        vertical = focal if self.fy is None else self.fy
+        cx = (self.width - 1) / 2 if self.cx is None else self.cx
+        cy = (self.height - 1) / 2 if self.cy is None else self.cy
+        return np.array([[focal, 0, cx], [0, vertical, cy], [0, 0, 1.0]])
+
+    def distortion(self) -> Array:
+        """Return (5,) k1, k2, p1, p2, k3."""
+        return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
+
+
+def project(lens: Lens, points: ArrayLike) -> Array:
+    """Return the pixels (N, 2) u, v of points (N, 3) in the optical frame; NaN for those not in front of the lens."""
+    x, y, z = np.asarray(points, np.float64).reshape(-1, 3).T
+    z = np.where(z > 1e-9, z, np.nan)
+    return _pixels(lens, _distort(lens, np.stack((x / z, y / z), axis=1)))
+
+
+def unproject(lens: Lens, pixels: ArrayLike) -> Array:
+    """Return the undistorted a, b (N, 2) of pixels (N, 2) u, v: where they cross the plane z = 1.
+
+    NaN where the distortion lets no direction fall there.
+    """
+    fx, fy, cx, cy = lens.intrinsics()[[0, 1, 0, 1], [0, 1, 2, 2]]
+    wanted = (np.asarray(pixels, np.float64).reshape(-1, 2) - (cx, cy)) / (fx, fy)
+    if not lens.distortion().any():
+        return wanted
+    found = wanted.copy()
+    for _ in range(NEWTON_STEPS):
+        step = 1e-6
+        error = _distort(lens, found) - wanted
+        by_a = (_distort(lens, found + (step, 0)) - _distort(lens, found - (step, 0))) / (2 * step)
+        by_b = (_distort(lens, found + (0, step)) - _distort(lens, found - (0, step))) / (2 * step)
+        slope = by_a[:, 0] * by_b[:, 1] - by_a[:, 1] * by_b[:, 0]
+        slope = np.where(slope > 1e-3, slope, np.nan)  # beyond the fold no direction is the right one
+        found = found - np.stack(
+            (
+                (by_b[:, 1] * error[:, 0] - by_b[:, 0] * error[:, 1]) / slope,
+                (by_a[:, 0] * error[:, 1] - by_a[:, 1] * error[:, 0]) / slope,
+            ),
+            axis=1,
+        )
+    return np.where(np.abs(_distort(lens, found) - wanted).max(axis=1, keepdims=True) < 1e-7, found, np.nan)
+
+
+@lru_cache(maxsize=16)
+def directions(lens: Lens) -> NDArray[np.float32]:
+    """Return the (height * width, 3) unit directions that fall on the pixels' centres, row after row; read-only."""
+    v, u = np.mgrid[: lens.height, : lens.width]
+    plane = unproject(lens, np.stack((u.ravel(), v.ravel()), axis=1))
+    rays = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    rays.flags.writeable = False
+    return rays
+
+
+def _distort(lens: Lens, plane: Array) -> Array:
+    k1, k2, p1, p2, k3 = lens.distortion()
+    a, b = plane.T
+    square = a**2 + b**2
+    radial = 1 + square * (k1 + square * (k2 + square * k3))
+    return np.stack(
+        (
+            a * radial + 2 * p1 * a * b + p2 * (square + 2 * a**2),
+            b * radial + p1 * (square + 2 * b**2) + 2 * p2 * a * b,
+        ),
+        axis=1,
+    )
+
+
+def _pixels(lens: Lens, plane: Array) -> Array:
+    fx, fy, cx, cy = lens.intrinsics()[[0, 1, 0, 1], [0, 1, 2, 2]]
+    return plane * (fx, fy) + (cx, cy)

@@ -1,0 +1,111 @@
+"""The light of a weather: what comes from the sun, from the sky, and what the air between takes and adds.
+
+One unit is the brightness that a camera exposed for full daylight shows as white.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.world.weather import Weather
+
+Colour = NDArray[np.float32]
+
+RAIN_EXTINCTION = 0.00022  # 1/m at 1 mm/h, growing with the rain's power of 0.63 (Atlas 1953, visible light)
+
+# Sun elevation [deg] -> colours of the sun's light on a surface face on, and of the sky overhead and at the horizon
+_ELEVATION = (-18.0, -9.0, -4.0, 0.0, 4.0, 10.0, 25.0, 60.0)
+_SUN = (
+    (0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0),
+    (0.32, 0.10, 0.02),
+    (1.05, 0.47, 0.16),
+    (1.62, 1.06, 0.62),
+    (2.00, 1.74, 1.38),
+    (2.20, 2.08, 1.86),
+)
+_ZENITH = (
+    (0.0007, 0.0009, 0.0016),
+    (0.004, 0.006, 0.013),
+    (0.030, 0.044, 0.090),
+    (0.085, 0.115, 0.210),
+    (0.130, 0.180, 0.310),
+    (0.150, 0.240, 0.430),
+    (0.150, 0.290, 0.570),
+    (0.145, 0.300, 0.620),
+)
+_HORIZON = (
+    (0.0028, 0.0024, 0.0026),
+    (0.014, 0.011, 0.014),
+    (0.130, 0.085, 0.090),
+    (0.420, 0.210, 0.120),
+    (0.700, 0.400, 0.230),
+    (0.720, 0.600, 0.490),
+    (0.640, 0.720, 0.800),
+    (0.600, 0.730, 0.860),
+)
+
+
+class Light(NamedTuple):
+    """What shines at one instant."""
+
+    to_sun: Colour  # (3,) unit, world
+    sun: Colour  # (3,) on a surface face on, through the clouds
+    zenith: Colour  # (3,) radiance of the clear sky overhead
+    horizon: Colour  # (3,) and above the horizon
+    cloud: Colour  # (3,) of a cloud
+    cover: float  # share of the sky that is clouds
+    air: Colour  # (3,) what the air between adds where it hides everything
+    extinction: float  # [1/m] by fog, haze and rain
+    exposure: float  # factor before tone mapping
+    wetness: float
+    lamps: float  # 0 off, 1 on
+
+
+def light_of(weather: Weather) -> Light:
+    """Return the light of `weather`."""
+    elevation, azimuth = np.radians(weather.sun_elevation_deg), np.radians(weather.sun_azimuth_deg)
+    level = np.cos(elevation)
+    to_sun = np.array([level * np.sin(azimuth), level * np.cos(azimuth), np.sin(elevation)])
+    clear_sun, zenith, horizon = (_at(weather.sun_elevation_deg, table) for table in (_SUN, _ZENITH, _HORIZON))
+    through = 1 - np.clip((weather.cloud_cover - 0.3) / 0.6, 0, 1)  # gaps close from a third of the sky on
+    fog = weather.fog_per_m
+    sun = clear_sun * through * np.exp(-120.0 * fog)
+    whole = 0.35 * clear_sun * max(np.sin(elevation), 0.06) + 0.5 * (zenith + horizon)
+    grey = whole.mean() * np.array([0.97, 1.0, 1.04])
+    deck = np.clip((weather.cloud_cover - 0.4) / 0.6, 0, 1)
+    cloud = grey * (1.25 - 0.55 * deck)
+    hazy = np.clip(fog * 400, 0, 1) * (1 - 0.3 * deck)
+    over = deck * 0.92
+    zenith = zenith * (1 - over) + cloud * over
+    horizon = horizon * (1 - over) + cloud * over
+    zenith = zenith * (1 - 0.6 * hazy) + 0.6 * hazy * horizon
+    air = 0.9 * horizon if fog else 0.95 * horizon
+    haze = 0.00012
+    rain = RAIN_EXTINCTION * weather.rain_mm_h**0.63 * 3.0
+    lamps = float(np.clip((2.0 - weather.sun_elevation_deg) / 6.0, 0, 1))
+    ambient = float((0.5 * sun * max(to_sun[2], 0.15) + 0.6 * zenith + 0.4 * horizon).mean())
+    return Light(
+        to_sun.astype(np.float32),
+        sun.astype(np.float32),
+        zenith.astype(np.float32),
+        horizon.astype(np.float32),
+        cloud.astype(np.float32),
+        float(weather.cloud_cover),
+        air.astype(np.float32),
+        float(fog + haze + rain),
+        _exposure(ambient),
+        float(weather.wetness),
+        lamps,
+    )
+
+
+def _at(elevation_deg: float, table: tuple[tuple[float, float, float], ...]) -> NDArray[np.float64]:
+    return np.array([np.interp(elevation_deg, _ELEVATION, column) for column in zip(*table)])
+
+
+def _exposure(ambient: float) -> float:
+    """Return how much longer a camera exposes in less light: not enough to make night day."""
+    return float(1.25 * (1.0 / max(ambient, 1e-4)) ** 0.55 if ambient < 1.0 else 1.25)
