@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,17 @@ from flcav.config import InputError
 
 Array = NDArray[np.float64]
 
+LaneKind = Literal["driving", "bicycle", "parking", "sidewalk", "crossing", "walkingarea"]  # parking: closed to traffic
+
+ONLY_FOR: dict[str, LaneKind] = {"pedestrian": "sidewalk", "bicycle": "bicycle"}
+
 
 @dataclass(frozen=True)
 class Lane:
     """One lane of an edge."""
 
     id: str
-    kind: str  # driving | bicycle | parking (closed to all traffic) | sidewalk | crossing | walkingarea
+    kind: LaneKind
     shape: Array  # (K, 2) centre line in driving direction, outline of a walkingarea, world [m]
     width: float  # [m]
     speed: float  # limit [m/s]
@@ -54,6 +59,18 @@ class Junction:
 
 
 @dataclass(frozen=True)
+class Connection:
+    """A way on from the end of one lane to the start of another."""
+
+    start: str  # lane ids
+    end: str
+    via: str  # first lane inside the junction; empty where there is none
+    turn: str  # s straight, l left, r right, L and R slightly so, t about
+    state: str  # who gives way: M has priority, m gives way, s stops, o is ruled by a light, ...
+    light: str  # "junction:link" as in `Trace.light`; empty without a light
+
+
+@dataclass(frozen=True)
 class RoadNet:
     """All of a net that the static world and the traffic are made from."""
 
@@ -63,6 +80,7 @@ class RoadNet:
     right_of_way: dict[
         str, str
     ]  # edge -> link states of its driving lanes, e.g. "MMm"; s stops, m gives way, M has priority
+    connections: tuple[Connection, ...]
 
     @property
     def streets(self) -> Iterator[Edge]:
@@ -97,7 +115,19 @@ def read_net(path: Path) -> RoadNet:
         edge = edges[row.attrib["from"]]
         if edge.function == "normal" and edge.lanes[int(row.attrib["fromLane"])].kind == "driving":
             states[edge.id] = states.get(edge.id, "") + row.attrib["state"]
-    return RoadNet(edges, junctions, frozenset(name for names in circling for name in names), states)
+    connections = tuple(_connection(row) for row in root.iterfind("connection"))
+    return RoadNet(edges, junctions, frozenset(name for names in circling for name in names), states, connections)
+
+
+def _connection(row: ElementTree.Element) -> Connection:
+    return Connection(
+        f"{row.attrib['from']}_{row.attrib['fromLane']}",
+        f"{row.attrib['to']}_{row.attrib['toLane']}",
+        row.get("via", ""),
+        row.get("dir", ""),
+        row.get("state", ""),
+        f"{row.attrib['tl']}:{row.attrib['linkIndex']}" if "tl" in row.attrib else "",
+    )
 
 
 def _edge(row: ElementTree.Element) -> Edge:
@@ -115,12 +145,12 @@ def _edge(row: ElementTree.Element) -> Edge:
     return Edge(row.attrib["id"], function, row.get("from", ""), row.get("to", ""), row.get("type", ""), lanes)
 
 
-def _lane_kind(function: str, lane: ElementTree.Element) -> str:
-    if function in ("crossing", "walkingarea"):
+def _lane_kind(function: str, lane: ElementTree.Element) -> LaneKind:
+    if function == "crossing" or function == "walkingarea":
         return function
     if lane.get("disallow") == "all":
         return "parking"
-    return {"pedestrian": "sidewalk", "bicycle": "bicycle"}.get(lane.get("allow", ""), "driving")
+    return ONLY_FOR.get(lane.get("allow", ""), "driving")
 
 
 def _points(text: str) -> Array:
