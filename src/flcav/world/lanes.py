@@ -79,7 +79,7 @@ def _arrows(net: RoadNet) -> Iterator[Arrow]:
         turns.setdefault(connection.start, set()).add(connection.turn.lower())
     for edge in net.streets:
         driving = edge.lanes_of("driving")
-        ways = [_way(turns.get(lane.id, set())) for lane in driving]
+        ways: list[ArrowKind | None] = [_way(turns.get(lane.id, set())) for lane in driving]
         if not net.junctions[edge.end].kind.startswith("traffic_light") and len(set(ways)) < 2:
             continue
         for lane, way in zip(driving, ways):

@@ -78,10 +78,19 @@ class PoleParameters(Config):
     height_m: Positive = 6.0
 
 
+class GeoReference(Config):
+    """Where on Earth a town's local origin is, on the WGS 84 ellipsoid; x points east there and y north."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] = 49.0
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 8.4
+    altitude_m: float = 0.0
+
+
 class TownParameters(Config):
     """A town's parameter file."""
 
     description: str
+    geo: GeoReference = GeoReference()
     seed: int  # of everything that stands still
     vehicles: Annotated[int, Field(ge=0)]  # moving at once, CAVs apart
     pedestrians: Annotated[int, Field(ge=0)]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError, read_config
 from flcav.seeds import stream
 from flcav.world import placement
-from flcav.world.parameters import TownParameters
+from flcav.world.parameters import GeoReference, TownParameters
 from flcav.world.roads import RoadNet, read_net
 from flcav.world.surfaces import kerb_lines, simple_polygons, surfaces
 
@@ -47,6 +47,7 @@ class Town:
     name: str
     net: Path  # the SUMO net file (.net.xml)
     parameters: TownParameters  # what the town was furnished by, and its traffic
+    geo: GeoReference  # of the world frame's origin
     bounds: tuple[float, float, float, float]  # x_min, y_min, x_max, y_max [m]
     roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, without holes
     sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2), raised by the kerb; traffic islands too
@@ -102,6 +103,7 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
         name=name,
         net=path,
         parameters=parameters,
+        geo=parameters.geo,
         bounds=(low_x - MARGIN_M, low_y - MARGIN_M, high_x + MARGIN_M, high_y + MARGIN_M),
         roads=simple_polygons(ground.roads),
         sidewalks=simple_polygons(ground.sidewalks),
