@@ -61,7 +61,8 @@ def project(lens: Lens, points: ArrayLike) -> Array:
     """Return the pixels (N, 2) u, v of points (N, 3) in the optical frame; NaN for those not in front of the lens."""
     x, y, z = np.asarray(points, np.float64).reshape(-1, 3).T
     z = np.where(z > 1e-9, z, np.nan)
-    return _pixels(lens, _distort(lens, np.stack((x / z, y / z), axis=1)))
+    fx, fy, cx, cy = _focus(lens.intrinsics())
+    return _distort(lens.distortion(), np.stack((x / z, y / z), axis=1)) * (fx, fy) + (cx, cy)
 
 
 def unproject(lens: Lens, pixels: ArrayLike) -> Array:
@@ -69,16 +70,39 @@ def unproject(lens: Lens, pixels: ArrayLike) -> Array:
 
     NaN where the distortion lets no direction fall there.
     """
-    fx, fy, cx, cy = lens.intrinsics()[[0, 1, 0, 1], [0, 1, 2, 2]]
-    wanted = (np.asarray(pixels, np.float64).reshape(-1, 2) - (cx, cy)) / (fx, fy)
-    if not lens.distortion().any():
+    return _unproject(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
+
+
+def directions(lens: Lens) -> NDArray[np.float32]:
+    """Return the (height * width, 3) unit directions that fall on the pixels' centres, row after row; read-only."""
+    intrinsics, distortion = lens.intrinsics().ravel().tolist(), lens.distortion().tolist()
+    return _directions(lens.width, lens.height, tuple(intrinsics), tuple(distortion))
+
+
+@lru_cache(maxsize=16)
+def _directions(
+    width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
+) -> NDArray[np.float32]:
+    v, u = np.mgrid[:height, :width]
+    pixels = np.stack((u.ravel(), v.ravel()), axis=1).astype(np.float64)
+    plane = _unproject(np.reshape(intrinsics, (3, 3)), np.array(distortion), pixels)
+    rays = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    rays.flags.writeable = False
+    return rays
+
+
+def _unproject(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
+    fx, fy, cx, cy = _focus(intrinsics)
+    wanted = (pixels - (cx, cy)) / (fx, fy)
+    if not distortion.any():
         return wanted
-    found = wanted.copy()
+    found, step = wanted.copy(), 1e-6
+    along_a, along_b = np.array((step, 0.0)), np.array((0.0, step))
     for _ in range(NEWTON_STEPS):
-        step = 1e-6
-        error = _distort(lens, found) - wanted
-        by_a = (_distort(lens, found + (step, 0)) - _distort(lens, found - (step, 0))) / (2 * step)
-        by_b = (_distort(lens, found + (0, step)) - _distort(lens, found - (0, step))) / (2 * step)
+        error = _distort(distortion, found) - wanted
+        by_a = (_distort(distortion, found + along_a) - _distort(distortion, found - along_a)) / (2 * step)
+        by_b = (_distort(distortion, found + along_b) - _distort(distortion, found - along_b)) / (2 * step)
         slope = by_a[:, 0] * by_b[:, 1] - by_a[:, 1] * by_b[:, 0]
         slope = np.where(slope > 1e-3, slope, np.nan)  # beyond the fold no direction is the right one
         found = found - np.stack(
@@ -88,22 +112,11 @@ def unproject(lens: Lens, pixels: ArrayLike) -> Array:
             ),
             axis=1,
         )
-    return np.where(np.abs(_distort(lens, found) - wanted).max(axis=1, keepdims=True) < 1e-7, found, np.nan)
+    return np.where(np.abs(_distort(distortion, found) - wanted).max(axis=1, keepdims=True) < 1e-7, found, np.nan)
 
 
-@lru_cache(maxsize=16)
-def directions(lens: Lens) -> NDArray[np.float32]:
-    """Return the (height * width, 3) unit directions that fall on the pixels' centres, row after row; read-only."""
-    v, u = np.mgrid[: lens.height, : lens.width]
-    plane = unproject(lens, np.stack((u.ravel(), v.ravel()), axis=1))
-    rays = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
-    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    rays.flags.writeable = False
-    return rays
-
-
-def _distort(lens: Lens, plane: Array) -> Array:
-    k1, k2, p1, p2, k3 = lens.distortion()
+def _distort(distortion: Array, plane: Array) -> Array:
+    k1, k2, p1, p2, k3 = distortion
     a, b = plane.T
     square = a**2 + b**2
     radial = 1 + square * (k1 + square * (k2 + square * k3))
@@ -116,6 +129,5 @@ def _distort(lens: Lens, plane: Array) -> Array:
     )
 
 
-def _pixels(lens: Lens, plane: Array) -> Array:
-    fx, fy, cx, cy = lens.intrinsics()[[0, 1, 0, 1], [0, 1, 2, 2]]
-    return plane * (fx, fy) + (cx, cy)
+def _focus(intrinsics: Array) -> tuple[float, float, float, float]:
+    return intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]

@@ -17,6 +17,7 @@ from flcav.world.meshes.buildings import building
 from flcav.world.meshes.furniture import clutter, lamp, sensor_mast, sign_plate, sign_post
 from flcav.world.meshes.mesh import Mesh, join, moved, sheet
 from flcav.world.meshes.plants import tree
+from flcav.world.meshes.signals import signal_head, signal_mast
 from flcav.world.town import KERB_M, Town
 
 GROUND_M = -0.03  # open ground lies a little below the road
@@ -68,9 +69,17 @@ def town_mesh(town: Town) -> Mesh:
 
 def town_things(town: Town) -> Things:
     """Return the signs and signal heads of `town`, and which faces of `town_mesh` are theirs; posts are not."""
-    world = static_world(town)
-    thing = np.where(world.part == Part.SIGN, world.row, -1)
-    return Things(town.signs.kind, town.signs.position, town.signs.yaw, ("",) * len(town.signs.kind), thing)
+    world, signs, signals = static_world(town), town.signs, town.signals
+    face = np.full(len(world.part), -1, np.int32)
+    for part, first in ((Part.SIGN, 0), (Part.SIGNAL, len(signs.kind))):
+        face[world.part == part] = first + world.row[world.part == part]
+    return Things(
+        kind=(*signs.kind, *("signal" for _ in signals.link)),
+        position=np.concatenate((signs.position, signals.position)),
+        yaw=np.concatenate((signs.yaw, signals.yaw)),
+        link=(*("" for _ in signs.kind), *signals.link),
+        face=face,
+    )
 
 
 _WORLDS: dict[str, StaticWorld] = {}  # the last few, by content
@@ -153,3 +162,13 @@ def _furniture(town: Town) -> Iterator[Owned]:
         yield Part.POST, row, moved(sign_post(z), x, y, 0.0, yaw)
     for row, ((x, y, z), yaw) in enumerate(zip(town.poles.position, town.poles.yaw)):
         yield Part.MAST, row, moved(sensor_mast(z), x, y, 0.0, yaw)
+    yield from _signals(town)
+
+
+def _signals(town: Town) -> Iterator[Owned]:
+    signals = town.signals
+    for row, ((x, y, z), yaw, foot) in enumerate(zip(signals.position, signals.yaw, signals.foot)):
+        left = np.array((-np.sin(yaw), np.cos(yaw)))
+        reach = float(left @ ((x, y) - foot))
+        yield Part.SIGNAL, row, moved(signal_head(z), x, y, 0.0, yaw)
+        yield Part.POST, row, moved(signal_mast(z, reach), *foot, 0.0, yaw)

@@ -1,6 +1,6 @@
 """A town: what stands still. Roads come from a SUMO net, the rest from the town's parameter file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from flcav.seeds import stream
 from flcav.world import placement
 from flcav.world.parameters import GeoReference, TownParameters
 from flcav.world.roads import RoadNet, read_net
+from flcav.world.signals import Signals, place_signals
 from flcav.world.surfaces import kerb_lines, simple_polygons, surfaces
 
 Array = NDArray[np.float64]
@@ -47,7 +48,6 @@ class Town:
     name: str
     net: Path  # the SUMO net file (.net.xml)
     parameters: TownParameters  # what the town was furnished by, and its traffic
-    geo: GeoReference  # of the world frame's origin
     bounds: tuple[float, float, float, float]  # x_min, y_min, x_max, y_max [m]
     roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, without holes
     sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2), raised by the kerb; traffic islands too
@@ -58,6 +58,8 @@ class Town:
     poles: Poles
     signs: Signs
     lamps: Array  # (L, 3) street lamp foot x, y and height
+    geo: GeoReference = GeoReference()  # of the world frame's origin
+    signals: Signals = field(default_factory=Signals.none)
 
 
 def load_town(name: str | Path) -> Town:
@@ -123,4 +125,5 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
             kind=tuple(row[2] for row in signs),
         ),
         lamps=placement.place_lamps(rows, stream(parameters.seed, "lamps")),
+        signals=place_signals(net),
     )

@@ -1,1 +1,1 @@
-"""Light: from what rays meet to the colours of pixels. Colours are linear red, green, blue unless a name says otherwise."""
+"""Light: from what rays meet to the colours of pixels. Colours are linear RGB unless a name says otherwise."""
