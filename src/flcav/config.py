@@ -32,14 +32,18 @@ def parse_config(model: type[ConfigT], values: object, origin: str) -> ConfigT:
 
 def read_config(model: type[ConfigT], path: Path) -> ConfigT:
     """Return the YAML file at `path` as a checked `model`; raises `InputError`."""
+    return parse_config(model, read_yaml(path), str(path))
+
+
+def read_yaml(path: Path) -> object:
+    """Return what the YAML (or JSON) file at `path` holds; raises `InputError`."""
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (IsADirectoryError, UnicodeDecodeError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a YAML file ({reason})") from None
-    return parse_config(model, values, str(path))
 
 
 def _sentence(error: ValidationError, model: type[BaseModel]) -> str:

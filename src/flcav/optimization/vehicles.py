@@ -4,8 +4,8 @@ A plan charges the links of a whole fleet. Here it is split: x samples and y rou
 numbers with sum(x) = the planned samples, at most the held ones, and in every round at least one vehicle of each edge
 group. All that a vehicle sends, over all its tasks, must be through within the horizon. Among such splits the first is
 taken by: most rounds joined (stragglers drop out of rounds only where their links cannot carry them), then samples of
-most worth, both weighted by data quality, then the earliest end. For IID data, where every sample is worth the same,
-throughput alone decides. Three small mixed-integer programs for HiGHS.
+most worth, both weighted by data quality, then the earliest end of stage I, when all samples are through. For IID data,
+where every sample is worth the same, throughput alone decides. Three small mixed-integer programs for HiGHS.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
-from scipy.sparse import coo_array, csr_array, vstack
+from scipy.sparse import coo_array, csr_array
 
 from flcav.optimization.allocation import Infeasible, TaskPlan
 from flcav.optimization.problem import Problem, Task, Uplink
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 BITS_PER_BYTE = 8
 TIE = 1e-7  # relative: what an earlier aim may lose to a later one, against rounding
-END_GAP = 1e-4  # relative: the earliest end is proven to this
+END_GAP = 1e-4  # relative: the earliest time is proven to this
 
 
 @dataclass(frozen=True)
@@ -94,18 +94,22 @@ def _parts(problem: Problem, task: Task, plan: TaskPlan) -> list[_Part]:
 
 def _split(parts: Sequence[_Part], plans: Sequence[TaskPlan], horizon_s: float | None) -> Array:
     """Return the samples and rounds (P, 2) of every part."""
-    size = 2 * len(parts) + 1  # the last variable is the time at which every link is through [s]
+    size = 2 * len(parts) + 1  # the last variable is a time [s]
     needs, least = _needs(parts, plans)
-    fixed = [LinearConstraint(needs, least[:, 0], least[:, 1]), LinearConstraint(_links(parts), ub=0.0)]  # pyright: ignore[reportArgumentType]
-    high = np.array([count for part in parts for count in (part.held, part.rounds)] + [horizon_s or np.inf])
+    joined_by_all = LinearConstraint(needs, least[:, 0], least[:, 1])  # pyright: ignore[reportArgumentType]
+    high = np.array([count for part in parts for count in (part.held, part.rounds)] + [np.inf])
+    end = np.r_[np.zeros(size - 1), 1.0]
+    busy = LinearConstraint(_busy(parts, with_rounds=True), ub=np.inf if horizon_s is None else horizon_s)
+    stage_one = LinearConstraint(_busy(parts, with_rounds=False, less_last=True), ub=0.0)  # pyright: ignore[reportArgumentType]
     quality = np.array([part.quality for part in parts])
-    joined, worth, end = np.zeros(size), np.zeros(size), np.zeros(size)
-    joined[1:-1:2], worth[0:-1:2], end[-1] = -quality, -quality, 1.0
-    found = None
+    joined, worth = np.zeros(size), np.zeros(size)
+    joined[1:-1:2], worth[0:-1:2] = -quality, -quality
+    fixed, found = [joined_by_all, busy, stage_one], None
     for aim, gap in ((joined, 0.0), (worth, 0.0), (end, END_GAP)):
         found = _least(aim, fixed, high, gap)
         if found is None:
-            raise _too_slow(end, fixed, high)
+            until = LinearConstraint(_busy(parts, with_rounds=True, less_last=True), ub=0.0)  # pyright: ignore[reportArgumentType]
+            raise _too_slow(_least(end, [joined_by_all, until], high, END_GAP), horizon_s)
         value = float(aim @ found)
         fixed.append(LinearConstraint(csr_array(aim[None]), ub=value + TIE * max(abs(value), 1.0)))  # pyright: ignore[reportArgumentType]
     assert found is not None
@@ -131,19 +135,18 @@ def _needs(parts: Sequence[_Part], plans: Sequence[TaskPlan]) -> tuple[csr_array
     return csr_array(coo_array((np.ones(len(rows)), (rows, columns)), shape=shape)), np.array(bounds, dtype=np.float64)
 
 
-def _links(parts: Sequence[_Part]) -> csr_array:
-    """Return a row per vehicle and link: the seconds that it is busy, less the time at which all are through."""
+def _busy(parts: Sequence[_Part], *, with_rounds: bool, less_last: bool = False) -> csr_array:
+    """Return a row per vehicle and link: the seconds that it is busy, if asked `less_last`, the last variable."""
     lines: dict[tuple[str, str], Array] = {}
     for number, part in enumerate(parts):
         for link, mbps in (("wireless", part.link.wireless), ("wireline", part.link.wireline)):
             if mbps is None:
                 continue
-            line = lines.setdefault((part.vehicle, link), np.zeros(2 * len(parts) + 1))
+            line = lines.setdefault((part.vehicle, link), np.r_[np.zeros(2 * len(parts)), -float(less_last)])
             line[2 * number] = BITS_PER_BYTE * part.task.sample_mb / mbps
-            if link == "wireless":
+            if with_rounds and link == "wireless":
                 line[2 * number + 1] = BITS_PER_BYTE * part.task.model_mb / mbps
-            line[-1] = -1.0
-    return csr_array(vstack([csr_array(line[None]) for line in lines.values()]))
+    return csr_array(np.stack(list(lines.values())))
 
 
 def _least(aim: Array, constraints: Sequence[LinearConstraint], high: Array, gap: float) -> Array | None:
@@ -159,13 +162,12 @@ def _least(aim: Array, constraints: Sequence[LinearConstraint], high: Array, gap
     return result.x
 
 
-def _too_slow(end: Array, constraints: Sequence[LinearConstraint], high: Array) -> Infeasible:
-    horizon_s = high[-1]
-    found = _least(end, constraints, np.r_[high[:-1], np.inf], END_GAP)
-    assert found is not None
+def _too_slow(soonest: Array | None, horizon_s: float | None) -> Infeasible:
+    assert soonest is not None
+    assert horizon_s is not None
     return Infeasible(
-        f"the vehicles' own links need {found[-1]:.6g} s for the plan even if stragglers leave out rounds, "
-        f"{found[-1] - horizon_s:.6g} s more than horizon_s = {horizon_s:g}"
+        f"the vehicles' own links need {soonest[-1]:.6g} s for the plan even if stragglers leave out rounds, "
+        f"{soonest[-1] - horizon_s:.6g} s more than horizon_s = {horizon_s:g}"
     )
 
 

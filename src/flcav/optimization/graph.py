@@ -1,0 +1,220 @@
+"""The three-layer graph: tasks - networks - modalities - vehicles (Wang et al., IEEE Network 37(3), 2023, Fig. 3a).
+
+Layer 1 joins each task to the network that it shares with others: they are a cluster, one resource serves them all, and
+its loss is the sum of theirs by weight. Layer 2 joins a network to the modalities that it reads, at the size of one
+sample. Layer 3 joins a modality to the vehicles that record it, with the samples they hold and how good these are.
+The graph is a plain `networkx.Graph` whose nodes (kind, name) and edges carry these numbers; it is saved as node-link
+JSON, and it holds all that an allocation problem needs.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import networkx as nx
+from pydantic import Field, model_validator
+
+from flcav.config import Config, InputError, parse_config, read_yaml
+from flcav.files import write_json
+from flcav.optimization.curves import Curve, Positive
+from flcav.optimization.problem import Budgets, Count, Limits, Problem, Uplink
+
+KINDS = ("task", "network", "modality", "vehicle")  # a layer joins neighbours
+
+
+class TaskNode(Config):
+    """A task, and the network it shares."""
+
+    network: str
+    weight: Positive = 1.0
+
+
+class NetworkNode(Config):
+    """A network: its size, what it reads, and the curve of its cluster's weighted mean error."""
+
+    model_mb: Positive
+    modalities: Annotated[tuple[str, ...], Field(min_length=1)]
+    limits: Limits
+    curve: Curve
+
+
+class ModalityNode(Config):
+    """A kind of sensor data."""
+
+    sample_mb: Positive
+
+
+class Held(Config):
+    """What a vehicle holds of a modality."""
+
+    samples: Count | None = None  # None: as many as are asked for
+    quality: Positive = 1.0
+
+
+class VehicleNode(Config):
+    """A vehicle: its edge server, its own link, and what it holds."""
+
+    edge: str
+    uplink_mbps: Uplink
+    holds: Annotated[Mapping[str, Held], Field(min_length=1)]
+
+
+class Layers(Config):
+    """The graph as one writes it, in YAML or code, by name."""
+
+    budgets_mb: Budgets
+    edge_rounds_per_cloud_round: Count = 1
+    horizon_s: Positive | None = None
+    tasks: Annotated[Mapping[str, TaskNode], Field(min_length=1)]
+    networks: Annotated[Mapping[str, NetworkNode], Field(min_length=1)]
+    modalities: Annotated[Mapping[str, ModalityNode], Field(min_length=1)]
+    vehicles: Annotated[Mapping[str, VehicleNode], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _joined(self) -> Self:
+        for name, task in self.tasks.items():
+            _known(f"tasks.{name}.network", task.network, self.networks)
+        for name, network in self.networks.items():
+            for modality in network.modalities:
+                _known(f"networks.{name}.modalities", modality, self.modalities)
+            if not any(task.network == name for task in self.tasks.values()):
+                raise ValueError(f"networks.{name} serves no task")
+            if not any(set(network.modalities) <= set(each.holds) for each in self.vehicles.values()):
+                raise ValueError(f"networks.{name} reads {', '.join(network.modalities)}, which no vehicle holds")
+        for name, vehicle in self.vehicles.items():
+            for modality in vehicle.holds:
+                _known(f"vehicles.{name}.holds", modality, self.modalities)
+        return self
+
+
+def _known(field: str, name: str, among: Mapping[str, Any]) -> None:
+    if name not in among:
+        raise ValueError(f"{field} = {name!r} is none of {', '.join(among)}")
+
+
+def build(layers: Layers) -> nx.Graph:
+    """Return the graph: nodes (kind, name), edges with `layer` 1, 2 or 3, both with the numbers of `layers`."""
+    graph = nx.Graph(
+        budgets_mb=layers.budgets_mb.model_dump(),
+        edge_rounds_per_cloud_round=layers.edge_rounds_per_cloud_round,
+        horizon_s=layers.horizon_s,
+    )
+    for name, task in layers.tasks.items():
+        graph.add_node(("task", name), kind="task")
+        graph.add_edge(("task", name), ("network", task.network), layer=1, weight=task.weight)
+    for name, network in layers.networks.items():
+        own = network.model_dump(mode="json", exclude={"modalities"})
+        graph.add_node(("network", name), kind="network", **own)
+        for modality in network.modalities:
+            sample_mb = layers.modalities[modality].sample_mb
+            graph.add_edge(("network", name), ("modality", modality), layer=2, sample_mb=sample_mb)
+    for name, modality in layers.modalities.items():
+        graph.add_node(("modality", name), kind="modality", sample_mb=modality.sample_mb)
+    for name, vehicle in layers.vehicles.items():
+        link = vehicle.uplink_mbps.model_dump(mode="json")
+        graph.add_node(("vehicle", name), kind="vehicle", edge=vehicle.edge, uplink_mbps=link)
+        for modality, held in vehicle.holds.items():
+            graph.add_edge(("modality", modality), ("vehicle", name), layer=3, **held.model_dump(mode="json"))
+    return graph
+
+
+def describe(graph: nx.Graph) -> Layers:
+    """Return the graph as one writes it: the inverse of `build`; raises `InputError` for any other graph."""
+    nodes = {kind: [key for key, found in graph.nodes(data="kind") if found == kind] for kind in KINDS}
+    for key in nodes["task"]:
+        if graph.degree[key] != 1:
+            raise InputError(f"graph: task {key[1]!r} is joined to {graph.degree[key]} networks, not to one")
+    try:
+        tasks = {
+            key[1]: {"network": network[1], "weight": graph.edges[key, network]["weight"]}
+            for key in nodes["task"]
+            for network in graph[key]
+        }
+        networks = {
+            key[1]: {
+                **{name: graph.nodes[key][name] for name in ("model_mb", "limits", "curve")},
+                "modalities": [other[1] for other in graph[key] if other[0] == "modality"],
+            }
+            for key in nodes["network"]
+        }
+        modalities = {key[1]: {"sample_mb": graph.nodes[key]["sample_mb"]} for key in nodes["modality"]}
+        vehicles = {
+            key[1]: {
+                **{name: graph.nodes[key][name] for name in ("edge", "uplink_mbps")},
+                "holds": {m[1]: {name: graph.edges[m, key][name] for name in Held.model_fields} for m in graph[key]},
+            }
+            for key in nodes["vehicle"]
+        }
+    except KeyError as error:
+        raise InputError(f"graph: a node or an edge has no {error.args[0]!r}") from None
+    values = {"tasks": tasks, "networks": networks, "modalities": modalities, "vehicles": vehicles}
+    return parse_config(Layers, {**graph.graph, **values}, "graph")
+
+
+def save(graph: nx.Graph, path: Path) -> None:
+    """Write the graph as node-link JSON."""
+    write_json(path, nx.node_link_data(graph, edges="links"))
+
+
+def load(path: Path) -> nx.Graph:
+    """Read a graph: one that `save` wrote, or its layers as one writes them; raises `InputError`."""
+    values = read_yaml(path)
+    if not (isinstance(values, dict) and "nodes" in values):
+        return build(parse_config(Layers, values, str(path)))
+    try:
+        return build(describe(nx.node_link_graph(values, edges="links")))
+    except (KeyError, TypeError, nx.NetworkXError) as error:
+        raise InputError(f"{path}: not a graph in node-link JSON ({' '.join(str(error).split())})") from None
+
+
+def read_problem(path: Path) -> Problem:
+    """Return the problem in the file at `path`: written as tasks, or as a graph in either form."""
+    values = read_yaml(path)
+    if isinstance(values, dict) and ("networks" in values or "nodes" in values):
+        return to_problem(load(path))
+    return parse_config(Problem, values, str(path))
+
+
+def clusters(graph: nx.Graph) -> dict[str, dict[str, float]]:
+    """Return the tasks of every network with their weights: one resource serves all of a cluster."""
+    found: dict[str, dict[str, float]] = {}
+    for task, network, weight in (
+        (a, b, weight) if a[0] == "task" else (b, a, weight)
+        for a, b, weight in graph.edges(data="weight")
+        if weight is not None
+    ):
+        found.setdefault(network[1], {})[task[1]] = weight
+    return found
+
+
+def to_problem(graph: nx.Graph) -> Problem:
+    """Return the allocation problem: a task per cluster, named after its tasks and weighing what they weigh together.
+
+    Its groups are the vehicles, by edge server, that hold every modality of its network: a vehicle's samples are those
+    it has of all of them, their quality the least among them. A sample is one of each modality.
+    """
+    layers = describe(graph)
+    tasks = []
+    for name, tasks_of in clusters(graph).items():
+        network = layers.networks[name]
+        fleet = {key: each for key, each in layers.vehicles.items() if set(network.modalities) <= set(each.holds)}
+        edges = list(dict.fromkeys(each.edge for each in fleet.values()))
+        ordered = {key: each for edge in edges for key, each in fleet.items() if each.edge == edge}
+        held = {key: [each.holds[modality] for modality in network.modalities] for key, each in ordered.items()}
+        counted = {key: [h.samples for h in own if h.samples is not None] for key, own in held.items()}
+        tasks.append(
+            {
+                "name": " + ".join(tasks_of),
+                "weight": sum(tasks_of.values()),
+                "sample_mb": sum(layers.modalities[modality].sample_mb for modality in network.modalities),
+                "model_mb": network.model_mb,
+                "edge_groups": [sum(each.edge == edge for each in ordered.values()) for edge in edges],
+                "uplink_mbps": {key: each.uplink_mbps.model_dump() for key, each in ordered.items()},
+                "samples_held": {key: min(samples) for key, samples in counted.items() if samples},
+                "data_quality": {key: min(h.quality for h in own) for key, own in held.items()},
+                "limits": network.limits.model_dump(),
+                "curve": network.curve.model_dump(),
+            }
+        )
+    shared = ("budgets_mb", "edge_rounds_per_cloud_round", "horizon_s")
+    return parse_config(Problem, {**{name: graph.graph[name] for name in shared}, "tasks": tasks}, "graph")

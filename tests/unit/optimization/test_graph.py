@@ -1,0 +1,115 @@
+from pathlib import Path
+from typing import Any
+
+import networkx as nx
+import pytest
+import yaml
+
+from flcav.config import InputError, parse_config
+from flcav.optimization.allocation import allocate
+from flcav.optimization.graph import Layers, build, clusters, describe, load, read_problem, save, to_problem
+from flcav.optimization.vehicles import vehicle_shares
+
+RECIPE = Path(__file__).parents[3] / "recipes" / "graphs" / "three_layers.yaml"
+
+
+def values() -> dict[str, Any]:
+    return yaml.safe_load(RECIPE.read_text())
+
+
+def layers(**changes: Any) -> Layers:
+    return parse_config(Layers, values() | changes, "test")
+
+
+def test_each_layer_joins_neighbouring_kinds() -> None:
+    graph = build(layers())
+    order = {"task": 0, "network": 1, "modality": 2, "vehicle": 3}
+    for (one, _), (other, _), layer in graph.edges(data="layer"):
+        assert sorted((order[one], order[other])) == [layer - 1, layer]
+    assert nx.is_connected(graph)
+    assert graph.edges[("network", "lidar detector"), ("modality", "lidar")]["sample_mb"] == 1.6
+    assert graph.edges[("modality", "camera"), ("vehicle", "car 4")]["quality"] == 0.6
+
+
+def test_a_graph_comes_back_from_its_file(tmp_path: Path) -> None:
+    graph = build(layers())
+    save(graph, tmp_path / "graph.json")
+    again = load(tmp_path / "graph.json")
+    assert nx.utils.graphs_equal(again, graph)
+    assert describe(again) == layers()
+    assert read_problem(tmp_path / "graph.json") == read_problem(RECIPE) == to_problem(graph)
+
+
+def test_a_cluster_shares_one_resource_and_weighs_what_its_tasks_weigh() -> None:
+    graph = build(layers())
+    assert clusters(graph)["classifier"] == {"weather": 0.2, "lights": 0.133}
+    problem = to_problem(graph)
+    shared = problem.tasks[0]
+    assert (shared.name, shared.weight) == ("weather + lights", pytest.approx(0.333))
+    plan = allocate(problem)
+    errors = {"weather": plan.tasks[0], "lights": plan.tasks[0], "signs": plan.tasks[1], "objects": plan.tasks[2]}
+    weights = {name: task["weight"] for name, task in values()["tasks"].items()}
+    assert plan.objective == pytest.approx(sum(weights[name] * errors[name].predicted_error for name in weights))
+
+
+def test_groups_are_the_vehicles_that_hold_every_modality_of_the_network() -> None:
+    changed = values()
+    changed["networks"]["lidar detector"]["modalities"] = ["camera", "lidar"]
+    del changed["vehicles"]["car 5"]["holds"]["lidar"]
+    changed["vehicles"]["car 1"]["holds"]["camera"] = {"samples": 300, "quality": 0.5}
+    (fused,) = (
+        task for task in to_problem(build(parse_config(Layers, changed, "test"))).tasks if task.name == "objects"
+    )
+    assert fused.edge_groups == (4, 2)
+    assert fused.sample_mb == pytest.approx(0.7 + 1.6)
+    assert list(fused.uplink_mbps or {}) == ["car 1", "car 2", "car 3", "car 4", "car 6", "car 7"]
+    assert (fused.samples_held["car 1"], fused.samples_held["car 2"]) == (300, 500)
+    assert (fused.data_quality["car 1"], fused.data_quality["car 4"]) == (0.5, 0.6)
+
+
+def test_the_vehicles_of_a_graph_carry_its_plan() -> None:
+    problem = read_problem(RECIPE)
+    plan = allocate(problem)
+    shares = vehicle_shares(problem, plan.tasks)
+    for task in plan.tasks:
+        assert sum(share.samples for share in shares[task.name]) == task.samples
+    assert all(share.samples == 0 for share in shares["signs"] if share.vehicle in ("car 3", "car 4"))  # poorer data
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "sentence"),
+    [
+        (("tasks", "signs", "network"), "none", "tasks.signs.network = 'none' is none of classifier"),
+        (("networks", "classifier", "modalities"), ["radar"], "networks.classifier.modalities = 'radar'"),
+        (("vehicles", "car 1", "holds"), {"radar": {}}, "vehicles.car 1.holds = 'radar'"),
+        (("modalities", "camera", "sample_mb"), float("nan"), "finite"),
+        (("modalities", "camera", "sample_mb"), -1, "greater than 0"),
+        (("networks", "idle"), {**values()["networks"]["classifier"]}, "networks.idle serves no task"),
+        (("vehicles",), {"car 1": values()["vehicles"]["car 1"] | {"holds": {"camera": {}}}}, "no vehicle holds"),
+        (("colour",), "red", "unknown field 'colour'"),
+    ],
+)
+def test_what_does_not_join_is_one_sentence(path: tuple[str, ...], value: Any, sentence: str) -> None:
+    changed = values()
+    at = changed
+    for key in path[:-1]:
+        at = at[key]
+    at[path[-1]] = value
+    with pytest.raises(InputError, match=sentence):
+        parse_config(Layers, changed, "test")
+
+
+def test_other_graphs_are_refused(tmp_path: Path) -> None:
+    graph = build(layers())
+    graph.add_edge(("task", "signs"), ("network", "classifier"), layer=1, weight=1.0)
+    with pytest.raises(InputError, match="task 'signs' is joined to 2 networks"):
+        describe(graph)
+    graph = build(layers())
+    del graph.nodes[("network", "classifier")]["model_mb"]
+    with pytest.raises(InputError, match="no 'model_mb'"):
+        describe(graph)
+    (tmp_path / "graph.json").write_text('{"nodes": [], "links": [{"layer": 1}]}')
+    with pytest.raises(InputError, match="node-link"):
+        load(tmp_path / "graph.json")
+    with pytest.raises(InputError, match="no such file"):
+        load(tmp_path / "none.json")
