@@ -6,7 +6,7 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import allocate, birdseye, demo, evaluate, fit, infer, place, record, reproduce, train, validate
+from flcav.cli import allocate, birdseye, demo, evaluate, export, fit, infer, place, record, reproduce, train, validate
 from flcav.config import InputError
 
 INTERRUPTED = 130
@@ -33,7 +33,7 @@ def _main(
     pass
 
 
-for command in (demo, record, validate, birdseye, train, evaluate, infer, allocate, place, fit, reproduce):
+for command in (demo, record, validate, birdseye, export, train, evaluate, infer, allocate, place, fit, reproduce):
     command.register(app)
 
 

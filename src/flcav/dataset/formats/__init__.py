@@ -1,1 +1,1 @@
-"""Other people's dataset formats."""
+"""Other people's dataset formats: exported to all of `EXPORTERS`, read from KITTI."""

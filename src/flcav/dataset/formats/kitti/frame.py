@@ -1,9 +1,8 @@
-"""KITTI's 3D object benchmark: point clouds, labels and calibration of one frame.
+"""Point clouds, labels and calibration of one frame, read from KITTI's files.
 
 KITTI labels boxes in its rectified camera frame (x right, y down, z ahead): the location is the middle of a box's
-bottom face, the rotation about y is zero along x. Nothing outside this module sees that frame: what is returned lies
-in KITTI's LiDAR frame (x ahead, y left, z up). Geiger et al., Are we ready for autonomous driving?, CVPR 2012, and the
-benchmark's development kit.
+bottom face, the rotation about y is zero along x. Nothing outside this package sees that frame: what is returned lies
+in KITTI's LiDAR frame (x ahead, y left, z up).
 """
 
 from dataclasses import dataclass
@@ -64,8 +63,19 @@ def read_calibration(path: Path) -> Calibration:
     return Calibration(camera_from_lidar=rectified @ camera, image_from_camera=matrices["P2"])
 
 
-def read_labels(path: Path, calibration: Calibration) -> Boxes:
-    """Return the labelled objects as boxes in the LiDAR frame, with KITTI's class names; DontCare regions left out.
+@dataclass(frozen=True)
+class Objects:
+    """The labelled objects of a frame, DontCare regions left out."""
+
+    boxes: Boxes  # (N,) LiDAR frame, KITTI's class names
+    truncation: NDArray[np.float64]  # (N,) share outside the image
+    occlusion: NDArray[np.int64]  # (N,) 0 fully visible, 1 partly and 2 largely occluded, 3 unknown
+    alpha: NDArray[np.float64]  # (N,) observation angle [rad]
+    rectangle: NDArray[np.float64]  # (N, 4) left, top, right, bottom [px]
+
+
+def read_objects(path: Path, calibration: Calibration) -> Objects:
+    """Return the labelled objects of a frame.
 
     A box stays upright in the LiDAR frame: the degree or so by which the camera tilts against it is dropped from its
     orientation, not from its place. Scores are kept where every row has one. Raises `InputError` for other text.
@@ -81,17 +91,28 @@ def read_labels(path: Path, calibration: Calibration) -> Boxes:
             raise InputError(f"{path}: line {number} is no KITTI label: a class and {LABEL_FIELDS - 1} numbers or 15")
         if kind != "DontCare":
             label.append(kind)
-            rows.append(values[7:])
-    if not rows:
-        return Boxes.empty()
-    height, width, length, x, y, z, rotation = np.array([row[:7] for row in rows]).T
+            rows.append(values)
+    scores = np.array([row[14] for row in rows]) if rows and all(len(row) == LABEL_FIELDS for row in rows) else None
+    numbers = np.array([row[:14] for row in rows]).reshape(-1, 14)
+    height, width, length, x, y, z, rotation = numbers[:, 7:].T
     lidar_from_camera = inverse(calibration.camera_from_lidar)
     center = transform_points(lidar_from_camera, np.stack((x, y - height / 2, z), axis=1))
     ahead = np.stack((np.cos(rotation), np.zeros_like(rotation), -np.sin(rotation)), axis=1)  # camera frame
     ahead = ahead @ lidar_from_camera[:3, :3].T
     yaw = wrap_angle(np.arctan2(ahead[:, 1], ahead[:, 0]))
-    scores = np.array([row[7] for row in rows]) if all(len(row) == 8 for row in rows) else None
-    return Boxes(center, np.stack((length, width, height), axis=1), yaw, np.array(label, dtype=np.str_), scores)
+    size = np.stack((length, width, height), axis=1)
+    return Objects(
+        Boxes(center, size, yaw, np.array(label, dtype=np.str_), scores),
+        truncation=numbers[:, 0],
+        occlusion=numbers[:, 1].astype(np.int64),
+        alpha=numbers[:, 2],
+        rectangle=numbers[:, 3:7],
+    )
+
+
+def read_labels(path: Path, calibration: Calibration) -> Boxes:
+    """Return the labelled objects as boxes only: see `read_objects`."""
+    return read_objects(path, calibration).boxes
 
 
 def _lines(path: Path) -> list[str]:

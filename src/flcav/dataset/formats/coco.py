@@ -1,0 +1,101 @@
+"""A dataset in COCO's layout: `images/<split>` and `annotations/<labels>_<split>.json`, signs and actors apart.
+
+Actors have their mask as uncompressed run lengths; signs have their rectangle only.
+"""
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.dataset.formats.exporter import ExportOptions, lacks
+from flcav.dataset.formats.images import png
+from flcav.dataset.formats.rectangles import CLASSES, rectangles
+from flcav.dataset.formats.splits import split_scenes
+from flcav.dataset.store import Dataset
+from flcav.progress import Report
+from flcav.sensors.frame import Frame
+
+
+def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+    """Write every picture of `dataset` with the rectangles and masks in it: see `Exporter`."""
+    split_of = split_scenes(dataset, options.validation)
+    tables = {(labels, split): _empty(labels) for labels in CLASSES for split in split_of.values()}
+    counts: Counter[str] = Counter(images=0, signs=0, actors=0)
+    for i, key in enumerate(dataset.keys):
+        frame = dataset.frame(i)
+        split = split_of[key.scene]
+        for camera, picture in frame.images.items():
+            path = out / "images" / split / f"{frame.key}_{camera}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(png(picture.rgb))
+            counts["images"] += 1
+            image = _image(frame, camera, path.name, counts["images"])
+            for labels in CLASSES:
+                table = tables[labels, split]
+                table["images"].append(image)
+                for annotation in _annotations(frame, camera, labels, options.min_pixels):
+                    counts[labels] += 1
+                    table["annotations"].append({"id": counts[labels], "image_id": image["id"], **annotation})
+        progress(i + 1, len(dataset), "")
+    if not counts["images"]:
+        raise lacks(dataset, "COCO", "camera images")
+    for (labels, split), table in tables.items():
+        path = out / "annotations" / f"{labels}_{split}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(table, allow_nan=False), encoding="utf-8")
+    return counts
+
+
+def run_lengths(mask: NDArray[np.bool_]) -> dict[str, list[int]]:
+    """Return COCO's uncompressed run lengths of (H, W) pixels: column by column, of what is not in the mask first."""
+    flat = mask.ravel(order="F")
+    edges = np.flatnonzero(np.diff(flat)) + 1
+    runs = np.diff(edges, prepend=0, append=flat.size).tolist()
+    return {"size": list(mask.shape), "counts": [0, *runs] if flat[0] else runs}
+
+
+def _empty(labels: str) -> dict[str, Any]:
+    kind = {"signs": "sign", "actors": "actor"}[labels]
+    categories = [{"id": i + 1, "name": name, "supercategory": kind} for i, name in enumerate(CLASSES[labels])]
+    return {"info": {"description": f"flcav {labels}"}, "images": [], "annotations": [], "categories": categories}
+
+
+def _image(frame: Frame, camera: str, file_name: str, number: int) -> dict[str, Any]:
+    height, width = frame.images[camera].rgb.shape[:2]
+    return {
+        "id": number,
+        "file_name": file_name,
+        "width": width,
+        "height": height,
+        "scene": frame.scene,
+        "agent": frame.agent,
+        "camera": camera,
+        "time_s": frame.time_s,
+    }
+
+
+def _annotations(frame: Frame, camera: str, labels: str, min_pixels: int) -> list[dict[str, Any]]:
+    found = rectangles(frame, camera, labels, min_pixels)
+    instance = frame.images[camera].instance
+    out = []
+    for label, box, pixels, row in zip(found.label, found.box, found.pixels, found.row):
+        left, top, right, bottom = box.tolist()
+        about = {
+            "category_id": int(label) + 1,
+            "bbox": [left, top, right - left, bottom - top],
+            "area": int(pixels),
+            "iscrowd": 0,
+        }
+        if labels == "actors":
+            about["segmentation"] = run_lengths(instance == row + 1)
+            about["track"] = str(frame.annotations.track[row])
+            about["occlusion"] = float(frame.annotations.views[camera].occlusion[row])
+        else:
+            about["segmentation"] = []
+            about["distance_m"] = float(frame.annotations.signs[camera].distance_m[row])
+        out.append(about)
+    return out

@@ -1,0 +1,30 @@
+"""What every format's exporter has in common."""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from flcav.config import Config, InputError
+from flcav.dataset.store import Dataset
+from flcav.progress import Report
+
+
+class ExportOptions(Config):
+    """What can be asked of an export; a format takes no notice of what does not concern it."""
+
+    labels: Literal["signs", "actors"] = "signs"  # YOLO has one list of classes
+    validation: float = Field(default=0.2, ge=0, lt=1)  # share of the scenes that validate
+    min_pixels: int = Field(default=1, ge=1)  # 2D labels of what shows fewer are left out
+
+
+# Writes a dataset in one format into an empty folder and returns counts of what it wrote, by name. Raises `InputError`
+# where the dataset lacks what the format needs.
+Exporter = Callable[[Dataset, Path, ExportOptions, Report], Counter[str]]
+
+
+def lacks(dataset: Dataset, name: str, needed: str) -> InputError:
+    """Return the error that says what a format misses in a dataset."""
+    return InputError(f"{dataset.folder}: cannot be exported to {name}, which needs {needed}; the dataset has none")

@@ -1,0 +1,25 @@
+"""KITTI's 3D object benchmark: read (`frame`, `folder`) and written (`export`).
+
+Geiger et al., Are we ready for autonomous driving? CVPR 2012, and the benchmark's development kit.
+"""
+
+from flcav.dataset.formats.kitti.folder import KittiFolder, KittiFrame
+from flcav.dataset.formats.kitti.frame import (
+    Calibration,
+    Objects,
+    read_calibration,
+    read_labels,
+    read_objects,
+    read_points,
+)
+
+__all__ = [
+    "Calibration",
+    "KittiFolder",
+    "KittiFrame",
+    "Objects",
+    "read_calibration",
+    "read_labels",
+    "read_objects",
+    "read_points",
+]

@@ -1,0 +1,23 @@
+"""How fast the agents of a scene move."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.dataset.layout import trace_path
+from flcav.dataset.store import Dataset
+from flcav.world.trace import Trace
+
+
+def agent_velocities(dataset: Dataset, scene: str) -> dict[tuple[str, int], NDArray[np.float64]]:
+    """Return (agent, spin) -> (3,) velocity, world [m/s]; zero of an agent that is not in the scene's traffic."""
+    keys = [dataset.keys[i] for i in dataset.select(scenes=[scene])]
+    velocities = {(key.agent, key.index): np.zeros(3) for key in keys}
+    if trace_path(scene) not in dataset.manifest["files"]:
+        return velocities
+    trace = Trace.load(dataset.folder / trace_path(scene))
+    actors = {name: a for a, name in enumerate(trace.actor.tolist())}
+    for key in keys:
+        if key.agent in actors:
+            t = int(np.argmin(np.abs(trace.time_s - key.time_s)))
+            velocities[key.agent, key.index] = trace.velocity[t, actors[key.agent]]
+    return velocities

@@ -1,0 +1,47 @@
+"""Which of an agent's sensors is which, by where it looks; and rotations as other formats write them."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from flcav.geometry import wrap_angle
+
+LEVEL_RAD = np.radians(2.0)  # a camera tilted or rolled by less is level
+AHEAD_RAD = np.radians(30.0)  # a camera turned by less looks ahead
+
+
+def optical_yaw(agent_from_camera: NDArray[np.float64]) -> float:
+    """Return the direction [rad] of a camera's axis (z of its optical frame), counter-clockwise from straight ahead."""
+    return float(np.arctan2(agent_from_camera[1, 2], agent_from_camera[0, 2]))
+
+
+def is_level(agent_from_camera: NDArray[np.float64]) -> bool:
+    """Return whether a camera's y axis (optical frame) points straight down."""
+    return bool(-agent_from_camera[2, 1] >= np.cos(LEVEL_RAD))
+
+
+def front_camera(agent_from_camera: Mapping[str, NDArray[np.float64]]) -> str | None:
+    """Return the name of the level camera that looks most nearly ahead; None where none does."""
+    turned = {name: abs(optical_yaw(mount)) for name, mount in agent_from_camera.items() if is_level(mount)}
+    name = min(turned, key=turned.__getitem__, default=None)
+    return name if name is not None and turned[name] <= AHEAD_RAD else None
+
+
+def channels(yaw: Mapping[str, float], named: Mapping[str, float]) -> dict[str, str]:
+    """Return sensor name -> channel: of the channels `named` by their direction [rad] those that fit all best.
+
+    Sensors in excess of the channels are left out.
+    """
+    sensors, known = list(yaw), list(named)
+    away = np.abs(wrap_angle(np.subtract.outer([yaw[name] for name in sensors], [named[name] for name in known])))
+    rows, columns = linear_sum_assignment(away.reshape(len(sensors), len(known)))
+    return {sensors[row]: known[column] for row, column in zip(rows, columns)}
+
+
+def quaternion(matrix: NDArray[np.float64]) -> list[float]:
+    """Return w, x, y, z of the rotation in a (3, 3) or (4, 4) transform."""
+    x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True).tolist()
+    return [w, x, y, z]

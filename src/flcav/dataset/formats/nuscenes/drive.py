@@ -1,0 +1,173 @@
+"""What one agent sees of a scene, as a scene of nuScenes: its files and rows."""
+
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.formats.images import png
+from flcav.dataset.formats.mounts import channels, optical_yaw, quaternion
+from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, lidar_bin, radar_pcd
+from flcav.dataset.formats.nuscenes.tables import CAMERAS, CATEGORIES, RADARS, Row, attribute, chain, token, visibility
+from flcav.geometry import pose, transform_points, yaw_of
+from flcav.sensors.frame import Frame
+
+Array = NDArray[np.float64]
+
+UNDATED = "1970-01-01"  # simulated time has no date
+
+
+class Drive:
+    """One nuScenes scene under way."""
+
+    def __init__(self, name: str, scene: str, agent: str, location: str, out: Path, global_from_world: Array) -> None:
+        self.name = name
+        self.scene = scene
+        self.agent = agent
+        self.location = location
+        self.out = out
+        self.global_from_world = global_from_world
+        self.samples: list[Row] = []
+        self.sensors: dict[str, Row] = {}
+        self.calibrated: dict[str, Row] = {}
+        self.poses: list[Row] = []
+        self.data: dict[str, list[Row]] = defaultdict(list)  # by channel
+        self.annotations: dict[str, list[Row]] = defaultdict(list)  # by track
+        self.category: dict[str, str] = {}  # of each track
+
+    def add(self, frame: Frame, velocity: Array, elevations: Array) -> None:
+        """Write the files of a frame and add its rows; the agent moves with `velocity` (3,) in the world [m/s]."""
+        self.samples.append(
+            {
+                "token": token(self.name, "sample", frame.index),
+                "timestamp": _micros(frame.time_s),
+                "scene_token": token(self.name),
+            }
+        )
+        mounts = frame.calibration.agent_from_sensor
+        for i, (name, points) in enumerate(frame.lidar.items()):
+            channel = "LIDAR_TOP" if i == 0 else f"LIDAR_{name.upper()}"
+            self._add_data(frame, name, channel, "pcd.bin", lidar_bin(points, elevations))
+        for name, channel in channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS).items():
+            if np.any(frame.calibration.distortion[name]):
+                raise InputError(
+                    f"{frame.key}: '{name}' distorts; nuScenes' images are rectified, so record it without"
+                )
+            self._add_data(frame, name, channel, "png", png(frame.images[name].rgb))
+        for name, channel in channels({name: yaw_of(mounts[name]) for name in frame.radar}, RADARS).items():
+            radar_from_world = frame.world_from_sensor(name)[:3, :3].T
+            self._add_data(frame, name, channel, "pcd", radar_pcd(frame.radar[name], radar_from_world @ velocity))
+        self._add_annotations(frame)
+
+    def _add_data(self, frame: Frame, name: str, channel: str, suffix: str, data: bytes) -> None:
+        true = frame.calibration
+        stamp = _micros(frame.time_s + true.offset_ms.get(name, 0.0) / 1000)
+        path = f"samples/{channel}/{self.name}__{channel}__{stamp}.{suffix}"
+        (self.out / path).parent.mkdir(parents=True, exist_ok=True)
+        (self.out / path).write_bytes(data)
+        ego_from_sensor = true.agent_from_sensor[name]
+        if channel.startswith("LIDAR"):
+            ego_from_sensor = ego_from_sensor @ OURS_FROM_LIDAR
+        modality = {"LIDAR": "lidar", "CAM": "camera", "RADAR": "radar"}[channel.partition("_")[0]]
+        picture = frame.images.get(name)
+        self.sensors[channel] = {"token": token(channel), "channel": channel, "modality": modality}
+        self.calibrated[channel] = {
+            "token": token(self.name, channel),
+            "sensor_token": token(channel),
+            **_placed(ego_from_sensor),
+            "camera_intrinsic": [] if picture is None else true.intrinsics[name].tolist(),
+        }
+        own = token(self.name, channel, frame.index)
+        self.poses.append(
+            {"token": own, "timestamp": stamp, **_placed(self.global_from_world @ frame.world_from_agent)}
+        )
+        self.data[channel].append(
+            {
+                "token": own,
+                "sample_token": self.samples[-1]["token"],
+                "ego_pose_token": own,
+                "calibrated_sensor_token": token(self.name, channel),
+                "timestamp": stamp,
+                "fileformat": "png" if picture is not None else "pcd",
+                "is_key_frame": True,
+                "height": 0 if picture is None else picture.rgb.shape[0],
+                "width": 0 if picture is None else picture.rgb.shape[1],
+                "filename": path,
+            }
+        )
+
+    def _add_annotations(self, frame: Frame) -> None:
+        truth, boxes = frame.annotations, frame.annotations.boxes
+        lidar = truth.points.get(next(iter(frame.lidar)), truth.returns)
+        radar = sum((truth.points[name] for name in frame.radar if name in truth.points), np.zeros(len(truth), int))
+        center = transform_points(self.global_from_world, boxes.center)
+        for i, (track, category) in enumerate(zip(truth.track.tolist(), boxes.label.tolist())):
+            length, width, height = boxes.size[i].tolist()
+            speed = float(np.linalg.norm(truth.velocity[i]))
+            self.category[track] = category
+            self.annotations[track].append(
+                {
+                    "token": token(self.name, "annotation", track, frame.index),
+                    "sample_token": self.samples[-1]["token"],
+                    "instance_token": token(self.name, "instance", track),
+                    "visibility_token": visibility(truth.occlusion[i]),
+                    "attribute_tokens": [attribute(category, track, speed)],
+                    "translation": center[i].tolist(),
+                    "size": [width, length, height],
+                    "rotation": quaternion(pose(0, 0, yaw=boxes.yaw[i])),
+                    "num_lidar_pts": int(lidar[i]),
+                    "num_radar_pts": int(radar[i]),
+                }
+            )
+
+    def rows(self) -> dict[str, list[Row]]:
+        """Return the rows of the scene by table."""
+        for rows in (self.samples, *self.data.values(), *self.annotations.values()):
+            chain(rows)
+        scene = {
+            "token": token(self.name),
+            "log_token": token(self.name, "log"),
+            "nbr_samples": len(self.samples),
+            "first_sample_token": self.samples[0]["token"],
+            "last_sample_token": self.samples[-1]["token"],
+            "name": self.name,
+            "description": f"{self.scene} {self.agent}",
+        }
+        log = {
+            "token": scene["log_token"],
+            "logfile": self.scene,
+            "vehicle": self.agent,
+            "date_captured": UNDATED,
+            "location": self.location,
+        }
+        instances = [
+            {
+                "token": rows[0]["instance_token"],
+                "category_token": token("category", CATEGORIES[self.category[track]]),
+                "nbr_annotations": len(rows),
+                "first_annotation_token": rows[0]["token"],
+                "last_annotation_token": rows[-1]["token"],
+            }
+            for track, rows in self.annotations.items()
+        ]
+        return {
+            "scene": [scene],
+            "log": [log],
+            "sample": self.samples,
+            "sensor": list(self.sensors.values()),
+            "calibrated_sensor": list(self.calibrated.values()),
+            "ego_pose": self.poses,
+            "sample_data": [row for rows in self.data.values() for row in rows],
+            "instance": instances,
+            "sample_annotation": [row for rows in self.annotations.values() for row in rows],
+        }
+
+
+def _placed(matrix: Array) -> Row:
+    return {"translation": matrix[:3, 3].tolist(), "rotation": quaternion(matrix)}
+
+
+def _micros(time_s: float) -> int:
+    return round(time_s * 1e6)

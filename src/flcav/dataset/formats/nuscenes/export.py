@@ -1,0 +1,101 @@
+"""A dataset as nuScenes' tables, `samples` and `maps`, to be opened as version `v1.0-flcav`.
+
+nuScenes knows one vehicle at a time: what one agent sees of a scene is a scene of its own. Every spin is a key frame.
+The global frame is our world, shifted so that the map's lower left corner is its origin.
+"""
+
+import json
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.formats.exporter import ExportOptions, lacks
+from flcav.dataset.formats.images import png
+from flcav.dataset.formats.motion import agent_velocities
+from flcav.dataset.formats.nuscenes.drive import Drive
+from flcav.dataset.formats.nuscenes.files import RESOLUTION_M, map_mask
+from flcav.dataset.formats.nuscenes.tables import constant_rows, token
+from flcav.dataset.formats.splits import split_scenes
+from flcav.dataset.store import Dataset
+from flcav.geometry import pose
+from flcav.progress import Report
+from flcav.sensors.lidar import Lidar, ray_pattern
+from flcav.world.town import load_town
+
+Array = NDArray[np.float64]
+
+VERSION = "v1.0-flcav"
+MAP = "maps/map.png"
+UNKNOWN_MARGIN_M = 120.0  # of the map around the agents, where the town is not known
+
+
+def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+    """Write one nuScenes scene for each agent and scene of `dataset`: see `Exporter`."""
+    split_of = split_scenes(dataset, options.validation)
+    tables = constant_rows()
+    global_from_world = _write_map(dataset, out / MAP)
+    location = Path(str(dataset.manifest["recipe"].get("town", "unknown"))).name
+    splits: dict[str, list[str]] = defaultdict(list)
+    counts: Counter[str] = Counter(scenes=0, samples=0, objects=0)
+    for scene, split in split_of.items():
+        velocities = agent_velocities(dataset, scene)
+        for agent in dict.fromkeys(dataset.keys[i].agent for i in dataset.select(scenes=[scene])):
+            selected = dataset.select(agents=[agent], scenes=[scene])
+            counts["scenes"] += 1
+            name = f"scene-{counts['scenes']:04d}"
+            splits[f"flcav_{split}"].append(name)
+            drive = Drive(name, scene, agent, location, out, global_from_world)
+            for i in selected:
+                frame = dataset.frame(i)
+                if not frame.lidar:
+                    raise lacks(dataset, "nuScenes", f"a LiDAR on every agent; '{agent}' has none")
+                drive.add(frame, velocities[agent, frame.index], _elevations(dataset, agent))
+                counts.update(samples=1, objects=len(frame.annotations))
+                progress(counts["samples"], len(dataset), "")
+            for table, rows in drive.rows().items():
+                tables[table] += rows
+    tables["sensor"] = list({row["token"]: row for row in tables["sensor"]}.values())
+    tables["map"] = [
+        {
+            "token": token("map"),
+            "category": "semantic_prior",
+            "filename": MAP,
+            "log_tokens": [row["token"] for row in tables["log"]],
+        }
+    ]
+    for name, rows in {**tables, "splits": splits}.items():
+        path = out / VERSION / f"{name}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(rows, indent=0, allow_nan=False), encoding="utf-8")
+    (out / "sweeps").mkdir()
+    return counts
+
+
+def _elevations(dataset: Dataset, agent: str) -> Array:
+    """Return the elevations [rad] of the channels of an agent's first LiDAR, from the lowest; none if not recorded."""
+    rig = dataset.manifest["recipe"].get("pole_rig" if agent.startswith("pole") else "vehicle_rig", {})
+    lidar = next(iter(rig.get("lidars", {}).values()), None)
+    if lidar is None:
+        return np.zeros(0)
+    settings = Lidar.model_validate(lidar["settings"])
+    return np.arcsin(ray_pattern(settings)[:: settings.azimuth_steps, 2].astype(np.float64))[::-1]
+
+
+def _write_map(dataset: Dataset, path: Path) -> Array:
+    """Write the mask of roads and sidewalks, empty where the dataset's town is not known; return global_from_world."""
+    path.parent.mkdir(parents=True)
+    name = dataset.manifest["recipe"].get("town", "")
+    try:
+        town = load_town(name)
+    except InputError:
+        positions = np.array([dataset.frame(i).world_from_agent[:2, 3] for i in range(len(dataset))])
+        low, high = positions.min(axis=0) - UNKNOWN_MARGIN_M, positions.max(axis=0) + UNKNOWN_MARGIN_M
+        height, width = np.ceil((high - low)[::-1] / RESOLUTION_M).astype(int)
+        mask = np.zeros((height, width), np.uint8)
+    else:
+        low, mask = np.array(town.bounds[:2]), map_mask(town)
+    path.write_bytes(png(mask))
+    return pose(-low[0], -low[1])

@@ -1,0 +1,86 @@
+"""Point clouds, radar sweeps and the map in nuScenes' encodings."""
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from flcav.world.town import Town
+
+OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # theirs: x right, y ahead
+RESOLUTION_M = 0.1  # of the map
+RADAR = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z")]
+    + [("dyn_prop", "i1"), ("id", "<i2")]
+    + [(name, "<f4") for name in ("rcs", "vx", "vy", "vx_comp", "vy_comp")]
+    + [(name, "i1") for name in ("is_quality_valid", "ambig_state", "x_rms", "y_rms")]
+    + [(name, "i1") for name in ("invalid_state", "pdh0", "vx_rms", "vy_rms")]
+)
+MOVING_M_S = 0.5  # a radar echo faster than this over ground is moving
+MOVING, STATIONARY, UNAMBIGUOUS, CERTAIN = 0, 1, 3, 1
+
+
+def lidar_bin(points: NDArray[np.float32], elevations: NDArray[np.float64]) -> bytes:
+    """Return (N, 5) float32 x, y, z, intensity 0 to 255, ring of points in our LiDAR frame.
+
+    A ring is the channel nearest in elevation, of those that `elevations` [rad] lists from the lowest.
+    """
+    x, y, z, intensity = points.T
+    ring = np.zeros(len(points), np.float32)
+    if len(elevations):
+        between = (elevations[1:] + elevations[:-1]) / 2
+        ring = np.searchsorted(between, np.arctan2(z, np.hypot(x, y)))
+    return np.column_stack((-y, x, z, intensity * 255, ring)).astype("<f4").tobytes()
+
+
+def radar_pcd(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> bytes:
+    """Return a binary PCD of (N, 5) range, azimuth, elevation, Doppler, RCS of a radar that moves with `velocity`.
+
+    The velocity is (3,) [m/s] in the radar's frame. Of an echo's own, the part along the ray is known: `vx`, `vy`
+    are the Doppler's, `vx_comp`, `vy_comp` the same over ground. Without echoes there is one that is not a number.
+    """
+    rows = np.zeros(max(len(echoes), 1), RADAR)
+    if not len(echoes):
+        rows["x"] = np.nan
+    else:
+        distance, azimuth, elevation, doppler, rcs = echoes.T.astype(np.float64)
+        level = np.cos(elevation)
+        ray = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
+        over_ground = doppler + ray @ velocity
+        for axis, name in enumerate("xyz"):
+            rows[name] = distance * ray[:, axis]
+        for axis, name in enumerate(("vx", "vy")):
+            rows[name] = doppler * ray[:, axis]
+            rows[f"{name}_comp"] = over_ground * ray[:, axis]
+        rows["rcs"] = rcs
+        rows["id"] = np.arange(len(rows))
+        rows["dyn_prop"] = np.where(np.abs(over_ground) > MOVING_M_S, MOVING, STATIONARY)
+        rows["is_quality_valid"] = 1
+    rows["ambig_state"], rows["pdh0"] = UNAMBIGUOUS, CERTAIN
+    kinds = {"f": "F", "i": "I"}
+    fields = [RADAR[name] for name in RADAR.names or ()]
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(RADAR.names or ()),
+        "SIZE " + " ".join(str(field.itemsize) for field in fields),
+        "TYPE " + " ".join(kinds[field.kind] for field in fields),
+        "COUNT " + " ".join("1" for _ in fields),
+        f"WIDTH {len(rows)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(rows)}",
+        "DATA binary\n",
+    )
+    return "\n".join(header).encode() + rows.tobytes() + b"\n"  # the devkit wants a byte after the last point
+
+
+def map_mask(town: Town) -> NDArray[np.uint8]:
+    """Return (H, W) 255 on roads and sidewalks, north up; its lower left corner is that of the town's bounds."""
+    x_min, y_min, x_max, y_max = town.bounds
+    width, height = (round(extent / RESOLUTION_M) for extent in (x_max - x_min, y_max - y_min))
+    image = Image.new("L", (width, height))
+    draw = ImageDraw.Draw(image)
+    for polygon in (*town.roads, *town.sidewalks):
+        pixels = np.column_stack((polygon[:, 0] - x_min, y_max - polygon[:, 1])) / RESOLUTION_M
+        draw.polygon([tuple(pixel) for pixel in pixels.tolist()], fill=255)
+    return np.asarray(image)

@@ -1,0 +1,105 @@
+"""The rows of nuScenes' tables that are the same whatever is exported, and how one row names another."""
+
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+
+Row = dict[str, Any]
+
+TABLES = (
+    "attribute",
+    "calibrated_sensor",
+    "category",
+    "ego_pose",
+    "instance",
+    "log",
+    "map",
+    "sample",
+    "sample_annotation",
+    "sample_data",
+    "scene",
+    "sensor",
+    "visibility",
+)
+CATEGORIES = {
+    "car": "vehicle.car",
+    "van": "vehicle.car",
+    "truck": "vehicle.truck",
+    "bus": "vehicle.bus.rigid",
+    "motorcycle": "vehicle.motorcycle",
+    "bicycle": "vehicle.bicycle",
+    "pedestrian": "human.pedestrian.adult",
+}
+ATTRIBUTES = (
+    "vehicle.moving",
+    "vehicle.stopped",
+    "vehicle.parked",
+    "cycle.with_rider",
+    "pedestrian.moving",
+    "pedestrian.standing",
+)
+VISIBILITY = (0.4, 0.6, 0.8)  # visible share from which the levels 2, 3 and 4 hold
+MOVING_M_S = 0.2
+CAMERAS = {  # channel -> where it looks, counter-clockwise from ahead [rad]
+    "CAM_FRONT": 0.0,
+    "CAM_FRONT_LEFT": np.radians(55),
+    "CAM_FRONT_RIGHT": np.radians(-55),
+    "CAM_BACK_LEFT": np.radians(110),
+    "CAM_BACK_RIGHT": np.radians(-110),
+    "CAM_BACK": np.pi,
+}
+RADARS = {
+    "RADAR_FRONT": 0.0,
+    "RADAR_FRONT_LEFT": np.radians(90),
+    "RADAR_FRONT_RIGHT": np.radians(-90),
+    "RADAR_BACK_LEFT": np.radians(170),
+    "RADAR_BACK_RIGHT": np.radians(-170),
+}
+
+
+def token(*names: object) -> str:
+    """Return 32 hexadecimal digits, the same for the same names."""
+    return sha256("/".join(map(str, names)).encode()).hexdigest()[:32]
+
+
+def constant_rows() -> dict[str, list[Row]]:
+    """Return all tables, with the rows of `category`, `attribute` and `visibility`."""
+    shares = ("0 to 40 %", "40 to 60 %", "60 to 80 %", "80 to 100 %")
+    tables: dict[str, list[Row]] = {name: [] for name in TABLES}
+    tables["category"] = [
+        {"token": token("category", name), "name": name, "description": "", "index": i}
+        for i, name in enumerate(dict.fromkeys(CATEGORIES.values()))
+    ]
+    tables["attribute"] = [{"token": token("attribute", name), "name": name, "description": ""} for name in ATTRIBUTES]
+    tables["visibility"] = [
+        {"token": str(i + 1), "level": f"v{share.replace(' to ', '-').removesuffix(' %')}", "description": share}
+        for i, share in enumerate(shares)
+    ]
+    return tables
+
+
+def visibility(occlusion: float) -> str:
+    """Return the token of the level at which an object is visible."""
+    return str(int(np.digitize(1 - occlusion, VISIBILITY)) + 1)
+
+
+def attribute(category: str, track: str, speed_m_s: float) -> str:
+    """Return the token of what an actor does."""
+    moves = speed_m_s > MOVING_M_S
+    if category == "pedestrian":
+        name = "pedestrian.moving" if moves else "pedestrian.standing"
+    elif category in ("bicycle", "motorcycle"):
+        name = "cycle.with_rider"
+    elif track.startswith("parked"):
+        name = "vehicle.parked"
+    else:
+        name = "vehicle.moving" if moves else "vehicle.stopped"
+    return token("attribute", name)
+
+
+def chain(rows: list[Row]) -> None:
+    """Make each of `rows` name the one before and after it; they belong together and are in order."""
+    for row, before, after in zip(rows, [None, *rows], [*rows[1:], None]):
+        row["prev"] = before["token"] if before else ""
+        row["next"] = after["token"] if after else ""

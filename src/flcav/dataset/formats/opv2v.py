@@ -1,0 +1,143 @@
+"""A dataset in OPV2V's layout, as OpenCOOD reads it: `<split>/<scenario>/<agent>/<time>.yaml`, `.pcd`, `_camera0.png`.
+
+Everything is in CARLA's left-handed frames (y to the right), poses are x, y, z [m], roll, yaw, pitch [degrees]. Agents
+and vehicles share one list of numbers. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `transformation_utils.x_to_world`.
+"""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from flcav.dataset.formats.exporter import ExportOptions, lacks
+from flcav.dataset.formats.images import png
+from flcav.dataset.formats.motion import agent_velocities
+from flcav.dataset.formats.mounts import channels, optical_yaw
+from flcav.dataset.formats.splits import split_scenes
+from flcav.dataset.store import Dataset
+from flcav.geometry import pose
+from flcav.progress import Report
+from flcav.sensors.frame import Frame
+from flcav.sensors.lens import BODY_FROM_OPTICAL
+
+Array = NDArray[np.float64]
+
+FOLDERS = {"train": "train", "val": "validate", "test": "test"}
+VEHICLES = ("car", "van", "truck", "bus")
+CAMERAS = {  # where they look, counter-clockwise from ahead [rad]
+    "camera0": 0.0,
+    "camera1": np.radians(-100),
+    "camera2": np.radians(100),
+    "camera3": np.pi,
+}
+FIRST_CAR, FIRST_POLE, FIRST_TRACK = 1001, 2001, 10001  # OpenCOOD takes the agent whose number sorts first as the ego
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+KMH = 3.6
+
+
+def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+    """Write one scenario for each scene of `dataset`: see `Exporter`."""
+    split_of = split_scenes(dataset, options.validation)
+    counts: Counter[str] = Counter(scenarios=0, frames=0, objects=0)
+    for scene, split in split_of.items():
+        folder = out / FOLDERS[split] / scene
+        selected = dataset.select(scenes=[scene])
+        numbers = agent_numbers(sorted({dataset.keys[i].agent for i in selected}))
+        speeds = agent_velocities(dataset, scene)
+        for i in selected:
+            frame = dataset.frame(i)
+            if not frame.lidar:
+                raise lacks(dataset, "OPV2V", f"a LiDAR on every agent; '{frame.agent}' has none")
+            for track in frame.annotations.track.tolist():
+                numbers.setdefault(track, FIRST_TRACK + len(numbers))
+            speed = float(np.linalg.norm(speeds[frame.agent, frame.index]))
+            counts["objects"] += _write_frame(frame, folder / str(numbers[frame.agent]), numbers, speed)
+            counts["frames"] += 1
+            progress(counts["frames"], len(dataset), "")
+        protocol = {"recipe": dataset.manifest["recipe"], "numbers": numbers}
+        (folder / "data_protocol.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False), encoding="utf-8")
+        counts["scenarios"] += 1
+    return counts
+
+
+def agent_numbers(agents: list[str]) -> dict[str, int]:
+    """Return the numbers of a scene's agents: those of vehicles sort before those of poles."""
+    cars = [agent for agent in agents if not agent.startswith("pole")]
+    poles = [agent for agent in agents if agent.startswith("pole")]
+    return {
+        **{agent: FIRST_CAR + i for i, agent in enumerate(cars)},
+        **{agent: FIRST_POLE + i for i, agent in enumerate(poles)},
+    }
+
+
+def carla_pose(world_from_body: Array) -> list[float]:
+    """Return x, y, z, roll, yaw, pitch in CARLA's left-handed world of a body with axes x ahead, y left, z up."""
+    matrix = MIRROR @ world_from_body @ MIRROR
+    roll = np.arctan2(-matrix[2, 1], matrix[2, 2])
+    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
+    pitch = np.arcsin(np.clip(matrix[2, 0], -1, 1))
+    return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw, pitch)).tolist()]
+
+
+def _write_frame(frame: Frame, folder: Path, numbers: dict[str, int], speed_m_s: float) -> int:
+    lidar, points = next(iter(frame.lidar.items()))
+    folder.mkdir(parents=True, exist_ok=True)
+    time = f"{frame.index:06d}"
+    (folder / f"{time}.pcd").write_bytes(pcd(points))
+    world_from_lidar = frame.world_from_sensor(lidar)
+    mounts = frame.calibration.agent_from_sensor
+    cameras = channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
+    about: dict[str, Any] = {}
+    for name, camera in sorted(cameras.items(), key=lambda pair: pair[1]):
+        (folder / f"{time}_{camera}.png").write_bytes(png(frame.images[name].rgb))
+        world_from_camera = frame.world_from_sensor(name) @ BODY_FROM_OPTICAL.T
+        about[camera] = {
+            "cords": carla_pose(world_from_camera),
+            "extrinsic": (MIRROR @ np.linalg.inv(world_from_camera) @ world_from_lidar @ MIRROR).tolist(),
+            "intrinsic": frame.calibration.intrinsics[name].tolist(),
+        }
+    ego = carla_pose(frame.world_from_agent)
+    vehicles = _vehicles(frame, numbers)
+    about |= {
+        "ego_speed": speed_m_s * KMH,
+        "lidar_pose": carla_pose(world_from_lidar),
+        "plan_trajectory": [],
+        "predicted_ego_pos": ego,
+        "true_ego_pos": list(ego),
+        "vehicles": vehicles,
+    }
+    (folder / f"{time}.yaml").write_text(yaml.dump(about, Dumper=yaml.CSafeDumper), encoding="utf-8")
+    return len(vehicles)
+
+
+def _vehicles(frame: Frame, numbers: dict[str, int]) -> dict[int, dict[str, Any]]:
+    """Return number -> box of the vehicles that the LiDAR has a return from."""
+    truth, boxes = frame.annotations, frame.annotations.boxes
+    vehicles = {}
+    for i in np.flatnonzero(np.isin(boxes.label, VEHICLES) & (truth.returns > 0)):
+        tall = boxes.size[i, 2]
+        x, y, z, *rotation = carla_pose(pose(*boxes.center[i], yaw=boxes.yaw[i]))
+        vehicles[numbers[str(truth.track[i])]] = {
+            "angle": rotation,
+            "center": [0.0, 0.0, float(tall / 2)],
+            "extent": (boxes.size[i] / 2).tolist(),
+            "location": [x, y, float(z - tall / 2)],
+            "speed": float(np.linalg.norm(truth.velocity[i]) * KMH),
+        }
+    return vehicles
+
+
+def pcd(points: NDArray[np.float32]) -> bytes:
+    """Return a binary PCD of (N, 4) x, y, z, intensity, mirrored; the intensity is the colour's red, as OPV2V's is."""
+    red = np.clip(np.rint(points[:, 3] * 255), 0, 255).astype("<u4") << 16
+    rows = np.column_stack((points[:, :3] * np.array([1, -1, 1], np.float32), red.view("<f4"))).astype(
+        "<f4", copy=False
+    )
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\n"
+        f"COUNT 1 1 1 1\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
+    )
+    return header.encode() + rows.tobytes()

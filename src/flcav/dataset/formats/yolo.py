@@ -1,0 +1,52 @@
+"""A dataset in YOLO's layout: `images`, `labels` with one text file each, and `data.yaml`.
+
+A row of a label file is a class number and the visible rectangle's centre, width and height as shares of the image.
+"""
+
+from collections import Counter
+from pathlib import Path
+
+import yaml
+
+from flcav.dataset.formats.exporter import ExportOptions, lacks
+from flcav.dataset.formats.images import png
+from flcav.dataset.formats.rectangles import CLASSES, Rectangles, rectangles
+from flcav.dataset.formats.splits import SPLITS, split_scenes
+from flcav.dataset.store import Dataset
+from flcav.progress import Report
+
+
+def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+    """Write every picture of `dataset` with the signs and lights in it, or with its actors: see `Exporter`."""
+    split_of = split_scenes(dataset, options.validation)
+    counts: Counter[str] = Counter(images=0, objects=0)
+    for i, key in enumerate(dataset.keys):
+        frame = dataset.frame(i)
+        split = split_of[key.scene]
+        for camera, picture in frame.images.items():
+            found = rectangles(frame, camera, options.labels, options.min_pixels)
+            height, width = picture.rgb.shape[:2]
+            name = f"{frame.key}_{camera}"
+            _write(out / "images" / split / f"{name}.png", png(picture.rgb))
+            _write(out / "labels" / split / f"{name}.txt", label_text(found, width, height).encode())
+            counts.update(images=1, objects=len(found))
+        progress(i + 1, len(dataset), "")
+    if not counts["images"]:
+        raise lacks(dataset, "YOLO", "camera images")
+    used = [split for split in SPLITS if split in split_of.values()]
+    folders = {split: f"images/{split}" for split in used}
+    names = dict(enumerate(CLASSES[options.labels]))
+    (out / "data.yaml").write_text(yaml.safe_dump({**folders, "names": names}, sort_keys=False), encoding="utf-8")
+    return counts
+
+
+def label_text(found: Rectangles, width: int, height: int) -> str:
+    """Return the label file of a picture of that many pixels."""
+    left, top, right, bottom = (found.box / (width, height, width, height)).T
+    rows = zip(found.label, (left + right) / 2, (top + bottom) / 2, right - left, bottom - top)
+    return "".join(f"{label} " + " ".join(f"{value:.6f}" for value in box) + "\n" for label, *box in rows)
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
