@@ -35,6 +35,28 @@ def test_every_recipe_gives_a_plan_within_its_budgets(recipe, capsys):
     assert plan["tasks"][0]["name"] in capsys.readouterr().out
 
 
+def test_a_graph_is_planned_down_to_its_vehicles(capsys):
+    graph = RECIPES[0].parents[1] / "graphs" / "three_layers.yaml"
+    assert called("allocate", graph, "--json") == 0
+    plan = json.loads(capsys.readouterr().out)
+    for task in plan["tasks"]:
+        assert set(task) == TASK_KEYS | {"vehicles"}
+        assert all(set(each) == {"vehicle", "samples", "rounds", "wireless_mb"} for each in task["vehicles"])
+        assert sum(each["samples"] for each in task["vehicles"]) == task["samples"]
+        assert sum(each["wireless_mb"] for each in task["vehicles"]) <= task["wireless_mb"] + 1e-6
+    assert called("allocate", graph) == 0
+    assert "car 4" in capsys.readouterr().out
+
+
+def test_links_too_slow_for_the_plan_are_infeasible(tmp_path, capsys):
+    values = yaml.safe_load((RECIPES[0].parents[1] / "graphs" / "three_layers.yaml").read_text())
+    (tmp_path / "graph.yaml").write_text(yaml.safe_dump(values | {"horizon_s": 60}))
+    assert called("allocate", tmp_path / "graph.yaml", "--json") == 2
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["status"] == "infeasible"
+    assert "more than horizon_s = 60" in answer["message"]
+
+
 def test_infeasible_is_exit_2_a_sentence_and_json(tmp_path, capsys):
     values = yaml.safe_load(RECIPES[0].read_text())
     values["budgets_mb"]["wireless"] = 100

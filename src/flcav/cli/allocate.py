@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,9 @@ import typer
 if TYPE_CHECKING:
     from flcav.optimization.allocation import Allocation
     from flcav.optimization.problem import Problem
+    from flcav.optimization.vehicles import VehicleShare
+
+    Shares = Mapping[str, Sequence[VehicleShare]]
 
 
 def register(app: typer.Typer) -> None:
@@ -18,29 +22,36 @@ def register(app: typer.Typer) -> None:
 
 
 def allocate(
-    problem: Path = typer.Argument(..., help="YAML: budgets, sizes, limits and learning curves of every task."),
+    problem: Path = typer.Argument(
+        ..., help="YAML: budgets, sizes, limits and learning curves of every task; or a three-layer graph."
+    ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
 ) -> None:
     """Split both uplink budgets over tasks and training stages so that the weighted error is least."""
-    from flcav.config import read_config
     from flcav.optimization import allocation
-    from flcav.optimization.problem import Problem
+    from flcav.optimization.graph import read_problem
+    from flcav.optimization.vehicles import vehicle_shares
 
-    asked = read_config(Problem, problem)
+    asked = read_problem(problem)
     try:
         plan = allocation.allocate(asked)
+        shares = vehicle_shares(asked, plan.tasks)
     except allocation.Infeasible as error:
         if as_json:
             typer.echo(json.dumps({"status": "infeasible", "message": str(error)}))
         raise
     if as_json:
-        typer.echo(json.dumps(_as_json(plan)))
+        typer.echo(json.dumps(_as_json(plan, shares)))
     else:
         _show(asked, plan)
+        _show_vehicles(shares)
 
 
-def _as_json(plan: "Allocation") -> dict:
+def _as_json(plan: "Allocation", shares: "Shares") -> dict:
     values = dataclasses.asdict(plan)
+    for task in values["tasks"]:
+        if task["name"] in shares:
+            task["vehicles"] = [dataclasses.asdict(share) for share in shares[task["name"]]]
     for name in ("used_mb", "marginal_error_per_gb"):
         values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
     return values
@@ -65,3 +76,17 @@ def _show(problem: "Problem", plan: "Allocation") -> None:
         ("wireline", plan.used_mb.wireline_mb, budgets.wireline, plan.marginal_error_per_gb.wireline_mb),
     ):
         console.print(f"{link}: {used:.1f} of {budget:.6g} MB; 1000 MB more would save about {rate:.4f} of error")
+
+
+def _show_vehicles(shares: "Shares") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    if not shares:
+        return
+    table = Table("task", "vehicle", "samples", "rounds joined", "wireless MB")
+    for task, own in shares.items():
+        for share in own:
+            cells = (str(share.samples), str(len(share.rounds)), f"{share.wireless_mb:.1f}")
+            table.add_row(task, share.vehicle, *cells)
+    Console().print(table)
