@@ -8,11 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from scipy import stats
-
 from flcav.dataset.layout import package_versions
 from flcav.experiments.demo import demo_protocol
+from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.pipeline import central_step, cloud_step, edge_step, plan_step, shared_steps, test_step
 from flcav.experiments.pretraining import LEDGER
 from flcav.experiments.protocol import Protocol
@@ -121,27 +119,21 @@ def summarise(seeds: Sequence[dict[str, Any]]) -> dict[str, Any]:
     first = seeds[0]
     return {
         "ap50": {
-            town: {arm: _mean([seed["ap"][town][arm]["ap50"] for seed in seeds]) for arm in arms}
+            town: {arm: mean_over_seeds([seed["ap"][town][arm]["ap50"] for seed in seeds]) for arm in arms}
             for town, arms in first["ap"].items()
         },
         "ap70": {
-            town: {arm: _mean([seed["ap"][town][arm]["ap70"] for seed in seeds]) for arm in arms}
+            town: {arm: mean_over_seeds([seed["ap"][town][arm]["ap70"] for seed in seeds]) for arm in arms}
             for town, arms in first["ap"].items()
         },
         "differences": {
-            name: _mean([seed["differences"][name]["mean"] for seed in seeds]) for name in first["differences"]
+            name: mean_over_seeds([seed["differences"][name]["mean"] for seed in seeds])
+            for name in first["differences"]
         },
-        "gap_closed": {arm: _mean([seed["gap_closed"][arm] for seed in seeds]) for arm in first["gap_closed"]},
+        "gap_closed": {
+            arm: mean_over_seeds([seed["gap_closed"][arm] for seed in seeds]) for arm in first["gap_closed"]
+        },
     }
-
-
-def _mean(values: Sequence[float]) -> dict[str, float]:
-    """Return the mean and its 95 % interval by Student's t; an interval without width of a single value."""
-    array = np.asarray(values, dtype=np.float64)
-    half = 0.0
-    if len(array) > 1:
-        half = float(stats.t.ppf(0.975, len(array) - 1) * array.std(ddof=1) / np.sqrt(len(array)))
-    return {"mean": float(array.mean()), "low": float(array.mean()) - half, "high": float(array.mean()) + half}
 
 
 def draw_arms(results: dict[str, Any]) -> bytes:

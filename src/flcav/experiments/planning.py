@@ -22,18 +22,25 @@ from flcav.optimization.problem import Problem
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.weights import to_arrays
 
+COLUMNS = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
 HISTORY = resources.files("flcav.experiments") / "data" / "history.csv"
+PROBLEM = "problem.json"
 LEAST_SAMPLES = 40
 
 
 def plan(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
     """Choose samples, edge rounds and cloud rounds under both budgets; keep the problem beside the answer."""
+    return asdict(allocate(run_problem(work, protocol)))
+
+
+def run_problem(work: Work, protocol: dict[str, Any]) -> Problem:
+    """Return the allocation problem of a run, which it also writes, sized by the frames it may upload."""
     setting = Protocol.model_validate(protocol)
     pool = opened(work, "suburb-pool")
     sample_mb = float(np.mean([pool.payload_bytes(i) for i in range(len(pool))])) / 1e6
     problem = problem_for(setting, sample_mb, update_mb(), len(pool), history_fit())
-    write_json(work.folder / "problem.json", problem)
-    return asdict(allocate(parse_config(Problem, problem, "the run's allocation problem")))
+    write_json(work.folder / PROBLEM, problem)
+    return parse_config(Problem, problem, "the run's allocation problem")
 
 
 def fixed_plan(work: Work, samples: int, edge_rounds: int, cloud_rounds: int) -> dict[str, Any]:
@@ -75,7 +82,11 @@ def update_mb() -> float:
 
 def history_fit() -> Fit:
     """Return the curve fitted to the history of other seeds' runs that the package carries."""
+    return fit_additive(*history_table().T)
+
+
+def history_table() -> np.ndarray:
+    """Return that history (n, 4): samples, edge rounds, cloud rounds, accuracy."""
     with HISTORY.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    columns = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
-    return fit_additive(*(np.array([float(row[name]) for row in rows]) for name in columns))
+    return np.array([[float(row[name]) for name in COLUMNS] for row in rows])
