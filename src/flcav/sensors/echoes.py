@@ -14,6 +14,9 @@ PANES = 6  # more panes than these stop a ray
 PANE_TRANSMISSION = 0.8  # of the power, there and back
 RETRO_GAIN = 4.0  # how much brighter than a white surface a retro-reflector is
 GLASS = int(Material.GLASS)
+ROAD, SIDEWALK = int(Material.ROAD), int(Material.SIDEWALK)
+WATER_INDEX = 1.33
+TURNED_BACK = 1 - (1 - 0.066) / WATER_INDEX**2  # share of diffuse light that water reflects back to what it covers
 AFTER_PANE_M = 0.002
 LEVELS = 4096
 QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of the normal distribution
@@ -79,18 +82,14 @@ def _look_up(instance, face, first, material, passes, glass):
 
 
 @compiled
-def detect(
-    echoes, directions, surfaces, sensor_from_instance, inverse_threshold, keep, chance, noise, noise_m, points, actor
-):
-    """Write the detected echoes' `points` (N, 4) and `actor` (N,) and return their number.
+def brightness(echoes, directions, surfaces, sensor_from_instance, wetness):
+    """Return how bright each ray's surface is seen: 1 for a white one face on, 0 where there is none. (N,) float32.
 
-    An echo of power P is detected with a probability that rises from 0 at 0.7 P_min to `keep` at 1.3 P_min;
-    `chance` (N,) in [0, 1) decides. `inverse_threshold` is 1 / P_min; `sensor_from_instance` (I, 3, 3) turns normals;
-    `noise` (N,) picks a quantile of the range error, whose standard deviation is `noise_m`.
+    `sensor_from_instance` (I, 3, 3) turns normals. On roads a film of water dims it as `wetness` (0..1) grows.
     """
-    distance, instance, face, materials, panes = echoes
+    _, instance, face, materials, panes = echoes
     turn = sensor_from_instance.reshape(-1, 9)
-    count = 0
+    out = np.zeros(len(directions), np.float32)
     for ray in range(len(directions)):
         i = instance[ray]
         if i < 0:
@@ -104,22 +103,72 @@ def detect(
             + y * (turn[i, 3] * nx + turn[i, 4] * ny + turn[i, 5] * nz)
             + z * (turn[i, 6] * nx + turn[i, 7] * ny + turn[i, 8] * nz)
         )
-        brightness = surfaces.reflectivity[i, material]
+        seen = surfaces.reflectivity[i, material]
+        if wetness > 0 and material in (ROAD, SIDEWALK):
+            seen *= np.float32(1 - wetness * (1 - under_water(cosine, seen)))
         if surfaces.retro[material]:
-            brightness *= np.float32(RETRO_GAIN)
+            seen *= np.float32(RETRO_GAIN)
         else:
-            brightness *= cosine
+            seen *= cosine
         for _ in range(panes[ray]):
-            brightness *= np.float32(PANE_TRANSMISSION)
-        power = brightness / (distance[ray] * distance[ray])
+            seen *= np.float32(PANE_TRANSMISSION)
+        out[ray] = seen
+    return out
+
+
+@compiled
+def under_water(cosine, reflectivity):
+    """Return how bright a diffuse surface is under a film of water, relative to dry.
+
+    Light enters and leaves through the film, whose Fresnel reflectance F grows towards grazing incidence, spreads by
+    1 / n^2 on the way out, and what is turned back inside (p) meets the surface again: Lekner and Dorf, "Why some
+    things are darker when wet", Applied Optics 27:1278 (1988).
+    """
+    inside = np.sqrt(1 - (1 - cosine**2) / WATER_INDEX**2)
+    across = (cosine - WATER_INDEX * inside) / (cosine + WATER_INDEX * inside)
+    along = (inside - WATER_INDEX * cosine) / (inside + WATER_INDEX * cosine)
+    fresnel = (across**2 + along**2) / 2
+    return (1 - fresnel) ** 2 / WATER_INDEX**2 / (1 - TURNED_BACK * reflectivity)
+
+
+@compiled
+def detect(
+    directions,
+    distance,
+    brightness,
+    source,
+    inverse_threshold,
+    keep,
+    chance,
+    noise,
+    noise_m,
+    noise_share,
+    points,
+    actor,
+):
+    """Write the detected echoes' `points` (N, 4) and `actor` (N,) and return their number.
+
+    An echo of power P = `brightness` / `distance`^2 is detected with a probability that rises from 0 at 0.7 P_min to
+    `keep` at 1.3 P_min; `chance` (N,) in [0, 1) decides. `inverse_threshold` is 1 / P_min. `source` (N,) is the actor
+    that each echo comes from. `noise` (N,) picks a quantile of the range error, whose standard deviation is `noise_m`
+    and, independently, `noise_share` of the range.
+    """
+    count = 0
+    for ray in range(len(directions)):
+        if brightness[ray] <= 0:
+            continue
+        power = brightness[ray] / (distance[ray] * distance[ray])
         margin = (power * inverse_threshold - np.float32(0.7)) / np.float32(0.6)
         if chance[ray] >= keep * min(margin, np.float32(1.0)):
             continue
-        measured = distance[ray] + noise_m * QUANTILES[noise[ray]]
-        points[count, 0] = x * measured
-        points[count, 1] = y * measured
-        points[count, 2] = z * measured
-        points[count, 3] = min(brightness, np.float32(1.0))
-        actor[count] = i - 1
+        deviation = noise_m
+        if noise_share > 0:
+            deviation = np.float32(np.hypot(noise_m, noise_share * distance[ray]))
+        measured = distance[ray] + deviation * QUANTILES[noise[ray]]
+        points[count, 0] = directions[ray, 0] * measured
+        points[count, 1] = directions[ray, 1] * measured
+        points[count, 2] = directions[ray, 2] * measured
+        points[count, 3] = min(brightness[ray], np.float32(1.0))
+        actor[count] = source[ray]
         count += 1
     return count

@@ -1,0 +1,46 @@
+"""A spin takes time: the sensor turns, and meanwhile it and everybody else move on.
+
+The beams look straight ahead at the scene's instant and turn counter-clockwise, so that a spin begins half its
+duration before and ends half its duration after. Azimuth is cut into SECTORS, each traced with the world as it is when
+the beams pass its middle. Points are left where the sensor measured them, each in the sensor's frame of its own time.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.geometry import inverse
+from flcav.world.scene import Scene
+
+SECTORS = 60
+
+
+def sectors(
+    scene: Scene, world_from_sensor: NDArray[np.float64], steps: int, spin_s: float, carrier: int | None
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Yield each sector's columns (C,) of the pattern and the (4, 4) pose of the sensor at its time.
+
+    While a sector is out, `scene` stands at its time; afterwards it stands where it was. `world_from_sensor` is the
+    pose at the scene's instant, `steps` the columns of a spin of `spin_s`, `carrier` the actor that the sensor is on.
+    """
+    index, instant_s = scene.index, scene.offset_s
+
+    def pose_now() -> NDArray[np.float64]:
+        return world_from_sensor if carrier is None else scene.world_from_actor(carrier) @ carrier_from_sensor
+
+    carrier_from_sensor = np.eye(4) if carrier is None else inverse(scene.world_from_actor(carrier)) @ world_from_sensor
+    sector = (np.arange(steps) * SECTORS // steps + SECTORS // 2) % SECTORS  # in the order they are traced
+    try:
+        for number in range(SECTORS):
+            columns = np.flatnonzero(sector == number)
+            scene.move_to(index, instant_s + ((number + 0.5) / SECTORS - 0.5) * spin_s)
+            yield columns, pose_now()
+    finally:
+        scene.move_to(index, instant_s)
+
+
+def time_in_spin_s(points: NDArray[np.float32], spin_s: float) -> NDArray[np.float32]:
+    """Return when each point (N, >=2) of a spin, in the sensor's frame, was measured: (N,) [s] after its middle."""
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    return (azimuth * (spin_s / (2 * np.pi))).astype(np.float32)
