@@ -12,6 +12,7 @@ from flcav.experiments.findings import findings
 from flcav.experiments.picture import look
 from flcav.experiments.pipeline import cloud_step, edge_step, plan_step, rounds_step, shared_steps, test_step
 from flcav.experiments.placing import ERRORS
+from flcav.experiments.points import HISTORY_FILE, append_points, points_of
 from flcav.experiments.pretraining import LEDGER
 from flcav.experiments.protocol import REGIONS, Protocol, Split, Training
 from flcav.experiments.recording import DATA
@@ -67,6 +68,7 @@ def run_demo(protocol: Protocol, out: Path, *, jobs: int, notify: Notify, clock:
         notify(step, done, total, note)
 
     values = run_steps(demo_steps(protocol), work, jobs=jobs, notify=noted)
+    append_points(out / HISTORY_FILE, points_of(values, f"seed{protocol.seed}"))
     results = collect(protocol, work, values)
     results["elapsed_s"] = round(clock(), 1)
     results["findings"] = findings(results)

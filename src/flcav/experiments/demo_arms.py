@@ -12,6 +12,7 @@ from flcav.dataset.layout import package_versions
 from flcav.experiments.demo import demo_protocol
 from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.pipeline import central_step, cloud_step, edge_step, plan_step, shared_steps, test_step
+from flcav.experiments.points import HISTORY_FILE, append_points, points_of
 from flcav.experiments.pretraining import LEDGER
 from flcav.experiments.protocol import Protocol
 from flcav.experiments.steps import Notify, Step, run_side_by_side
@@ -65,6 +66,8 @@ def run_arms(protocols: Sequence[Protocol], out: Path, *, jobs: int, notify: Not
     folders = [out / f"seed{protocol.seed}" for protocol in protocols]
     runs = {folder: arm_steps(protocol) for folder, protocol in zip(folders, protocols, strict=True)}
     values = run_side_by_side(runs, jobs=jobs, notify=notify)
+    for folder in folders:
+        append_points(out / HISTORY_FILE, points_of(values[folder], folder.name))
     seeds = [_one_seed(protocol, folder, values[folder]) for protocol, folder in zip(protocols, folders, strict=True)]
     return {
         "protocol": protocols[0].model_dump(mode="json", exclude={"seed"}),

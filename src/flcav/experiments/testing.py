@@ -57,7 +57,7 @@ def test_rounds(work: Work, arm: str, town: str, frames: int) -> list[dict[str, 
     for round_ in range(1, rounds + 1):
         at_round = round_network(network, work.inputs[arm], round_)
         result = evaluate(at_round, (data.frame(int(i)) for i in chosen))
-        rows.append({"round": round_, "ap50": result.score("Car", "3d", 0.5).ap})
+        rows.append({"round": round_, "ap50": result.score("Car", "3d", 0.5).ap, "frames": len(chosen)})
         work.report(round_, rounds, "")
     return rows
 
