@@ -10,6 +10,7 @@ from flcav.world.trace import CATEGORIES
 
 SIGNS = ("stop", "yield", "speed_30", "speed_60", "speed_90", "light_red", "light_yellow", "light_green")
 LIGHTS = {"red": "light_red", "red_amber": "light_red", "amber": "light_yellow", "green": "light_green"}
+HALF_PX = 0.5  # a frame's pixels have their centres at whole numbers
 CLASSES = {"signs": SIGNS, "actors": CATEGORIES}
 
 
@@ -18,7 +19,7 @@ class Rectangles:
     """What shows in one picture."""
 
     label: NDArray[np.int64]  # (N,) index into the list of CLASSES
-    box: NDArray[np.float64]  # (N, 4) left, top, right, bottom of what is visible [px]
+    box: NDArray[np.float64]  # (N, 4) left, top, right, bottom of what is visible [px], from the image's corner
     pixels: NDArray[np.int64]  # (N,) that show it
     row: NDArray[np.int64]  # (N,) which of the frame's annotations, or of the picture's signs, it is
 
@@ -41,4 +42,4 @@ def rectangles(frame: Frame, camera: str, labels: str, min_pixels: int) -> Recta
     number = {name: i for i, name in enumerate(CLASSES[labels])}
     label = np.array([number.get(name, -1) for name in names], np.int64)
     row = np.flatnonzero((label >= 0) & (pixels >= min_pixels))
-    return Rectangles(label[row], box[row], pixels[row], row)
+    return Rectangles(label[row], box[row] + HALF_PX, pixels[row], row)

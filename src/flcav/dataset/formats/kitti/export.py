@@ -46,14 +46,13 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
         camera = front_camera({name: frame.calibration.agent_from_sensor[name] for name in frame.images})
         if camera is None or not frame.lidar:
             counts["left_out"] += 1
-            continue
-        split = split_of[key.scene]
-        number = f"{counts['frames']:06d}"
-        folder = out / ("testing" if split == "test" else "training")
-        counts["objects"] += _write_frame(frame, camera, folder, number)
-        counts["frames"] += 1
-        numbers[split].append(number)
-        rows.append((number, split, frame.key, frame.agent, f"{frame.time_s:.3f}", camera))
+        else:
+            split, number = split_of[key.scene], f"{counts['frames']:06d}"
+            folder = out / ("testing" if split == "test" else "training")
+            counts["objects"] += _write_frame(frame, camera, folder, number)
+            counts["frames"] += 1
+            numbers[split].append(number)
+            rows.append((number, split, frame.key, frame.agent, f"{frame.time_s:.3f}", camera))
         progress(i + 1, len(dataset), "")
     if not rows:
         raise lacks(dataset, "KITTI", "a LiDAR and a level camera that looks ahead")

@@ -1,0 +1,330 @@
+"""Every format holds what the dataset holds: read back by `format_readers`, and by COCO's own readers."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import painted_source
+import pytest
+import yaml
+from format_readers import READERS, Seen
+from painted_source import CATEGORIES, RETURNS, PaintedSource
+from PIL import Image
+from shapely.geometry import MultiPoint, Point
+
+from flcav.config import InputError
+from flcav.dataset.formats.export import EXPORTERS, export
+from flcav.dataset.formats.exporter import ExportOptions
+from flcav.dataset.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.geometry import inverse, points_in_boxes, wrap_angle
+from flcav.sensors.frame import Frame
+
+SCENES = 3  # of which the last validates
+KITTI = ["Car", "Van", "Truck", "Truck", "Cyclist", "Cyclist", "Pedestrian", "Car", "Car"]
+NUSCENES = ["car", "car", "truck", "bus.rigid", "motorcycle", "bicycle"]
+NAMES = {
+    "kitti": KITTI,
+    "nuscenes": [f"vehicle.{name}" for name in NUSCENES] + ["human.pedestrian.adult", "vehicle.car", "vehicle.car"],
+    "opv2v": ["vehicle"] * len(CATEGORIES),
+    "mcap": CATEGORIES,
+}
+PRECISION = {"kitti": 1e-4, "nuscenes": 1e-6, "opv2v": 1e-6, "mcap": 1e-6}  # metres, radians
+INTENSITY = {"kitti": 0, "nuscenes": 1e-6, "opv2v": 0.5 / 255 + 1e-6, "mcap": 0}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("painted") / "dataset"
+    record(PaintedSource(SCENES), folder)
+    dataset = Dataset.open(folder)
+    key = {i: dataset.keys[i] for i in range(len(dataset))}
+    dataset.frame = lambda i: PaintedSource().frame(key[i].scene, key[i].index, key[i].agent)
+    return dataset
+
+
+@pytest.fixture(scope="module")
+def exported(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("exports")
+    options = ExportOptions(validation=0.3)
+    for name in EXPORTERS:
+        export(dataset, name, root / name, options)
+    export(dataset, "yolo", root / "yolo_actors", ExportOptions(validation=0.3, labels="actors"))
+    return {path.name: path for path in root.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def seen(exported: dict[str, Path]) -> dict[str, dict[str, Seen]]:
+    return {name: read(exported[name]) for name, read in READERS.items()}
+
+
+def _kept(name: str, frame: Frame) -> np.ndarray:
+    """Return which actors of a frame the format is meant to hold."""
+    if name == "kitti":
+        views = frame.annotations.views["front"]
+        left, top, right, bottom = np.nan_to_num(views.amodal_box, nan=-1).T
+        within = (right > 0) & (bottom > 0) & (left < painted_source.WIDTH - 1) & (top < painted_source.HEIGHT - 1)
+        return np.flatnonzero(within & ((views.pixels > 0) | (frame.annotations.returns > 0)))
+    if name == "opv2v":
+        return np.flatnonzero(np.isin(CATEGORIES, ["car", "van", "truck", "bus"]) & (RETURNS > 0))
+    return np.arange(len(CATEGORIES))
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_boxes_names_and_counts_are_the_source_s(name: str, dataset: Dataset, seen: dict[str, dict[str, Seen]]):
+    expected = {
+        key: frame
+        for frame in (dataset.frame(i) for i in range(len(dataset)))
+        if frame.images or name != "kitti"
+        for key in [frame.key]
+    }
+    assert seen[name].keys() == expected.keys()
+    for key, frame in expected.items():
+        kept, boxes = _kept(name, frame), seen[name][key].boxes
+        source = frame.annotations.boxes.transformed(inverse(frame.world_from_sensor("lidar")))[kept]
+        assert sorted(boxes.label.tolist()) == sorted(NAMES[name][i] for i in kept)
+        away = np.abs(boxes.center[:, None] - source.center[None]).max(axis=2)
+        match = away.argmin(axis=1)
+        assert sorted(match) == list(range(len(kept)))
+        assert boxes.label.tolist() == [NAMES[name][kept[i]] for i in match]
+        assert away.min(axis=1).max() <= PRECISION[name]
+        assert np.abs(boxes.size - source.size[match]).max() <= PRECISION[name]
+        assert np.abs(wrap_angle(boxes.yaw - source.yaw[match])).max() <= PRECISION[name]
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_points_are_the_source_s_and_lie_in_their_boxes(name: str, dataset: Dataset, seen: dict[str, dict[str, Seen]]):
+    for key, frame in seen[name].items():
+        source = dataset.frame(dataset.number(key))
+        cloud = source.lidar["lidar"]
+        np.testing.assert_allclose(frame.points[:, :3], cloud[:, :3], atol=1e-5)
+        np.testing.assert_allclose(frame.points[:, 3], cloud[:, 3], atol=max(INTENSITY[name], 1e-9))
+        truth = source.annotations.boxes.transformed(inverse(source.world_from_sensor("lidar")))
+        rows = np.linalg.norm(frame.boxes.center[:, None] - truth.center[None], axis=2).argmin(axis=1)
+        inside = points_in_boxes(frame.points, frame.boxes, 1e-3).sum(axis=1)
+        np.testing.assert_array_equal(inside, RETURNS[rows])
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_boxes_project_onto_their_pixels(name: str, dataset: Dataset, seen: dict[str, dict[str, Seen]]):
+    """Painted pixels lie within the projected hull of their actor's box, and where all of it shows they fill it."""
+    painted, expected = 0, 0
+    for key, frame in seen[name].items():
+        source = dataset.frame(dataset.number(key))
+        truth = source.annotations.boxes.transformed(inverse(source.world_from_sensor("lidar")))
+        rows = np.linalg.norm(frame.boxes.center[:, None] - truth.center[None], axis=2).argmin(axis=1)
+        cameras = [camera for camera in source.images if camera == "front" or name != "kitti"]
+        assert len(frame.images) == len(cameras)
+        expected += sum((source.annotations.views[camera].pixels[rows] > 0).sum() for camera in cameras)
+        for image, projection in frame.images:
+            for row, corners in zip(rows, frame.boxes.corners()):
+                v, u = np.nonzero((image == painted_source.colour(row)).all(axis=2))
+                if not len(u):
+                    continue
+                projected = np.column_stack((corners, np.ones(8))) @ projection.T
+                assert (projected[:, 2] > 0).all()
+                hull = MultiPoint(projected[:, :2] / projected[:, 2:]).convex_hull
+                assert all(hull.distance(Point(pixel)) < 1 for pixel in zip(u, v))
+                views = next(view for view in source.annotations.views.values() if view.pixels[row])
+                if views.occlusion[row] + views.truncation[row] == 0:
+                    assert len(u) > 0.9 * hull.area
+                painted += 1
+    assert painted == expected > 0
+
+
+def test_kitti_splits_by_scene_and_has_what_openpcdet_expects(dataset: Dataset, exported: dict[str, Path]):
+    out = exported["kitti"]
+    lists = {name: (out / "ImageSets" / f"{name}.txt").read_text().split() for name in ("train", "val", "test")}
+    with (out / "frames.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    scenes = {split: {row["frame"][:13] for row in rows if row["number"] in lists[split]} for split in lists}
+    assert scenes == {"train": {"painted-0-000", "painted-0-001"}, "val": {"painted-0-002"}, "test": set()}
+    trainval = (out / "ImageSets" / "trainval.txt").read_text().split()
+    assert sorted(lists["train"] + lists["val"]) == trainval == [row["number"] for row in rows]
+    lines = (out / "training" / "calib" / "000000.txt").read_text().splitlines()
+    assert [line.split(":")[0] for line in lines] == [f"P{i}" for i in range(4)] + [
+        "R0_rect",
+        "Tr_velo_to_cam",
+        "Tr_imu_to_velo",
+    ]
+    shapes = [len(line.split()) - 1 for line in lines]
+    assert shapes == [12, 12, 12, 12, 9, 12, 12]
+    for line in (out / "training" / "label_2" / "000000.txt").read_text().splitlines():
+        name, *fields = line.split(" ")
+        assert name in {"Car", "Van", "Truck", "Cyclist", "Pedestrian"}
+        assert len(fields) == 14
+        truncation, occlusion, alpha, left, _, right, _, *_, x, _, z, rotation = map(float, fields)
+        assert 0 <= truncation <= 1
+        assert occlusion in (0, 1, 2, 3)
+        assert wrap_angle(rotation - np.arctan2(x, z) - alpha) == pytest.approx(0, abs=1e-3)
+        assert 0 <= left < right <= painted_source.WIDTH - 1
+
+
+def test_kitti_grades_occlusion(dataset: Dataset, seen: dict[str, dict[str, Seen]], exported: dict[str, Path]):
+    """The second car stands behind the first; what shows no pixel is of unknown occlusion."""
+    from flcav.dataset.formats.kitti import KittiFolder
+
+    objects = KittiFolder.open(exported["kitti"]).frame(0).objects
+    views = dataset.frame(0).annotations.views["front"]
+    row = {tuple(np.round(size, 2)): i for i, size in enumerate(dataset.frame(0).annotations.boxes.size.tolist())}
+    for size, level, rectangle in zip(objects.boxes.size, objects.occlusion, objects.rectangle):
+        i = row[tuple(np.round(size, 2).tolist())]
+        hidden = views.occlusion[i]
+        assert level == (3 if not views.pixels[i] else 0 if hidden < 0.1 else 1 if hidden < 0.5 else 2)
+        wide, tall = painted_source.WIDTH - 1, painted_source.HEIGHT - 1
+        np.testing.assert_allclose(rectangle, np.clip(views.amodal_box[i], 0, (wide, tall, wide, tall)), atol=1e-4)
+    assert len(set(objects.occlusion.tolist())) > 1
+
+
+def _labels(found: dict[str, list], frame: Frame, camera: str, name: str) -> None:
+    """Check (class name, left, top, right, bottom) rows of a picture, in pixels from its corner, against the source."""
+    rows = sorted(found[f"{frame.key}_{camera}"])
+    if name == "signs":
+        signs = frame.annotations.signs[camera]
+        expected = [("stop", 0), ("speed_60", 1), ("light_red", 2), ("light_green", 3)]
+        source = [(label, *(signs.box[i] + 0.5)) for label, i in expected]
+    else:
+        views = frame.annotations.views[camera]
+        source = [(CATEGORIES[i], *(views.visible_box[i] + 0.5)) for i in np.flatnonzero(views.pixels)]
+    assert [row[0] for row in rows] == [row[0] for row in sorted(source)]
+    np.testing.assert_allclose([row[1:] for row in rows], [row[1:] for row in sorted(source)], atol=1e-3)
+
+
+def _pictures(dataset: Dataset) -> list[tuple[Frame, str]]:
+    return [(frame, camera) for i in range(len(dataset)) for frame in [dataset.frame(i)] for camera in frame.images]
+
+
+@pytest.mark.parametrize(("folder", "name"), [("yolo", "signs"), ("yolo_actors", "actors")])
+def test_yolo_labels_are_the_source_s(folder: str, name: str, dataset: Dataset, exported: dict[str, Path]):
+    out = exported[folder]
+    about = yaml.safe_load((out / "data.yaml").read_text())
+    assert [about[split] for split in ("train", "val")] == ["images/train", "images/val"]
+    found = {}
+    for path in sorted(out.glob("images/*/*.png")):
+        with Image.open(path) as image:
+            wide, tall = image.size
+        rows = []
+        for line in (out / "labels" / path.parent.name / f"{path.stem}.txt").read_text().splitlines():
+            number, x, y, w, h = map(float, line.split())
+            assert all(0 <= value <= 1 for value in (x, y, w, h))
+            left, top = (x - w / 2) * wide, (y - h / 2) * tall
+            rows.append((about["names"][int(number)], left, top, left + w * wide, top + h * tall))
+        found[path.stem] = rows
+    pictures = _pictures(dataset)
+    assert len(found) == len(pictures)
+    for frame, camera in pictures:
+        _labels(found, frame, camera, name)
+
+
+@pytest.mark.parametrize("reader", ["pycocotools.coco", "faster_coco_eval"])
+@pytest.mark.parametrize("name", ["signs", "actors"])
+def test_coco_s_readers_find_the_source_s_labels_and_masks(
+    reader: str, name: str, dataset: Dataset, exported: dict[str, Path], capsys: pytest.CaptureFixture[str]
+):
+    coco_class = pytest.importorskip(reader).COCO
+    checked = 0
+    for split in ("train", "val"):
+        coco = coco_class(str(exported["coco"] / "annotations" / f"{name}_{split}.json"))
+        found, number = {}, {}
+        for image in coco.loadImgs(coco.getImgIds()):
+            path = exported["coco"] / "images" / split / image["file_name"]
+            pixels = np.asarray(Image.open(path))
+            assert pixels.shape[:2] == (image["height"], image["width"])
+            notes = coco.loadAnns(coco.getAnnIds(imgIds=[image["id"]]))
+            rows = []
+            for note in notes:
+                x, y, w, h = note["bbox"]
+                rows.append((coco.loadCats([note["category_id"]])[0]["name"], x, y, x + w, y + h))
+                if name == "actors":
+                    mask = coco.annToMask(note).astype(bool)
+                    assert mask.sum() == note["area"]
+                    painted = (pixels == painted_source.colour(int(note["track"][3:]))).all(axis=2)
+                    np.testing.assert_array_equal(mask, painted)
+                    checked += 1
+            found[path.stem] = rows
+            number[path.stem] = image["id"]
+        scenes = {"train": ("000", "001"), "val": ("002",)}[split]
+        for frame, camera in _pictures(dataset):
+            if frame.scene[-3:] in scenes:
+                _labels(found, frame, camera, name)
+                del number[f"{frame.key}_{camera}"]
+        assert not number
+    assert checked or name == "signs"
+
+
+def test_small_things_can_be_left_out(dataset: Dataset, tmp_path: Path):
+    export(dataset, "coco", tmp_path / "out", ExportOptions(min_pixels=6))
+    notes = json.loads((tmp_path / "out" / "annotations" / "signs_train.json").read_text())["annotations"]
+    assert {note["area"] for note in notes} == {9, 6}
+
+
+@pytest.mark.parametrize("name", EXPORTERS)
+def test_an_export_that_ends_early_leaves_nothing(name: str, dataset: Dataset, tmp_path: Path):
+    def full_disk(done: int, total: int, note: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left") as error:
+        export(dataset, name, tmp_path / "out", progress=full_disk)
+    assert error.value.filename == str(tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / ".out.part").mkdir()
+    (tmp_path / ".out.part" / "left").touch()
+    (tmp_path / "out").mkdir()
+    export(dataset, name, tmp_path / "out")
+    assert not list((tmp_path / "out").rglob("left"))
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("name", EXPORTERS)
+def test_progress_reaches_the_end(name: str, dataset: Dataset, tmp_path: Path):
+    calls = []
+    export(dataset, name, tmp_path / "out", progress=lambda done, total, note: calls.append((done, total)))
+    assert [done for done, _ in calls] == sorted(done for done, _ in calls)
+    assert calls[-1] == (len(dataset), len(dataset))
+
+
+@pytest.mark.parametrize("name", EXPORTERS)
+def test_equal_exports_are_equal_bytes(name: str, dataset: Dataset, exported: dict[str, Path], tmp_path: Path):
+    export(dataset, name, tmp_path / "out", ExportOptions(validation=0.3))
+    files = {path.relative_to(tmp_path / "out"): path for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    assert len(files) == len([path for path in exported[name].rglob("*") if path.is_file()])
+    for relative, path in files.items():
+        assert path.read_bytes() == (exported[name] / relative).read_bytes(), relative
+
+
+def test_targets_that_are_refused(dataset: Dataset, tmp_path: Path):
+    with pytest.raises(InputError, match="format 'waymo': unknown; known formats: kitti, yolo, coco"):
+        export(dataset, "waymo", tmp_path / "out")
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="is a file"):
+        export(dataset, "kitti", tmp_path / "file")
+    with pytest.raises(InputError, match="holds other files"):
+        export(dataset, "kitti", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "needed"),
+    [
+        ("kitti", PaintedSource(1, cameras=False), "a level camera that looks ahead"),
+        ("yolo", PaintedSource(1, cameras=False), "camera images"),
+        ("coco", PaintedSource(1, cameras=False), "camera images"),
+        ("kitti", PaintedSource(1, lidar=False), "a LiDAR and"),
+        ("nuscenes", PaintedSource(1, lidar=False), "a LiDAR on every agent"),
+        ("opv2v", PaintedSource(1, lidar=False), "a LiDAR on every agent"),
+    ],
+)
+def test_what_a_dataset_lacks_is_one_sentence(name: str, source: PaintedSource, needed: str, tmp_path: Path):
+    record(source, tmp_path / "dataset")
+    dataset = Dataset.open(tmp_path / "dataset")
+    with pytest.raises(InputError, match=f"dataset: cannot be exported to .* needs .*{needed}"):
+        export(dataset, name, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("split", "lists"), [("val", ["val"]), ("test", ["test"]), ("extra", ["train", "val"])])
+def test_a_dataset_goes_to_the_split_it_was_recorded_for(split: str, lists: list[str], tmp_path: Path):
+    record(PaintedSource(2, spins=1, split=split), tmp_path / "dataset")
+    export(Dataset.open(tmp_path / "dataset"), "opv2v", tmp_path / "out")
+    folders = {"train": "train", "val": "validate", "test": "test"}
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(folders[name] for name in lists)
