@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flcav.geometry import inverse
 from flcav.world.scene import Scene
 
-SECTORS = 60
+SECTORS = 36
 
 
 def sectors(

@@ -66,9 +66,7 @@ class Scene:
 
     def world_from_instance(self) -> NDArray[np.float64]:
         """Return the instances' (I, 3, 3) rotations; the identity for the town and for absent actors."""
-        yaw = np.concatenate(([0.0], np.nan_to_num(self._poses()[:, 3])))
-        cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
-        return np.array([[cos, -sin, zero], [sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
+        return _turned(np.concatenate(([0.0], np.nan_to_num(self._poses()[:, 3]))))
 
     def cast(
         self,
@@ -129,13 +127,22 @@ class Scene:
         wanted = np.where(self.trace.present[self.index, :, None], self._poses(), np.nan)
         if self._hidden is not None:
             wanted[self._hidden] = np.nan
-        for actor in np.flatnonzero(
-            ~((wanted == self._placed) | np.isnan(wanted) & np.isnan(self._placed)).all(axis=1)
-        ):
-            nowhere = np.isnan(wanted[actor]).any()
-            self._assembly.place(int(actor) + 1, None if nowhere else pose(*wanted[actor]))
+        same = (wanted == self._placed) | np.isnan(wanted) & np.isnan(self._placed)
+        moved = np.flatnonzero(~same.all(axis=1))
+        nowhere = np.isnan(wanted[moved]).any(axis=1)
+        world_from_actor = np.tile(np.eye(4), (len(moved), 1, 1))
+        world_from_actor[:, :3, :3] = _turned(wanted[moved, 3])
+        world_from_actor[:, :3, 3] = wanted[moved, :3]
+        for number, actor in enumerate(moved.tolist()):
+            self._assembly.place(actor + 1, None if nowhere[number] else world_from_actor[number])
         self._placed = wanted
         self._assembly.commit()
+
+
+def _turned(yaw: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (K, 3, 3) rotations by `yaw` (K,) [rad] about the vertical."""
+    cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
+    return np.array([[cos, -sin, zero], [sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
 
 
 class _Model(NamedTuple):
