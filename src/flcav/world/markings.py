@@ -16,7 +16,7 @@ from shapely.geometry.base import BaseGeometry
 from shapely.ops import substring
 
 from flcav.world.layers import Marking, MarkingKind
-from flcav.world.roads import Edge, Lane, RoadNet
+from flcav.world.roads import CARRIAGEWAY, Edge, Lane, RoadNet
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,6 @@ INSET_M = 0.2  # of an edge line from the edge
 FAST = 13.0  # [m/s] streets as fast as this have edge lines even along a kerb
 SHORTEST_M = 0.3  # painted line
 SAME_LINE_M = 0.7  # two edges this close are the two directions of one street
-CARRIAGEWAY = ("driving", "bicycle", "parking")
 
 
 def markings(net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry) -> Iterator[Marking]:

@@ -86,11 +86,19 @@ class GeoReference(Config):
     altitude_m: float = 0.0
 
 
+class MapSource(Config):
+    """The map a town was imported from."""
+
+    file: str
+    offset_m: tuple[float, float] = (0.0, 0.0)  # town = map + offset
+
+
 class TownParameters(Config):
     """A town's parameter file."""
 
     description: str
     geo: GeoReference = GeoReference()
+    source: MapSource | None = None  # None: drawn here
     seed: int  # of everything that stands still
     vehicles: Annotated[int, Field(ge=0)]  # moving at once, CAVs apart
     pedestrians: Annotated[int, Field(ge=0)]

@@ -16,7 +16,8 @@ from flcav.config import InputError
 
 Array = NDArray[np.float64]
 
-LaneKind = Literal["driving", "bicycle", "parking", "sidewalk", "crossing", "walkingarea"]  # parking: closed to traffic
+LaneKind = Literal["driving", "bicycle", "parking", "shoulder", "sidewalk", "crossing", "walkingarea"]
+CARRIAGEWAY: tuple[LaneKind, ...] = ("driving", "bicycle", "parking", "shoulder")  # the last two are closed to traffic
 
 ONLY_FOR: dict[str, LaneKind] = {"pedestrian": "sidewalk", "bicycle": "bicycle"}
 
@@ -149,7 +150,7 @@ def _lane_kind(function: str, lane: ElementTree.Element) -> LaneKind:
     if function == "crossing" or function == "walkingarea":
         return function
     if lane.get("disallow") == "all":
-        return "parking"
+        return "shoulder" if lane.get("type") == "shoulder" else "parking"
     return ONLY_FOR.get(lane.get("allow", ""), "driving")
 
 

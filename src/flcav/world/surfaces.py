@@ -10,7 +10,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import linemerge, split
 
-from flcav.world.roads import RoadNet
+from flcav.world.roads import CARRIAGEWAY, RoadNet
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ def surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Surfaces:
         LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
         for edge in net.edges.values()
         for lane in edge.lanes
-        if lane.kind in ("driving", "bicycle", "parking") and LineString(lane.shape).length > SLIVER_M
+        if lane.kind in CARRIAGEWAY and LineString(lane.shape).length > SLIVER_M
     ]
     walked, paved = [], []
     narrowest = min(frontage_m.values(), default=0.0)

@@ -1,0 +1,112 @@
+"""Parameters of an imported town: what lines its streets, how busy it is, where a roadside sensor could stand."""
+
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from shapely.geometry import LineString
+
+from flcav.world.parameters import GeoReference, MapSource, PoleParameters, StreetParameters, TownParameters
+from flcav.world.roads import Edge, RoadNet
+
+VEHICLES_PER_KM = 9.0  # of driving lane
+PEDESTRIANS_PER_KM = 10.0  # of sidewalk
+MOST = 150  # of either
+CORNER_M = 4.0  # from a pole to the end of its edge
+STRAIGHT_M = 60.0  # a stretch as long as this gets a pole midway
+BENT_M = 2.0  # and may be this far off the straight line
+STREETS: dict[str, dict[str, Any]] = {
+    "arterial": {
+        "frontage_m": 1.0,
+        "setback_m": (0.5, 3.0),
+        "building_length_m": (12.0, 22.0),
+        "building_depth_m": (10.0, 13.0),
+        "building_height_m": (9.0, 18.0),
+        "building_gap_m": (0.5, 4.0),
+        "tree_spacing_m": 24.0,
+        "clutter_spacing_m": 16.0,
+        "clutter": {"kiosk": 0.6, "shelter": 1.0, "bins": 1.0, "planter": 1.0, "cabinet": 0.8},
+        "parked": 0.3,
+        "parked_mix": {"car": 0.8, "van": 0.2},
+        "traffic": 1.5,
+        "footfall": 2.0,
+    },
+    "street": {
+        "setback_m": (1.5, 4.5),
+        "building_height_m": (5.0, 10.0),
+        "building_gap_m": (1.5, 6.0),
+        "tree_spacing_m": 16.0,
+        "clutter_spacing_m": 15.0,
+        "clutter": {"hedge": 2.0, "bins": 1.0, "cabinet": 0.4},
+        "parked": 0.3,
+        "parked_mix": {"car": 0.9, "van": 0.1},
+    },
+    "open": {"footfall": 0.0},
+}
+MIX = {"car": 0.66, "van": 0.12, "truck": 0.05, "bus": 0.03, "motorcycle": 0.05, "bicycle": 0.09}
+
+
+def furnish(net: RoadNet, *, description: str, seed: int, geo: GeoReference, source: MapSource) -> TownParameters:
+    """Return the parameters of a town on `net`, whose street types are those of `STREETS`."""
+    kinds = sorted({edge.type for edge in net.streets})
+    return TownParameters(
+        description=description,
+        seed=seed,
+        geo=geo,
+        source=source,
+        vehicles=_count(net, "driving", VEHICLES_PER_KM),
+        pedestrians=_count(net, "sidewalk", PEDESTRIANS_PER_KM),
+        mix=MIX,
+        streets={kind: StreetParameters(**STREETS[kind]) for kind in kinds},
+        poles=tuple(candidate_poles(net)),
+    )
+
+
+def candidate_poles(net: RoadNet) -> list[PoleParameters]:
+    """Return candidate sites, numbered from north to south and west to east.
+
+    One stands at the corner of each junction of three streets or more, on the widest street that leads there, and one
+    midway of each straight stretch of at least `STRAIGHT_M`; only where there is a sidewalk to stand on.
+    """
+    into: dict[str, list[Edge]] = {}
+    for edge in net.streets:
+        if edge.lanes_of("sidewalk") and edge.lanes_of("driving") and _length(edge) > 2 * CORNER_M:
+            into.setdefault(edge.end, []).append(edge)
+    arms = {name: {edge.start for edge in net.streets if edge.end == name} for name in net.junctions}
+    sites: list[tuple[Edge, Literal["straight", "cross", "tee", "roundabout"], float]] = []
+    done: set[frozenset[str]] = set()
+    for name, edges in into.items():
+        if len(arms[name] | {edge.end for edge in net.streets if edge.start == name}) > 2:
+            widest = max(edges, key=lambda edge: (len(edge.lanes_of("driving")), _length(edge), edge.id))
+            kind = "roundabout" if name in net.roundabouts else "cross" if len(arms[name]) > 3 else "tee"
+            sites.append((widest, kind, CORNER_M))
+        for edge in sorted(edges, key=lambda edge: edge.id):
+            street = frozenset((edge.start, edge.end))
+            if street not in done and _length(edge) >= STRAIGHT_M and _bend(edge) <= BENT_M:
+                done.add(street)
+                sites.append((edge, "straight", round(_length(edge) / 2, 1)))
+
+    def place(site: tuple[Edge, str, float]) -> tuple[float, float]:
+        line = LineString(site[0].lanes_of("sidewalk")[-1].shape)
+        at = line.interpolate(line.length - site[2])
+        return -round(at.y), round(at.x)
+
+    return [
+        PoleParameters(id=i + 1, kind=kind, edge=edge.id, before_end_m=before)
+        for i, (edge, kind, before) in enumerate(sorted(sites, key=place))
+    ]
+
+
+def _count(net: RoadNet, kind: str, per_km: float) -> int:
+    metres = sum(LineString(lane.shape).length for edge in net.streets for lane in edge.lanes_of(kind))
+    return min(round(per_km * metres / 1000), MOST)
+
+
+def _length(edge: Edge) -> float:
+    return LineString(edge.lanes[0].shape).length
+
+
+def _bend(edge: Edge) -> float:
+    line = edge.lanes[0].shape
+    chord = LineString(line[[0, -1]])
+    return float(np.max(shapely.distance(shapely.points(line), chord)))

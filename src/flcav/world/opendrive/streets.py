@@ -1,0 +1,198 @@
+"""A map's nodes, edges and connections, as netconvert wrote them, written anew as the streets of a town.
+
+Who may use which lane is said anew: cars drive on lanes for driving, people walk on the outermost sidewalk (which is
+added where a map has none at all), and everything else that is paved stays in its place, closed to traffic.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.world.opendrive.document import OPEN_ROADS, Document, Road
+
+FAR_M = 5000.0  # a map farther from its origin than this is moved there
+SIDEWALK_M = 2.0  # width of an added sidewalk
+PARKING_M = 1.9  # a shoulder as wide as this beside a town's street is parked on
+SHORT_M = 60.0  # an edge shorter than this has no room to change lanes
+ARTERIAL = 16.0  # [m/s] a street as fast as this, or of several lanes a direction, is one
+PRIORITY = {"arterial": "3", "open": "3", "street": "2"}
+ALLOWED = {
+    "driving": {"disallow": "pedestrian"},
+    "bicycle": {"allow": "bicycle"},
+    "sidewalk": {"allow": "pedestrian"},
+    "parking": {"disallow": "all", "type": "parking"},
+    "shoulder": {"disallow": "all", "type": "shoulder"},
+}
+
+
+@dataclass(frozen=True)
+class Rewritten:
+    """What became of a map's streets."""
+
+    offset_m: tuple[float, float]  # town = map + offset
+    sidewalks_added: bool
+
+
+@dataclass(frozen=True)
+class _Lane:
+    kind: str
+    width: float
+    before: int | None  # index in the map; None for an added one
+
+
+def rewrite(prefix: Path, document: Document, origin: Path) -> Rewritten:
+    """Rewrite the parts beside `prefix` in place; raises `InputError` naming `origin` where no car can drive."""
+    nodes, edges, connections = (ElementTree.parse(f"{prefix}.{part}.xml") for part in ("nod", "edg", "con"))
+    rows = edges.getroot().findall("edge")
+    add = not any("sidewalk" in lane.get("type", "") for row in rows for lane in row.iterfind("lane"))
+    kept: dict[str, dict[int, int]] = {}  # edge -> lane index in the map -> in the town, of lanes with traffic
+    for row in rows:
+        road = _road(row.attrib["id"], document)
+        lanes = _lanes(row, road, add)
+        if not any(lane.kind == "driving" for lane in lanes):
+            edges.getroot().remove(row)
+            continue
+        _write_edge(row, lanes, road)
+        kept[row.attrib["id"]] = {
+            lane.before: i
+            for i, lane in enumerate(lanes)
+            if lane.before is not None and lane.kind in ("driving", "bicycle")
+        }
+    if not kept:
+        raise InputError(f"{origin}: has no road with a lane for driving")
+    _connect(connections.getroot(), kept)
+    _open_short_lanes(
+        connections.getroot(), {row.attrib["id"]: _length(row) for row in edges.getroot().findall("edge")}
+    )
+    _rule(nodes.getroot(), edges.getroot().findall("edge"), document)
+    offset = _move(nodes.getroot(), edges.getroot())
+    for part, tree in (("nod", nodes), ("edg", edges), ("con", connections)):
+        tree.write(f"{prefix}.{part}.xml")
+    return Rewritten(offset, add)
+
+
+def _road(edge: str, document: Document) -> Road:
+    """Return the road an edge was made of: netconvert calls it by the road's id, a sign before, a section behind."""
+    name = edge.removeprefix("-")
+    while name not in document.roads and "." in name:
+        name = name.rpartition(".")[0]
+    return document.roads.get(name, Road("unknown", None))
+
+
+def _lanes(row: ElementTree.Element, road: Road, add_sidewalk: bool) -> list[_Lane]:
+    """Return an edge's lanes from the kerb to the middle."""
+    found = sorted(row.iterfind("lane"), key=lambda lane: int(lane.attrib["index"]))
+    kinds = [_kind(lane) for lane in found]
+    town = road.kind not in OPEN_ROADS
+    first_driven = kinds.index("driving") if "driving" in kinds else 0
+    walked = max((i for i in range(first_driven) if kinds[i] == "sidewalk"), default=None)
+    out = [_Lane("sidewalk", SIDEWALK_M, None)] if walked is None and add_sidewalk and town else []
+    for i in range(walked or 0, len(found)):
+        width, kind = float(found[i].get("width", "3.2")), kinds[i]
+        if kind == "sidewalk" and i != walked:
+            kind = "shoulder"
+        if kind == "shoulder" and i < first_driven and town and width >= PARKING_M:
+            kind = "parking"
+        out.append(_Lane(kind, width, i))
+    return out
+
+
+def _kind(lane: ElementTree.Element) -> str:
+    kind = lane.get("type", "driving")
+    if kind in ("sidewalk", "walking"):
+        return "sidewalk"
+    if kind == "biking":
+        return "bicycle"
+    if kind == "parking":
+        return "parking"
+    allowed = lane.get("allow")
+    closed = lane.get("disallow") == "all" or (allowed is not None and "passenger" not in allowed.split())
+    return "shoulder" if closed else "driving"
+
+
+def _write_edge(row: ElementTree.Element, lanes: list[_Lane], road: Road) -> None:
+    old = {int(lane.attrib["index"]): lane for lane in row.iterfind("lane")}
+    driven = [lane.before for lane in lanes if lane.kind == "driving" and lane.before is not None]
+    speed = road.speed or float(old[driven[0]].get("speed", "13.89"))
+    busy = len(driven) > 1 or speed >= ARTERIAL
+    kind = "open" if road.kind in OPEN_ROADS else "arterial" if busy else "street"
+    for child in list(row):
+        row.remove(child)
+    row.attrib |= {"type": kind, "priority": PRIORITY[kind], "numLanes": str(len(lanes)), "speed": f"{speed:.2f}"}
+    for i, lane in enumerate(lanes):
+        ElementTree.SubElement(row, "lane", {"index": str(i), "width": f"{lane.width:.2f}", **ALLOWED[lane.kind]})
+
+
+def _connect(root: ElementTree.Element, kept: dict[str, dict[int, int]]) -> None:
+    for row in list(root):
+        if row.tag != "connection":
+            continue
+        start, end = kept.get(row.get("from", "")), kept.get(row.get("to", ""))
+        here = start.get(int(row.get("fromLane", "-1"))) if start else None
+        there = end.get(int(row.get("toLane", "-1"))) if end else None
+        if here is None or there is None:
+            root.remove(row)
+            continue
+        ends = {"from": row.attrib["from"], "to": row.attrib["to"], "fromLane": str(here), "toLane": str(there)}
+        row.clear()
+        row.attrib |= ends
+
+
+def _open_short_lanes(root: ElementTree.Element, length: dict[str, float]) -> None:
+    """Let every lane of a short edge lead wherever any of its lanes does.
+
+    Where there is no room to change lanes, two vehicles that each need the other's would wait for each other for ever.
+    """
+    ways: dict[str, dict[str, dict[int, int]]] = {}  # edge -> next edge -> lane -> its lane
+    for row in root.findall("connection"):
+        onward = ways.setdefault(row.attrib["from"], {}).setdefault(row.attrib["to"], {})
+        onward[int(row.attrib["fromLane"])] = int(row.attrib["toLane"])
+    for start, onward in ways.items():
+        if length[start] >= SHORT_M:
+            continue
+        lanes = sorted({lane for ends in onward.values() for lane in ends})
+        for end, ends in onward.items():
+            for lane in lanes:
+                if lane not in ends:
+                    nearest = min(ends, key=lambda other: abs(other - lane))
+                    values = {"from": start, "to": end, "fromLane": str(lane), "toLane": str(ends[nearest])}
+                    ElementTree.SubElement(root, "connection", values)
+
+
+def _length(row: ElementTree.Element) -> float:
+    points = np.array([point.split(",")[:2] for point in row.attrib["shape"].split()], dtype=np.float64)
+    return float(np.hypot(*np.diff(points, axis=0).T).sum())
+
+
+def _rule(root: ElementTree.Element, edges: Iterable[ElementTree.Element], document: Document) -> None:
+    """Say who goes first at each node: lights only where three streets or more meet, stop signs as the map has them."""
+    neighbours: dict[str, set[str]] = {}
+    for edge in edges:
+        neighbours.setdefault(edge.attrib["from"], set()).add(edge.attrib["to"])
+        neighbours.setdefault(edge.attrib["to"], set()).add(edge.attrib["from"])
+    for node in root.findall("node"):
+        name = node.attrib["id"]
+        junction = len(neighbours.get(name, ())) > 2
+        lights = junction and node.get("type", "").startswith("traffic_light")
+        node.attrib.pop("tl", None)
+        node.set("type", "traffic_light" if lights else "priority_stop" if name in document.stops else "priority")
+
+
+def _move(nodes: ElementTree.Element, edges: ElementTree.Element) -> tuple[float, float]:
+    """Move a far map to the origin; return by how much [m]."""
+    rows = nodes.findall("node")
+    at = np.array([(float(row.attrib["x"]), float(row.attrib["y"])) for row in rows])
+    if np.abs(at).max() <= FAR_M:
+        return 0.0, 0.0
+    dx, dy = (float(v) for v in -np.round((at.min(axis=0) + at.max(axis=0)) / 2, -2))
+    for row, (x, y) in zip(rows, at):
+        row.attrib |= {"x": f"{x + dx:.2f}", "y": f"{y + dy:.2f}"}
+    for row in edges.findall("edge"):
+        points = [tuple(float(v) for v in point.split(",")[:2]) for point in row.get("shape", "").split()]
+        if points:
+            row.set("shape", " ".join(f"{x + dx:.2f},{y + dy:.2f}" for x, y in points))
+    return dx, dy
