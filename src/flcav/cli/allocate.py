@@ -52,9 +52,15 @@ def _as_json(plan: "Allocation", shares: "Shares") -> dict:
     for task in values["tasks"]:
         if task["name"] in shares:
             task["vehicles"] = [dataclasses.asdict(share) for share in shares[task["name"]]]
+    values["tasks"] = [_given(task, "upper_error", "members") for task in values["tasks"]]
     for name in ("used_mb", "marginal_error_per_gb"):
         values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
-    return values
+    return _given(values, "note", "warnings")
+
+
+def _given(values: dict, *optional: str) -> dict:
+    """Return `values` without those of `optional` that say nothing."""
+    return {name: value for name, value in values.items() if name not in optional or value}
 
 
 def _show(problem: "Problem", plan: "Allocation") -> None:

@@ -1,10 +1,10 @@
 """Learning curves: the error that is left after so many samples, edge rounds and cloud rounds."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flcav.config import Config
 
@@ -81,4 +81,34 @@ class Effective(Config):
         return self.alpha * np.asarray(samples) + self.beta * self.group_samples * (1 - 1 / (t + 1.0))
 
 
-Curve = Annotated[Additive | Effective, Field(discriminator="model")]
+class Member(Config):
+    """One of the tasks that share a network and its data."""
+
+    name: Annotated[str, Field(min_length=1)]
+    weight: Positive = 1.0
+    curve: Annotated[Additive | Effective, Field(discriminator="model")]
+
+
+class Shared(Config):
+    """The weighted mean error of a cluster: one sample or round serves every member."""
+
+    model: Literal["shared"]
+    members: Annotated[tuple[Member, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _additive(self) -> Self:
+        for member in self.members:
+            if len(self.members) > 1 and isinstance(member.curve, Effective):
+                raise ValueError(f"members: {member.name!r} shares its network, so its curve must be additive")
+        return self
+
+    def error(
+        self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1
+    ) -> NDArray[np.float64]:
+        """Return the weighted mean error after so much of each stage, elementwise."""
+        weights = [member.weight for member in self.members]
+        errors = [member.curve.error(samples, edge_rounds, cloud_rounds, k) for member in self.members]
+        return np.asarray(np.average(errors, axis=0, weights=weights), dtype=np.float64)
+
+
+Curve = Annotated[Additive | Effective | Shared, Field(discriminator="model")]

@@ -115,18 +115,20 @@ class Cuts:
         return coo_array((values, (rows, columns)), shape=(len(limit), n + len(program.terms))).tocsr(), limit
 
 
-def outer_approximation(program: Program, starts: Sequence[Array], gap: float) -> tuple[list[Array], float, Array]:
+def outer_approximation(
+    program: Program, starts: Sequence[Array], gap: float, floor: float = 0.0
+) -> tuple[list[Array], float, Array]:
     """Return the whole points visited, a proven lower bound and the (2,) multipliers of the relaxed problem.
 
     A point may overspend by the solver's tolerance (1e-7 of a budget): the caller trims it. It ends when the best point
-    is within the relative `gap` of the bound, or adds no line: then it is optimal.
+    is within `gap` of the bound, relative to the bound plus `floor`, or adds no line: then it is optimal.
     """
     cuts = Cuts(program)
     for x in starts:
         cuts.add(x)
     x, bound, multipliers = cuts.relax()
     for _ in range(40):
-        if program.value(x) - bound <= 0.1 * gap * bound or not cuts.add(x):
+        if program.value(x) - bound <= 0.1 * gap * (bound + floor) or not cuts.add(x):
             break
         x, bound, multipliers = cuts.relax()
     visited: list[Array] = []
@@ -135,6 +137,6 @@ def outer_approximation(program: Program, starts: Sequence[Array], gap: float) -
         x, below = cuts.solve(gap / 2)
         visited.append(x)
         bound, best = max(bound, below), min(best, program.value(x))
-        if best - bound <= gap * bound or not cuts.add(x):
+        if best - bound <= gap * (bound + floor) or not cuts.add(x):
             break
     return visited, bound, multipliers / program.budget

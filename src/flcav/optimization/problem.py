@@ -2,15 +2,18 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Annotated, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
 from flcav.config import Config
-from flcav.optimization.curves import STAGES, Additive, Curve, Effective, Positive
+from flcav.optimization.curves import STAGES, Additive, Curve, Effective, NonNegative, Positive, Shared
 
 Count = Annotated[int, Field(ge=0)]
 Range = tuple[Count, Count]  # least and most, both allowed
+Share = Annotated[float, Field(ge=0, le=1)]
+Name = Annotated[str, Field(min_length=1)]
+Objective = Literal["weighted", "max-min", "area"]
 
 
 class Limits(Config):
@@ -36,10 +39,29 @@ class Uplink(Config):
     wireline: Positive | None = None  # what its edge server passes on for it; None: as much as it sends
 
 
-class Task(Config):
-    """One task: what its messages weigh, who takes part, and what its training brings."""
+class Learner(NamedTuple):
+    """What is learned with a task's resources: the task itself, or a member of its cluster."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: str
+    weight: float
+    curve: Additive | Effective
+
+
+class Measured(Config):
+    """Most of each quantity that the curve's history covers; a plan beyond it is a guess, and says so."""
+
+    samples: NonNegative | None = None
+    edge_rounds: NonNegative | None = None
+    cloud_rounds: NonNegative | None = None
+
+
+class Task(Config):
+    """One task, or a cluster of them: what its messages weigh, who takes part, and what its training brings.
+
+    Tasks that share a network and its data are one task here, with a `shared` curve: the mean of theirs by weight.
+    """
+
+    name: Name
     weight: Positive = 1.0
     sample_mb: Positive
     model_mb: Positive
@@ -49,6 +71,19 @@ class Task(Config):
     data_quality: Mapping[str, Positive] = {}  # by vehicle: what a sample of its is worth; 1 if not named
     limits: Limits
     curve: Curve
+    upper: Curve | None = None  # the upper band of `curve`, for robust plans
+    measured: Measured = Measured()
+    performance_without: Share | None = None  # of the whole system when this task is left out
+
+    @property
+    def learners(self) -> tuple[Learner, ...]:
+        """Return what is learned; the weights sum to the task's."""
+        if not isinstance(self.curve, Shared):
+            return (Learner(self.name, self.weight, self.curve),)
+        total = sum(member.weight for member in self.curve.members)
+        return tuple(
+            Learner(member.name, self.weight * member.weight / total, member.curve) for member in self.curve.members
+        )
 
     @model_validator(mode="after")
     def _vehicles(self) -> Self:
@@ -67,16 +102,27 @@ class Task(Config):
     @model_validator(mode="after")
     def _finite(self) -> Self:
         limits = self.limits
-        if isinstance(self.curve, Effective) and limits.samples[0] == 0:
-            raise ValueError(
-                f"limits.samples of task {self.name!r} must start at 1 or more: its error at 0 is infinite"
-            )
-        if isinstance(self.curve, Additive):
-            ranges = (limits.samples, limits.edge_rounds, limits.cloud_rounds)
-            for stage, decay, (_, most) in zip(STAGES, self.curve.decays(), ranges):
-                if most == 0 and decay.infinite_at_0:
-                    raise ValueError(f"curve.{stage}.x0 of task {self.name!r} is 0: its error at 0 is infinite")
+        ranges = (limits.samples, limits.edge_rounds, limits.cloud_rounds)
+        for field, curve in (("curve", self.curve), ("upper", self.upper)):
+            for each in (member.curve for member in curve.members) if isinstance(curve, Shared) else (curve,):
+                if isinstance(each, Effective) and limits.samples[0] == 0:
+                    raise ValueError(
+                        f"limits.samples of task {self.name!r} must start at 1 or more: its error at 0 is infinite"
+                    )
+                for stage, decay, (_, most) in zip(STAGES, each.decays(), ranges) if isinstance(each, Additive) else ():
+                    if most == 0 and decay.infinite_at_0:
+                        raise ValueError(f"{field}.{stage}.x0 of task {self.name!r} is 0: its error at 0 is infinite")
         return self
+
+    @model_validator(mode="after")
+    def _same_members(self) -> Self:
+        if self.upper is not None and _members(self.curve) != _members(self.upper):
+            raise ValueError(f"upper of task {self.name!r} must have the members of its curve, with the same weights")
+        return self
+
+
+def _members(curve: Curve) -> list[tuple[str, float]]:
+    return [(member.name, member.weight) for member in curve.members] if isinstance(curve, Shared) else []
 
 
 class Budgets(Config):
@@ -92,6 +138,9 @@ class Problem(Config):
     budgets_mb: Budgets
     edge_rounds_per_cloud_round: Count = 1  # k: each cloud round runs, and pays, k edge rounds in every region
     horizon_s: Positive | None = None  # how long each vehicle's own link may be busy with the plan
+    objective: Objective = "weighted"
+    robust: bool = False  # plan for the upper bands of the curves instead of the curves
+    performance: Share | None = None  # of the whole system with all tasks; then weights are what each task adds to it
     tasks: Annotated[tuple[Task, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -107,9 +156,11 @@ class Problem(Config):
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
-        name, times = Counter(task.name for task in self.tasks).most_common(1)[0]
-        if times > 1:
-            raise ValueError(f"{times} tasks are named {name!r}")
+        names = [learner.name for task in self.tasks for learner in task.learners]
+        for each in ([task.name for task in self.tasks], names):
+            name, times = Counter(each).most_common(1)[0]
+            if times > 1:
+                raise ValueError(f"{times} tasks are named {name!r}")
         if self.edge_rounds_per_cloud_round == 0:
             for task in self.tasks:
                 if task.limits.cloud_rounds[0] > 1:
@@ -117,4 +168,20 @@ class Problem(Config):
                         f"task {task.name!r} asks for {task.limits.cloud_rounds[0]} cloud rounds or more, and "
                         "edge_rounds_per_cloud_round = 0 allows one: models that no one trains in between are equal"
                     )
+        return self
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.objective == "area" and sum(len(task.learners) for task in self.tasks) < 3:
+            raise ValueError("objective 'area' needs at least 3 tasks: the area has one corner per task")
+        for task in self.tasks:
+            if self.robust and task.upper is None:
+                raise ValueError(f"robust = true needs 'upper' beside the curve of task {task.name!r}")
+            if (self.performance is None) != (task.performance_without is None):
+                given, missing = ("performance_without", "performance")[:: 1 if self.performance is None else -1]
+                raise ValueError(f"task {task.name!r}: '{given}' is given, and '{missing}' is missing")
+        if self.performance is not None and all(
+            (task.performance_without or 0) >= self.performance for task in self.tasks
+        ):
+            raise ValueError(f"no task adds to performance = {self.performance:g}: there is nothing to weigh")
         return self

@@ -1,47 +1,107 @@
-"""Sums of inverse powers under two budgets: the continuous optimum by its dual, and a good integer point.
+"""Sums of inverse powers under two budgets: the continuous optimum by its dual (water-filling).
 
-    minimise sum_j a_j (x_j + x0_j)^(-b_j)   subject to   sum_j cost_jl x_j <= budget_l,   low_j <= x_j <= high_j
+    minimise sum_m a_m (x_of(m) + x0_m)^(-b_m)   subject to   sum_j cost_jl x_j <= budget_l,   low_j <= x_j <= high_j
 
-At multipliers l >= 0 each x_j has a closed form: its marginal gain a b (x + x0)^(-b-1) equals its price p = cost . l,
-or it stands at a bound (water-filling). The dual is concave in the two multipliers; its gradient is the overspend.
+At multipliers l >= 0 each x_j is where its marginal gain equals its price p_j = cost_j . l, or it stands at a bound.
+For one power that is (a b / p)^(1 / (b + 1)) - x0; for several, Newton's method climbs to it from the largest of
+theirs. The dual is concave in the two multipliers; its gradient is the overspend. Nothing loops over tasks.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from flcav.config import InputError
 
 Array = NDArray[np.float64]
 
 LARGEST_STEP = 4.0  # of a multiplier's logarithm in one iteration
 BUDGET_SLACK = 1e-12  # relative: rounding of the sums, not room to overspend
+NO_DECAY = -1e9  # stands for the logarithm of a = 0
 
 
 @dataclass(frozen=True)
 class Separable:
-    """A problem of n quantities; `low` is within the budgets, and finite error there."""
+    """A problem of n quantities and m >= n powers; `low` is within the budgets, and the error there is finite."""
 
-    a: Array  # (n,)
-    b: Array  # (n,)
-    x0: Array  # (n,)
+    a: Array  # (m,) >= 0
+    b: Array  # (m,) > 0
+    x0: Array  # (m,) >= 0
     low: Array  # (n,) whole numbers
     high: Array  # (n,) whole numbers
-    cost: Array  # (n, 2) of one unit on each link
+    cost: Array  # (n, 2) of one unit on each link, >= 0
     budget: Array  # (2,)
+    of: NDArray[np.intp] | None = None  # (m,) the quantity of each power; default: one each, in order
 
     def error(self, x: Array) -> Array:
         """Return the (n,) errors at x (n,)."""
-        return self.a * (x + self.x0) ** -self.b
-
-    def cheapest(self, multipliers: Array) -> Array:
-        """Return the (n,) quantities that minimise error plus cost at `multipliers` (2,)."""
-        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-            level = (self.a * self.b / (self.cost @ multipliers)) ** (1 / (self.b + 1)) - self.x0
-        return np.clip(np.where(self.a > 0, level, self.low), self.low, self.high)
+        if self.of is None:
+            return self.a * (x + self.x0) ** -self.b
+        return self._summed(self.a * (x[self.of] + self.x0) ** -self.b)
 
     def fits(self, x: Array) -> bool:
         """Return whether x (n,) is within the budgets."""
-        return bool(np.all(x @ self.cost <= self.budget * (1 + BUDGET_SLACK)))
+        return bool(np.all(self.spent(x) <= self.budget * (1 + BUDGET_SLACK)))
+
+    def spent(self, x: Array) -> Array:
+        """Return what x (n,) costs on each link, (2,)."""
+        return np.array([x @ column for column in self._columns])
+
+    def prices(self, multipliers: Array) -> Array:
+        """Return the (n,) price of one unit of each quantity at `multipliers` (2,)."""
+        return multipliers[0] * self._columns[0] + multipliers[1] * self._columns[1]
+
+    def cheapest(self, multipliers: Array) -> Array:
+        """Return the (n,) quantities that minimise error plus price at `multipliers` (2,)."""
+        return self._level(self.prices(multipliers))
+
+    def bend(self, x: Array, prices: Array) -> Array:
+        """Return how fast each quantity inside its bounds falls with the logarithm of its price, (n,)."""
+        if self.of is None:
+            return (x + self.x0) / (self.b + 1)
+        shifted = x[self.of] + self.x0
+        return prices / self._summed(self.a * self.b * (self.b + 1) * shifted ** (-self.b - 2))
+
+    def _level(self, prices: Array) -> Array:
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            log_price = np.log(prices)
+            if self.of is None:
+                return np.clip(np.exp((self._log_gain - log_price) * self._root) - self.x0, self.low, self._useful)
+            alone = np.exp((self._log_gain - log_price[self.of]) * self._root) - self.x0
+            level = self.low.copy()
+            np.maximum.at(level, self.of, np.minimum(alone, self._useful[self.of]))
+            for _ in range(50):  # the marginal gain is convex and falls: from below, no step goes too far
+                shifted = level[self.of] + self.x0
+                gain = self.a * self.b * shifted ** (-self.b - 1)
+                step = (self._summed(gain) - prices) / self._summed(gain * (self.b + 1) / shifted)
+                following = np.clip(level + np.nan_to_num(step, nan=0.0), level, self._useful)
+                if np.all(following - level <= 1e-13 * (level + 1)):
+                    break
+                level = following
+            return level
+
+    def _summed(self, values: Array) -> Array:
+        return np.bincount(self.of, weights=values, minlength=len(self.low)).astype(np.float64)  # pyright: ignore[reportArgumentType]
+
+    @cached_property
+    def _columns(self) -> tuple[Array, Array]:
+        return np.ascontiguousarray(self.cost[:, 0]), np.ascontiguousarray(self.cost[:, 1])
+
+    @cached_property
+    def _log_gain(self) -> Array:
+        return np.log(self.a * self.b, out=np.full(len(self.a), NO_DECAY), where=self.a > 0)
+
+    @cached_property
+    def _root(self) -> Array:
+        return 1 / (self.b + 1)
+
+    @cached_property
+    def _useful(self) -> Array:
+        """What nothing is gained by stays at its least, even where it costs nothing."""
+        total = self.a if self.of is None else self._summed(self.a)
+        return np.where(total > 0, self.high, self.low)
 
 
 @dataclass(frozen=True)
@@ -53,11 +113,54 @@ class Relaxed:
     bound: float  # the dual value: no plan within the budgets has less error
 
 
+def separable(
+    a: ArrayLike, b: ArrayLike, x0: ArrayLike, low: ArrayLike, high: ArrayLike, cost: ArrayLike, budget: ArrayLike
+) -> Separable:
+    """Return a checked problem of n quantities with one power each, from anything array-like.
+
+    `high` is lowered to what the budgets leave room for. Raises `InputError` where a value is not a number or out of
+    range, and where `low` is not within the budgets.
+    """
+    named = {"a": a, "b": b, "x0": x0, "low": low, "high": high, "cost": cost, "budget": budget}
+    arrays = {name: np.asarray(values, dtype=np.float64) for name, values in named.items()}
+    n = len(arrays["a"])
+    for name, values in arrays.items():
+        shape = {"cost": (n, 2), "budget": (2,)}.get(name, (n,))
+        if values.shape != shape:
+            raise InputError(f"{name} has shape {values.shape}, and must have {shape}")
+        wrong = ~(values >= 0) if name not in ("b", "budget") else ~(values > 0)
+        wrong |= np.isinf(values) & (name != "high")
+        if wrong.any():
+            at = np.argwhere(wrong)[0]
+            allowed = "more than 0" if name in ("b", "budget") else "0 or more"
+            raise InputError(f"{name}{at.tolist()} = {values[tuple(at)]} must be a finite number of {allowed}")
+    problem = Separable(**arrays, of=None)
+    if not np.all(problem.low <= problem.high):
+        first = int(np.argmax(problem.low > problem.high))
+        raise InputError(f"low[{first}] = {problem.low[first]:g} is more than high[{first}] = {problem.high[first]:g}")
+    if not np.all(np.isfinite(problem.error(problem.low)[problem.a > 0])):
+        raise InputError("low + x0 must be more than 0 wherever a is: the error would be infinite")
+    if not problem.fits(problem.low):
+        raise InputError(f"low costs {problem.spent(problem.low)}, more than budget = {problem.budget}")
+    return replace(problem, high=np.minimum(problem.high, problem.low + room(problem)))
+
+
+def room(problem: Separable) -> Array:
+    """Return how many whole units of each quantity alone fit on top of `low`, (n,)."""
+    left = problem.budget * (1 + BUDGET_SLACK) - problem.spent(problem.low)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.floor(np.min(np.where(problem.cost > 0, left / problem.cost, np.inf), axis=1))
+
+
 def relax(problem: Separable) -> Relaxed:
     """Return the continuous optimum: the first set of binding budgets whose multipliers leave the others unbroken."""
-    best = _value(problem, np.zeros(2))
-    for binding in ((), (0,), (1,), (0, 1)):
-        best = _ascend(problem, list(binding))
+    everything = _value(problem, np.zeros(2))
+    if problem.fits(everything.x):
+        return everything
+    scarce = int(np.argmax(problem.spent(everything.x) / problem.budget))
+    best = everything
+    for binding in ([scarce], [1 - scarce], [0, 1]):
+        best = _ascend(problem, binding, _start(problem, binding) if len(binding) == 1 else best.multipliers)
         if problem.fits(best.x * (1 - 1e-9)):
             break
     return best
@@ -65,21 +168,28 @@ def relax(problem: Separable) -> Relaxed:
 
 def _value(problem: Separable, multipliers: Array) -> Relaxed:
     x = problem.cheapest(multipliers)
-    return Relaxed(x, multipliers, float(problem.error(x).sum() + multipliers @ (x @ problem.cost - problem.budget)))
+    overspend = problem.spent(x) - problem.budget
+    return Relaxed(x, multipliers, float(problem.error(x).sum() + multipliers @ overspend))
 
 
-def _ascend(problem: Separable, binding: list[int]) -> Relaxed:
-    """Return the best dual point at which only the `binding` budgets have a multiplier: Newton in its logarithm."""
-    multipliers = np.zeros(2)
+def _start(problem: Separable, binding: list[int]) -> Array:
+    """Return multipliers of the size of the mean gain per unit of a budget, half-way between the bounds."""
     middle = (problem.low + problem.high) / 2
-    gain = problem.error(middle) * problem.b / (middle + problem.x0 + 1)
-    multipliers[binding] = gain.sum() / np.maximum((problem.cost[:, binding]).sum(axis=0), 1e-300)
-    now = _value(problem, multipliers)
-    for _ in range(200 if binding else 0):
-        overspend = now.x @ problem.cost[:, binding] - problem.budget[binding]
+    gain = problem.error(middle) / (middle + 1)
+    multipliers = np.zeros(2)
+    multipliers[binding] = gain.sum() / np.maximum(problem.cost[:, binding].sum(axis=0), 1e-300)
+    return multipliers
+
+
+def _ascend(problem: Separable, binding: list[int], start: Array) -> Relaxed:
+    """Return the best dual point at which only the `binding` budgets have a multiplier: Newton in its logarithm."""
+    fresh = _start(problem, binding)
+    now = _value(problem, np.where(start[binding].min() > 0, start, fresh))
+    for _ in range(200):
+        overspend = (problem.spent(now.x) - problem.budget)[binding]
         if np.all(np.abs(overspend) <= 1e-10 * problem.budget[binding]):
             break
-        step = _newton(problem, now, binding, overspend)
+        step = newton_step(problem, now.x, now.multipliers, binding, overspend)
         following = now
         for shrink in 0.5 ** np.arange(40):
             multipliers = now.multipliers.copy()
@@ -93,47 +203,18 @@ def _ascend(problem: Separable, binding: list[int]) -> Relaxed:
     return now
 
 
-def _newton(problem: Separable, now: Relaxed, binding: list[int], overspend: Array) -> Array:
+def newton_step(
+    problem: Separable, x: Array, multipliers: Array, binding: list[int], overspend: Array
+) -> NDArray[np.float64]:
     """Return the Newton step of the logarithms of the binding multipliers, made an ascent direction and capped."""
-    cost, scale = problem.cost[:, binding], now.multipliers[binding]
-    prices = problem.cost @ now.multipliers
-    inside = (now.x > problem.low) & (now.x < problem.high) & (prices > 0)
-    bend = (now.x + problem.x0)[inside] / ((problem.b + 1)[inside] * prices[inside])
-    curvature = (cost[inside] * bend[:, None]).T @ cost[inside] * np.outer(scale, scale)
+    prices = problem.prices(multipliers)
+    inside = (x > problem.low) & (x < problem.high) & (prices > 0)
+    bend = problem.bend(x, prices)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = np.where(inside, bend / prices, 0.0)
+    cost, scale = problem.cost[:, binding], multipliers[binding]
+    curvature = (cost * scaled[:, None]).T @ cost * np.outer(scale, scale)
     gradient = overspend * scale
     ridge = 1e-12 * max(float(np.trace(curvature)), float(np.abs(gradient).max()))
     step = np.linalg.solve(curvature + ridge * np.eye(len(binding)), gradient)
     return np.asarray(step * min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-300)), dtype=np.float64)
-
-
-def whole_bound(problem: Separable, multipliers: Array) -> float:
-    """Return the dual value over whole quantities: no whole plan within the budgets has less error."""
-    below = np.floor(problem.cheapest(multipliers))
-    prices = problem.cost @ multipliers
-    total = np.minimum(*(problem.error(x) + prices * x for x in (below, np.minimum(below + 1, problem.high))))
-    return float(total.sum() - multipliers @ problem.budget)
-
-
-def round_down(problem: Separable, relaxed: Relaxed) -> Array:
-    """Return whole (n,) quantities within the budgets: rounded down, then filled by the best gain per price."""
-    x = np.clip(np.floor(relaxed.x + 1e-9), problem.low, problem.high)
-    prices = problem.cost @ (relaxed.multipliers + 1e-9 * relaxed.multipliers.sum() + 1e-300)
-    while not problem.fits(x):  # by the rounding of the continuous optimum alone: a unit or so
-        fewer = np.maximum(x - 1, problem.low)
-        loss = np.where(x > problem.low, (problem.error(fewer) - problem.error(x)) / prices, np.inf)
-        x[np.argmin(loss)] -= 1
-    return fill(problem, x, prices)
-
-
-def fill(problem: Separable, x: Array, prices: Array) -> Array:
-    """Return whole x (n,) with units added, the best gain per price (n,) first, while any fits and gains."""
-    x = x.copy()
-    left = problem.budget * (1 + BUDGET_SLACK) - x @ problem.cost
-    while True:
-        gain = problem.error(x) - problem.error(x + 1)
-        possible = (gain > 0) & (x < problem.high) & np.all(problem.cost <= left, axis=1)
-        if not possible.any():
-            return x
-        best = np.argmax(np.where(possible, gain / prices, -np.inf))
-        x[best] += 1
-        left -= problem.cost[best]

@@ -10,7 +10,7 @@ import pytest
 from flcav.config import InputError, parse_config
 from flcav.optimization.allocation import Infeasible, allocate
 from flcav.optimization.problem import Problem
-from flcav.optimization.separable import Separable, relax
+from flcav.optimization.separable import relax, separable
 
 LIMITS = {"samples": [100, 5000], "edge_rounds": [0, 100], "cloud_rounds": [0, 100]}
 
@@ -110,7 +110,7 @@ def test_the_relaxed_optimum_is_that_of_a_convex_solver(wireline):
     a, b, x0 = rng.uniform(0.1, 1, n), rng.uniform(0.2, 0.9, n), rng.uniform(0.5, 2, n)
     low, high = np.zeros(n), np.tile([5000.0, 100.0, 100.0], n // 3)
     budget = 1000.0 * n / 3 * np.array([1.0, wireline])
-    ours = relax(Separable(a, b, x0, low, high, cost.reshape(-1, 2), budget))
+    ours = relax(separable(a, b, x0, low, high, cost.reshape(-1, 2), budget))
     x = cp.Variable(n)
     error = cp.sum(cp.multiply(a, cp.exp(cp.multiply(-b, cp.log(x + x0)))))
     theirs = cp.Problem(cp.Minimize(error), [cost.reshape(-1, 2).T @ x <= budget, x >= low, x <= high])
