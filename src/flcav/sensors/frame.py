@@ -38,9 +38,9 @@ class CameraImage:
 
 @dataclass(frozen=True)
 class Views:
-    """How the M annotated actors appear to one camera."""
+    """How the M annotated actors appear to one camera; pixels, with the centre of the first one at (0, 0)."""
 
-    amodal_box: Array  # (M, 4) x1 y1 x2 y2 [px] of the whole actor, not clipped to the image; NaN behind the camera
+    amodal_box: Array  # (M, 4) x1 y1 x2 y2 of the whole actor, not clipped to the image; NaN behind the camera
     visible_box: Array  # (M, 4) of its visible pixels, their outer edges; NaN where there are none
     pixels: NDArray[np.int64]  # (M,) visible ones
     truncation: Array  # (M,) share of the amodal box outside the image; 1 behind the camera
@@ -49,11 +49,11 @@ class Views:
 
 @dataclass(frozen=True)
 class SignViews:
-    """The signs and signal heads whose readable sides show in one camera."""
+    """The signs and signal heads whose readable sides show in one camera; pixels as in `Views`."""
 
     kind: NDArray[np.str_]  # (K,) class: see `flcav.world.static.Things`
     state: NDArray[np.str_]  # (K,) of a signal: "red", "red_amber", "amber", "green", "off"; of a sign ""
-    box: Array  # (K, 4) x1 y1 x2 y2 [px] of its visible pixels, their outer edges
+    box: Array  # (K, 4) x1 y1 x2 y2 of its visible pixels, their outer edges
     pixels: NDArray[np.int64]  # (K,)
     distance_m: Array  # (K,) from the camera
     thing: NDArray[np.int64]  # (K,) its number in the town, stable over scenes
@@ -100,6 +100,8 @@ class Frame:
     gnss: Mapping[str, Array] = field(default_factory=dict)  # (3,) latitude, longitude [degrees], altitude [m]
     imu: Mapping[str, Array] = field(default_factory=dict)  # (6,) specific force [m/s^2], angular rate [rad/s]
     weather: Weather | None = None
+    agent_at_trigger: Mapping[str, Array] = field(default_factory=dict)
+    # sensor -> (4, 4) world_from_agent when it looks; only sensors of vehicles that do not look at the spin
 
     @property
     def key(self) -> str:
@@ -112,9 +114,9 @@ class Frame:
         return self.calibration.agent_from_sensor
 
     def world_from_sensor(self, name: str) -> Array:
-        """Return the (4, 4) transform of sensor `name`, as it is, to the world; for labels, which are exact."""
-        return self.world_from_agent @ self.calibration.agent_from_sensor[name]
+        """Return the (4, 4) transform of sensor `name`, as it is when it looks, to the world: labels go by it."""
+        return self.agent_at_trigger.get(name, self.world_from_agent) @ self.calibration.agent_from_sensor[name]
 
     def assumed_world_from_sensor(self, name: str) -> Array:
         """Return the (4, 4) transform of sensor `name` to the world as the agent believes it to be."""
-        return self.world_from_agent @ self.assumed.agent_from_sensor[name]
+        return self.agent_at_trigger.get(name, self.world_from_agent) @ self.assumed.agent_from_sensor[name]

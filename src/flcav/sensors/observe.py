@@ -1,125 +1,157 @@
 """One agent's frame: what its sensors see, and the truth about everything within their range."""
 
 import re
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav import seeds
 from flcav.config import InputError
-from flcav.geometry import Boxes, pose
-from flcav.sensors.frame import Annotations, Calibration, Frame
+from flcav.geometry import pose
+from flcav.seeds import stream
+from flcav.sensors.calibration import CalibrationError, assume, calibration_of
+from flcav.sensors.camera import photograph
+from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
+from flcav.sensors.labels.annotate import Sight, Sweep, annotate
 from flcav.sensors.lidar import Lidar, cast, draw_passes, measure
-from flcav.sensors.rig import Rig
-from flcav.sensors.visibility import unoccluded_rays
+from flcav.sensors.rig import CAMERA_RANGE_M, Rig
 from flcav.world.scene import Scene
+from flcav.world.weather import WEATHERS, Weather
+
+CLEAR = WEATHERS["clear"]
+EXACT = CalibrationError()
 
 
-def observe(scene: Scene, rig: Rig, agent: str, index: int, *, scene_name: str, seed: int) -> Frame:
+def observe(
+    scene: Scene,
+    rig: Rig,
+    agent: str,
+    index: int,
+    *,
+    scene_name: str,
+    seed: int,
+    weather: Weather = CLEAR,
+    error: CalibrationError = EXACT,
+) -> Frame:
     """Return what `agent` ("cav0", "pole3") sees with `rig` at instant `index` of the scene's traffic run.
 
-    Moves `scene` there. The same arguments give the same bytes, whatever was observed before.
+    Moves `scene` there. The same arguments give the same bytes, whatever was observed before; what a sensor measures
+    does not depend on which others the rig has, nor on `error`, which is in what the agent believes.
     Raises `InputError` for an agent that the run does not have, or not at that instant.
     """
+    carrier = _Carrier(scene, agent, index, _actor_of(scene, agent, index), calibration_of(rig))
+
+    def rng(sensor: str) -> np.random.Generator:
+        return stream(seed, scene_name, index, agent, sensor)
+
+    lidar, sweeps = {}, {}
+    for name, mounted in rig.lidars.items():
+        lidar[name], sweeps[name] = _sweep(carrier, name, mounted.settings, weather, rng(name))
+    exposures, sights = {}, {}
+    for name, mounted in rig.cameras.items():
+        at = carrier.go_to(name)
+        exposures[name] = photograph(scene, at, mounted.settings, weather, rng(name), hidden=carrier.own)
+        sights[name] = Sight(mounted.settings, at, scene.offset_s, exposures[name].instance)
+
     scene.move_to(index)
-    own, world_from_agent = _carrier(scene, agent)
-    calibration = Calibration({name: lidar.mount.agent_from_sensor() for name, lidar in rig.lidars.items()})
-    sweeps = {
-        name: _sweep(
-            scene,
-            lidar.settings,
-            world_from_agent @ calibration.agent_from_sensor[name],
-            own,
-            seeds.stream(seed, scene_name, index, agent, name),
-        )
-        for name, lidar in rig.lidars.items()
-    }
+    annotations, actors = annotate(
+        scene, carrier.own, within=_within_range(carrier, rig), sweeps=sweeps, sights=sights, echoes={}
+    )
+    row = np.zeros(len(scene.trace.actor) + 1, np.uint16)
+    row[actors + 1] = np.arange(1, len(actors) + 1)
     return Frame(
         scene=scene_name,
         index=index,
         time_s=float(scene.trace.time_s[index]),
         agent=agent,
-        world_from_agent=world_from_agent,
-        calibration=calibration,
-        assumed=calibration,
-        lidar={name: sweep.points for name, sweep in sweeps.items()},
-        annotations=_annotate(scene, list(sweeps.values()), own),
+        world_from_agent=carrier.pose(),
+        calibration=carrier.calibration,
+        assumed=assume(carrier.calibration, error, seed=seed, agent=agent),
+        lidar=lidar,
+        annotations=annotations,
+        images={
+            name: CameraImage(seen.rgb, seen.depth_m, seen.semantic, row[np.maximum(seen.instance, 0)])
+            for name, seen in exposures.items()
+        },
+        weather=weather,
+        agent_at_trigger=carrier.poses_at_triggers(),
     )
 
 
-class _Sweep(NamedTuple):
-    lidar: Lidar
-    world_from_sensor: NDArray[np.float64]
-    passes: NDArray[np.bool_]  # see `draw_passes`
-    points: NDArray[np.float32]  # (N, 4) see `scan`
-    returns: NDArray[np.int64]  # (A,) points of each actor
-    visible: NDArray[np.int64]  # (A,) rays that come back from it, detected or not
+@dataclass(frozen=True)
+class _Carrier:
+    """Who carries the sensors through a scene."""
+
+    scene: Scene
+    agent: str
+    index: int
+    own: int | None  # its actor; None for a pole
+    calibration: Calibration
+
+    def pose(self) -> Array:
+        """Return the (4, 4) `world_from_agent` where the scene stands."""
+        if self.own is not None:
+            return self.scene.world_from_actor(self.own)
+        poles = self.scene.town.poles
+        site = np.flatnonzero(poles.id == int(self.agent.removeprefix("pole")))[0]
+        x, y, z = poles.position[site]
+        return pose(x, y, z, float(poles.yaw[site]))
+
+    def go_to(self, sensor: str) -> Array:
+        """Move the scene to the instant at which `sensor` looks and return its (4, 4) `world_from_sensor` then."""
+        self.scene.move_to(self.index, self.calibration.offset_ms[sensor] / 1e3)
+        return self.pose() @ self.calibration.agent_from_sensor[sensor]
+
+    def poses_at_triggers(self) -> dict[str, Array]:
+        """Return `world_from_agent` at the triggers of the sensors that do not look at the spin; moves the scene."""
+        poses = {}
+        for sensor, offset_ms in self.calibration.offset_ms.items():
+            if offset_ms and self.own is not None:
+                self.go_to(sensor)
+                poses[sensor] = self.pose()
+        self.scene.move_to(self.index)
+        return poses
 
 
-def _sweep(
-    scene: Scene,
-    lidar: Lidar,
-    world_from_sensor: NDArray[np.float64],
-    own: int | None,
-    rng: np.random.Generator,
-) -> _Sweep:
-    passes = draw_passes(lidar, rng)
-    echoes = cast(scene, world_from_sensor, lidar, passes, own)
-    points, actor = measure(scene, world_from_sensor, lidar, echoes, rng)
-    count = len(scene.trace.actor)
-    returns = np.bincount(actor + 1, minlength=count + 1)[1:]
-    visible = np.bincount(echoes.instance + 1, minlength=count + 2)[2:]  # without what is missed, and the town
-    return _Sweep(lidar, world_from_sensor, passes, points, returns, visible)
-
-
-def _annotate(scene: Scene, sweeps: list[_Sweep], own: int | None) -> Annotations:
-    trace, index = scene.trace, scene.index
-    actors = _within_range(scene, sweeps, own)
-    visible = np.sum([sweep.visible[actors] for sweep in sweeps], axis=0)
-    unoccluded = np.zeros(len(actors), np.int64)
-    seen = np.flatnonzero(visible)  # of the others nothing is visible, whatever they would show
-    for sweep in sweeps:
-        unoccluded[seen] += unoccluded_rays(scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, actors[seen])
-    size = trace.size[actors]
-    center = trace.position[index, actors] + size * (0, 0, 0.5)
-    return Annotations(
-        track=trace.actor[actors],
-        boxes=Boxes(center, size, trace.yaw[index, actors], trace.category[actors]),
-        velocity=trace.velocity[index, actors],
-        acceleration=trace.acceleration[index, actors],
-        returns=np.sum([sweep.returns[actors] for sweep in sweeps], axis=0),
-        occlusion=1 - visible / np.maximum(np.maximum(unoccluded, visible), 1),
-    )
-
-
-def _within_range(scene: Scene, sweeps: list[_Sweep], own: int | None) -> NDArray[np.int64]:
-    """Return the actors present whose box centre lies within the range of a sensor, but `own`."""
-    trace = scene.trace
-    center = trace.position[scene.index] + trace.size * (0, 0, 0.5)
-    within = np.zeros(len(trace.actor), bool)
-    for sweep in sweeps:
-        away = np.linalg.norm(center - sweep.world_from_sensor[:3, 3], axis=1)
-        within |= trace.present[scene.index] & (away <= sweep.lidar.range_m)
-    if own is not None:
-        within[own] = False
-    return np.flatnonzero(within)
-
-
-def _carrier(scene: Scene, agent: str) -> tuple[int | None, NDArray[np.float64]]:
-    """Return the actor that carries the sensors (None for a pole) and the (4, 4) `world_from_agent`."""
-    poles = scene.town.poles
+def _actor_of(scene: Scene, agent: str, index: int) -> int | None:
+    """Move the scene to the instant and return the actor that carries the sensors, None for a pole."""
+    scene.move_to(index)
+    poles = scene.town.poles.id
     if match := re.fullmatch(r"pole(\d+)", agent):
-        site = np.flatnonzero(poles.id == int(match[1]))
-        if not len(site):
-            known = ", ".join(f"pole{pole}" for pole in poles.id)
+        if int(match[1]) not in poles:
+            known = ", ".join(f"pole{pole}" for pole in poles)
             raise InputError(f"agent '{agent}': town {scene.town.name} has no such pole; it has {known}")
-        x, y, z = poles.position[site[0]]
-        return None, pose(x, y, z, float(poles.yaw[site[0]]))
+        return None
     found = np.flatnonzero(scene.trace.actor == agent)
     if not len(found):
         raise InputError(f"agent '{agent}': no such vehicle in this traffic run")
-    actor = int(found[0])
-    if not scene.trace.present[scene.index, actor]:
-        raise InputError(f"agent '{agent}' is not in town at {scene.trace.time_s[scene.index]:.1f} s")
-    return actor, scene.world_from_actor(actor)
+    if not scene.trace.present[index, found[0]]:
+        raise InputError(f"agent '{agent}' is not in town at {scene.trace.time_s[index]:.1f} s")
+    return int(found[0])
+
+
+def _sweep(
+    carrier: _Carrier, name: str, lidar: Lidar, weather: Weather, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], Sweep]:
+    """Return the points of a LiDAR, (N, 4), and what else there is to know of its sweep."""
+    scene, world_from_sensor = carrier.scene, carrier.go_to(name)
+    passes = draw_passes(lidar, rng)
+    echoes = cast(scene, world_from_sensor, lidar, passes, carrier.own)
+    points, actor = measure(scene, world_from_sensor, lidar, echoes, rng, weather)
+    count = len(scene.trace.actor)
+    returns = np.bincount(actor + 1, minlength=count + 1)[1:]
+    visible = np.bincount(echoes.instance + 1, minlength=count + 2)[2:]  # without what is missed, and the town
+    return points, Sweep(lidar, world_from_sensor, passes, returns, visible)
+
+
+def _within_range(carrier: _Carrier, rig: Rig) -> NDArray[np.bool_]:
+    """Return (A,) which actors are present with their box centre within a LiDAR's range, or a lone camera's."""
+    scene, world_from_agent = carrier.scene, carrier.pose()
+    trace = scene.trace
+    center = trace.position[scene.index] + trace.size * (0, 0, 0.5)
+    ranges = {name: mounted.settings.range_m for name, mounted in rig.lidars.items()}
+    within = np.zeros(len(trace.actor), bool)
+    for name, range_m in (ranges or dict.fromkeys(rig.cameras, CAMERA_RANGE_M)).items():
+        sensor = (world_from_agent @ carrier.calibration.agent_from_sensor[name])[:3, 3]
+        within |= trace.present[scene.index] & (np.linalg.norm(center - sensor, axis=1) <= range_m)
+    return within

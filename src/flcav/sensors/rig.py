@@ -1,16 +1,28 @@
 """Rigs: which sensors an agent carries, and where."""
 
+import re
+from collections import Counter
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flcav.config import Config
 from flcav.geometry import pose
+from flcav.sensors.camera import Camera
 from flcav.sensors.lidar import Lidar
+
+CAMERA_RANGE_M = (
+    100.0  # of labels, where an agent has cameras alone; what shows in an image is labelled at any distance
+)
+TRIGGER_MS = 100.0
+RESERVED = ("traces",)  # folders of a dataset
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
 class Mount(Config):
-    """A sensor's pose on its agent. A positive pitch turns it downwards."""
+    """A sensor's pose on its agent: x forward, y left, z up; a camera looks along x. A positive pitch is downwards."""
 
     x: float = 0.0
     y: float = 0.0
@@ -20,37 +32,111 @@ class Mount(Config):
     roll_deg: float = 0.0
 
     def agent_from_sensor(self) -> NDArray[np.float64]:
-        """Return the (4, 4) transform."""
+        """Return the (4, 4) transform; of a camera, with its body axes, not the optical ones."""
         yaw, pitch, roll = np.radians((self.yaw_deg, self.pitch_deg, self.roll_deg))
         return pose(self.x, self.y, self.z, yaw, pitch, roll)
 
 
+class Mounted(Config):
+    """A sensor's pose, and when it looks."""
+
+    mount: Mount = Mount()
+    trigger_ms: float = Field(default=0.0, ge=-TRIGGER_MS, le=TRIGGER_MS)  # after the LiDAR spin
+
+
 class MountedLidar(Config):
-    """A LiDAR and where it is."""
+    """A LiDAR and where it is. Its spin is the frame."""
 
     mount: Mount = Mount()
     settings: Lidar = Lidar()
 
 
+class MountedCamera(Mounted):
+    """A camera and where it is."""
+
+    settings: Camera = Camera()
+
+
 class Rig(Config):
     """The sensors of one agent, by name. A car's frame is at its ground centre, a pole's at its mount."""
 
-    lidars: dict[str, MountedLidar] = Field(min_length=1)
+    lidars: dict[str, MountedLidar] = Field(default_factory=dict)
+    cameras: dict[str, MountedCamera] = Field(default_factory=dict)
 
-    def range_m(self) -> float:
-        """Return how far the farthest-seeing sensor sees."""
-        return max(lidar.settings.range_m for lidar in self.lidars.values())
+    @model_validator(mode="after")
+    def _check_names(self) -> "Rig":
+        kinds = [getattr(self, kind) for kind in type(self).model_fields]
+        if not (self.lidars or self.cameras):
+            raise ValueError("a rig needs at least one LiDAR or camera")
+        times = Counter(name for kind in kinds for name in kind)
+        for name, count in times.items():
+            if count > 1:
+                raise ValueError(f"two sensors are called '{name}'; names must differ over all kinds")
+            if not _NAME.fullmatch(name) or name in RESERVED:
+                raise ValueError(
+                    f"sensor name '{name}': must be letters, digits, - and _, and none of {', '.join(RESERVED)}"
+                )
+        return self
+
+    def sensors(self) -> Mapping[str, MountedLidar | Mounted]:
+        """Return every sensor by its name."""
+        return {name: sensor for kind in type(self).model_fields for name, sensor in getattr(self, kind).items()}
 
 
-def car() -> Rig:
-    """Return one 32-channel LiDAR above the roof."""
+def lidar32() -> Rig:
+    """Return one 32-channel LiDAR above a car's roof."""
     return Rig(lidars={"lidar": MountedLidar(mount=Mount(z=1.85), settings=Lidar(channels=32, azimuth_steps=900))})
 
 
-def roadside() -> Rig:
+def lidar_pole() -> Rig:
     """Return one 64-channel LiDAR at a pole's mount, seeing all round and far down."""
     settings = Lidar(channels=64, azimuth_steps=1024, range_m=100.0, up_deg=2.0, down_deg=-45.0, sensitivity_m=400.0)
     return Rig(lidars={"lidar": MountedLidar(settings=settings)})
 
 
-RIGS: dict[str, Rig] = {"car": car(), "roadside": roadside()}
+def car(cameras: Mapping[str, MountedCamera] | None = None) -> Rig:
+    """Return a car's LiDAR and a camera that looks ahead, or the `cameras` given."""
+    ahead = {"camera": MountedCamera(mount=Mount(x=0.5, z=1.5))}
+    return Rig(lidars=lidar32().lidars, cameras=dict(ahead if cameras is None else cameras))
+
+
+def car_surround() -> Rig:
+    """Return a car's sensors with six cameras around, placed and as wide as those of nuScenes."""
+    directions = {"front": 0, "front_left": 55, "front_right": -55, "back_left": 110, "back_right": -110, "back": 180}
+    cameras = {}
+    for name, yaw_deg in directions.items():
+        x, y = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+        mount = Mount(x=round(float(x), 3), y=round(0.5 * float(y), 3), z=1.5, yaw_deg=yaw_deg)
+        cameras[name] = MountedCamera(mount=mount, settings=Camera(fov_deg=110.0 if name == "back" else 70.0))
+    return car(cameras)
+
+
+def roadside() -> Rig:
+    """Return a pole's LiDAR and two cameras that look to the left and to the right of where the pole faces."""
+    cameras = {
+        name: MountedCamera(mount=Mount(yaw_deg=yaw_deg, pitch_deg=20.0))
+        for name, yaw_deg in (("camera_left", 42.0), ("camera_right", -42.0))
+    }
+    return Rig(lidars=lidar_pole().lidars, cameras=cameras)
+
+
+def kitti() -> Rig:
+    """Return KITTI's set-up: HDL-64E, left colour camera, GNSS and IMU (Geiger et al., IJRR 32(11), 2013, fig. 3).
+
+    Intrinsics and offsets are those of the recordings of 26 September 2011, rotations of less than a degree apart.
+    """
+    camera = Camera(width=1242, height=375, fx=721.5377, fy=721.5377, cx=609.5593, cy=172.854)
+    return Rig(
+        lidars={"velodyne": MountedLidar(mount=Mount(z=1.73), settings=Lidar(beams="hdl64e"))},
+        cameras={"image_2": MountedCamera(mount=Mount(x=0.27, y=0.06, z=1.65), settings=camera)},
+    )
+
+
+RIGS: dict[str, Rig] = {
+    "car": car(),
+    "car_surround": car_surround(),
+    "roadside": roadside(),
+    "kitti": kitti(),
+    "lidar32": lidar32(),
+    "lidar_pole": lidar_pole(),
+}

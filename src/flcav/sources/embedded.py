@@ -5,9 +5,10 @@ from typing import Any
 
 from flcav.config import InputError
 from flcav.files import sha256
-from flcav.seeds import child_seed
+from flcav.seeds import child_seed, stream
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
+from flcav.sensors.rig import Rig
 from flcav.sources.recipe import Recipe
 from flcav.world.scene import Scene
 from flcav.world.town import load_town
@@ -19,7 +20,7 @@ class EmbeddedSource:
     """The frames of a recipe. Scene i has the same traffic whatever the number of scenes, agents apart."""
 
     def __init__(self, recipe: Recipe) -> None:
-        """Load the town; raises `InputError` where it, one of the poles or an observer is missing."""
+        """Load the town; raises `InputError` where it, a pole or an observer is missing, and for a mount below ground."""
         self.recipe = recipe
         self.town = load_town(recipe.town)
         known = self.town.poles.id.tolist()
@@ -29,9 +30,14 @@ class EmbeddedSource:
         self.agents = [f"cav{i}" for i in range(recipe.cavs)] + [f"pole{pole}" for pole in self.poles]
         if not self.agents:
             raise InputError("fields 'cavs' = 0 and 'poles' = []: nobody observes; give at least one of them")
+        _check_mounts("vehicle_rig", recipe.vehicle_rig, "a vehicle", 0.0)
+        for pole in self.poles:
+            mount_m = float(self.town.poles.position[known.index(pole), 2])
+            _check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
         self._per_scene = recipe.spins_per_scene * len(self.agents)
         self._frames = recipe.frames or recipe.scenes * self._per_scene
-        self._last: tuple[str, Trace] | None = None
+        self._last_trace: tuple[str, Trace] | None = None
+        self._last_scene: tuple[str, Scene] | None = None
 
     def describe(self) -> dict[str, Any]:
         """Return the recipe with every name resolved: the poles, the rigs, what the town was built from."""
@@ -56,20 +62,44 @@ class EmbeddedSource:
 
     def frames(self, scene: str) -> Iterator[Frame]:
         """Yield the scene's frames: spin after spin, the vehicles of each before its poles."""
-        world = Scene(self.town, self.trace(scene))
-        for number in range(self.frame_count(scene)):
+        yield from self.replay(scene, self.trace(scene), range(self.frame_count(scene)))
+
+    def replay(self, scene: str, trace: Trace, numbers: range) -> Iterator[Frame]:
+        """Yield some of the scene's frames in the traffic that `trace(scene)` gave: see `Replayable`."""
+        if self._last_scene is None or self._last_scene[0] != scene:
+            self._last_scene = scene, Scene(self.town, trace)
+        world, recipe = self._last_scene[1], self.recipe
+        weather = recipe.weather.draw(stream(recipe.seed, scene, "weather"))
+        for number in numbers:
             index, agent = divmod(number, len(self.agents))
-            name = self.agents[agent]
-            rig = self.recipe.vehicle_rig if agent < self.recipe.cavs else self.recipe.pole_rig
-            yield observe(world, rig, name, index, scene_name=scene, seed=self.recipe.seed)
+            yield observe(
+                world,
+                recipe.vehicle_rig if agent < recipe.cavs else recipe.pole_rig,
+                self.agents[agent],
+                index,
+                scene_name=scene,
+                seed=recipe.seed,
+                weather=weather.at(float(trace.time_s[index] - trace.time_s[0])),
+                error=recipe.calibration_error,
+            )
 
     def trace(self, scene: str) -> Trace:
         """Return the scene's traffic at the times of its spins."""
-        if self._last is None or self._last[0] != scene:
+        if self._last_trace is None or self._last_trace[0] != scene:
             seed = child_seed(self.recipe.seed, "traffic", self.scenes().index(scene))
             trace = simulate(self.town, seed=seed, cavs=self.recipe.cavs, times_s=self.recipe.times_s())
-            self._last = scene, trace
-        return self._last[1]
+            self._last_trace = scene, trace
+        return self._last_trace[1]
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_last": None}
+        return self.__dict__ | {"_last_trace": None, "_last_scene": None}
+
+
+def _check_mounts(field: str, rig: Rig, carrier: str, mount_m: float) -> None:
+    """Raise `InputError` where a sensor would not be above the ground on a carrier whose frame is `mount_m` up."""
+    for name, sensor in rig.sensors().items():
+        if mount_m + sensor.mount.z <= 0:
+            raise InputError(
+                f"field '{field}': sensor '{name}' at z = {sensor.mount.z} m would not be above the ground on {carrier}, "
+                f"whose frame is {mount_m:.1f} m up"
+            )

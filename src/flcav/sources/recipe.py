@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from flcav.config import Config
+from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
+from flcav.world.weather import WEATHERS, WeatherSchedule
 
 STEP_S = 0.1  # of the traffic
 
@@ -54,8 +56,10 @@ class Recipe(Config):
     every_s: Duration = 1.0
     cavs: int = Field(default=1, ge=0)
     poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()
-    vehicle_rig: NamedRig = RIGS["car"]
-    pole_rig: NamedRig = RIGS["roadside"]
+    vehicle_rig: NamedRig = RIGS["lidar32"]
+    pole_rig: NamedRig = RIGS["lidar_pole"]
+    weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])
+    calibration_error: CalibrationError = CalibrationError()
 
     def times_s(self) -> NDArray[np.float64]:
         """Return the (spins_per_scene,) times of the spins in each run [s]."""

@@ -1,7 +1,7 @@
 """Whatever observes traffic: the built-in simulator, another simulator, a log."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
@@ -32,4 +32,16 @@ class Source(Protocol):
 
     def trace(self, scene: str) -> Trace | None:
         """Return the traffic of a scene whose frames have been consumed; None from a source that knows none."""
+        ...
+
+
+@runtime_checkable
+class Replayable(Source, Protocol):
+    """A source that observes any frame of a scene once its traffic is there, so that frames go in parallel.
+
+    Its `trace(scene)` may be asked at any time and gives the traffic.
+    """
+
+    def replay(self, scene: str, trace: Trace, numbers: range) -> Iterator[Frame]:
+        """Yield frames `numbers`, counted as `frames(scene)` yields them, of the scene whose traffic is `trace`."""
         ...

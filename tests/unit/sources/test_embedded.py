@@ -7,6 +7,8 @@ from flcav.config import InputError
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
+BURIED, TOO_LOW = ({"lidars": {"low": {"mount": {"z": z}}}} for z in (-0.3, -9.0))
+
 
 def small(**fields: object) -> EmbeddedSource:
     settings = {"town": "suburb", "seed": 3, "cavs": 2, "warmup_s": 35.0, "spins_per_scene": 2, "scenes": 2}
@@ -59,6 +61,8 @@ def test_scenes_differ_in_traffic_and_in_parked_cars():
     [
         ({"town": "atlantis"}, "unknown town 'atlantis'"),
         ({"poles": [99]}, "field 'poles' = 99: no pole of suburb"),
+        ({"vehicle_rig": BURIED}, r"field 'vehicle_rig': sensor 'low' at z = -0.3 m .* above the ground on a vehicle"),
+        ({"poles": [1], "pole_rig": TOO_LOW}, r"field 'pole_rig': sensor 'low' at z = -9.0 m .* on pole 1, .* m up"),
         ({"cavs": 0}, "nobody observes"),
     ],
 )

@@ -15,8 +15,8 @@ def parsed(**fields: object) -> Recipe:
 
 
 def test_rigs_by_name_and_written_out():
-    recipe = parsed(vehicle_rig="roadside", pole_rig={"lidars": {"lidar": {"settings": {"channels": 16}}}})
-    assert recipe.vehicle_rig == RIGS["roadside"]
+    recipe = parsed(vehicle_rig="car_surround", pole_rig={"lidars": {"lidar": {"settings": {"channels": 16}}}})
+    assert recipe.vehicle_rig == RIGS["car_surround"]
     assert recipe.pole_rig.lidars["lidar"].settings.channels == 16
     assert parse_config(Recipe, recipe.model_dump(mode="json"), "resolved") == recipe
 
@@ -43,7 +43,9 @@ def test_times_are_exact_tenths_of_a_second():
         ({"poles": "some"}, "field 'poles' = 'some': must be a list of different pole numbers, or 'all'"),
         ({"poles": [1, 1]}, "field 'poles'"),
         ({"poles": [True]}, "field 'poles'"),
-        ({"vehicle_rig": "plane"}, "field 'vehicle_rig' = 'plane': unknown rig; known rigs: car, roadside"),
+        ({"vehicle_rig": "plane"}, "field 'vehicle_rig' = 'plane': unknown rig; known rigs: car, car_surround"),
+        ({"weather": "hail"}, "field 'weather.*unknown weather"),
+        ({"calibration_error": {"position_m": -1}}, "field 'calibration_error.position_m' = -1"),
         ({"vehicle_rig": 3}, "field 'vehicle_rig' = 3"),
         (
             {"vehicle_rig": {"lidars": {"lidar": {"settings": {"range_m": -5}}}}},

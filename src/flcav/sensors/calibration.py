@@ -1,0 +1,68 @@
+"""What a rig's calibration is, and what an agent that was calibrated badly believes it to be."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from flcav.config import Config
+from flcav.seeds import stream
+from flcav.sensors.frame import Array, Calibration
+from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
+from flcav.sensors.rig import Mounted, Rig
+
+
+class CalibrationError(Config):
+    """Standard deviations of an agent's calibration; each sensor's error is drawn once per dataset."""
+
+    position_m: float = Field(default=0.0, ge=0, le=10)  # along each axis of the sensor
+    rotation_deg: float = Field(default=0.0, ge=0, le=45)  # about each axis of the sensor
+    focal_px: float = Field(default=0.0, ge=0, le=1000)  # of both focal lengths alike
+    time_ms: float = Field(default=0.0, ge=0, le=1000)  # of the trigger time
+
+
+def calibration_of(rig: Rig) -> Calibration:
+    """Return the calibration of a rig that is exactly as it says."""
+    lenses = _lenses(rig)
+    return Calibration(
+        agent_from_sensor={
+            name: sensor.mount.agent_from_sensor() @ (BODY_FROM_OPTICAL if name in lenses else np.eye(4))
+            for name, sensor in rig.sensors().items()
+        },
+        intrinsics={name: lens.intrinsics() for name, lens in lenses.items()},
+        distortion={name: lens.distortion() for name, lens in lenses.items()},
+        offset_ms={
+            name: sensor.trigger_ms if isinstance(sensor, Mounted) else 0.0 for name, sensor in rig.sensors().items()
+        },
+    )
+
+
+def assume(true: Calibration, error: CalibrationError, *, seed: int, agent: str) -> Calibration:
+    """Return what `agent` believes where its calibration is in error; of no error, `true` itself.
+
+    A sensor's error depends on its name, the agent's and the seed alone.
+    """
+    if error == CalibrationError():
+        return true
+    drawn = {name: _draw(error, seed, agent, name) for name in true.agent_from_sensor}
+    return replace(
+        true,
+        agent_from_sensor={name: mount @ drawn[name][0] for name, mount in true.agent_from_sensor.items()},
+        intrinsics={name: matrix + drawn[name][1] * np.diag((1, 1, 0)) for name, matrix in true.intrinsics.items()},
+        offset_ms={name: offset + drawn[name][2] for name, offset in true.offset_ms.items()},
+    )
+
+
+def _draw(error: CalibrationError, seed: int, agent: str, name: str) -> tuple[Array, float, float]:
+    """Return the errors of one sensor: (4, 4) `sensor_from_assumed`, of the focal lengths [px], of the trigger [ms]."""
+    normal = stream(seed, "calibration", agent, name).normal(size=8)
+    sensor_from_assumed = np.eye(4)
+    sensor_from_assumed[:3, :3] = Rotation.from_rotvec(error.rotation_deg * normal[3:6], degrees=True).as_matrix()
+    sensor_from_assumed[:3, 3] = error.position_m * normal[:3]
+    return sensor_from_assumed, error.focal_px * normal[6], error.time_ms * normal[7]
+
+
+def _lenses(rig: Rig) -> Mapping[str, Lens]:
+    return {name: camera.settings for name, camera in rig.cameras.items()}

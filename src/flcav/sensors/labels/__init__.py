@@ -1,0 +1,1 @@
+"""The truth about what sensors see of actors, signs and lights."""

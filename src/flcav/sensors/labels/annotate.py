@@ -1,0 +1,92 @@
+"""The ground truth of one frame, from what its sensors met."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.geometry import Boxes
+from flcav.sensors.frame import Annotations, Array
+from flcav.sensors.labels.regions import actor_regions
+from flcav.sensors.labels.signs import view_signs
+from flcav.sensors.labels.views import view_actors
+from flcav.sensors.lens import Lens
+from flcav.sensors.lidar import Lidar
+from flcav.sensors.visibility import unoccluded_rays
+from flcav.world.scene import Scene
+
+
+class Sweep(NamedTuple):
+    """What a LiDAR met."""
+
+    lidar: Lidar
+    world_from_sensor: Array  # (4, 4)
+    passes: NDArray[np.bool_]  # see `draw_passes`
+    returns: NDArray[np.int64]  # (A,) points of each of the scene's actors
+    visible: NDArray[np.int64]  # (A,) rays that come back from it, detected or not
+
+
+class Sight(NamedTuple):
+    """What a camera, infrared ones too, met."""
+
+    lens: Lens
+    world_from_camera: Array  # (4, 4) of the optical frame
+    offset_s: float  # after the spin
+    instance: NDArray[np.int32]  # (H, W) 0 none, a + 1 = the scene's actor a, -(t + 1) = thing t of the town
+
+
+def annotate(
+    scene: Scene,
+    own: int | None,
+    *,
+    within: NDArray[np.bool_],
+    sweeps: Mapping[str, Sweep],
+    sights: Mapping[str, Sight],
+    echoes: Mapping[str, NDArray[np.int64]],
+) -> tuple[Annotations, NDArray[np.int64]]:
+    """Return the truth about all actors but `own` that are `within` (A,) reach or show in a camera, and their numbers.
+
+    `echoes` are the (A,) radar detections of each actor. Moves `scene` about its instant, and back to the spin.
+    """
+    trace, index = scene.trace, scene.index
+    regions = {name: actor_regions(sight.instance, len(trace.actor)) for name, sight in sights.items()}
+    labelled = np.logical_or.reduce([within, *(region.pixels > 0 for region in regions.values())])
+    if own is not None:
+        labelled[own] = False
+    actors = np.flatnonzero(labelled)
+
+    views, signs = {}, {}
+    for name, sight in sights.items():
+        scene.move_to(index, sight.offset_s)
+        views[name] = view_actors(scene, sight.world_from_camera, sight.lens, sight.instance, regions[name], actors)
+        signs[name] = view_signs(scene, sight.world_from_camera, sight.instance)
+    scene.move_to(index)
+
+    size = trace.size[actors]
+    center = trace.position[index, actors] + size * (0, 0, 0.5)
+    annotations = Annotations(
+        track=trace.actor[actors],
+        boxes=Boxes(center, size, trace.yaw[index, actors], trace.category[actors]),
+        velocity=trace.velocity[index, actors],
+        acceleration=trace.acceleration[index, actors],
+        returns=np.sum([sweep.returns[actors] for sweep in sweeps.values()], axis=0, dtype=np.int64)
+        + np.zeros(len(actors), np.int64),
+        occlusion=_occlusion(scene, list(sweeps.values()), actors),
+        points={name: sweep.returns[actors] for name, sweep in sweeps.items()}
+        | {name: counts[actors] for name, counts in echoes.items()},
+        views=views,
+        signs=signs,
+    )
+    return annotations, actors
+
+
+def _occlusion(scene: Scene, sweeps: list[Sweep], actors: NDArray[np.int64]) -> Array:
+    """Return (K,) the share of each actor that is hidden from all LiDARs together; 1 where nothing is visible."""
+    visible, unoccluded = np.zeros((2, len(actors)), np.int64)
+    for sweep in sweeps:
+        visible += sweep.visible[actors]
+    seen = np.flatnonzero(visible)  # of the others nothing is visible, whatever they would show
+    for sweep in sweeps:
+        unoccluded[seen] += unoccluded_rays(scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, actors[seen])
+    return 1 - visible / np.maximum(np.maximum(unoccluded, visible), 1)

@@ -1,0 +1,100 @@
+"""The amodal rectangle of an actor in an image: around the projection of its mesh's convex hull, exact for pinholes."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from flcav.geometry import inverse, transform_points
+from flcav.sensors.lens import Lens, project, unproject
+from flcav.world.meshes import actor_mesh
+from flcav.world.scene import Scene
+
+Array = NDArray[np.float64]
+
+NEAR_M = 0.1  # an actor is cut off so far in front of the camera
+BEYOND_IMAGE = 1.3  # a lens that distorts is trusted up to so many times its image's radius
+
+
+class Hull(NamedTuple):
+    """The convex hull of a mesh."""
+
+    vertices: Array  # (V, 3) body frame [m]
+    edges: NDArray[np.int64]  # (E, 2) rows of vertices
+
+
+@lru_cache(maxsize=64)
+def hull(category: str, shape: int) -> Hull:
+    """Return the convex hull of an actor's mesh."""
+    vertices = actor_mesh(category, shape).vertices.astype(np.float64)
+    found = ConvexHull(vertices)
+    rows = np.searchsorted(found.vertices, found.simplices, sorter=(order := np.argsort(found.vertices)))
+    faces = order[rows]
+    sides = np.sort(np.concatenate((faces[:, :2], faces[:, 1:], faces[:, ::2])), axis=1)
+    return Hull(vertices[found.vertices], np.unique(sides, axis=0))
+
+
+def amodal_boxes(
+    scene: Scene, world_from_camera: Array, lens: Lens, actors: NDArray[np.int64], near_m: float = NEAR_M
+) -> Array:
+    """Return (M, 4) x1 y1 x2 y2 [px] around all of each of `actors` (M,) that lies in front of the camera.
+
+    Not clipped to the image; NaN where nothing lies in front. `world_from_camera` (4, 4) is of the optical frame.
+    """
+    camera_from_world = inverse(world_from_camera)
+    boxes = np.full((len(actors), 4), np.nan)
+    outlines: dict[int, Array] = {}
+    for row, actor in enumerate(actors):
+        model = hull(str(scene.trace.category[actor]), int(scene.trace.shape[actor]))
+        points = transform_points(camera_from_world @ scene.world_from_actor(int(actor)), model.vertices)
+        points = points if points[:, 2].min() >= near_m else _in_front(points, model.edges, near_m)
+        if len(points):
+            outlines[row] = points
+    if outlines:
+        pixels = _project(lens, np.concatenate(list(outlines.values())))
+        first = np.cumsum([0, *(len(points) for points in outlines.values())])[:-1]
+        lowest, highest = np.minimum.reduceat(pixels, first), np.maximum.reduceat(pixels, first)
+        boxes[list(outlines)] = np.concatenate((lowest, highest), axis=1)
+    return boxes
+
+
+def clipped(boxes: Array, lens: Lens) -> Array:
+    """Return boxes (M, 4) clipped to the image; of no area where they lie outside, NaN where they were."""
+    last = (lens.width - 0.5, lens.height - 0.5)
+    return np.clip(boxes, -0.5, (*last, *last))
+
+
+def truncation(boxes: Array, lens: Lens) -> Array:
+    """Return (M,) the share of each box (M, 4) that lies outside the image; 1 where the box is NaN."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = _area(clipped(boxes, lens)) / _area(boxes)
+    return 1 - np.nan_to_num(share, nan=0.0)
+
+
+def _area(boxes: Array) -> Array:
+    return (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+
+
+def _in_front(points: Array, edges: NDArray[np.int64], near_m: float) -> Array:
+    """Return the corners of the part of a hull beyond the plane z = `near_m`."""
+    ahead = points[:, 2] >= near_m
+    one, other = (points[end] for end in edges[ahead[edges[:, 0]] != ahead[edges[:, 1]]].T)
+    share = (near_m - one[:, 2:]) / (other[:, 2:] - one[:, 2:])
+    return np.concatenate((points[ahead], one + share * (other - one)))
+
+
+def _project(lens: Lens, points: Array) -> Array:
+    """Return pixels (N, 2) of points in front of the camera; distortion is followed as far as the lens is trusted."""
+    if lens.distortion().any():
+        plane = points[:, :2] / points[:, 2:]
+        radius = np.linalg.norm(plane, axis=1, keepdims=True)
+        plane = plane * np.minimum(1, BEYOND_IMAGE * _image_radius(lens) / np.maximum(radius, 1e-9))
+        points = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
+    return project(lens, points)
+
+
+def _image_radius(lens: Lens) -> float:
+    corners = unproject(lens, [(u, v) for u in (0, lens.width - 1) for v in (0, lens.height - 1)])
+    return float(np.linalg.norm(corners, axis=1).max())

@@ -1,0 +1,69 @@
+"""How actors appear to a camera: rectangles, pixels, truncation, occlusion."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.geometry import inverse
+from flcav.sensors.frame import Array, Views
+from flcav.sensors.labels.outlines import amodal_boxes, clipped, truncation
+from flcav.sensors.labels.regions import Regions
+from flcav.sensors.lens import Lens, directions
+from flcav.world.scene import Scene
+
+SAMPLES = 4096  # of an actor's rectangle, about; a large one is sampled in every n-th row and column
+NO_PIXEL = np.zeros((0, 2), np.int64)
+
+
+def view_actors(
+    scene: Scene,
+    world_from_camera: Array,
+    lens: Lens,
+    instance: NDArray[np.int32],
+    regions: Regions,
+    actors: NDArray[np.int64],
+) -> Views:
+    """Return how `actors` (M,) appear in an image whose `instance` (H, W) is a + 1 at the scene's actor a.
+
+    `regions` are those of all the scene's actors. The scene stands at the instant of the image.
+    """
+    box = amodal_boxes(scene, world_from_camera, lens, actors)
+    occlusion = np.ones(len(actors))
+    inside = clipped(box, lens)
+    for row in np.flatnonzero(regions.pixels[actors]):  # of the others nothing is visible, whatever they would show
+        actor = int(actors[row])
+        sampled = _sampled(inside[row])
+        visible = np.count_nonzero(instance[np.ix_(*sampled)] == actor + 1)
+        unoccluded = _unoccluded(scene, world_from_camera, lens, actor, sampled)
+        if visible and unoccluded:
+            occlusion[row] = 1 - min(visible / unoccluded, 1.0)
+    return Views(
+        amodal_box=box,
+        visible_box=regions.box[actors],
+        pixels=regions.pixels[actors],
+        truncation=truncation(box, lens),
+        occlusion=occlusion,
+    )
+
+
+def _sampled(box: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows and the columns of the pixels by which an actor in `box` (4,) is judged."""
+    x1, y1, x2, y2 = box
+    step = max(1, int(np.sqrt((x2 - x1) * (y2 - y1) / SAMPLES)))
+    first_column, first_row = int(np.ceil(x1)), int(np.ceil(y1))
+    return np.arange(first_row, int(np.floor(y2)) + 1, step), np.arange(first_column, int(np.floor(x2)) + 1, step)
+
+
+def _unoccluded(
+    scene: Scene,
+    world_from_camera: Array,
+    lens: Lens,
+    actor: int,
+    sampled: tuple[NDArray[np.int64], NDArray[np.int64]],
+) -> int:
+    """Return how many of the sampled pixels would show the actor in an empty world."""
+    rows, columns = sampled
+    rays = directions(lens).reshape(lens.height, lens.width, 3)[np.ix_(rows, columns)].reshape(-1, 3)
+    if not len(rays):
+        return 0
+    body_from_camera = inverse(scene.world_from_actor(actor)) @ world_from_camera
+    return int(np.count_nonzero(scene.cast_alone(actor, body_from_camera, rays).face >= 0))
