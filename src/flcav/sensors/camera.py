@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from flcav.sensors.lens import Lens, directions
 from flcav.sensors.shading.appearance import SEMANTICS, Appearance, appearance_of
 from flcav.sensors.shading.light import light_of
+from flcav.sensors.shading.shadows import shadows
+from flcav.sensors.shading.state import lamps_of, state_of
 from flcav.sensors.shading.surface import shade
 from flcav.sensors.shading.survey import Survey, survey
 from flcav.sensors.shading.tone import develop
@@ -46,26 +48,33 @@ def photograph(
     it is `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments, and the same state of `rng`, give the same bytes.
     """
     rays = directions(camera)
-    appearance = appearance_of(scene)
-    light = light_of(weather)
-    seen = survey(scene, world_from_camera, rays, far_m=FAR_M, hidden=hidden)
-    facing = seen.normal @ light.to_sun
-    far = np.where((seen.row >= 0) & (facing > 0), np.float32(300), np.float32(-1))
-    lit = 1 - scene.blocked(seen.position, light.to_sun[None], far, hidden=hidden).astype(np.float32)
-    radiance = np.empty((len(rays), 3), np.float32)
-    shade(seen, light, scene.surfaces.material, appearance, lit, radiance)
+    appearance, light = appearance_of(scene), light_of(weather)
+    state = state_of(scene, light.lamps, low_sight=light.extinction > 0.002)
+    lamps = lamps_of(scene, state)
+    hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden)
+    seen = survey(scene, appearance, world_from_camera, rays, hits)
+    key, lit = shadows(scene, seen, light, lamps, hidden)
+    open_sky = np.ones(len(rays), np.float32)
+    radiance, painted = np.empty((len(rays), 3), np.float32), np.empty(len(rays), np.bool_)
+    pixel_angle = np.float32(1 / camera.intrinsics()[0, 0])
+    shade(seen, light, appearance, state, lamps, key, lit, open_sky, pixel_angle, radiance, painted)
     rgb = np.empty((len(rays), 3), np.uint8)
     develop(radiance, np.float32(light.exposure), rgb)
-    return _exposure(camera, rays, rgb, seen, appearance)
+    return _exposure(camera, rays, rgb, seen, appearance, painted)
 
 
 def _exposure(
-    camera: Camera, rays: NDArray[np.float32], rgb: NDArray[np.uint8], seen: Survey, appearance: Appearance
+    camera: Camera,
+    rays: NDArray[np.float32],
+    rgb: NDArray[np.uint8],
+    seen: Survey,
+    appearance: Appearance,
+    painted: NDArray[np.bool_],
 ) -> Exposure:
     shape = (camera.height, camera.width)
     semantic = np.empty(len(rays), np.uint8)
     instance = np.empty(len(rays), np.int32)
-    _label(seen, appearance, np.uint8(SEMANTICS["sky"]), semantic, instance)
+    _label(seen, appearance, painted, SEMANTICS["sky"], SEMANTICS["road_line"], semantic, instance)
     return Exposure(
         rgb.reshape(*shape, 3),
         (seen.distance * rays[:, 2]).reshape(shape),
@@ -75,11 +84,11 @@ def _exposure(
 
 
 @compiled
-def _label(seen, appearance, sky, semantic, instance):
+def _label(seen, appearance, painted, sky, road_line, semantic, instance):
     for ray in range(len(semantic)):
         row = seen.row[ray]
         if row < 0:
             semantic[ray], instance[ray] = sky, 0
         else:
-            semantic[ray] = appearance.semantic[row]
+            semantic[ray] = road_line if painted[ray] else appearance.semantic[row]
             instance[ray] = appearance.thing[row] if seen.instance[ray] == 0 else seen.instance[ray]

@@ -171,4 +171,4 @@ def _signals(town: Town) -> Iterator[Owned]:
         left = np.array((-np.sin(yaw), np.cos(yaw)))
         reach = float(left @ ((x, y) - foot))
         yield Part.SIGNAL, row, moved(signal_head(z), x, y, 0.0, yaw)
-        yield Part.POST, row, moved(signal_mast(z, reach), *foot, 0.0, yaw)
+        yield Part.POST, row, moved(signal_mast(z, reach), foot[0], foot[1], 0.0, yaw)

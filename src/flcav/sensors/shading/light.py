@@ -55,6 +55,8 @@ class Light(NamedTuple):
     sun: Colour  # (3,) on a surface face on, through the clouds
     zenith: Colour  # (3,) radiance of the clear sky overhead
     horizon: Colour  # (3,) and above the horizon
+    ambient: Colour  # (3,) what the whole sky sends to a level surface
+    bounce: Colour  # (3,) and what the ground sends back up
     cloud: Colour  # (3,) of a cloud
     cover: float  # share of the sky that is clouds
     air: Colour  # (3,) what the air between adds where it hides everything
@@ -86,12 +88,16 @@ def light_of(weather: Weather) -> Light:
     haze = 0.00012
     rain = RAIN_EXTINCTION * weather.rain_mm_h**0.63 * 3.0
     lamps = float(np.clip((2.0 - weather.sun_elevation_deg) / 6.0, 0, 1))
+    sky = 0.62 * zenith + 0.38 * horizon
+    bounce = 0.16 * (sun * max(to_sun[2], 0.0) + sky)
     ambient = float((0.5 * sun * max(to_sun[2], 0.15) + 0.6 * zenith + 0.4 * horizon).mean())
     return Light(
         to_sun.astype(np.float32),
         sun.astype(np.float32),
         zenith.astype(np.float32),
         horizon.astype(np.float32),
+        sky.astype(np.float32),
+        bounce.astype(np.float32),
         cloud.astype(np.float32),
         float(weather.cloud_cover),
         air.astype(np.float32),

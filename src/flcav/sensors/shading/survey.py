@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.sensors.shading.appearance import Appearance
 from flcav.world.rays.compiled import compiled
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
@@ -19,7 +20,7 @@ class Survey(NamedTuple):
     distance: NDArray[np.float32]  # (N,) [m]; inf for the sky
     instance: NDArray[np.int32]  # (N,) of the scene; -1 for the sky
     row: NDArray[np.int32]  # (N,) of the scene's surfaces; -1 for the sky
-    normal: NDArray[np.float32]  # (N, 3) unit, towards the camera
+    normal: NDArray[np.float32]  # (N, 3) unit, towards the camera; smooth over the curved surfaces of actors
     position: NDArray[np.float32]  # (N, 3) [m], `LIFT_M` off the surface
 
     def __len__(self) -> int:
@@ -28,21 +29,16 @@ class Survey(NamedTuple):
 
 def survey(
     scene: Scene,
+    appearance: Appearance,
     world_from_camera: NDArray[np.float64],
     directions: NDArray[np.float32],
-    *,
-    far_m: float,
-    hidden: int | None,
-    near_m: NDArray[np.float32] | None = None,
+    hits: Hits,
 ) -> Survey:
-    """Return what the rays `directions` (N, 3), optical frame, meet between `near_m` (N,) and `far_m`."""
-    hits = scene.cast(world_from_camera, directions, near_m=near_m, far_m=far_m, hidden=hidden)
-    return ends(scene, world_from_camera, directions, hits)
-
-
-def ends(scene: Scene, world_from_camera: NDArray[np.float64], directions: NDArray[np.float32], hits: Hits) -> Survey:
-    """Return the ends of rays that were cast already."""
-    count = len(directions)
+    """Return what the rays `directions` (N, 3), optical frame, met: their `hits`, looked up."""
+    count, present = len(directions), scene.trace.present[scene.index]
+    bodies = np.tile(np.eye(4), (len(present) + 1, 1, 1))
+    for actor in np.flatnonzero(present):
+        bodies[actor + 1] = scene.world_from_actor(int(actor))
     out = Survey(
         np.empty((count, 3), np.float32),
         hits.distance,
@@ -51,20 +47,14 @@ def ends(scene: Scene, world_from_camera: NDArray[np.float64], directions: NDArr
         np.zeros((count, 3), np.float32),
         np.zeros((count, 3), np.float32),
     )
-    _ends(
-        world_from_camera.astype(np.float32),
-        directions,
-        hits.face,
-        scene.surfaces.first,
-        scene.surfaces.normal,
-        scene.world_from_instance().astype(np.float32),
-        out,
-    )
+    pose = world_from_camera.astype(np.float32)
+    first, normals = scene.surfaces.first, scene.surfaces.normal
+    _look_up(pose, directions, hits.face, first, normals, bodies.astype(np.float32), appearance, out)
     return out
 
 
 @compiled
-def _ends(pose, directions, face, first, normals, world_from_instance, out):
+def _look_up(pose, directions, face, first, normals, bodies, appearance, out):
     lift = np.float32(LIFT_M)
     for ray in range(len(directions)):
         x, y, z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
@@ -78,14 +68,51 @@ def _ends(pose, directions, face, first, normals, world_from_instance, out):
             continue
         row = first[instance] + face[ray]
         out.row[ray] = row
+        distance = out.distance[ray]
+        px, py, pz = pose[0, 3] + dx * distance, pose[1, 3] + dy * distance, pose[2, 3] + dz * distance
         nx, ny, nz = normals[row, 0], normals[row, 1], normals[row, 2]
+        body = bodies[instance]
         if instance > 0:
-            turn = world_from_instance[instance]
-            nx, ny = turn[0, 0] * nx + turn[0, 1] * ny, turn[1, 0] * nx + turn[1, 1] * ny
+            nx, ny = body[0, 0] * nx + body[0, 1] * ny, body[1, 0] * nx + body[1, 1] * ny
         if nx * dx + ny * dy + nz * dz > 0:
             nx, ny, nz = -nx, -ny, -nz
+        out.position[ray, 0], out.position[ray, 1], out.position[ray, 2] = (
+            px + nx * lift,
+            py + ny * lift,
+            pz + nz * lift,
+        )
+        if instance > 0:
+            nx, ny, nz = _smooth(px, py, pz, dx, dy, dz, nx, ny, nz, body, row - appearance.first_actor, appearance)
         out.normal[ray, 0], out.normal[ray, 1], out.normal[ray, 2] = nx, ny, nz
-        distance = out.distance[ray]
-        out.position[ray, 0] = pose[0, 3] + dx * distance + nx * lift
-        out.position[ray, 1] = pose[1, 3] + dy * distance + ny * lift
-        out.position[ray, 2] = pose[2, 3] + dz * distance + nz * lift
+
+
+@compiled
+def _smooth(px, py, pz, dx, dy, dz, nx, ny, nz, body, face, appearance):
+    """Return the normal of the smooth surface at a point of an actor's face, whose own normal is nx, ny, nz."""
+    ex, ey = px - body[0, 3], py - body[1, 3]
+    x, y, z = body[0, 0] * ex + body[1, 0] * ey, body[0, 1] * ex + body[1, 1] * ey, pz - body[2, 3]
+    corner, normal = appearance.corner[face], appearance.corner_normal[face]
+    ax, ay, az = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
+    bx, by, bz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
+    cx, cy, cz = x - corner[0, 0], y - corner[0, 1], z - corner[0, 2]
+    aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
+    ca, cb = cx * ax + cy * ay + cz * az, cx * bx + cy * by + cz * bz
+    area = aa * bb - ab * ab
+    if area < 1e-14:
+        return nx, ny, nz
+    v = min(max((bb * ca - ab * cb) / area, np.float32(0)), np.float32(1))
+    w = min(max((aa * cb - ab * ca) / area, np.float32(0)), np.float32(1))
+    u = 1 - v - w
+    sx = u * normal[0, 0] + v * normal[1, 0] + w * normal[2, 0]
+    sy = u * normal[0, 1] + v * normal[1, 1] + w * normal[2, 1]
+    sz = u * normal[0, 2] + v * normal[1, 2] + w * normal[2, 2]
+    sx, sy = body[0, 0] * sx + body[0, 1] * sy, body[1, 0] * sx + body[1, 1] * sy
+    length = np.sqrt(sx * sx + sy * sy + sz * sz)
+    if length < 1e-6:
+        return nx, ny, nz
+    if sx * nx + sy * ny + sz * nz < 0:
+        length = -length
+    sx, sy, sz = sx / length, sy / length, sz / length
+    if sx * dx + sy * dy + sz * dz > np.float32(-0.02):  # a smooth normal may not face away from who sees the face
+        return nx, ny, nz
+    return sx, sy, sz

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,29 @@ class Mesh:
         normal = np.cross(b - a, c - a)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         return (normal / np.maximum(length, 1e-12)).astype(np.float32)
+
+    def corner_normals(self, crease_deg: float = 40.0) -> NDArray[np.float32]:
+        """Return (F, 3, 3) unit normals at each face's corners, as of the smooth surface the faces stand for.
+
+        Faces that share a corner are one surface where they bend by less than `crease_deg`; signs are those of
+        `normals`.
+        """
+        corners = self.vertices[self.faces]
+        flat = self.normals().astype(np.float64)
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        _, place = np.unique(corners.reshape(-1, 3).round(4), axis=0, return_inverse=True)
+        order = np.argsort(place, kind="stable")
+        starts = np.searchsorted(place[order], np.arange(place.max() + 2))
+        out = np.empty((len(order), 3))
+        for first, last in pairwise(starts):
+            shared = order[first:last]
+            normal, weight = flat[shared // 3], area[shared // 3]
+            alike = normal @ normal.T
+            share = np.where(np.abs(alike) > np.cos(np.radians(crease_deg)), np.sign(alike) * weight, 0.0)
+            out[shared] = share @ normal
+        out = out.reshape(-1, 3, 3)
+        length = np.linalg.norm(out, axis=2, keepdims=True)
+        return np.where(length > 1e-12, out / np.maximum(length, 1e-12), flat[:, None]).astype(np.float32)
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the lowest and the highest x, y, z, (3,) each."""

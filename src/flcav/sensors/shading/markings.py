@@ -1,0 +1,137 @@
+"""What is painted on the roads, as rectangles in a grid, and how much of a pixel it covers.
+
+A rectangle's coverage of a pixel's footprint is the product of two overlaps of intervals, along and across it: exact
+where the footprint is aligned with it, smooth and right in the mean elsewhere. So lines fade with distance, and do not
+break up.
+"""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString, Polygon
+from shapely.ops import substring
+
+from flcav.sensors.shading.noise import overlap
+from flcav.world.layers import MapLayers, Marking
+from flcav.world.paint import glyph, stripes
+from flcav.world.rays.compiled import compiled
+
+CELL_M = 2.0
+REACH_M = 0.3  # how far beyond a rectangle its cells go
+STRIP_M = 0.12  # arrows are cut into strips of this length
+COLOURS = {"white": (0.68, 0.68, 0.66), "yellow": (0.62, 0.42, 0.06)}
+
+Rectangle = tuple[float, float, float, float, float, float]  # centre x, y, direction x, y, half length, half width
+
+
+class Markings(NamedTuple):
+    """Painted rectangles, findable by place."""
+
+    rectangle: NDArray[np.float32]  # (K, 6) see Rectangle
+    colour: NDArray[np.float32]  # (K, 3)
+    corner: NDArray[np.float64]  # (2,) lowest x, y of the grid
+    first: NDArray[np.int32]  # (cells along x, cells along y + 1) where each cell's list begins
+    listed: NDArray[np.int32]  # rows of `rectangle`
+
+
+def markings_of(layers: MapLayers) -> Markings:
+    """Return the paint on the roads of a map."""
+    pieces = [(piece, COLOURS.get(line.colour, COLOURS["white"])) for line in layers.markings for piece in _line(line)]
+    white = COLOURS["white"]
+    pieces += [(_box(stripe), white) for crossing in layers.crossings for stripe in stripes(crossing)]
+    pieces += [(strip, white) for arrow in layers.arrows for strip in _strips(glyph(arrow), arrow.yaw)]
+    rectangle = np.array([piece for piece, _ in pieces], np.float32).reshape(-1, 6)
+    colour = np.array([colour for _, colour in pieces], np.float32).reshape(-1, 3)
+    return Markings(rectangle, colour, *_grid(rectangle))
+
+
+@compiled
+def paint_at(x, y, look_x, look_y, across, along, markings):
+    """Return the share of a footprint about x, y that is painted, and the rectangle that paints most of it.
+
+    The footprint is `along` [m] long in the horizontal direction look_x, look_y (unit), and `across` wide.
+    """
+    i, j = int((x - markings.corner[0]) / CELL_M), int((y - markings.corner[1]) / CELL_M)
+    if i < 0 or j < 0 or i >= markings.first.shape[0] or j >= markings.first.shape[1] - 1:
+        return np.float32(0), 0
+    total, most, which = np.float32(0), np.float32(0), 0
+    for place in range(markings.first[i, j], markings.first[i, j + 1]):
+        piece = markings.listed[place]
+        row = markings.rectangle[piece]
+        dx, dy = np.float32(x - row[0]), np.float32(y - row[1])
+        parallel = abs(look_x * row[2] + look_y * row[3])
+        crossed = abs(look_x * row[3] - look_y * row[2])
+        share = overlap(dx * row[2] + dy * row[3], row[4], parallel * along + crossed * across)
+        if share > 0:
+            share *= overlap(dy * row[2] - dx * row[3], row[5], crossed * along + parallel * across)
+            total += share
+            if share > most:
+                most, which = share, piece
+    return min(total, np.float32(1)), which
+
+
+def _line(marking: Marking) -> Iterator[Rectangle]:
+    line = LineString(marking.line)
+    stroke = marking.dash_m or line.length
+    for start in np.arange(0.0, line.length - 1e-6, stroke + marking.gap_m if marking.dash_m else line.length):
+        points = np.asarray(substring(line, start, min(start + stroke, line.length)).coords)
+        for a, b in pairwise(points):
+            length = float(np.hypot(*(b - a)))
+            if length > 1e-6:
+                x, y = (a + b) / 2
+                yield x, y, (b[0] - a[0]) / length, (b[1] - a[1]) / length, length / 2, marking.width_m / 2
+
+
+def _box(outline: NDArray[np.float64]) -> Rectangle:
+    """Return the smallest rectangle about a polygon."""
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(Polygon(outline)))
+    one, other = corners[1] - corners[0], corners[2] - corners[1]
+    length, width = np.hypot(*one), np.hypot(*other)
+    x, y = corners[:4].mean(axis=0)
+    return x, y, one[0] / length, one[1] / length, length / 2, width / 2
+
+
+def _strips(outline: NDArray[np.float64], yaw: float) -> Iterator[Rectangle]:
+    """Yield a polygon as strips across the direction `yaw`."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    turned = Polygon(outline @ np.array([[cos, -sin], [sin, cos]]))
+    low_x, low_y, high_x, high_y = turned.bounds
+    for start in np.arange(low_x, high_x, STRIP_M):
+        end = min(start + STRIP_M, high_x)
+        middle = (start + end) / 2
+        chord = turned.intersection(LineString([(middle, low_y - 1), (middle, high_y + 1)]))
+        for part in getattr(chord, "geoms", [chord]):
+            if part.length > 0:
+                y = part.centroid.y
+                yield middle * cos - y * sin, middle * sin + y * cos, cos, sin, (end - start) / 2, part.length / 2
+
+
+def _grid(rectangle: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:
+    """Return the grid's corner, and where and what its cells list."""
+    if not len(rectangle):
+        return np.zeros(2), np.zeros((1, 2), np.int32), np.zeros(0, np.int32)
+    x, y, tx, ty, length, width = rectangle.T.astype(np.float64)
+    half_x, half_y = np.abs(tx) * length + np.abs(ty) * width, np.abs(ty) * length + np.abs(tx) * width
+    corner = np.array([(x - half_x).min(), (y - half_y).min()]) - REACH_M
+    cells = np.ceil((np.array([(x + half_x).max(), (y + half_y).max()]) + REACH_M - corner) / CELL_M).astype(int) + 1
+    found: list[NDArray[np.int64]] = []
+    for row in range(len(rectangle)):
+        spread = np.array([half_x[row], half_y[row]]) + REACH_M
+        low, high = ((np.array([x[row], y[row]]) + side * spread - corner) / CELL_M for side in (-1, 1))
+        i, j = np.mgrid[int(low[0]) : int(high[0]) + 1, int(low[1]) : int(high[1]) + 1].reshape(2, -1)
+        dx, dy = corner[0] + (i + 0.5) * CELL_M - x[row], corner[1] + (j + 0.5) * CELL_M - y[row]
+        near = 0.71 * CELL_M + REACH_M
+        within = np.abs(dx * tx[row] + dy * ty[row]) < length[row] + near
+        within &= np.abs(dy * tx[row] - dx * ty[row]) < width[row] + near
+        found.append(np.stack((i[within] * cells[1] + j[within], np.full(within.sum(), row)), axis=1))
+    pairs = np.concatenate(found)
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    starts = np.searchsorted(pairs[:, 0], np.arange(cells[0] * cells[1] + 1)).astype(np.int32)
+    first = np.empty((cells[0], cells[1] + 1), np.int32)
+    first[:, :-1] = starts[:-1].reshape(cells[0], cells[1])
+    first[:, -1] = starts[cells[1] :: cells[1]]
+    return corner, first, pairs[:, 1].astype(np.int32)

@@ -1,0 +1,35 @@
+"""Which light is kept away: one ray from every surface seen to the light that matters most there."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.sensors.shading.light import Light
+from flcav.sensors.shading.state import Lamps, strongest
+from flcav.sensors.shading.survey import Survey
+from flcav.world.rays.compiled import compiled
+from flcav.world.scene import Scene
+
+SUN_REACH_M = 300.0
+DARK = 1e-3  # a sun dimmer than this casts no shadow
+
+
+def shadows(
+    scene: Scene, seen: Survey, light: Light, lamps: Lamps, hidden: int | None
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return for each ray's end the lamp that casts its shadow (-1: the sun), and the share of that light there."""
+    key, far = np.full(len(seen), -1, np.int32), np.empty(len(seen), np.float32)
+    if light.lamps == 1.0:
+        towards = np.zeros((len(seen), 3), np.float32)
+        strongest(seen, lamps, key, towards, far)
+    else:
+        towards = light.to_sun[None]
+        _facing(seen, light.to_sun, light.sun.max() > DARK, far)
+    return key, 1 - scene.blocked(seen.position, towards, far, hidden=hidden).astype(np.float32)
+
+
+@compiled
+def _facing(seen, to_sun, shines, far):
+    for ray in range(len(far)):
+        normal = seen.normal[ray]
+        turned = normal[0] * to_sun[0] + normal[1] * to_sun[1] + normal[2] * to_sun[2]
+        far[ray] = SUN_REACH_M if shines and seen.row[ray] >= 0 and turned > 0 else -1.0
