@@ -1,0 +1,134 @@
+"""What the comparison of two plans says, in sentences computed from its numbers."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from flcav.experiments.findings import HELD, NOT_HELD, UNDECIDED, verdict
+
+EQUAL, JOINT = "equal-stages", "joint"
+TOWN = "grid"  # whose accuracies the planner's history holds
+STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"}
+COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
+
+_VERDICTS = {
+    HELD: "the interval lies above 0, so the claim held",
+    NOT_HELD: "the interval lies below 0, so the claim did not hold",
+    UNDECIDED: "the interval contains 0, so these runs do not decide",
+}
+
+
+def allocation_findings(results: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return findings about `results`: question, verdict and a sentence with the numbers behind it."""
+    return [_better(results), _ranking(results), _accuracy(results), _budgets(results)]
+
+
+def _better(results: Mapping[str, Any]) -> dict[str, str]:
+    realised = results["summary"]["realised"][TOWN]
+    difference, how = _difference(results)
+    decided = verdict(difference["low"], difference["high"])
+    sentence = (
+        f"On {TOWN}, AP50 after the last stage was {realised[EQUAL]['cloud']['mean']:.3f} with equal stages and "
+        f"{realised[JOINT]['cloud']['mean']:.3f} with the joint plan: {_signed(difference['mean'])}, 95 % interval "
+        f"{_signed(difference['low'])} to {_signed(difference['high'])} {how}; {_VERDICTS[decided]}."
+    )
+    return _finding("Does the joint plan beat equal shares for every stage?", decided, sentence)
+
+
+def _difference(results: Mapping[str, Any]) -> tuple[Mapping[str, float], str]:
+    """Return the paired difference after the last stage: over seeds, or over the scenes of the only one."""
+    seeds = results["seeds"]
+    if len(seeds) == 1:
+        return seeds[0]["differences"][TOWN]["cloud"], "over test scenes of one seed, in which training does not vary"
+    return results["summary"]["realised_difference"][TOWN]["cloud"], f"over {len(seeds)} seeds, paired"
+
+
+def _ranking(results: Mapping[str, Any]) -> dict[str, str]:
+    predicted = results["summary"]["predicted_difference"]["cloud"]
+    difference, _ = _difference(results)
+    question = "Does the prediction rank the two plans rightly?"
+    if predicted == 0:
+        return _finding(question, UNDECIDED, "Both plans are predicted to reach the same: there is nothing to rank.")
+    seeds = results["seeds"]
+    agree = sum(predicted * (_ap(seed, JOINT, "cloud") - _ap(seed, EQUAL, "cloud")) > 0 for seed in seeds)
+    expected = (
+        f"The curve predicts {_signed(predicted)} for the joint plan; {agree} of {len(seeds)} seeds agree in sign"
+    )
+    towards = sorted((difference["low"] * _sign(predicted), difference["high"] * _sign(predicted)))
+    decided = verdict(*towards)
+    if difference["mean"] * predicted > 0 and decided != NOT_HELD:
+        sure = "with an interval off 0" if decided == HELD else "but its interval contains 0"
+        return _finding(question, decided, f"{expected}, and so does their mean, {sure}.")
+    sure = ", but its interval contains 0" if decided == UNDECIDED else ""
+    return _finding(question, decided, f"{expected}, and their mean does not{sure}. {_why(results)}")
+
+
+def _why(results: Mapping[str, Any]) -> str:
+    """Return where prediction and training part most, and whether the plans go beyond what history holds."""
+    summary = results["summary"]
+    predicted = _gains(summary["predicted_difference"])
+    realised = _gains({stage: each["mean"] for stage, each in summary["realised_difference"][TOWN].items()})
+    stage = max(STAGE_NAMES, key=lambda name: abs(predicted[name] - realised[name]))
+    sentence = (
+        f"They part most in {STAGE_NAMES[stage]}: of what that stage adds, the joint plan was to have "
+        f"{_signed(predicted[stage])} more than equal stages, and had {_signed(realised[stage])}."
+    )
+    beyond = [
+        f"{COUNT_NAMES[count]} {plans[name][count]} of the {name} plan (history: {low:g} to {high:g})"
+        for count, (low, high) in results["history"].items()
+        for plans in (results["seeds"][0]["plans"],)
+        for name in (EQUAL, JOINT)
+        if not low <= plans[name][count] <= high
+    ]
+    return sentence + (f" The curve is extrapolated for {'; '.join(beyond)}." if beyond else "")
+
+
+def _gains(after: Mapping[str, float]) -> dict[str, float]:
+    """Return what each stage adds to what was there before it."""
+    before = {"pretrain": 0.0, "edge": after["pretrain"], "cloud": after["edge"]}
+    return {stage: after[stage] - before[stage] for stage in STAGE_NAMES}
+
+
+def _accuracy(results: Mapping[str, Any]) -> dict[str, str]:
+    errors = [
+        _ap(seed, name, "cloud") - seed["predicted"][name]["cloud"]
+        for seed in results["seeds"]
+        for name in (EQUAL, JOINT)
+    ]
+    wide = sum(abs(error) for error in errors) / len(errors)
+    claimed = abs(results["summary"]["predicted_difference"]["cloud"])
+    decided = HELD if wide < claimed else NOT_HELD
+    compared = "less" if wide < claimed else "no less"
+    sentence = (
+        f"Over {len(errors)} runs, AP50 after the last stage was off its prediction by {wide:.3f} on average (from "
+        f"{_signed(min(errors))} to {_signed(max(errors))}): {compared} than the {claimed:.3f} that are predicted to "
+        f"lie between the plans."
+    )
+    return _finding("Is the prediction exact enough to tell the plans apart?", decided, sentence)
+
+
+def _budgets(results: Mapping[str, Any]) -> dict[str, str]:
+    rows = [row for seed in results["seeds"] for book in seed["ledger"].values() for row in book.values()]
+    within = all(row["used_mb"] <= row["budget_mb"] for row in rows)
+    off = [row["used_mb"] - row["planned_mb"] for row in rows]
+    spent = [row["used_mb"] / row["budget_mb"] for row in rows]
+    sentence = (
+        f"Every ledger ends {'within' if within else 'above'} its budgets, at {min(spent):.0%} to {max(spent):.0%} of "
+        f"a link's; what was sent differs from the plan's price by {_signed(min(off), 2)} to {_signed(max(off), 2)} MB."
+    )
+    return _finding("Did the runs keep their budgets?", HELD if within else NOT_HELD, sentence)
+
+
+def _ap(seed: Mapping[str, Any], name: str, stage: str) -> float:
+    return seed["realised"][TOWN][name][stage]["ap50"]
+
+
+def _finding(question: str, decided: str, sentence: str) -> dict[str, str]:
+    return {"question": question, "verdict": decided, "sentence": sentence}
+
+
+def _sign(value: float) -> int:
+    return 1 if value > 0 else -1
+
+
+def _signed(value: float, digits: int = 3) -> str:
+    return f"{value:+.{digits}f}".replace("-", "−")

@@ -1,0 +1,156 @@
+"""The page about a plan: everything it shows, computed from the problem and the plan."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+from flcav.network.plan import MessageSizes, Price, StagePlan, price
+from flcav.optimization.allocation import Allocation, TaskPlan
+from flcav.optimization.budget_sweep import LINKS, BudgetPoint, budget_sweep
+from flcav.optimization.problem import Problem, Task
+from flcav.optimization.vehicles import VehicleShare
+from flcav.report import html, plan_charts, style
+
+STAGES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
+SHOWN = 6  # tasks with a colour of their own; the others are drawn as one
+FULL = 0.99  # share of a budget from which on it is used up, whole samples and rounds considered
+Shares = Mapping[str, Sequence[VehicleShare]]
+
+
+def plan_page(problem: Problem, plan: Allocation, shares: Shares) -> str:
+    """Return the page as HTML that needs nothing but itself."""
+    results = plan_results(problem, plan, shares)
+    pictures = {
+        "megabytes": plan_charts.megabytes(results["parts"], results["links"]),
+        "budgets": plan_charts.error_by_budget(results["sweep"]),
+        "marginal": plan_charts.marginal_values(results["sweep"]["both links"], results["links"]),
+    }
+    return html.render(results, {name: style.png(figure) for name, figure in pictures.items()}, "plan.html.j2")
+
+
+def plan_results(problem: Problem, plan: Allocation, shares: Shares) -> dict[str, Any]:
+    """Return what the page shows: numbers and sentences."""
+    scaled = {"both links": LINKS, "wireless alone": ("wireless",), "wireline alone": ("wireline",)}
+    sweep = {name: budget_sweep(problem, links) for name, links in scaled.items()}
+    links = {
+        link: {
+            "budget_mb": getattr(problem.budgets_mb, link),
+            "used_mb": getattr(plan.used_mb, f"{link}_mb"),
+            "share": getattr(plan.used_mb, f"{link}_mb") / getattr(problem.budgets_mb, link),
+            "marginal": getattr(plan.marginal_error_per_gb, f"{link}_mb"),
+        }
+        for link in LINKS
+    }
+    weights = sum(task.weight for task in problem.tasks)
+    tasks = [
+        {**asdict(row), "weight": task.weight, "vehicles": sum(task.edge_groups)}
+        for task, row in zip(problem.tasks, plan.tasks, strict=True)
+    ]
+    values = {
+        "objective": plan.objective,
+        "lower_bound": plan.lower_bound,
+        "gap": plan.gap,
+        "status": plan.status,
+        "weights": weights,
+        "k": problem.edge_rounds_per_cloud_round,
+        "tasks": tasks,
+        "links": links,
+        "parts": _parts(problem, plan),
+        "sweep": {name: [asdict(point) for point in points] for name, points in sweep.items()},
+        "vehicles": _vehicles(problem, shares),
+        "horizon_s": problem.horizon_s,
+    }
+    return values | {"sentences": _sentences(values, sweep["both links"])}
+
+
+def _parts(problem: Problem, plan: Allocation) -> list[dict[str, Any]]:
+    """Return megabytes by link, task and stage; tasks beyond the `SHOWN` largest are one."""
+    ordered = sorted(plan.tasks, key=lambda row: -(row.wireless_mb + row.wireline_mb))
+    shown = {row.name for row in ordered[: SHOWN if len(ordered) > SHOWN + 1 else len(ordered)]}
+    others = f"{len(ordered) - len(shown)} other tasks"
+    totals: dict[tuple[str, str, str], float] = {}
+    for task, row in zip(problem.tasks, plan.tasks, strict=True):
+        for stage, cost in _stage_prices(problem, task, row).items():
+            for link in LINKS:
+                key = (link, row.name if row.name in shown else others, stage)
+                totals[key] = totals.get(key, 0.0) + getattr(cost, f"{link}_mb")
+    return [{"link": link, "task": task, "stage": stage, "mb": mb} for (link, task, stage), mb in totals.items()]
+
+
+def _stage_prices(problem: Problem, task: Task, row: TaskPlan) -> dict[str, Price]:
+    sizes, k = MessageSizes(task.sample_mb, task.model_mb), problem.edge_rounds_per_cloud_round
+    none = StagePlan(0, 0, 0, task.edge_groups, k)
+    return {name: price(replace(none, **{field: getattr(row, field)}), sizes) for field, name in STAGES.items()}
+
+
+def _vehicles(problem: Problem, shares: Shares) -> list[dict[str, Any]]:
+    """Return a row per vehicle: what it uploads and joins for all tasks, and how long its wireless link is busy."""
+    rows: dict[str, dict[str, Any]] = {}
+    for task in problem.tasks:
+        for share in shares.get(task.name, ()):
+            mbps = (task.uplink_mbps or {})[share.vehicle].wireless
+            row = rows.setdefault(share.vehicle, {"vehicle": share.vehicle, "mbps": mbps, "mb": 0.0, "parts": []})
+            row["mb"] += share.wireless_mb
+            row["parts"].append({"task": task.name, "samples": share.samples, "rounds": len(share.rounds)})
+    most = {task: max(len(share.rounds) for share in own) for task, own in shares.items()}
+    for row in rows.values():
+        row["busy_s"] = 8 * row["mb"] / row["mbps"]
+        row["missed"] = sum(most[part["task"]] - part["rounds"] for part in row["parts"])
+    return list(rows.values())
+
+
+def _sentences(values: Mapping[str, Any], both: Sequence[BudgetPoint]) -> dict[str, str]:
+    return {
+        "proof": _proof(values),
+        "links": " ".join(_link(name, link) for name, link in values["links"].items()),
+        "stages": _stages(values["parts"]),
+        "budgets": _budgets(values["objective"], both),
+        "vehicles": _stragglers(values["vehicles"], values["horizon_s"]),
+    }
+
+
+def _proof(values: Mapping[str, Any]) -> str:
+    bound = f"no plan within these budgets can have less than {values['lower_bound']:.4f}"
+    return f"This is proven: {bound}, {values['gap']:.3%} below." if values["gap"] > 0 else f"This is proven: {bound}."
+
+
+def _link(name: str, link: Mapping[str, Any]) -> str:
+    used = f"{link['used_mb']:,.0f} of {link['budget_mb']:,.0f} MB of the {name} budget are used"
+    if link["marginal"] > 0:
+        return f"{used}; 1,000 MB more would lower the error by about {link['marginal']:.2g}."
+    return f"{used}; more of it would not lower the error."
+
+
+def _stages(parts: Sequence[Mapping[str, Any]]) -> str:
+    sentences = []
+    for link in LINKS:
+        by_stage: dict[str, float] = {}
+        for part in parts:
+            if part["link"] == link:
+                by_stage[part["stage"]] = by_stage.get(part["stage"], 0.0) + part["mb"]
+        total = sum(by_stage.values())
+        split = ", ".join(f"{mb / total:.0%} {stage}" for stage, mb in by_stage.items() if mb > 0)
+        sentences.append(f"Of what goes over the {link} link: {split}." if total else f"Nothing goes over {link}.")
+    return " ".join(sentences)
+
+
+def _budgets(objective: float, both: Sequence[BudgetPoint]) -> str:
+    at = {point.factor: point.objective for point in both}
+    half = f"{at[0.5]:.4f}" if 0.5 in at else "nothing: the least that the limits allow does not fit"
+    double = f"{at[2.0]:.4f}"
+    return (
+        f"With half of both budgets the error would be {half}; with these it is {objective:.4f}; with double, {double}."
+    )
+
+
+def _stragglers(vehicles: Sequence[Mapping[str, Any]], horizon_s: float | None) -> str:
+    if not vehicles:
+        return ""
+    missing = [row for row in vehicles if row["missed"]]
+    slowest = max(vehicles, key=lambda row: row["busy_s"])
+    within = f", within the {horizon_s:,.0f} s that links may be busy" if horizon_s is not None else ""
+    busy = f"The busiest link is that of {slowest['vehicle']}: {slowest['busy_s']:,.0f} s{within}."
+    if not missing:
+        return f"Every vehicle joins every round. {busy}"
+    names = ", ".join(f"{row['vehicle']} ({row['missed']})" for row in missing)
+    return f"Rounds that a vehicle leaves out because its link cannot carry them: {names}. {busy}"

@@ -1,0 +1,79 @@
+"""A plan in pictures: megabytes per link, error against budget, and what more megabytes are worth."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from flcav.report import style
+from flcav.report.figures import WIDTH
+
+Row = Mapping[str, Any]
+
+TASKS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION, style.RULE)
+SHADES = {"samples": 1.0, "edge rounds": 0.62, "cloud rounds": 0.32}  # opacity by stage
+LINKS = {"both links": style.INK, "wireless alone": style.BLUE, "wireline alone": style.VERMILLION}
+
+
+@style.styled
+def megabytes(parts: Sequence[Row], links: Mapping[str, Row]) -> Figure:
+    """Return a bar per link: a part per task (colour) and stage (shade), against the budget [MB]."""
+    tasks = list(dict.fromkeys(row["task"] for row in parts))
+    colours = dict(zip(tasks, TASKS, strict=False))
+    figure = style.canvas(WIDTH, 0.72 * WIDTH + 0.1 * len(tasks))
+    axes = figure.add_subplot()
+    widest = max(link["budget_mb"] for link in links.values())
+    for y, (name, link) in enumerate(links.items()):
+        left = 0.0
+        for row in sorted(parts, key=lambda part: tasks.index(part["task"])):
+            if row["link"] != name or not row["mb"]:
+                continue
+            shade = {"color": colours[row["task"]], "alpha": SHADES[row["stage"]]}
+            axes.barh(y, row["mb"], left=left, height=0.44, edgecolor="white", linewidth=1.0, **shade)
+            if row["mb"] > 0.09 * widest:
+                axes.text(left + row["mb"] / 2, y, f"{row['mb']:,.0f}", ha="center", va="center_baseline", fontsize=9)
+            left += row["mb"]
+        axes.plot([link["budget_mb"]] * 2, [y - 0.32, y + 0.32], color=style.INK, linewidth=2)
+        note = f"{left:,.0f} of {link['budget_mb']:,.0f} MB"
+        axes.text(link["budget_mb"], y - 0.36, note, ha="right", va="bottom", fontsize=style.SMALL)
+    handles = [Patch(color=colour, label=task) for task, colour in colours.items()]
+    handles += [Patch(color=style.INK, alpha=shade, label=stage) for stage, shade in SHADES.items()]
+    style.key(figure, handles, ncols=2)
+    axes.set_yticks(range(len(links)), list(links))
+    axes.set(xlabel="uplink megabytes (1 MB = 10⁶ bytes)", ylim=(len(links) - 0.6, -0.75))
+    return figure
+
+
+@style.styled
+def error_by_budget(sweep: Mapping[str, Sequence[Row]]) -> Figure:
+    """Return the best error at multiples of the budgets, scaled together and one at a time."""
+    figure = style.canvas(WIDTH, 0.8 * WIDTH)
+    axes = figure.add_subplot()
+    for name, colour in LINKS.items():
+        points = sweep[name]
+        axes.plot([p["factor"] for p in points], [p["objective"] for p in points], color=colour, marker="o", ms=3)
+    now = [p["objective"] for p in sweep["both links"] if p["factor"] == 1]
+    axes.plot([1] * len(now), now, "o", color=style.INK, markersize=8, markeredgecolor="white")
+    axes.annotate("this plan", (1, now[0]), (8, 8), textcoords="offset points", fontweight="bold")
+    style.key(figure, [Line2D([], [], color=colour, marker="o", ms=3, label=name) for name, colour in LINKS.items()])
+    axes.set(xlabel="budget, as a multiple of this one", ylabel="error")
+    axes.grid(axis="y")
+    return figure
+
+
+@style.styled
+def marginal_values(both: Sequence[Row], links: Mapping[str, Row]) -> Figure:
+    """Return what 1,000 MB more of each link save, at multiples of both budgets."""
+    figure = style.canvas(WIDTH, 0.8 * WIDTH)
+    axes = figure.add_subplot()
+    handles = []
+    for name, colour in zip(links, (style.BLUE, style.VERMILLION), strict=True):
+        saved = [point["marginal_error_per_gb"][f"{name}_mb"] for point in both]
+        handles += axes.plot([point["factor"] for point in both], saved, color=colour, marker="o", ms=3, label=name)
+    axes.axvline(1, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
+    style.key(figure, handles)
+    axes.set(xlabel="both budgets, as a multiple of these", ylabel="error saved by 1,000 MB more", ylim=(0, None))
+    axes.grid(axis="y")
+    return figure
