@@ -48,6 +48,14 @@ def test_a_graph_is_planned_down_to_its_vehicles(capsys):
     assert "car 4" in capsys.readouterr().out
 
 
+def test_out_is_a_page_that_tells_the_plan(tmp_path, capsys):
+    assert called("allocate", RECIPES[0], "--json", "--out", tmp_path / "plan.html") == 0
+    plan = json.loads(capsys.readouterr().out)
+    page = (tmp_path / "plan.html").read_text()
+    assert f"{plan['objective']:.4f}" in page
+    assert f"<td>{plan['tasks'][0]['samples']:,}</td>" in page
+
+
 def test_links_too_slow_for_the_plan_are_infeasible(tmp_path, capsys):
     values = yaml.safe_load((RECIPES[0].parents[1] / "graphs" / "three_layers.yaml").read_text())
     (tmp_path / "graph.yaml").write_text(yaml.safe_dump(values | {"horizon_s": 60}))

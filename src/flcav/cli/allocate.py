@@ -26,6 +26,7 @@ def allocate(
         ..., help="YAML: budgets, sizes, limits and learning curves of every task; or a three-layer graph."
     ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
+    out: Path | None = typer.Option(None, "--out", help="Write a page about the plan (HTML): where megabytes go, why."),
 ) -> None:
     """Split both uplink budgets over tasks and training stages so that the weighted error is least."""
     from flcav.optimization import allocation
@@ -40,6 +41,11 @@ def allocate(
         if as_json:
             typer.echo(json.dumps({"status": "infeasible", "message": str(error)}))
         raise
+    if out is not None:
+        from flcav.experiments.plan_page import plan_page
+        from flcav.files import write_bytes
+
+        write_bytes(out, plan_page(asked, plan, shares).encode())
     if as_json:
         typer.echo(json.dumps(_as_json(plan, shares)))
     else:

@@ -110,8 +110,9 @@ def _sentences(values: Mapping[str, Any], both: Sequence[BudgetPoint]) -> dict[s
 
 
 def _proof(values: Mapping[str, Any]) -> str:
-    bound = f"no plan within these budgets can have less than {values['lower_bound']:.4f}"
-    return f"This is proven: {bound}, {values['gap']:.3%} below." if values["gap"] > 0 else f"This is proven: {bound}."
+    bound = f"no plan within these budgets has less than {values['lower_bound']:.6g}"
+    near = f", and this one has at most {100 * values['gap']:.2g} % more" if values["gap"] > 0 else ""
+    return f"This is proven: {bound}{near}."
 
 
 def _link(name: str, link: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ Row = Mapping[str, Any]
 
 TASKS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION, style.RULE)
 SHADES = {"samples": 1.0, "edge rounds": 0.62, "cloud rounds": 0.32}  # opacity by stage
-LINKS = {"both links": style.INK, "wireless alone": style.BLUE, "wireline alone": style.VERMILLION}
+LINKS = {"both links": style.RULE, "wireless alone": style.BLUE, "wireline alone": style.VERMILLION}
 
 
 @style.styled
@@ -33,7 +33,9 @@ def megabytes(parts: Sequence[Row], links: Mapping[str, Row]) -> Figure:
             shade = {"color": colours[row["task"]], "alpha": SHADES[row["stage"]]}
             axes.barh(y, row["mb"], left=left, height=0.44, edgecolor="white", linewidth=1.0, **shade)
             if row["mb"] > 0.09 * widest:
-                axes.text(left + row["mb"] / 2, y, f"{row['mb']:,.0f}", ha="center", va="center_baseline", fontsize=9)
+                ink = "white" if row["stage"] == "samples" and row["task"] == tasks[0] else style.INK
+                place = {"ha": "center", "va": "center_baseline", "fontsize": style.SMALL}
+                axes.text(left + row["mb"] / 2, y, f"{row['mb']:,.0f}", color=ink, **place)
             left += row["mb"]
         axes.plot([link["budget_mb"]] * 2, [y - 0.32, y + 0.32], color=style.INK, linewidth=2)
         note = f"{left:,.0f} of {link['budget_mb']:,.0f} MB"
@@ -51,13 +53,19 @@ def error_by_budget(sweep: Mapping[str, Sequence[Row]]) -> Figure:
     """Return the best error at multiples of the budgets, scaled together and one at a time."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
     axes = figure.add_subplot()
+    widths = dict(zip(LINKS, (5.0, 1.6, 1.6), strict=True))  # lines that coincide are both seen
     for name, colour in LINKS.items():
         points = sweep[name]
-        axes.plot([p["factor"] for p in points], [p["objective"] for p in points], color=colour, marker="o", ms=3)
+        line = {"color": colour, "linewidth": widths[name], "marker": "o", "markersize": widths[name] + 1.5}
+        axes.plot([p["factor"] for p in points], [p["objective"] for p in points], **line)
     now = [p["objective"] for p in sweep["both links"] if p["factor"] == 1]
     axes.plot([1] * len(now), now, "o", color=style.INK, markersize=8, markeredgecolor="white")
     axes.annotate("this plan", (1, now[0]), (8, 8), textcoords="offset points", fontweight="bold")
-    style.key(figure, [Line2D([], [], color=colour, marker="o", ms=3, label=name) for name, colour in LINKS.items()])
+    style.key(
+        figure,
+        [Line2D([], [], color=colour, linewidth=widths[name], label=name) for name, colour in LINKS.items()],
+        columnspacing=1.0,
+    )
     axes.set(xlabel="budget, as a multiple of this one", ylabel="error")
     axes.grid(axis="y")
     return figure
