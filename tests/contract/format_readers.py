@@ -154,16 +154,17 @@ def _x_to_world(pose: list[float]) -> NDArray:
 def mcap(out: Path) -> dict[str, Seen]:
     seen = {}
     for path in sorted(out.glob("*.mcap")):
-        frames = defaultdict(lambda: defaultdict(dict))
+        messages = defaultdict(list)
         with path.open("rb") as file:
-            for _, channel, message, decoded in make_reader(
-                file, decoder_factories=[_Decoder()]
-            ).iter_decoded_messages():
+            reader = make_reader(file, decoder_factories=[_Decoder()])
+            for _, channel, message, decoded in reader.iter_decoded_messages():
                 agent, topic = channel.topic[1:].split("/", 1)
-                frames[agent][message.log_time][topic] = decoded
-        for agent, times in frames.items():
-            for index, time in enumerate(sorted(times)):
-                seen[f"{path.stem}_{index:04d}_{agent}"] = _mcap_frame(agent, times[time])
+                messages[agent].append((message.log_time, topic, decoded))
+        for agent, logged in messages.items():
+            spins = sorted(time for time, topic, _ in logged if topic == "objects")
+            for index, spin in enumerate(spins):
+                near = [(time, topic, decoded) for time, topic, decoded in logged if abs(time - spin) <= 100e6]
+                seen[f"{path.stem}_{index:04d}_{agent}"] = _mcap_frame(spin, near)
     return seen
 
 
@@ -174,20 +175,26 @@ class _Decoder(DecoderFactory):
         return json.loads if message_encoding == "json" else super().decoder_for(message_encoding, schema)
 
 
-def _mcap_frame(agent: str, topics: dict) -> Seen:
-    parent = {item.child_frame_id: (item.parent_frame_id, item) for item in topics["tf"].transforms}
+def _mcap_frame(spin: int, messages: list) -> Seen:
+    topics = {topic: decoded for _, topic, decoded in messages if topic != "tf"}
+    parent = {
+        (item.timestamp.ToNanoseconds(), item.child_frame_id): (item.parent_frame_id, item)
+        for _, topic, decoded in messages
+        if topic == "tf"
+        for item in decoded.transforms
+    }
 
-    def world_from(frame_id: str) -> NDArray:
+    def world_from(frame_id: str, time: int) -> NDArray:
         out = np.eye(4)
-        while frame_id != "world":
-            frame_id, item = parent[frame_id]
+        while frame_id != "world":  # mounts are known from the spin on, the agent moves
+            frame_id, item = parent.get((time, frame_id)) or parent[spin, frame_id]
             out = _matrix(item.translation, item.rotation) @ out
         return out
 
     cloud = topics["lidar/points"]
     assert [field.name for field in cloud.fields] == ["x", "y", "z", "intensity"]
     points = np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_stride // 4)
-    lidar_from_world = np.linalg.inv(world_from(cloud.frame_id))
+    lidar_from_world = np.linalg.inv(world_from(cloud.frame_id, cloud.timestamp.ToNanoseconds()))
     boxes, labels = [], []
     for entity in topics["objects"].entities:
         assert entity.frame_id == "world"
@@ -202,7 +209,8 @@ def _mcap_frame(agent: str, topics: dict) -> Seen:
             calibration = topics[topic.replace("/image", "/calibration")]
             pixels = np.asarray(Image.open(BytesIO(message.data)))
             assert pixels.shape[:2] == (calibration.height, calibration.width)
-            camera_from_lidar = np.linalg.inv(world_from(message.frame_id)) @ np.linalg.inv(lidar_from_world)
+            world_from_camera = world_from(message.frame_id, message.timestamp.ToNanoseconds())
+            camera_from_lidar = np.linalg.inv(world_from_camera) @ np.linalg.inv(lidar_from_world)
             images.append((pixels, np.array(calibration.P).reshape(3, 4) @ camera_from_lidar))
     return Seen(Boxes.from_array(boxes, labels), points, images)
 

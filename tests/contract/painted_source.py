@@ -84,7 +84,8 @@ class PaintedSource:
         world_from_agent = pose(float(x), float(y), yaw=float(rng.uniform(-3, 3)))
         boxes = Boxes.from_array(LOCAL, CATEGORIES).transformed(world_from_agent)
         cameras = ["front", "back"] if self.cameras and agent == "cav0" else []
-        pictures = {name: _picture(boxes, world_from_agent @ MOUNTS[name]) for name in cameras}
+        triggered = {name: world_from_agent @ pose(0.4, 0.03, yaw=0.02) for name in cameras}
+        pictures = {name: _picture(boxes, triggered[name] @ MOUNTS[name]) for name in cameras}
         lidar = _points(boxes, world_from_agent @ MOUNTS["lidar"], rng)
         radar = np.column_stack([rng.uniform(low, high, 4) for low, high in RADAR_RANGES]).astype(np.float32)
         names = ["lidar", *cameras, "radar", "gnss", "imu"] if agent == "cav0" else ["lidar"]
@@ -92,6 +93,7 @@ class PaintedSource:
             {name: MOUNTS[name] for name in names},
             intrinsics=dict.fromkeys(cameras, INTRINSICS),
             distortion=dict.fromkeys(cameras, np.zeros(5)),
+            offset_ms=dict.fromkeys(cameras, 40.0),
         )
         return Frame(
             scene=scene,
@@ -116,6 +118,7 @@ class PaintedSource:
             images={name: picture.image for name, picture in pictures.items()},
             radar={"radar": radar} if agent == "cav0" else {},
             gnss={"gnss": np.array([49.001, 8.402, 113.5])} if agent == "cav0" else {},
+            agent_at_trigger=triggered,
             imu={"imu": np.array([0.1, -0.2, 9.81, 0.01, 0.02, -0.03])} if agent == "cav0" else {},
         )
 

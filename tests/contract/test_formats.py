@@ -22,6 +22,7 @@ from flcav.geometry import inverse, points_in_boxes, wrap_angle
 from flcav.sensors.frame import Frame
 
 SCENES = 3  # of which the last validates
+BRUSH_PX = 1.5  # pillow paints so far beyond the edges of a polygon
 KITTI = ["Car", "Van", "Truck", "Truck", "Cyclist", "Cyclist", "Pedestrian", "Car", "Car"]
 NUSCENES = ["car", "car", "truck", "bus.rigid", "motorcycle", "bicycle"]
 NAMES = {
@@ -125,7 +126,7 @@ def test_boxes_project_onto_their_pixels(name: str, dataset: Dataset, seen: dict
                 projected = np.column_stack((corners, np.ones(8))) @ projection.T
                 assert (projected[:, 2] > 0).all()
                 hull = MultiPoint(projected[:, :2] / projected[:, 2:]).convex_hull
-                assert all(hull.distance(Point(pixel)) < 1 for pixel in zip(u, v))
+                assert all(hull.distance(Point(pixel)) < BRUSH_PX for pixel in zip(u, v))
                 views = next(view for view in source.annotations.views.values() if view.pixels[row])
                 if views.occlusion[row] + views.truncation[row] == 0:
                     assert len(u) > 0.9 * hull.area

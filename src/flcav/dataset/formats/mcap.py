@@ -34,6 +34,7 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 from numpy.typing import NDArray
 
+from flcav.dataset.formats.colours import COLOURS, OTHER
 from flcav.dataset.formats.exporter import ExportOptions
 from flcav.dataset.formats.images import png
 from flcav.dataset.formats.mounts import quaternion
@@ -45,15 +46,6 @@ from flcav.sensors.frame import Frame
 LIDAR_FIELDS = ("x", "y", "z", "intensity")
 RADAR_FIELDS = ("x", "y", "z", "range_m", "azimuth_rad", "elevation_rad", "doppler_m_s", "rcs_dbsm")
 IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^2], [rad/s], body frame
-COLOURS = {  # red, green, blue of a box
-    "car": (0.20, 0.55, 0.95),
-    "van": (0.10, 0.75, 0.80),
-    "truck": (0.95, 0.55, 0.15),
-    "bus": (0.90, 0.75, 0.10),
-    "motorcycle": (0.75, 0.35, 0.90),
-    "bicycle": (0.45, 0.80, 0.30),
-    "pedestrian": (0.95, 0.30, 0.40),
-}
 
 
 def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
@@ -117,7 +109,10 @@ def messages(frame: Frame) -> Iterator[tuple[str, Message | dict[str, Any], floa
     def of(sensor: str) -> float:
         return float(true.offset_ms.get(sensor, 0.0))
 
-    yield "tf", _transforms(frame, spin), 0.0
+    mounts = [(frame.agent, f"{frame.agent}/{name}", mount) for name, mount in true.agent_from_sensor.items()]
+    yield "tf", _transforms([("world", frame.agent, frame.world_from_agent), *mounts], spin), 0.0
+    for name, world_from_agent in frame.agent_at_trigger.items():
+        yield "tf", _transforms([("world", frame.agent, world_from_agent)], stamp[name]), of(name)
     for name, points in frame.lidar.items():
         yield f"{name}/points", _cloud(points, LIDAR_FIELDS, **place(name)), of(name)
     for name, picture in frame.images.items():
@@ -162,10 +157,8 @@ def _cloud(points: NDArray[np.float32], names: tuple[str, ...], **place: Any) ->
     return PointCloud(**place, pose=_pose(np.eye(4)), point_stride=4 * len(names), fields=fields, data=data)
 
 
-def _transforms(frame: Frame, stamp: Timestamp) -> FrameTransforms:
-    sensors = frame.calibration.agent_from_sensor.items()
-    tree = [("world", frame.agent, frame.world_from_agent)]
-    tree += [(frame.agent, f"{frame.agent}/{name}", mount) for name, mount in sensors]
+def _transforms(tree: list[tuple[str, str, NDArray[np.float64]]], stamp: Timestamp) -> FrameTransforms:
+    """Return parent, child and (4, 4) parent_from_child as one message."""
     return FrameTransforms(
         transforms=[
             FrameTransform(
@@ -185,7 +178,7 @@ def _scene_update(frame: Frame, stamp: Timestamp) -> SceneUpdate:
     boxes = truth.boxes
     entities = []
     for i, label in enumerate(boxes.label.tolist()):
-        red, green, blue = COLOURS.get(label, (0.6, 0.6, 0.6))
+        red, green, blue = COLOURS.get(label, OTHER)
         cube = CubePrimitive(
             pose=_pose(pose(*boxes.center[i], yaw=boxes.yaw[i])),
             size=Vector3(**dict(zip("xyz", boxes.size[i].tolist()))),

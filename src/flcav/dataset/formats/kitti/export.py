@@ -75,7 +75,7 @@ def _write_frame(frame: Frame, camera: str, folder: Path, number: str) -> int:
         folder / "calib" / f"{number}.txt",
         calibration_lines(
             frame.calibration.intrinsics[camera],
-            camera_from_lidar=inverse(mounts[camera]) @ mounts[lidar],
+            camera_from_lidar=inverse(frame.world_from_sensor(camera)) @ frame.world_from_sensor(lidar),
             lidar_from_imu=inverse(mounts[lidar]) @ mounts.get(next(iter(frame.imu), ""), np.eye(4)),
         ),
     )

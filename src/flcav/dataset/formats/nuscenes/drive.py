@@ -80,9 +80,8 @@ class Drive:
             "camera_intrinsic": [] if picture is None else true.intrinsics[name].tolist(),
         }
         own = token(self.name, channel, frame.index)
-        self.poses.append(
-            {"token": own, "timestamp": stamp, **_placed(self.global_from_world @ frame.world_from_agent)}
-        )
+        world_from_agent = frame.agent_at_trigger.get(name, frame.world_from_agent)
+        self.poses.append({"token": own, "timestamp": stamp, **_placed(self.global_from_world @ world_from_agent)})
         self.data[channel].append(
             {
                 "token": own,
