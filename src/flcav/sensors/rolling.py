@@ -14,6 +14,7 @@ from flcav.geometry import inverse
 from flcav.world.scene import Scene
 
 SECTORS = 36
+ROUNDING = 1e-6  # of a turn: what looks straight back belongs to the beginning of the spin, not to its end
 
 
 def sectors(
@@ -42,5 +43,5 @@ def sectors(
 
 def time_in_spin_s(points: NDArray[np.float32], spin_s: float) -> NDArray[np.float32]:
     """Return when each point (N, >=2) of a spin, in the sensor's frame, was measured: (N,) [s] after its middle."""
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    return (azimuth * (spin_s / (2 * np.pi))).astype(np.float32)
+    turned = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+    return (((turned + ROUNDING) % 1.0 - 0.5) * spin_s).astype(np.float32)

@@ -181,5 +181,5 @@ def test_rigs_fit_what_carries_them():
     assert roadside.settings.channels == 64
     with pytest.raises(InputError, match=r"lidars\.roof\.settings\.range_m"):
         parse_config(Rig, {"lidars": {"roof": {"settings": {"range_m": -1}}}}, "recipe.yaml")
-    with pytest.raises(InputError, match="field 'lidars'"):
+    with pytest.raises(InputError, match="at least one LiDAR"):
         parse_config(Rig, {"lidars": {}}, "recipe.yaml")
