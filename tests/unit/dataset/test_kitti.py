@@ -1,13 +1,23 @@
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from flcav.config import InputError
-from flcav.dataset.formats.kitti import Calibration, read_calibration, read_labels, read_points
+from flcav.dataset.formats.kitti import (
+    Calibration,
+    KittiFolder,
+    read_calibration,
+    read_labels,
+    read_objects,
+    read_points,
+)
 from flcav.geometry import points_in_boxes
 
 CALIBRATION = """P2: 700 0 600 45 0 700 180 0.2 0 0 1 0.003
@@ -116,6 +126,75 @@ def test_what_is_no_label(tmp_path: Path, calibration: Calibration, text: str):
         read_labels(tmp_path / "label.txt", calibration)
 
 
+LABEL = "Car 0.10 1 -0.5 10 20 50 60 1.5 1.7 4 1 2 20 0.5\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two frames in KITTI's layout, the second of them in the list `val`."""
+    root = tmp_path / "kitti"
+    for part in ("calib", "velodyne", "image_2", "label_2"):
+        (root / "training" / part).mkdir(parents=True)
+    for name in ("000000", "000001"):
+        (root / "training" / "calib" / f"{name}.txt").write_text(CALIBRATION)
+        np.ones((3, 4), np.float32).tofile(root / "training" / "velodyne" / f"{name}.bin")
+        Image.new("RGB", (100, 80), (1, 2, 3)).save(root / "training" / "image_2" / f"{name}.png")
+        (root / "training" / "label_2" / f"{name}.txt").write_text(LABEL)
+    (root / "ImageSets").mkdir()
+    (root / "ImageSets" / "val.txt").write_text("000001\n")
+    return root
+
+
+def test_a_folder_is_read_frame_by_frame(folder: Path):
+    assert KittiFolder.open(folder).names == ["000000", "000001"]
+    kitti = KittiFolder.open(folder, "val")
+    assert len(kitti) == 1
+    frame = kitti.frame(0)
+    assert (frame.name, frame.points.shape, frame.image.shape) == ("000001", (3, 4), (80, 100, 3))
+    assert frame.image[0, 0].tolist() == [1, 2, 3]
+    objects = frame.objects
+    assert (objects.truncation[0], objects.occlusion[0], objects.alpha[0]) == (0.1, 1, -0.5)
+    assert objects.rectangle.tolist() == [[10, 20, 50, 60]]
+
+
+def _replace(part: str, old: str, new: str) -> Callable[[Path], None]:
+    def damage(root: Path) -> None:
+        path = root / part
+        path.write_text(path.read_text().replace(old, new))
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda root: shutil.rmtree(root / "training"), "no KITTI folder; it holds no 'training'"),
+        (lambda root: (root / "training" / "calib" / "000001.txt").unlink(), r"calib/000001\.txt: missing"),
+        (lambda root: (root / "ImageSets" / "val.txt").unlink(), r"val\.txt: no such list"),
+        (_replace("ImageSets/val.txt", "000001", "000001\n000001"), "names a frame twice"),
+        (_replace("ImageSets/val.txt", "000001", "000007"), r"calib/000007\.txt: missing"),
+        (_replace("training/label_2/000001.txt", "Car", "Lorry"), "unknown class 'Lorry'; KITTI has Car"),
+        (_replace("training/label_2/000001.txt", " 50 60", " 150 60"), "object 1 has a rectangle .* of 100 x 80"),
+        (_replace("training/label_2/000001.txt", " 10 20", " 51 20"), "object 1 has a rectangle"),
+        (_replace("training/label_2/000001.txt", "0.10", "1.10"), "object 1 has a truncation outside 0 to 1"),
+        (_replace("training/label_2/000001.txt", "0.10 1 ", "0.10 4 "), "object 1 has an occlusion"),
+        (_replace("training/label_2/000001.txt", "1.7", "0.0"), "object 1 has a size that is not positive"),
+        (lambda root: (root / "training" / "image_2" / "000001.png").write_text("no"), r"000001\.png: not an image"),
+    ],
+)
+def test_what_is_wrong_in_a_folder_is_one_sentence(folder: Path, damage: Callable[[Path], None], message: str):
+    damage(folder)
+    with pytest.raises(InputError, match=message):
+        KittiFolder.open(folder, "val").frame(0)
+
+
+def test_regions_nobody_cares_about_are_in_no_column(tmp_path: Path, calibration: Calibration):
+    (tmp_path / "label.txt").write_text(LABEL + LABEL.replace("Car", "DontCare"))
+    objects = read_objects(tmp_path / "label.txt", calibration)
+    assert objects.boxes.label.tolist() == ["Car"]
+    assert [len(part) for part in (objects.truncation, objects.occlusion, objects.alpha, objects.rectangle)] == [1] * 4
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"the real KITTI frame is not at {REAL}; set FLCAV_REAL_DATA")
 def test_the_boxes_of_the_real_frame_hold_its_points():
     frame = REAL / "training"
@@ -129,3 +208,18 @@ def test_the_boxes_of_the_real_frame_hold_its_points():
     assert inside[distance < 9].min() > 500, inside
     bottom = boxes.center[:, 2] - boxes.size[:, 2] / 2
     assert ((bottom > -2.2) & (bottom < -1.3)).all(), bottom
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"the real KITTI frame is not at {REAL}; set FLCAV_REAL_DATA")
+def test_the_real_frame_is_a_whole_folder_and_its_points_project_onto_their_objects():
+    kitti = KittiFolder.open(REAL)
+    assert kitti.names == ["000008"]
+    frame = kitti.frame(0)
+    assert frame.image.shape == (375, 1242, 3)
+    inside = points_in_boxes(frame.points, frame.objects.boxes)
+    for points, (left, top, right, bottom) in zip(inside, frame.objects.rectangle):
+        lidar = np.column_stack((frame.points[points, :3], np.ones(points.sum())))
+        projected = lidar @ (frame.calibration.image_from_camera @ frame.calibration.camera_from_lidar).T
+        u, v = projected[:, 0] / projected[:, 2], projected[:, 1] / projected[:, 2]
+        within = (u > left - 5) & (u < right + 5) & (v > top - 5) & (v < bottom + 5)
+        assert within.mean() > 0.95
