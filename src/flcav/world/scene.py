@@ -60,13 +60,22 @@ class Scene:
         self.index, self.offset_s = index, offset_s
         self._place()
 
+    def poses(self) -> NDArray[np.float64]:
+        """Return (A, 4) x, y, z, yaw of every actor at the scene's time; NaN where absent."""
+        trace, i, dt = self.trace, self.index, self.offset_s
+        position, yaw = trace.position[i], trace.yaw[i]
+        if dt:
+            position = position + dt * trace.velocity[i] + dt**2 / 2 * trace.acceleration[i]
+            yaw = yaw + dt * trace.yaw_rate[i]
+        return np.concatenate((position, yaw[:, None]), axis=1)
+
     def world_from_actor(self, actor: int) -> NDArray[np.float64]:
         """Return the (4, 4) pose of an actor that is present; its origin is the ground centre."""
-        return pose(*self._poses()[actor])
+        return pose(*self.poses()[actor])
 
     def world_from_instance(self) -> NDArray[np.float64]:
         """Return the instances' (I, 3, 3) rotations; the identity for the town and for absent actors."""
-        return _turned(np.concatenate(([0.0], np.nan_to_num(self._poses()[:, 3]))))
+        return _turned(np.concatenate(([0.0], np.nan_to_num(self.poses()[:, 3]))))
 
     def cast(
         self,
@@ -114,17 +123,8 @@ class Scene:
             self._hidden = hidden
             self._place()
 
-    def _poses(self) -> NDArray[np.float64]:
-        """Return (A, 4) x, y, z, yaw."""
-        trace, i, dt = self.trace, self.index, self.offset_s
-        position, yaw = trace.position[i], trace.yaw[i]
-        if dt:
-            position = position + dt * trace.velocity[i] + dt**2 / 2 * trace.acceleration[i]
-            yaw = yaw + dt * trace.yaw_rate[i]
-        return np.concatenate((position, yaw[:, None]), axis=1)
-
     def _place(self) -> None:
-        wanted = np.where(self.trace.present[self.index, :, None], self._poses(), np.nan)
+        wanted = np.where(self.trace.present[self.index, :, None], self.poses(), np.nan)
         if self._hidden is not None:
             wanted[self._hidden] = np.nan
         same = (wanted == self._placed) | np.isnan(wanted) & np.isnan(self._placed)

@@ -1,0 +1,106 @@
+"""A radar's detector: what resolution cells hold, how loud that is, and what exceeds the noise.
+
+The radar equation gives each cell's signal-to-noise ratio, S = K g(direction) sigma L(rain) / r^4, with g the two-way
+antenna gain. A cell fluctuates as Swerling's case 1: its measured power, in units of the noise, is exponential with
+mean 1 + S and is reported above T = -ln(P_fa); so a target is detected with the probability P_fa^(1 / (1 + S))
+(Richards, "Fundamentals of Radar Signal Processing", section 6.3). Errors of a reported value shrink with the square
+root of the power.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.config import Config
+
+Array = NDArray[np.float64]
+
+REFERENCE_M2 = 10.0  # of the target that `detects_car_m` speaks of
+EDGE_DB = 6.0  # two-way gain at the edge of the field of view, below that ahead
+SPLIT = 1.6  # how many times finer than a cell a value is read at a signal-to-noise ratio of 1/2 (Barton)
+RAIN_DB = (1.13, 0.718)  # k, a of k R^a [dB/km] at 77 GHz: ITU-R P.838-3
+
+
+class Radar(Config):
+    """What a radar is built like; the defaults are those of a front radar of a car."""
+
+    range_m: float = Field(default=120.0, gt=0, le=500)
+    azimuth_deg: float = Field(default=120.0, gt=0, le=170)  # field of view, whole
+    elevation_deg: float = Field(default=20.0, gt=0, le=90)
+    speed_m_s: float = Field(default=70.0, gt=0)  # Doppler measured up to here, either way
+    range_cell_m: float = Field(default=0.4, gt=0)
+    azimuth_cell_deg: float = Field(default=2.0, gt=0)
+    elevation_cell_deg: float = Field(default=5.0, gt=0)
+    doppler_cell_m_s: float = Field(default=0.2, gt=0)
+    detects_car_m: float = Field(default=150.0, gt=0)  # 10 dBsm ahead are detected half the time at this range
+    false_alarm_rate: float = Field(default=1e-6, gt=0, lt=0.1)  # of one cell in one sweep
+
+    def resolution(self) -> Array:
+        """Return (4,) a cell's range [m], azimuth [rad], elevation [rad] and Doppler [m/s]."""
+        angles = np.radians((self.azimuth_cell_deg, self.elevation_cell_deg))
+        return np.array((self.range_cell_m, *angles, self.doppler_cell_m_s))
+
+    def extent(self) -> Array:
+        """Return (4, 2) lowest and highest range [m], azimuth [rad], elevation [rad] and Doppler [m/s]."""
+        azimuth, elevation = np.radians((self.azimuth_deg, self.elevation_deg)) / 2
+        limits = ((0.0, self.range_m), (-azimuth, azimuth), (-elevation, elevation), (-self.speed_m_s, self.speed_m_s))
+        return np.array(limits)
+
+
+class Cells(NamedTuple):
+    """What the resolution cells that hold anything hold."""
+
+    values: Array  # (C, 4) range, azimuth, elevation, Doppler: means weighted by cross-section
+    sigma: Array  # (C,) [m^2]
+    actor: NDArray[np.int64]  # (C,) the loudest; -1 for the town
+
+
+def resolve(values: Array, sigma: Array, actor: NDArray[np.int32], radar: Radar) -> Cells:
+    """Return the cells in which echoes fall: (N, 4) range, azimuth, elevation, Doppler, (N,) [m^2] and (N,) actors."""
+    low = radar.extent()[:, 0]
+    key = np.floor((values - low) / radar.resolution()).astype(np.int64)
+    order = np.lexsort((-sigma, *key.T))  # the loudest of a cell first
+    values, sigma, key = values[order], sigma[order], key[order]
+    fresh = np.ones(len(key), bool)
+    fresh[1:] = (key[1:] != key[:-1]).any(axis=1)
+    starts = np.flatnonzero(fresh)
+    total = np.add.reduceat(sigma, starts) if len(starts) else sigma
+    weighted = np.add.reduceat(values * sigma[:, None], starts) if len(starts) else values
+    return Cells(weighted / np.maximum(total, 1e-30)[:, None], total, actor[order][starts].astype(np.int64))
+
+
+def snr_per_m2(radar: Radar, values: Array, rain_mm_h: float) -> Array:
+    """Return (N,) the signal-to-noise ratio of 1 m^2 at `values` (N, >=3) range, azimuth, elevation."""
+    threshold = -np.log(radar.false_alarm_rate)
+    at_reference = threshold / np.log(2) - 1  # detected half the time
+    gain_db = -EDGE_DB * ((values[:, 1:3] / radar.extent()[1:3, 1]) ** 2).sum(axis=1)
+    distance = np.maximum(values[:, 0], radar.range_cell_m)
+    k, a = RAIN_DB
+    loss_db = 2 * distance / 1e3 * k * rain_mm_h**a
+    return at_reference / REFERENCE_M2 * (radar.detects_car_m / distance) ** 4 * 10 ** ((gain_db - loss_db) / 10)
+
+
+def detect(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
+    """Return (M, 5) what is reported of the cells that are detected, and (M,) their actors."""
+    per_m2 = snr_per_m2(radar, cells.values, rain_mm_h)
+    power = (1 + per_m2 * cells.sigma) * rng.standard_exponential(len(per_m2))
+    found = power > -np.log(radar.false_alarm_rate)
+    power = power[found]
+    values = cells.values[found]
+    values = values + rng.standard_normal(values.shape) * radar.resolution() / (SPLIT * np.sqrt(2 * power))[:, None]
+    low, high = radar.extent().T
+    inside = ((values >= low) & (values <= high)).all(axis=1)
+    reported = np.column_stack((values, 10 * np.log10(power / per_m2[found])))
+    return reported[inside], cells.actor[found][inside]
+
+
+def false_alarms(radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> Array:
+    """Return (M, 5) reports of cells where nothing but noise exceeds the threshold."""
+    low, high = radar.extent().T
+    cells = np.prod(np.ceil((high - low) / radar.resolution()))
+    count = rng.poisson(cells * radar.false_alarm_rate)
+    values = rng.uniform(low, high, (count, 4))
+    power = -np.log(radar.false_alarm_rate) + rng.standard_exponential(count)
+    return np.column_stack((values, 10 * np.log10(power / snr_per_m2(radar, values, rain_mm_h))))
