@@ -17,7 +17,7 @@ from flcav.dataset.layout import FrameKey
 from flcav.dataset.leakage import leaks
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.dataset.tables import write_table
+from flcav.dataset.tables import FILES_SCHEMA, write_table
 from flcav.dataset.validate import check_order, validate
 from flcav.files import sha256, write_json
 from flcav.sources.embedded import EmbeddedSource
@@ -44,10 +44,15 @@ def folder(recorded: Path, tmp_path: Path) -> Path:
 def resign(folder: Path, drop: str | None = None) -> None:
     """Make the manifest say that the folder is as it should be; without the file `drop`."""
     manifest = json.loads((folder / "manifest.json").read_text())
+    files = pq.read_table(folder / "files.parquet").to_pylist()
     if drop is not None:
         (folder / drop).unlink()
-        del manifest["files"][drop]
-    for name, entry in manifest["files"].items():
+        files = [entry for entry in files if entry["path"] != drop]
+    for entry in files:
+        path = folder / entry["path"]
+        entry |= {"bytes": path.stat().st_size, "sha256": sha256(path)}
+    write_table(pa.Table.from_pylist(files, schema=FILES_SCHEMA), folder / "files.parquet")
+    for name, entry in manifest["tables"].items():
         entry |= {"bytes": (folder / name).stat().st_size, "sha256": sha256(folder / name)}
     write_json(folder / "manifest.json", manifest)
 

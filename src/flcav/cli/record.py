@@ -33,8 +33,8 @@ def record(
     manifest = read_manifest(out)
     counts = manifest["counts"]
     done = "recorded" if written else "already recorded, nothing to do:"
-    size_mb = sum(entry["bytes"] for entry in manifest["files"].values()) / 1e6
+    size_mb = (counts["payload_bytes"] + sum(entry["bytes"] for entry in manifest["tables"].values())) / 1e6
     typer.echo(
         f"{out}: {done} {counts['frames']} frames of {counts['scenes']} scenes, "
-        f"{counts['annotations']} annotations, {counts['points']} points, {size_mb:.1f} MB"
+        f"{counts['annotations']} annotations, {counts['points']} points, {counts['images']} images, {size_mb:.1f} MB"
     )

@@ -10,10 +10,11 @@ from flcav.config import InputError
 
 FORMAT = 2
 MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
-CALIBRATION = "calibration.json"  # agent -> sensor -> agent_from_sensor, row by row
+CALIBRATION = "calibration.json"  # see `flcav.dataset.calibration`
+FILES = "files"  # table of the payload files: all that is neither a table, the calibration nor the manifest
 TRACES = "traces"
 WORK = ".recording"  # what a recording under way keeps; gone when it is done
-PACKAGES = ("flcav", "embreex", "libsumo", "numba", "numpy", "pyarrow")  # those that decide the bytes
+PACKAGES = ("flcav", "embreex", "libsumo", "numba", "numpy", "pillow", "pyarrow")  # those that decide the bytes
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,9 @@ def table_path(name: str) -> str:
     return f"{name}.parquet"
 
 
-def points_path(lidar: str, key: str) -> str:
-    """Return the file of one point cloud: (N, 4) little-endian float32 x, y, z [m], intensity; sensor frame."""
-    return f"{lidar}/{key}.bin"
+def payload_path(sensor: str, key: str, suffix: str) -> str:
+    """Return the file of what `sensor` measured in the frame `key`, in an encoding of `flcav.dataset.payloads`."""
+    return f"{sensor}/{key}.{suffix}"
 
 
 def trace_path(scene: str) -> str:
@@ -47,7 +48,7 @@ def package_versions() -> dict[str, str]:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Return a dataset's manifest; raises `InputError` where the folder holds no finished dataset."""
+    """Return a dataset's manifest; raises `InputError` where the folder holds no finished dataset of this format."""
     path = folder / MANIFEST
     if not folder.is_dir():
         raise InputError(f"{folder}: no such dataset folder")
@@ -58,9 +59,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise InputError(f"{path}: not JSON ({error})") from None
-    expected = {"format", "recipe", "versions", "counts", "scenes", "files"}
-    if not isinstance(manifest, dict) or not expected <= manifest.keys():
+    found = manifest.get("format") if isinstance(manifest, dict) else None
+    if isinstance(found, int) and found != FORMAT:
+        advice = "update flcav to read it" if found > FORMAT else "record it again from its recipe"
+        raise InputError(f"{path}: dataset format {found}, this version of flcav reads format {FORMAT}; {advice}")
+    expected = {"format", "recipe", "versions", "counts", "scenes", "tables"}
+    if found is None or not expected <= manifest.keys():
         raise InputError(f"{path}: not a dataset manifest; it must hold {', '.join(sorted(expected))}")
-    if manifest["format"] != FORMAT:
-        raise InputError(f"{path}: dataset format {manifest['format']}, this version of flcav reads format {FORMAT}")
     return manifest

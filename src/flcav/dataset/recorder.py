@@ -1,8 +1,8 @@
-"""Any source to a dataset folder: resumable, and the same bytes whatever the number of jobs.
+"""Any source to a dataset folder: resumable, and the same bytes whoever does the work.
 
-Everything is first written below the hidden `.recording`: a scene appears there when it is whole. When all have, their
-files move into the folder, their tables are joined, and the manifest comes last. An interruption at any point costs
-the scenes that were under way.
+Everything is first written below the hidden `.recording`: a part of a scene appears there when it is whole. When all
+have, their files move into the folder, their tables are joined, and the manifest comes last. An interruption at any
+point costs the parts that were under way.
 """
 
 import json
@@ -12,28 +12,33 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from flcav.config import InputError
 from flcav.dataset.layout import (
     CALIBRATION,
+    FILES,
     FORMAT,
     MANIFEST,
     WORK,
     package_versions,
     read_manifest,
     table_path,
+    trace_path,
 )
-from flcav.dataset.scenes import FILES
-from flcav.dataset.tables import SCHEMAS, read_table, write_table
-from flcav.dataset.workers import write_scenes
+from flcav.dataset.schedule import pending, record_scenes
+from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, join_tables, write_table
+from flcav.dataset.tasks import PAYLOADS, TRAFFIC, parts
+from flcav.dataset.workers import processes
 from flcav.files import sha256, write_json
 from flcav.progress import Report, silent
 from flcav.sources.source import Source
 
 HEADER = "recipe.json"
+JOINED = "joined"  # below `.recording`: what becomes of the parts
 
 
-def record(source: Source, out: Path, *, jobs: int = 1, progress: Report = silent) -> bool:
+def record(source: Source, out: Path, *, jobs: int = 1, engine: str = "processes", progress: Report = silent) -> bool:
     """Record `source` into the folder `out`; returns whether there was anything to do.
 
     False says that `out` already held this very dataset. A folder whose recording was interrupted is finished.
@@ -41,12 +46,14 @@ def record(source: Source, out: Path, *, jobs: int = 1, progress: Report = silen
     """
     if jobs < 1:
         raise InputError(f"jobs = {jobs}: must be at least 1")
+    if engine not in ENGINES:
+        raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
     header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))
     try:
         if not _claim(out, header):
             return False
-        _write(source, out, jobs, progress)
-        _assemble(out, list(source.scenes()), header)
+        _write(source, out / WORK, jobs, engine, progress)
+        _assemble(source, out, header)
     except OSError as error:
         if error.strerror and error.filename is None:  # a write does not know its file
             error.filename = str(out)
@@ -54,20 +61,21 @@ def record(source: Source, out: Path, *, jobs: int = 1, progress: Report = silen
     return True
 
 
-def _write(source: Source, out: Path, jobs: int, progress: Report) -> None:
-    """Write the scenes that are not there yet below `.recording`."""
-    work = out / WORK
-    counts = {scene: source.frame_count(scene) for scene in source.scenes()}
-    pending = [scene for scene in counts if not (work / scene).is_dir()]
-    total = sum(counts.values())
-    kept = total - sum(counts[scene] for scene in pending)
+ENGINES = {"processes": processes}
+
+
+def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report) -> None:
+    """Do what is left of the recording below `.recording`."""
+    total = sum(source.frame_count(scene) for scene in source.scenes())
+    missing = sum(part.frames for scene in source.scenes() for part in pending(source, scene, work))
     start = time.perf_counter()
 
     def wrote(count: int) -> None:
-        rate = count / (time.perf_counter() - start)
-        progress(kept + count, total, f"{rate:.1f} frames/s")
+        rate = count / max(time.perf_counter() - start, 1e-9)
+        progress(total - missing + count, total, f"{rate:.1f} frames/s")
 
-    write_scenes(source, pending, work, jobs, wrote)
+    with ENGINES[engine](source, work, jobs, wrote) as hands:
+        record_scenes(source, hands, work)
 
 
 def _claim(out: Path, header: dict[str, Any]) -> bool:
@@ -99,50 +107,71 @@ def _refuse_other(out: Path, what: str, held: dict[str, Any], wanted: dict[str, 
         raise InputError(f"{out}: {what} (different: {', '.join(different)}); record into another folder")
 
 
-def _assemble(out: Path, scenes: list[str], header: dict[str, Any]) -> None:
-    """Make the dataset of the scenes below `.recording`; may be repeated after an interruption."""
-    work = out / WORK
-    files: dict[str, dict[str, Any]] = {}
-    calibration: dict[str, Any] = {}
-    for scene in scenes:
-        part = work / scene
-        listing = json.loads((part / f"{FILES}.json").read_text())
-        for name in listing:
-            if (part / FILES / name).exists():
-                _move(part / FILES / name, out / name)
-        files |= listing
-        for agent, mounts in json.loads((part / CALIBRATION).read_text()).items():
-            if calibration.setdefault(agent, mounts) != mounts:
-                raise ValueError(f"{scene}: the sensors of {agent} are mounted otherwise than in another scene")
+def _assemble(source: Source, out: Path, header: dict[str, Any]) -> None:
+    """Make the dataset of the parts below `.recording`; may be repeated after an interruption."""
+    work, scenes = out / WORK, list(source.scenes())
+    joined = work / JOINED
+    joined.mkdir(exist_ok=True)
+    folders = [part.folder(work) for scene in scenes for part in parts(source, scene)]
+    listings = [listing for scene in scenes if (listing := _move_traffic(work / scene, scene, out))]
+    for folder in folders:
+        listings.append(folder / table_path(FILES))
+        for name in pq.ParquetFile(listings[-1]).read()["path"].to_pylist():
+            if (folder / PAYLOADS / name).exists():
+                _move(folder / PAYLOADS / name, out / name)
 
-    tables = {
-        name: pa.concat_tables([read_table(work / scene / table_path(name), name) for scene in scenes])
-        for name in SCHEMAS
+    join_tables(listings, FILES_SCHEMA, joined / table_path(FILES))
+    rows = {
+        name: join_tables([folder / table_path(name) for folder in folders], schema, joined / table_path(name))
+        for name, schema in SCHEMAS.items()
     }
-    for name, table in tables.items():
-        write_table(table, work / table_path(name))
-    write_json(work / CALIBRATION, calibration)
-    for name in (CALIBRATION, *map(table_path, SCHEMAS)):
-        path = work / name
-        files[name] = {"bytes": path.stat().st_size, "sha256": sha256(path)}
-        _move(path, out / name)
-
-    points = tables["frames"]["points"].combine_chunks().values
+    write_json(joined / CALIBRATION, _calibrations(folders))
+    names = (CALIBRATION, *map(table_path, (*SCHEMAS, FILES)))
     manifest = {
         "format": FORMAT,
         **header,
         "scenes": scenes,
         "counts": {
             "scenes": len(scenes),
-            "frames": len(tables["frames"]),
-            "annotations": len(tables["annotations"]),
-            "points": sum(points.to_pylist()),
+            "frames": rows["frames"],
+            "annotations": rows["annotations"],
+            "points": int(_values(joined / table_path("frames"), "points").to_numpy().sum()),
+            "images": len(_values(joined / table_path("frames"), "cameras")),
+            "payload_bytes": int(_values(joined / table_path(FILES), "bytes").to_numpy().sum()),
         },
-        "files": files,
+        "tables": {name: {"bytes": (joined / name).stat().st_size, "sha256": sha256(joined / name)} for name in names},
     }
+    for name in names:
+        _move(joined / name, out / name)
     write_json(work / MANIFEST, manifest)
     _move(work / MANIFEST, out / MANIFEST)
     shutil.rmtree(work)
+
+
+def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
+    """Move the traffic of a scene into the dataset and return its listing; None of a scene that has none."""
+    traffic, listing = folder / TRAFFIC, folder / table_path(FILES)
+    if traffic.exists():
+        values = [trace_path(scene)], [traffic.stat().st_size], [sha256(traffic)]
+        write_table(pa.table(dict(zip(FILES_SCHEMA.names, values)), schema=FILES_SCHEMA), listing)
+        _move(traffic, out / trace_path(scene))
+    return listing if listing.exists() else None
+
+
+def _calibrations(folders: list[Path]) -> dict[str, Any]:
+    """Return the calibrations of all agents in all parts."""
+    found: dict[str, Any] = {}
+    for folder in folders:
+        for agent, calibration in json.loads((folder / CALIBRATION).read_text()).items():
+            if found.setdefault(agent, calibration) != calibration:
+                raise ValueError(f"{folder.parent.name}: {agent} is calibrated otherwise than in another scene")
+    return found
+
+
+def _values(path: Path, column: str) -> pa.Array:
+    """Return the values of a column; of one of lists, their elements."""
+    values = pq.ParquetFile(path).read(columns=[column])[column].combine_chunks()
+    return values.flatten() if isinstance(values, pa.ListArray) else values
 
 
 def _move(source: Path, target: Path) -> None:

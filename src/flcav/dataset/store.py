@@ -1,41 +1,53 @@
 """A recorded dataset, read frame by frame in any order."""
 
-import json
-from collections.abc import Collection
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.layout import CALIBRATION, FrameKey, points_path, read_manifest, table_path
-from flcav.dataset.tables import SCHEMAS, annotations_of, read_table
-from flcav.sensors.frame import Calibration, Frame
+from flcav.dataset.calibration import Calibrations, read_calibrations
+from flcav.dataset.frames import annotations_of, vectors_of, weather_of
+from flcav.dataset.layout import CALIBRATION, FrameKey, payload_path, read_manifest, table_path, trace_path
+from flcav.dataset.payloads import INFRARED, PLANES, POINTS, RADAR, read_image, read_plane, read_rows
+from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, read_table
+from flcav.sensors.frame import CameraImage, Frame
+from flcav.world.trace import Trace
 
 POINT_BYTES = 16  # four float32
+NOT_IN_SAMPLE = ("ax", "ay", "az")  # columns of `annotations` that nobody learns from
+
+Value = TypeVar("Value")
 
 
 class Dataset:
-    """A dataset folder: tables in memory, point clouds read when asked for."""
+    """A dataset folder: tables in memory, what sensors measured is read when asked for."""
 
     def __init__(
-        self, folder: Path, manifest: dict[str, Any], calibration: dict[str, Any], tables: dict[str, pa.Table]
+        self,
+        folder: Path,
+        manifest: dict[str, Any],
+        calibrations: dict[str, Calibrations],
+        tables: dict[str, pa.Table],
+        first: dict[str, NDArray[np.int64]],
     ) -> None:
         self.folder = folder
         self.manifest = manifest
-        self.calibration = {
-            agent: Calibration({sensor: np.array(matrix).reshape(4, 4) for sensor, matrix in mounts.items()})
-            for agent, mounts in calibration.items()
-        }
+        self.calibrations = calibrations
         frames = tables["frames"].to_pydict()
         self.keys = [FrameKey(*fields) for fields in zip(*(frames[name] for name in FrameKey.__annotations__))]
         self._name: list[str] = frames["key"]
         self._lidar = [dict(zip(*counts)) for counts in zip(frames["lidar"], frames["points"])]
-        self._poses = np.array(tables["poses"]["world_from_agent"].to_pylist()).reshape(-1, 4, 4)
-        self._annotations = tables["annotations"]
-        self._first = np.concatenate(([0], np.cumsum(frames["annotations"]))).astype(int)
+        self._radar = [dict(zip(*counts)) for counts in zip(frames["radar"], frames["detections"])]
+        self._cameras: list[list[str]] = frames["cameras"]
+        self._infrared: list[list[str]] = frames["infrared"]
+        self._tables = tables
+        self._first = first
 
     @classmethod
     def open(cls, path: Path | str) -> "Dataset":
@@ -48,32 +60,66 @@ class Dataset:
             raise InputError(f"{folder / table_path('frames')}: the dataset is empty, it holds no frames")
         if not tables["poses"]["frame"].equals(frames["key"]):
             raise InputError(f"{folder / table_path('poses')}: its rows are not those of the frames")
-        expected = np.repeat(frames["key"].to_numpy(), frames["annotations"].to_numpy())
-        if not np.array_equal(tables["annotations"]["frame"].to_numpy(), expected):
+        first = {
+            name: _first_rows(table, frames, folder / table_path(name))
+            for name, table in tables.items()
+            if name not in ("frames", "poses")
+        }
+        if not np.array_equal(np.diff(first["annotations"]), frames["annotations"].to_numpy()):
             raise InputError(f"{folder / table_path('annotations')}: its rows are not those of the frames")
-        return cls(folder, manifest, _read_calibration(folder / CALIBRATION, frames), tables)
+        calibrations = read_calibrations(folder / CALIBRATION, _sensors(frames))
+        return cls(folder, manifest, calibrations, tables, first)
 
     def __len__(self) -> int:
         return len(self.keys)
 
     def frame(self, i: int) -> Frame:
-        """Return frame `i`; raises `InputError` where a point cloud is missing or not as long as the table says."""
-        key = self.keys[i]
+        """Return frame `i`; images are read when first asked for.
+
+        Raises `InputError` where a point cloud is missing or not as long as the table says; so does asking for images.
+        """
+        key, calibration = self.keys[i], self.calibrations[self.keys[i].agent]
+        poses = self._tables["poses"].slice(i, 1).to_pylist()[0]
+        then = np.array(poses["world_from_agent_then"]).reshape(-1, 4, 4)
         return Frame(
             scene=key.scene,
             index=key.index,
             time_s=key.time_s,
             agent=key.agent,
-            world_from_agent=self._poses[i],
-            calibration=self.calibration[key.agent],
-            assumed=self.calibration[key.agent],
-            lidar={lidar: self._points(i, lidar) for lidar in self._lidar[i]},
-            annotations=annotations_of(self._label_rows(i)),
+            world_from_agent=np.array(poses["world_from_agent"]).reshape(4, 4),
+            calibration=calibration.true,
+            assumed=calibration.assumed,
+            lidar=self._rows_of(i, self._lidar[i], POINTS),
+            annotations=annotations_of(
+                *(self._rows(name, i) for name in ("annotations", "points", "views", "signs")),
+                ranging=(*self._lidar[i], *self._radar[i]),
+                cameras=(*self._cameras[i], *self._infrared[i]),
+            ),
+            images=ReadWhenAsked(self._cameras[i], lambda camera: self._image(i, camera)),
+            infrared=ReadWhenAsked(self._infrared[i], lambda camera: self._thermal(i, camera)),
+            radar=self._rows_of(i, self._radar[i], RADAR),
+            gnss=vectors_of(self._rows("gnss", i), GNSS_COLUMNS),
+            imu=vectors_of(self._rows("imu", i), IMU_COLUMNS),
+            weather=weather_of(self._rows("weather", i)),
+            agent_at_trigger=dict(zip(poses["triggered"], then)),
         )
+
+    def plane(self, i: int, camera: str, plane: str) -> NDArray:
+        """Return one plane ("rgb", "depth_m", "semantic", "instance") of one image of frame `i`: see `CameraImage`."""
+        return read_plane(self.plane_path(i, camera, plane), plane)
+
+    def plane_path(self, i: int, camera: str, plane: str) -> Path:
+        """Return the file of one plane of one image of frame `i`."""
+        return self.folder / payload_path(camera, self._name[i], PLANES[plane])
+
+    def trace(self, scene: str) -> Trace | None:
+        """Return the traffic of a scene, None where it was not known; raises `InputError` where it cannot be read."""
+        path = self.folder / trace_path(scene)
+        return Trace.load(path) if path.is_file() else None
 
     def payload_bytes(self, i: int) -> int:
         """Return the bytes of frame `i` as a labelled sample: its point clouds and its annotation rows."""
-        return sum(self._lidar[i].values()) * POINT_BYTES + self._label_rows(i).nbytes
+        return sum(self._lidar[i].values()) * POINT_BYTES + self._rows("annotations", i).drop(NOT_IN_SAMPLE).nbytes
 
     def select(
         self,
@@ -99,6 +145,10 @@ class Dataset:
         """Return the names of the LiDARs of frame `i`."""
         return list(self._lidar[i])
 
+    def cameras(self, i: int) -> list[str]:
+        """Return the names of the cameras of frame `i`, without the infrared ones."""
+        return list(self._cameras[i])
+
     def number(self, name: str) -> int:
         """Return the number of the frame with this key; raises `InputError` where there is none."""
         try:
@@ -106,32 +156,58 @@ class Dataset:
         except ValueError:
             raise InputError(f"{self.folder}: no frame '{name}'; the first is '{self._name[0]}'") from None
 
-    def _label_rows(self, i: int) -> pa.Table:
-        first, last = int(self._first[i]), int(self._first[i + 1])
-        return self._annotations.slice(first, last - first)
+    def _rows(self, table: str, i: int) -> pa.Table:
+        first, last = int(self._first[table][i]), int(self._first[table][i + 1])
+        return self._tables[table].slice(first, last - first)
 
-    def _points(self, i: int, lidar: str) -> NDArray[np.float32]:
-        path = self.folder / points_path(lidar, self._name[i])
-        expected = self._lidar[i][lidar]
-        try:
-            found = path.stat().st_size
-            points = np.fromfile(path, dtype="<f4")
-        except FileNotFoundError:
-            raise InputError(f"{path}: missing from the dataset") from None
-        if found != expected * POINT_BYTES:
-            raise InputError(f"{path}: {found} bytes where {expected} points take {expected * POINT_BYTES}")
-        return points.reshape(-1, 4)
+    def _rows_of(self, i: int, counts: dict[str, int], suffix: str) -> dict[str, NDArray[np.float32]]:
+        return {
+            sensor: read_rows(self.folder / payload_path(sensor, self._name[i], suffix), suffix, count)
+            for sensor, count in counts.items()
+        }
+
+    def _image(self, i: int, camera: str) -> CameraImage:
+        return CameraImage(**{plane: self.plane(i, camera, plane) for plane in PLANES})
+
+    def _thermal(self, i: int, camera: str) -> NDArray[np.uint16]:
+        return read_image(self.folder / payload_path(camera, self._name[i], INFRARED), np.uint16)
 
 
-def _read_calibration(path: Path, frames: pa.Table) -> dict[str, Any]:
-    try:
-        calibration = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing from the dataset") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON ({error})") from None
-    for agent, lidars in zip(frames["agent"].to_pylist(), frames["lidar"].to_pylist()):
-        for lidar in lidars:
-            if len(calibration.get(agent, {}).get(lidar, ())) != 16:
-                raise InputError(f"{path}: no mount of the sensor '{lidar}' of '{agent}'")
-    return calibration
+class ReadWhenAsked(Mapping[str, Value], Generic[Value]):
+    """Values by name, each read when first asked for and kept."""
+
+    def __init__(self, names: Collection[str], read: Callable[[str], Value]) -> None:
+        self._names, self._read = list(names), read
+        self._known: dict[str, Value] = {}
+
+    def __getitem__(self, name: str) -> Value:
+        if name not in self._names:
+            raise KeyError(name)
+        if name not in self._known:
+            self._known[name] = self._read(name)
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def _first_rows(table: pa.Table, frames: pa.Table, path: Path) -> NDArray[np.int64]:
+    """Return (F + 1,) the first row of each frame; raises `InputError` where rows are of no frame, or out of order."""
+    number = pc.call_function(
+        "index_in", [table["frame"]], pc.SetLookupOptions(value_set=frames["key"].combine_chunks())
+    )
+    if number.null_count or (np.diff(number.to_numpy()) < 0).any():
+        raise InputError(f"{path}: its rows are not those of the frames")
+    return np.searchsorted(number.to_numpy(), np.arange(len(frames) + 1))
+
+
+def _sensors(frames: pa.Table) -> dict[str, set[str]]:
+    """Return the names of each agent's LiDARs, radars and cameras."""
+    found: dict[str, set[str]] = defaultdict(set)
+    for kind in ("lidar", "radar", "cameras", "infrared"):
+        for agent, names in zip(frames["agent"].to_pylist(), frames[kind].to_pylist()):
+            found[agent].update(names)
+    return found

@@ -1,23 +1,32 @@
-"""The Parquet tables of a dataset: their columns, and frames to rows and back.
+"""The Parquet tables of a dataset: their columns, and how they are written, joined and read.
 
-`frames` has one row per frame; `poses` one row per frame; `annotations` one row per frame and actor, in frame order.
+`frames` has one row per frame; so does `poses`. All other tables have any number of rows per frame, in frame order.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flcav.config import InputError
-from flcav.geometry import Boxes
-from flcav.sensors.frame import Annotations, Frame
+from flcav.world.weather import Weather
 
 ROWS_PER_GROUP = 65_536
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 VELOCITY_COLUMNS = ("vx", "vy", "vz")
 ACCELERATION_COLUMNS = ("ax", "ay", "az")
+AMODAL_COLUMNS = ("amodal_x1", "amodal_y1", "amodal_x2", "amodal_y2")
+VISIBLE_COLUMNS = ("visible_x1", "visible_y1", "visible_x2", "visible_y2")
+RECTANGLE_COLUMNS = ("x1", "y1", "x2", "y2")
+GNSS_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m")
+IMU_COLUMNS = ("force_x", "force_y", "force_z", "rate_x", "rate_y", "rate_z")
+WEATHER_COLUMNS = tuple(Weather.model_fields)
+
+
+def _numbers(names: Iterable[str]) -> list[tuple[str, pa.DataType]]:
+    return [(name, pa.float64()) for name in names]
+
 
 SCHEMAS: dict[str, pa.Schema] = {
     "frames": pa.schema(
@@ -29,13 +38,19 @@ SCHEMAS: dict[str, pa.Schema] = {
             ("time_s", pa.float64()),
             ("lidar", pa.list_(pa.string())),  # names of the frame's LiDARs: folders of the point clouds
             ("points", pa.list_(pa.int64())),  # points of each
+            ("radar", pa.list_(pa.string())),
+            ("detections", pa.list_(pa.int64())),  # of each radar
+            ("cameras", pa.list_(pa.string())),
+            ("infrared", pa.list_(pa.string())),
             ("annotations", pa.int64()),  # rows of the frame in `annotations`
         ]
     ),
     "poses": pa.schema(
         [
             ("frame", pa.string()),
-            ("world_from_agent", pa.list_(pa.float64(), 16)),  # row by row
+            ("world_from_agent", pa.list_(pa.float64(), 16)),  # at the spin, row by row
+            ("triggered", pa.list_(pa.string())),  # sensors that look at another time
+            ("world_from_agent_then", pa.list_(pa.float64())),  # 16 numbers of each
         ]
     ),
     "annotations": pa.schema(
@@ -43,75 +58,73 @@ SCHEMAS: dict[str, pa.Schema] = {
             ("frame", pa.string()),
             ("track", pa.string()),
             ("category", pa.string()),
-            *((name, pa.float64()) for name in BOX_COLUMNS),  # geometric centre, world frame [m], [rad]
-            *((name, pa.float64()) for name in VELOCITY_COLUMNS),  # world frame [m/s]
-            *((name, pa.float64()) for name in ACCELERATION_COLUMNS),  # world frame [m/s^2]
+            *_numbers(BOX_COLUMNS),  # geometric centre, world frame [m], [rad]
+            *_numbers(VELOCITY_COLUMNS),  # world frame [m/s]
+            *_numbers(ACCELERATION_COLUMNS),  # world frame [m/s^2]
             ("returns", pa.int64()),
             ("occlusion", pa.float64()),
         ]
     ),
+    "points": pa.schema(  # on actors; rows of actors that have any
+        [
+            ("frame", pa.string()),
+            ("sensor", pa.string()),  # a LiDAR or a radar
+            ("row", pa.int64()),  # of the frame's annotations
+            ("points", pa.int64()),
+        ]
+    ),
+    "views": pa.schema(  # see `Views`; rows of actors whose amodal box is a number
+        [
+            ("frame", pa.string()),
+            ("sensor", pa.string()),  # a camera, infrared ones too
+            ("row", pa.int64()),  # of the frame's annotations
+            *_numbers(AMODAL_COLUMNS),
+            *_numbers(VISIBLE_COLUMNS),
+            ("pixels", pa.int64()),
+            ("truncation", pa.float64()),
+            ("occlusion", pa.float64()),
+        ]
+    ),
+    "signs": pa.schema(  # see `SignViews`
+        [
+            ("frame", pa.string()),
+            ("sensor", pa.string()),
+            ("kind", pa.string()),
+            ("state", pa.string()),
+            *_numbers(RECTANGLE_COLUMNS),
+            ("pixels", pa.int64()),
+            ("distance_m", pa.float64()),
+            ("thing", pa.int64()),
+        ]
+    ),
+    "gnss": pa.schema([("frame", pa.string()), ("sensor", pa.string()), *_numbers(GNSS_COLUMNS)]),
+    "imu": pa.schema([("frame", pa.string()), ("sensor", pa.string()), *_numbers(IMU_COLUMNS)]),
+    "weather": pa.schema([("frame", pa.string()), *_numbers(WEATHER_COLUMNS)]),
 }
-
-
-def frame_table(frame: Frame) -> pa.Table:
-    """Return the one row of `frames` that `frame` gives."""
-    row = {
-        "key": frame.key,
-        "scene": frame.scene,
-        "index": frame.index,
-        "agent": frame.agent,
-        "time_s": frame.time_s,
-        "lidar": list(frame.lidar),
-        "points": [len(points) for points in frame.lidar.values()],
-        "annotations": len(frame.annotations),
-    }
-    return pa.Table.from_pylist([row], schema=SCHEMAS["frames"])
-
-
-def pose_table(frame: Frame) -> pa.Table:
-    """Return the one row of `poses` that `frame` gives."""
-    row = {"frame": frame.key, "world_from_agent": frame.world_from_agent.ravel().tolist()}
-    return pa.Table.from_pylist([row], schema=SCHEMAS["poses"])
-
-
-def annotation_table(frame: Frame) -> pa.Table:
-    """Return the rows of `annotations` that `frame` gives."""
-    truth = frame.annotations
-    columns = {
-        "frame": [frame.key] * len(truth),
-        "track": truth.track.tolist(),
-        "category": truth.boxes.label.tolist(),
-        **dict(zip(BOX_COLUMNS, truth.boxes.array().T)),
-        **dict(zip(VELOCITY_COLUMNS, truth.velocity.T)),
-        **dict(zip(ACCELERATION_COLUMNS, truth.acceleration.T)),
-        "returns": truth.returns,
-        "occlusion": truth.occlusion,
-    }
-    return pa.table(columns, schema=SCHEMAS["annotations"])
-
-
-def annotations_of(rows: pa.Table) -> Annotations:
-    """Return the annotations that rows of `annotations` hold."""
-
-    def text(name: str) -> np.ndarray:
-        return np.array(rows[name].to_pylist(), dtype=np.str_)
-
-    def numbers(names: Sequence[str]) -> np.ndarray:
-        return np.stack([rows[name].to_numpy() for name in names], axis=1)
-
-    return Annotations(
-        track=text("track"),
-        boxes=Boxes.from_array(numbers(BOX_COLUMNS), text("category")),
-        velocity=numbers(VELOCITY_COLUMNS),
-        acceleration=numbers(ACCELERATION_COLUMNS),
-        returns=rows["returns"].to_numpy().copy(),
-        occlusion=rows["occlusion"].to_numpy().copy(),
-    )
+FILES_SCHEMA = pa.schema([("path", pa.string()), ("bytes", pa.int64()), ("sha256", pa.string())])
 
 
 def write_table(table: pa.Table, path: Path) -> None:
     """Write a table so that equal rows give equal bytes."""
     pq.write_table(table.combine_chunks(), path, row_group_size=ROWS_PER_GROUP, compression="zstd")
+
+
+def join_tables(parts: Iterable[Path], schema: pa.Schema, path: Path) -> int:
+    """Write the rows of all `parts`, one after another, as one table and return their number.
+
+    Equal rows give equal bytes; never more than one row group is in memory.
+    """
+    rows = 0
+    waiting = schema.empty_table()
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        for part in parts:
+            waiting = pa.concat_tables([waiting, pq.ParquetFile(part).read()])
+            while len(waiting) >= ROWS_PER_GROUP:
+                rows += ROWS_PER_GROUP
+                writer.write_table(waiting.slice(0, ROWS_PER_GROUP).combine_chunks())
+                waiting = waiting.slice(ROWS_PER_GROUP)
+        writer.write_table(waiting.combine_chunks())
+    return rows + len(waiting)
 
 
 def read_table(path: Path, name: str) -> pa.Table:
@@ -123,9 +136,9 @@ def read_table(path: Path, name: str) -> pa.Table:
     except (pa.ArrowException, OSError) as error:
         reason = str(error).partition("\n")[0]
         raise InputError(f"{path}: not a readable Parquet file ({reason})") from None
-    if not table.schema.equals(SCHEMAS[name]):
-        expected = ", ".join(SCHEMAS[name].names)
-        raise InputError(f"{path}: its columns are not those of the table '{name}' ({expected})")
+    schema = SCHEMAS.get(name, FILES_SCHEMA)
+    if not table.schema.equals(schema):
+        raise InputError(f"{path}: its columns are not those of the table '{name}' ({', '.join(schema.names)})")
     if any(column.null_count for column in table.columns):
         raise InputError(f"{path}: has empty cells")
     return table.combine_chunks()

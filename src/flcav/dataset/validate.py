@@ -1,16 +1,19 @@
 """Every check of one dataset folder: its files against the manifest, then what they hold."""
 
+import contextlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError
 from flcav.dataset.frame_checks import check_points, check_traffic, check_values
-from flcav.dataset.layout import MANIFEST, FrameKey, points_path, read_manifest, trace_path
+from flcav.dataset.layout import FILES, MANIFEST, FrameKey, read_manifest, table_path, trace_path
 from flcav.dataset.store import Dataset
+from flcav.dataset.tables import read_table
 from flcav.files import sha256
 from flcav.progress import Report, silent
+from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
 
@@ -21,9 +24,10 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
     """
     folder = Path(path)
     manifest = read_manifest(folder)
-    damaged = {name: problem for name, entry in manifest["files"].items() if (problem := _damage(folder, name, entry))}
+    listed = _listed_files(folder, manifest)
+    damaged = {name: problem for name, entry in listed.items() if (problem := _damage(folder / name, *entry))}
     problems = [f"{folder / name}: {problem}" for name, problem in damaged.items()]
-    problems += _extra_files(folder, manifest)
+    problems += _extra_files(folder, listed)
     try:
         dataset = Dataset.open(folder)
     except InputError as error:
@@ -36,17 +40,19 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
         if key.scene not in traces:
             traces = {key.scene: _trace(dataset, key.scene, damaged)}
         try:
-            frame = dataset.frame(i)
-        except InputError as error:
-            if not damaged.keys() & {points_path(name, dataset.name(i)) for name in dataset.lidars(i)}:
+            problems += _frame_problems(dataset.frame(i), traces[key.scene])
+        except InputError as error:  # a file that cannot be read
+            if not any(str(error).startswith(str(folder / name)) for name in damaged):
                 problems.append(str(error))
-            continue
-        trace = traces[key.scene]
-        problems += check_values(frame)
-        problems += check_points(frame)
-        problems += [] if trace is None else check_traffic(frame, trace)
         progress(i + 1, len(dataset), "")
     return problems
+
+
+def _frame_problems(frame: Frame, trace: Trace | None) -> Iterator[str]:
+    yield from check_values(frame)
+    yield from check_points(frame)
+    if trace is not None:
+        yield from check_traffic(frame, trace)
 
 
 def check_order(keys: Sequence[FrameKey]) -> list[str]:
@@ -68,20 +74,28 @@ def check_order(keys: Sequence[FrameKey]) -> list[str]:
     return problems
 
 
-def _damage(folder: Path, name: str, entry: dict[str, Any]) -> str | None:
-    path = folder / name
+def _listed_files(folder: Path, manifest: dict[str, Any]) -> dict[str, tuple[int, str]]:
+    """Return the bytes and the hash of every file of the dataset but the manifest."""
+    listed = {name: (int(entry["bytes"]), str(entry["sha256"])) for name, entry in manifest["tables"].items()}
+    with contextlib.suppress(InputError):  # named as damaged
+        files = read_table(folder / table_path(FILES), FILES).to_pydict()
+        listed |= {name: (size, digest) for name, size, digest in zip(files["path"], files["bytes"], files["sha256"])}
+    return listed
+
+
+def _damage(path: Path, recorded_bytes: int, recorded_hash: str) -> str | None:
     if not path.is_file():
         return "missing"
     size = path.stat().st_size
-    if size != entry["bytes"]:
-        return f"truncated or grown: {size} bytes, recorded were {entry['bytes']}"
-    return None if sha256(path) == entry["sha256"] else "altered: its hash is not the recorded one"
+    if size != recorded_bytes:
+        return f"truncated or grown: {size} bytes, recorded were {recorded_bytes}"
+    return None if sha256(path) == recorded_hash else "altered: its hash is not the recorded one"
 
 
-def _extra_files(folder: Path, manifest: dict[str, Any]) -> Iterator[str]:
-    known = {MANIFEST, *manifest["files"]}
+def _extra_files(folder: Path, listed: Collection[str]) -> Iterator[str]:
     for path in sorted(folder.rglob("*")):
-        if not path.is_dir() and path.relative_to(folder).as_posix() not in known:
+        name = path.relative_to(folder).as_posix()
+        if not path.is_dir() and name != MANIFEST and name not in listed:
             yield f"{path}: not part of the dataset"
 
 
@@ -93,9 +107,6 @@ def _other_counts(dataset: Dataset) -> Iterator[str]:
         yield f"{dataset.folder / MANIFEST}: counts {dataset.manifest['counts']['frames']} frames of {len(dataset)}"
 
 
-def _trace(dataset: Dataset, scene: str, damaged: dict[str, str]) -> Trace | None:
+def _trace(dataset: Dataset, scene: str, damaged: Collection[str]) -> Trace | None:
     """Return a scene's traffic where there is any and it can be trusted."""
-    name = trace_path(scene)
-    if name in damaged or name not in dataset.manifest["files"]:
-        return None
-    return Trace.load(dataset.folder / name)
+    return None if trace_path(scene) in damaged else dataset.trace(scene)

@@ -1,56 +1,87 @@
-"""Scenes rendered by several processes at once."""
+"""Engines on one machine: this process, or several beside it."""
 
 import contextlib
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
-from flcav.dataset.scenes import write_scene
+from flcav.dataset.schedule import Engine
+from flcav.dataset.tasks import Task, perform
 from flcav.sources.source import Source
 
 POLL_S = 0.2
 _THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # read when a library is first loaded
 
-_written: Any = None  # in a worker: the count of frames that all workers share
+_job: Any = None  # in a worker: the source, the folder, and the count of frames that all workers share
 
 
-def write_scenes(source: Source, scenes: Sequence[str], work: Path, jobs: int, wrote: Callable[[int], None]) -> None:
-    """Write each of `scenes` below `work`; calls `wrote` with the frames written so far.
+@contextlib.contextmanager
+def processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
+    """Yield an engine of `jobs` processes that calls `wrote` with the number of frames written so far.
 
     One job works in this process. More are processes of their own, which end with this one however it ends.
     """
-    if jobs == 1 or len(scenes) < 2:
-        count = 0
-
-        def count_frame() -> None:
-            nonlocal count
-            count += 1
-            wrote(count)
-
-        for scene in scenes:
-            write_scene(source, scene, work, count_frame)
+    if jobs == 1:
+        yield _Here(source, work, wrote)
         return
-
     context = multiprocessing.get_context("spawn")
     written = context.Value("q", 0)
-    jobs = min(jobs, len(scenes))
     with (
         _threads_per_process(max(1, (os.cpu_count() or 1) // jobs)),
-        ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(written,)) as pool,
+        ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(source, work, written)) as pool,
         _children_end_on_error(),
     ):
-        pending = {pool.submit(_write_scene, source, scene, work) for scene in scenes}
-        while pending:
-            done, pending = wait(pending, timeout=POLL_S, return_when=FIRST_EXCEPTION)
-            wrote(written.value)
-            for future in done:
-                _raise_failure(future)
+        yield _Pool(jobs, pool, lambda: wrote(written.value))
+
+
+class _Here:
+    """One task after another in this process."""
+
+    slots = 1
+
+    def __init__(self, source: Source, work: Path, wrote: Callable[[int], None]) -> None:
+        self._source, self._work, self._wrote = source, work, wrote
+        self._tasks: deque[Task] = deque()
+        self._count = 0
+
+    def submit(self, task: Task) -> None:
+        self._tasks.append(task)
+
+    def wait(self) -> list[Task]:
+        task = self._tasks.popleft()
+        perform(self._source, task, self._work, self._count_frame)
+        return [task]
+
+    def _count_frame(self) -> None:
+        self._count += 1
+        self._wrote(self._count)
+
+
+class _Pool:
+    """Tasks in processes."""
+
+    def __init__(self, slots: int, pool: ProcessPoolExecutor, report: Callable[[], None]) -> None:
+        self.slots, self._pool, self._report = slots, pool, report
+        self._tasks: dict[Future[None], Task] = {}
+
+    def submit(self, task: Task) -> None:
+        self._tasks[self._pool.submit(_perform, task)] = task
+
+    def wait(self) -> list[Task]:
+        done: set[Future[None]] = set()
+        while not done:
+            done, _ = wait(self._tasks, timeout=POLL_S, return_when=FIRST_COMPLETED)
+            self._report()
+        for future in done:
+            _raise_failure(future)
+        return [self._tasks.pop(future) for future in done]
 
 
 def _raise_failure(future: Future[None]) -> None:
@@ -60,9 +91,9 @@ def _raise_failure(future: Future[None]) -> None:
         raise OSError("a worker was killed from outside, most often for want of memory: try fewer jobs") from None
 
 
-def _begin(written: Any) -> None:
-    global _written
-    _written = written
+def _begin(source: Source, work: Path, written: Any) -> None:
+    global _job
+    _job = source, work, written
     end_with_parent()
 
 
@@ -79,13 +110,14 @@ def _exit_after_parent() -> None:
         os._exit(1)
 
 
-def _write_scene(source: Source, scene: str, work: Path) -> None:
-    write_scene(source, scene, work, _count_frame)
+def _perform(task: Task) -> None:
+    source, work, written = _job
 
+    def count_frame() -> None:
+        with written.get_lock():
+            written.value += 1
 
-def _count_frame() -> None:
-    with _written.get_lock():
-        _written.value += 1
+    perform(source, task, work, count_frame)
 
 
 @contextlib.contextmanager

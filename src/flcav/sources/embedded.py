@@ -20,7 +20,7 @@ class EmbeddedSource:
     """The frames of a recipe. Scene i has the same traffic whatever the number of scenes, agents apart."""
 
     def __init__(self, recipe: Recipe) -> None:
-        """Load the town; raises `InputError` where it, a pole or an observer is missing, and for a mount below ground."""
+        """Load the town; raises `InputError` where it, a pole or an observer is missing, or a mount below ground."""
         self.recipe = recipe
         self.town = load_town(recipe.town)
         known = self.town.poles.id.tolist()
@@ -100,6 +100,6 @@ def _check_mounts(field: str, rig: Rig, carrier: str, mount_m: float) -> None:
     for name, sensor in rig.sensors().items():
         if mount_m + sensor.mount.z <= 0:
             raise InputError(
-                f"field '{field}': sensor '{name}' at z = {sensor.mount.z} m would not be above the ground on {carrier}, "
+                f"field '{field}': sensor '{name}' at z = {sensor.mount.z} m is not above the ground on {carrier}, "
                 f"whose frame is {mount_m:.1f} m up"
             )

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 from toy_source import ToySource
 
@@ -51,8 +52,11 @@ def test_the_manifest_lists_every_file_and_no_surroundings(tmp_path: Path):
     manifest = Dataset.open(tmp_path / "data").manifest
     found = digests(tmp_path / "data")
     del found["manifest.json"]
-    assert {name: entry["sha256"] for name, entry in manifest["files"].items()} == found
-    assert manifest["counts"] == {"scenes": 2, "frames": 12, "annotations": 48, "points": 12 * 125}
+    files = pq.read_table(tmp_path / "data" / "files.parquet").to_pydict()
+    listed = {name: entry["sha256"] for name, entry in manifest["tables"].items()}
+    assert listed | dict(zip(files["path"], files["sha256"])) == found
+    counts = {"scenes": 2, "frames": 12, "annotations": 48, "points": 12 * 125, "images": 0}
+    assert manifest["counts"] == counts | {"payload_bytes": 12 * 125 * 16}
     assert manifest["recipe"] == ToySource().describe()
     assert str(tmp_path) not in (tmp_path / "data" / "manifest.json").read_text()
 
@@ -142,7 +146,7 @@ if __name__ == "__main__":
 """
     (tmp_path / "run.py").write_text(script)
     process = subprocess.Popen([sys.executable, tmp_path / "run.py"], stderr=subprocess.DEVNULL, start_new_session=True)
-    while not list(out.glob(f"{layout.WORK}/*/files/lidar/*.bin")):
+    while not list(out.glob(f"{layout.WORK}/*/*/payloads/lidar/*.bin")):
         assert process.poll() is None
         time.sleep(0.02)
     if number == signal.SIGINT:

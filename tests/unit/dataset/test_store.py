@@ -89,7 +89,9 @@ def test_a_missing_point_cloud_is_named(folder: Path):
         Dataset.open(folder).frame(0)
 
 
-@pytest.mark.parametrize("name", ["frames.parquet", "poses.parquet", "annotations.parquet", "calibration.json"])
+@pytest.mark.parametrize(
+    "name", ["frames.parquet", "poses.parquet", "annotations.parquet", "views.parquet", "calibration.json"]
+)
 def test_an_unreadable_table_is_named(folder: Path, name: str):
     path = folder / name
     path.write_bytes(path.read_bytes()[:40])

@@ -1,0 +1,94 @@
+"""Rows of the tables as parts of a frame: the way back from `flcav.dataset.rows`."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from flcav.dataset.tables import (
+    ACCELERATION_COLUMNS,
+    AMODAL_COLUMNS,
+    BOX_COLUMNS,
+    RECTANGLE_COLUMNS,
+    VELOCITY_COLUMNS,
+    VISIBLE_COLUMNS,
+    WEATHER_COLUMNS,
+)
+from flcav.geometry import Boxes
+from flcav.sensors.frame import Annotations, SignViews, Views
+from flcav.world.weather import Weather
+
+
+def annotations_of(
+    rows: pa.Table, points: pa.Table, views: pa.Table, signs: pa.Table, ranging: Iterable[str], cameras: Iterable[str]
+) -> Annotations:
+    """Return the annotations of a frame from its rows in four tables, for its LiDARs and radars and its cameras."""
+    count, cameras = len(rows), list(cameras)
+    return Annotations(
+        track=_text(rows, "track"),
+        boxes=Boxes.from_array(_numbers(rows, BOX_COLUMNS), _text(rows, "category")),
+        velocity=_numbers(rows, VELOCITY_COLUMNS),
+        acceleration=_numbers(rows, ACCELERATION_COLUMNS),
+        returns=rows["returns"].to_numpy().copy(),
+        occlusion=rows["occlusion"].to_numpy().copy(),
+        points={name: _points(_of_sensor(points, name), count) for name in ranging},
+        views={name: _view(_of_sensor(views, name), count) for name in cameras},
+        signs={name: _signs(_of_sensor(signs, name)) for name in cameras},
+    )
+
+
+def vectors_of(rows: pa.Table, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Return the numbers in `columns` by the sensor of the row."""
+    return dict(zip(rows["sensor"].to_pylist(), _numbers(rows, columns)))
+
+
+def weather_of(rows: pa.Table) -> Weather | None:
+    """Return the weather of a frame, None where it is not known."""
+    return Weather(**{name: rows[name][0].as_py() for name in WEATHER_COLUMNS}) if len(rows) else None
+
+
+def _points(rows: pa.Table, count: int) -> NDArray[np.int64]:
+    points = np.zeros(count, np.int64)
+    points[rows["row"].to_numpy()] = rows["points"].to_numpy()
+    return points
+
+
+def _view(rows: pa.Table, count: int) -> Views:
+    at = rows["row"].to_numpy()
+
+    def filled(values: NDArray, missing: float) -> NDArray:
+        column = np.full((count, *values.shape[1:]), missing, values.dtype)
+        column[at] = values
+        return column
+
+    return Views(
+        amodal_box=filled(_numbers(rows, AMODAL_COLUMNS), np.nan),
+        visible_box=filled(_numbers(rows, VISIBLE_COLUMNS), np.nan),
+        pixels=filled(rows["pixels"].to_numpy(), 0),
+        truncation=filled(rows["truncation"].to_numpy(), 1.0),
+        occlusion=filled(rows["occlusion"].to_numpy(), 1.0),
+    )
+
+
+def _signs(rows: pa.Table) -> SignViews:
+    return SignViews(
+        kind=_text(rows, "kind"),
+        state=_text(rows, "state"),
+        box=_numbers(rows, RECTANGLE_COLUMNS),
+        pixels=rows["pixels"].to_numpy().copy(),
+        distance_m=rows["distance_m"].to_numpy().copy(),
+        thing=rows["thing"].to_numpy().copy(),
+    )
+
+
+def _of_sensor(rows: pa.Table, name: str) -> pa.Table:
+    return rows.filter(np.array(rows["sensor"].to_pylist(), dtype=np.str_) == name)
+
+
+def _text(rows: pa.Table, name: str) -> NDArray[np.str_]:
+    return np.array(rows[name].to_pylist(), dtype=np.str_)
+
+
+def _numbers(rows: pa.Table, names: Sequence[str]) -> NDArray[np.float64]:
+    return np.stack([rows[name].to_numpy() for name in names], axis=1)

@@ -1,0 +1,117 @@
+"""What sensors measure as files: one encoding for each kind, all without loss but the depth's last bits.
+
+Chosen by size and CPU time, see `benchmarks/bench_recording.py`.
+"""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from PIL import Image
+
+from flcav.config import InputError
+from flcav.dataset.layout import payload_path
+from flcav.sensors.frame import Frame
+
+DEPTH_BITS = 14  # of a depth's mantissa that are kept: 3 mm at 100 m
+_DROPPED = 23 - DEPTH_BITS
+PLANES = {"rgb": "webp", "depth_m": "depth.zst", "semantic": "semantic.png", "instance": "instance.png"}
+POINTS, RADAR, INFRARED = "bin", "radar.bin", "infrared.png"
+COLUMNS = {POINTS: 4, RADAR: 5}  # little-endian float32, row after row
+
+
+class Payload(NamedTuple):
+    """One file of a frame."""
+
+    path: str
+    data: bytes
+
+
+def payloads(frame: Frame) -> Iterator[Payload]:
+    """Yield the files of what the frame's sensors measured."""
+    for name, points in frame.lidar.items():
+        yield Payload(payload_path(name, frame.key, POINTS), encode_rows(points))
+    for name, image in frame.images.items():
+        for plane, suffix in PLANES.items():
+            yield Payload(payload_path(name, frame.key, suffix), encode_plane(plane, getattr(image, plane)))
+    for name, image in frame.infrared.items():
+        yield Payload(payload_path(name, frame.key, INFRARED), _png(image))
+    for name, detections in frame.radar.items():
+        yield Payload(payload_path(name, frame.key, RADAR), encode_rows(detections))
+
+
+def encode_rows(rows: NDArray[np.float32]) -> bytes:
+    """Return the rows of a LiDAR or a radar as little-endian float32."""
+    return np.ascontiguousarray(rows, dtype="<f4").tobytes()
+
+
+def encode_plane(plane: str, pixels: NDArray) -> bytes:
+    """Return one of PLANES of a `CameraImage` as the bytes of a file."""
+    if plane == "rgb":
+        data = io.BytesIO()
+        Image.fromarray(pixels).save(data, "webp", lossless=True, quality=0, method=0)
+        return data.getvalue()
+    return encode_depth(pixels) if plane == "depth_m" else _png(pixels)
+
+
+def encode_depth(depth_m: NDArray[np.float32]) -> bytes:
+    """Return depths (H, W), rounded to `DEPTH_BITS`, compressed by Zstandard.
+
+    Below is NumPy's .npy file of an array (4, H, W) uint8: the bytes of the little-endian float32, lowest first.
+    """
+    bits = np.ascontiguousarray(depth_m, dtype="<f4").view("<u4")
+    rounded = (bits + np.uint32(1 << (_DROPPED - 1))) & np.uint32(0xFFFFFFFF << _DROPPED & 0xFFFFFFFF)
+    planes = np.where(np.isfinite(depth_m), rounded, bits).astype("<u4").view(np.uint8)
+    data = io.BytesIO()
+    np.save(data, np.ascontiguousarray(planes.reshape(*depth_m.shape, 4).transpose(2, 0, 1)))
+    return pa.Codec("zstd", compression_level=1).compress(data.getvalue(), asbytes=True)
+
+
+def read_rows(path: Path, suffix: str, expected: int) -> NDArray[np.float32]:
+    """Return the `expected` rows of a LiDAR or radar file; raises `InputError` where it is missing or holds others."""
+    row_bytes = 4 * COLUMNS[suffix]
+    try:
+        found = path.stat().st_size
+        rows = np.fromfile(path, dtype="<f4")
+    except FileNotFoundError:
+        raise InputError(f"{path}: missing from the dataset") from None
+    if found != expected * row_bytes:
+        raise InputError(f"{path}: {found} bytes where {expected} points take {expected * row_bytes}")
+    return rows.reshape(-1, COLUMNS[suffix])
+
+
+def read_plane(path: Path, plane: str) -> NDArray:
+    """Return one of PLANES of a `CameraImage`; raises `InputError` where the file is missing or no such image."""
+    return _read_depth(path) if plane == "depth_m" else read_image(path, np.uint16 if plane == "instance" else np.uint8)
+
+
+def read_image(path: Path, dtype: type[np.generic]) -> NDArray:
+    """Return the pixels of an image file; raises `InputError` where it is missing or none."""
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image).astype(dtype)
+    except FileNotFoundError:
+        raise InputError(f"{path}: missing from the dataset") from None
+    except (OSError, ValueError, SyntaxError) as error:
+        raise InputError(f"{path}: not a readable image ({error})") from None
+
+
+def _read_depth(path: Path) -> NDArray[np.float32]:
+    try:
+        with pa.CompressedInputStream(pa.OSFile(str(path)), "zstd") as stream:
+            planes = np.load(io.BytesIO(stream.read()), allow_pickle=False)
+        return np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f4")[..., 0]
+    except FileNotFoundError:
+        raise InputError(f"{path}: missing from the dataset") from None
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: not a readable depth image ({error})") from None
+
+
+def _png(pixels: NDArray) -> bytes:
+    data = io.BytesIO()
+    Image.fromarray(pixels).save(data, "png", compress_level=1)
+    return data.getvalue()

@@ -1,0 +1,159 @@
+"""A frame as rows of the tables."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from flcav.dataset.tables import (
+    ACCELERATION_COLUMNS,
+    AMODAL_COLUMNS,
+    BOX_COLUMNS,
+    GNSS_COLUMNS,
+    IMU_COLUMNS,
+    RECTANGLE_COLUMNS,
+    SCHEMAS,
+    VELOCITY_COLUMNS,
+    VISIBLE_COLUMNS,
+    WEATHER_COLUMNS,
+)
+from flcav.sensors.frame import Frame, SignViews, Views
+
+Columns = Mapping[str, Any]
+
+
+def rows_of(frame: Frame) -> dict[str, pa.Table]:
+    """Return the rows of `frame` in each table, by the table's name."""
+    return {name: pa.table(dict(columns(frame)), schema=SCHEMAS[name]) for name, columns in COLUMNS.items()}
+
+
+def _frames(frame: Frame) -> Columns:
+    return {
+        "key": [frame.key],
+        "scene": [frame.scene],
+        "index": [frame.index],
+        "agent": [frame.agent],
+        "time_s": [frame.time_s],
+        "lidar": [list(frame.lidar)],
+        "points": [[len(points) for points in frame.lidar.values()]],
+        "radar": [list(frame.radar)],
+        "detections": [[len(detections) for detections in frame.radar.values()]],
+        "cameras": [list(frame.images)],
+        "infrared": [list(frame.infrared)],
+        "annotations": [len(frame.annotations)],
+    }
+
+
+def _poses(frame: Frame) -> Columns:
+    then = [matrix.ravel() for matrix in frame.agent_at_trigger.values()]
+    return {
+        "frame": [frame.key],
+        "world_from_agent": [frame.world_from_agent.ravel().tolist()],
+        "triggered": [list(frame.agent_at_trigger)],
+        "world_from_agent_then": [np.concatenate(then).tolist() if then else []],
+    }
+
+
+def _annotations(frame: Frame) -> Columns:
+    truth = frame.annotations
+    return {
+        "frame": [frame.key] * len(truth),
+        "track": truth.track.tolist(),
+        "category": truth.boxes.label.tolist(),
+        **dict(zip(BOX_COLUMNS, truth.boxes.array().T)),
+        **dict(zip(VELOCITY_COLUMNS, truth.velocity.T)),
+        **dict(zip(ACCELERATION_COLUMNS, truth.acceleration.T)),
+        "returns": truth.returns,
+        "occlusion": truth.occlusion,
+    }
+
+
+def _points(frame: Frame) -> Columns:
+    rows = {name: np.flatnonzero(counts) for name, counts in frame.annotations.points.items()}
+    return {
+        **_named(frame, {name: len(found) for name, found in rows.items()}),
+        "row": _joined([*rows.values()], np.int64),
+        "points": _joined([frame.annotations.points[name][found] for name, found in rows.items()], np.int64),
+    }
+
+
+def _views(frame: Frame) -> Columns:
+    views = frame.annotations.views
+    rows = {name: np.flatnonzero(~np.isnan(view.amodal_box).any(axis=1)) for name, view in views.items()}
+
+    def column(values: Callable[[Views], np.ndarray], dtype: type) -> np.ndarray:
+        return _joined([values(views[name])[found] for name, found in rows.items()], dtype)
+
+    return {
+        **_named(frame, {name: len(found) for name, found in rows.items()}),
+        "row": _joined([*rows.values()], np.int64),
+        **{name: column(lambda view, i=i: view.amodal_box[:, i], np.float64) for i, name in enumerate(AMODAL_COLUMNS)},
+        **{
+            name: column(lambda view, i=i: view.visible_box[:, i], np.float64) for i, name in enumerate(VISIBLE_COLUMNS)
+        },
+        "pixels": column(lambda view: view.pixels, np.int64),
+        "truncation": column(lambda view: view.truncation, np.float64),
+        "occlusion": column(lambda view: view.occlusion, np.float64),
+    }
+
+
+def _signs(frame: Frame) -> Columns:
+    signs = frame.annotations.signs
+
+    def column(values: Callable[[SignViews], np.ndarray], dtype: type) -> np.ndarray:
+        return _joined([values(seen) for seen in signs.values()], dtype)
+
+    return {
+        **_named(frame, {name: len(seen) for name, seen in signs.items()}),
+        "kind": [kind for seen in signs.values() for kind in seen.kind.tolist()],
+        "state": [state for seen in signs.values() for state in seen.state.tolist()],
+        **{name: column(lambda seen, i=i: seen.box[:, i], np.float64) for i, name in enumerate(RECTANGLE_COLUMNS)},
+        "pixels": column(lambda seen: seen.pixels, np.int64),
+        "distance_m": column(lambda seen: seen.distance_m, np.float64),
+        "thing": column(lambda seen: seen.thing, np.int64),
+    }
+
+
+def _gnss(frame: Frame) -> Columns:
+    return {**_named(frame, dict.fromkeys(frame.gnss, 1)), **_stacked(frame.gnss, GNSS_COLUMNS)}
+
+
+def _imu(frame: Frame) -> Columns:
+    return {**_named(frame, dict.fromkeys(frame.imu, 1)), **_stacked(frame.imu, IMU_COLUMNS)}
+
+
+def _weather(frame: Frame) -> Columns:
+    known = [] if frame.weather is None else [frame.weather]
+    return {
+        "frame": [frame.key] * len(known),
+        **{name: [float(getattr(weather, name)) for weather in known] for name in WEATHER_COLUMNS},
+    }
+
+
+COLUMNS: dict[str, Callable[[Frame], Columns]] = {
+    "frames": _frames,
+    "poses": _poses,
+    "annotations": _annotations,
+    "points": _points,
+    "views": _views,
+    "signs": _signs,
+    "gnss": _gnss,
+    "imu": _imu,
+    "weather": _weather,
+}
+
+
+def _named(frame: Frame, counts: Mapping[str, int]) -> Columns:
+    """Return the columns `frame` and `sensor` for so many rows of each sensor."""
+    sensors = [name for name, count in counts.items() for _ in range(count)]
+    return {"frame": [frame.key] * len(sensors), "sensor": sensors}
+
+
+def _stacked(values: Mapping[str, np.ndarray], names: tuple[str, ...]) -> Columns:
+    rows = np.array(list(values.values()), np.float64).reshape(-1, len(names))
+    return dict(zip(names, rows.T))
+
+
+def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
+    return np.concatenate([np.zeros(0, dtype), *parts]).astype(dtype)
