@@ -35,7 +35,7 @@ class Radar(Config):
     elevation_cell_deg: float = Field(default=5.0, gt=0)
     doppler_cell_m_s: float = Field(default=0.2, gt=0)
     detects_car_m: float = Field(default=150.0, gt=0)  # 10 dBsm ahead are detected half the time at this range
-    false_alarm_rate: float = Field(default=1e-6, gt=0, lt=0.1)  # of one cell in one sweep
+    false_alarm_rate: float = Field(default=3e-7, gt=0, lt=0.1)  # of one cell in one sweep
 
     def resolution(self) -> Array:
         """Return (4,) a cell's range [m], azimuth [rad], elevation [rad] and Doppler [m/s]."""

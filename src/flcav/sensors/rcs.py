@@ -37,9 +37,9 @@ FLASH = 24.0  # exponent of the cosine: a flash is about 25 degrees wide at half
 
 LYING = (Material.GROUND, Material.ROAD, Material.SIDEWALK)
 TOWN_DB: dict[Material, float] = {
-    Material.GROUND: -15.0,  # of the lying: gamma
-    Material.ROAD: -24.0,
-    Material.SIDEWALK: -22.0,
+    Material.GROUND: -20.0,  # of the lying: gamma
+    Material.ROAD: -30.0,
+    Material.SIDEWALK: -28.0,
     Material.WALL: -10.0,  # of the others: per square metre of their silhouette, from the side
     Material.ROOF: -10.0,
     Material.BARK: -8.0,

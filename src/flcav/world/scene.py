@@ -129,12 +129,12 @@ class Scene:
             wanted[self._hidden] = np.nan
         same = (wanted == self._placed) | np.isnan(wanted) & np.isnan(self._placed)
         moved = np.flatnonzero(~same.all(axis=1))
-        nowhere = np.isnan(wanted[moved]).any(axis=1)
+        nowhere = set(moved[np.isnan(wanted[moved, 0])].tolist())
         world_from_actor = np.tile(np.eye(4), (len(moved), 1, 1))
         world_from_actor[:, :3, :3] = _turned(wanted[moved, 3])
         world_from_actor[:, :3, 3] = wanted[moved, :3]
-        for number, actor in enumerate(moved.tolist()):
-            self._assembly.place(actor + 1, None if nowhere[number] else world_from_actor[number])
+        for actor, matrix in zip(moved.tolist(), world_from_actor):
+            self._assembly.place(actor + 1, None if actor in nowhere else matrix)
         self._placed = wanted
         self._assembly.commit()
 
