@@ -5,11 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from flcav.config import Config, InputError
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
+from flcav.sensors.frame import Frame
 
 
 class ExportOptions(Config):
@@ -28,3 +30,11 @@ Exporter = Callable[[Dataset, Path, ExportOptions, Report], Counter[str]]
 def lacks(dataset: Dataset, name: str, needed: str) -> InputError:
     """Return the error that says what a format misses in a dataset."""
     return InputError(f"{dataset.folder}: cannot be exported to {name}, which needs {needed}; the dataset has none")
+
+
+def check_rectified(frame: Frame, camera: str, name: str) -> None:
+    """Raise `InputError` where a camera distorts, whose images the format `name` wants rectified."""
+    if np.any(frame.calibration.distortion.get(camera, 0)):
+        raise InputError(
+            f"{frame.key}: '{camera}' distorts; {name} wants rectified images, so record without distortion"
+        )

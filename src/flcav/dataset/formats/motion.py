@@ -12,9 +12,10 @@ def agent_velocities(dataset: Dataset, scene: str) -> dict[tuple[str, int], NDAr
     """Return (agent, spin) -> (3,) velocity, world [m/s]; zero of an agent that is not in the scene's traffic."""
     keys = [dataset.keys[i] for i in dataset.select(scenes=[scene])]
     velocities = {(key.agent, key.index): np.zeros(3) for key in keys}
-    if trace_path(scene) not in dataset.manifest["files"]:
+    path = dataset.folder / trace_path(scene)
+    if not path.is_file():
         return velocities
-    trace = Trace.load(dataset.folder / trace_path(scene))
+    trace = Trace.load(path)
     actors = {name: a for a, name in enumerate(trace.actor.tolist())}
     for key in keys:
         if key.agent in actors:

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import ExportOptions, lacks
+from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks
 from flcav.dataset.formats.images import png
 from flcav.dataset.formats.motion import agent_velocities
 from flcav.dataset.formats.mounts import channels, optical_yaw
@@ -92,6 +92,7 @@ def _write_frame(frame: Frame, folder: Path, numbers: dict[str, int], speed_m_s:
     cameras = channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
     about: dict[str, Any] = {}
     for name, camera in sorted(cameras.items(), key=lambda pair: pair[1]):
+        check_rectified(frame, name, "OPV2V")
         (folder / f"{time}_{camera}.png").write_bytes(png(frame.images[name].rgb))
         world_from_camera = frame.world_from_sensor(name) @ BODY_FROM_OPTICAL.T
         about[camera] = {

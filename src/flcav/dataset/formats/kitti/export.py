@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
-from flcav.dataset.formats.exporter import ExportOptions, lacks
+from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks
 from flcav.dataset.formats.images import png
 from flcav.dataset.formats.mounts import front_camera
 from flcav.dataset.formats.splits import SPLITS, split_scenes
@@ -67,8 +66,7 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
 def _write_frame(frame: Frame, camera: str, folder: Path, number: str) -> int:
     lidar = next(iter(frame.lidar))
     mounts = frame.calibration.agent_from_sensor
-    if np.any(frame.calibration.distortion[camera]):
-        raise InputError(f"{frame.key}: '{camera}' distorts; KITTI's images are rectified, so record it without")
+    check_rectified(frame, camera, "KITTI")
     labels = label_lines(frame, camera)
     _write_lines(folder / "label_2" / f"{number}.txt", labels)
     _write_lines(

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.dataset.formats.exporter import check_rectified
 from flcav.dataset.formats.images import png
 from flcav.dataset.formats.mounts import channels, optical_yaw, quaternion
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, lidar_bin, radar_pcd
@@ -22,8 +22,9 @@ UNDATED = "1970-01-01"  # simulated time has no date
 class Drive:
     """One nuScenes scene under way."""
 
-    def __init__(self, name: str, scene: str, agent: str, location: str, out: Path, global_from_world: Array) -> None:
-        self.name = name
+    def __init__(self, number: int, scene: str, agent: str, location: str, out: Path, global_from_world: Array) -> None:
+        self.number = number
+        self.name = f"scene-{number:04d}"
         self.scene = scene
         self.agent = agent
         self.location = location
@@ -42,7 +43,7 @@ class Drive:
         self.samples.append(
             {
                 "token": token(self.name, "sample", frame.index),
-                "timestamp": _micros(frame.time_s),
+                "timestamp": self._micros(frame.time_s),
                 "scene_token": token(self.name),
             }
         )
@@ -51,10 +52,7 @@ class Drive:
             channel = "LIDAR_TOP" if i == 0 else f"LIDAR_{name.upper()}"
             self._add_data(frame, name, channel, "pcd.bin", lidar_bin(points, elevations))
         for name, channel in channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS).items():
-            if np.any(frame.calibration.distortion[name]):
-                raise InputError(
-                    f"{frame.key}: '{name}' distorts; nuScenes' images are rectified, so record it without"
-                )
+            check_rectified(frame, name, "nuScenes")
             self._add_data(frame, name, channel, "png", png(frame.images[name].rgb))
         for name, channel in channels({name: yaw_of(mounts[name]) for name in frame.radar}, RADARS).items():
             radar_from_world = frame.world_from_sensor(name)[:3, :3].T
@@ -63,7 +61,7 @@ class Drive:
 
     def _add_data(self, frame: Frame, name: str, channel: str, suffix: str, data: bytes) -> None:
         true = frame.calibration
-        stamp = _micros(frame.time_s + true.offset_ms.get(name, 0.0) / 1000)
+        stamp = self._micros(frame.time_s + true.offset_ms.get(name, 0.0) / 1000)
         path = f"samples/{channel}/{self.name}__{channel}__{stamp}.{suffix}"
         (self.out / path).parent.mkdir(parents=True, exist_ok=True)
         (self.out / path).write_bytes(data)
@@ -96,6 +94,10 @@ class Drive:
                 "filename": path,
             }
         )
+
+    def _micros(self, time_s: float) -> int:
+        """Return a time stamp; those of no two scenes are equal, since the devkit cannot sort scenes that are."""
+        return round(time_s * 1e6) + self.number
 
     def _add_annotations(self, frame: Frame) -> None:
         truth, boxes = frame.annotations, frame.annotations.boxes
@@ -166,7 +168,3 @@ class Drive:
 
 def _placed(matrix: Array) -> Row:
     return {"translation": matrix[:3, 3].tolist(), "rotation": quaternion(matrix)}
-
-
-def _micros(time_s: float) -> int:
-    return round(time_s * 1e6)

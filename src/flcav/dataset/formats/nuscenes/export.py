@@ -45,9 +45,8 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
         for agent in dict.fromkeys(dataset.keys[i].agent for i in dataset.select(scenes=[scene])):
             selected = dataset.select(agents=[agent], scenes=[scene])
             counts["scenes"] += 1
-            name = f"scene-{counts['scenes']:04d}"
-            splits[f"flcav_{split}"].append(name)
-            drive = Drive(name, scene, agent, location, out, global_from_world)
+            drive = Drive(counts["scenes"], scene, agent, location, out, global_from_world)
+            splits[f"flcav_{split}"].append(drive.name)
             for i in selected:
                 frame = dataset.frame(i)
                 if not frame.lidar:
