@@ -6,7 +6,22 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import allocate, birdseye, demo, evaluate, export, fit, infer, place, record, reproduce, train, validate
+from flcav.cli import (
+    allocate,
+    birdseye,
+    demo,
+    evaluate,
+    export,
+    fit,
+    infer,
+    place,
+    record,
+    reproduce,
+    towns,
+    train,
+    validate,
+    view,
+)
 from flcav.config import InputError
 
 INTERRUPTED = 130
@@ -33,7 +48,22 @@ def _main(
     pass
 
 
-for command in (demo, record, validate, birdseye, export, train, evaluate, infer, allocate, place, fit, reproduce):
+for command in (
+    demo,
+    towns,
+    record,
+    validate,
+    birdseye,
+    view,
+    export,
+    train,
+    evaluate,
+    infer,
+    allocate,
+    place,
+    fit,
+    reproduce,
+):
     command.register(app)
 
 

@@ -9,14 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
+from flcav.world.scenarios.director import Director
+from flcav.world.scenarios.scenario import Scenario
+from flcav.world.scenarios.stage import State
+
 STEP_S = 0.1
 
 
-def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path) -> None:
+def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenarios: list[Scenario]) -> None:
     """Simulate up to the last of `steps` (ascending, of 0.1 s) and write what was read at each to `out` (.npz).
 
     Arrays: `id`, `type` (A,); `row` (N, 2) instant and actor index; `state` (N, 4) SUMO's x, y [m], angle [deg
-    clockwise from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of each light's links.
+    clockwise from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of each light's links; `begun`
+    the step at which each scenario began, 0 where it never did.
     """
     import libsumo
 
@@ -33,6 +38,7 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path) -> None
         "no-warnings": "true",
     }
     libsumo.start(["sumo", *(part for name, value in options.items() for part in (f"--{name}", str(value)))])
+    director = Director(libsumo, net, scenarios) if scenarios else None
     index: dict[str, int] = {}
     kinds: list[str] = []
     rows: list[tuple[int, int]] = []
@@ -40,19 +46,32 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path) -> None
     lights = libsumo.trafficlight.getIDList()
     light_states: list[list[str]] = []
     now = 0
+
+    def note(instant: int, name: str, kind: str, state: State) -> None:
+        if name not in index:
+            index[name] = len(kinds)
+            kinds.append(kind.partition("@")[0])  # what SUMO makes of a type once somebody's is changed
+        rows.append((instant, index[name]))
+        states.append(state)
+
     for instant, step in enumerate(steps):
         while now < step:
             libsumo.simulationStep()
             now += 1
+            if director:
+                director.direct()
         for domain in (libsumo.vehicle, libsumo.person):
             for name in domain.getIDList():
-                if name not in index:
-                    index[name] = len(kinds)
-                    kinds.append(domain.getTypeID(name))
-                rows.append((instant, index[name]))
-                states.append((*domain.getPosition(name), domain.getAngle(name), domain.getSpeed(name)))
+                state = (*domain.getPosition(name), domain.getAngle(name), domain.getSpeed(name))
+                note(instant, name, domain.getTypeID(name), director.stage.seen(name, state) if director else state)
         light_states.append([libsumo.trafficlight.getRedYellowGreenState(light) for light in lights])
     libsumo.close()
+    begun = [0] * len(scenarios)
+    if director:
+        begun = [director.begun.get(i, 0) for i in range(len(scenarios))]
+        for instant, step in enumerate(steps):  # only now: a script may say where somebody has been all along
+            for prop in director.props(step):
+                note(instant, *prop)
     np.savez(
         out,
         id=np.array(list(index), dtype=np.str_),
@@ -61,9 +80,11 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path) -> None
         state=np.array(states, dtype=np.float64).reshape(-1, 4),
         light=np.array(lights, dtype=np.str_),
         light_state=np.array(light_states, dtype=np.str_).reshape(len(steps), len(lights)),
+        begun=np.array(begun, dtype=np.int64),
     )
 
 
 if __name__ == "__main__":
     job = json.loads(Path(sys.argv[1]).read_text())
-    run(Path(job["net"]), Path(job["routes"]), job["seed"], job["steps"], Path(sys.argv[2]))
+    asked = [Scenario.model_validate(scenario) for scenario in job["scenarios"]]
+    run(Path(job["net"]), Path(job["routes"]), job["seed"], job["steps"], Path(sys.argv[2]), asked)

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,10 @@ from flcav.seeds import child_seed, stream
 from flcav.world.demand import types, write_demand
 from flcav.world.parking import Parked, park
 from flcav.world.roads import read_net
+from flcav.world.scenarios.scenario import Scenario
 from flcav.world.shapes import SHAPES
 from flcav.world.sumo_process import STEP_S
+from flcav.world.surfaces import footprint
 from flcav.world.town import KERB_M, Town
 from flcav.world.trace import Trace
 
@@ -29,12 +32,14 @@ FILL_S = 30.0  # everybody is under way by then
 SMOOTHING_STEPS = 4  # half width of the window over which a pose is averaged: SUMO turns and changes lanes in jerks
 
 
-def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray) -> Trace:
+def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: Sequence[Scenario] = ()) -> Trace:
     """Return the traffic of `town` at `times_s` (T,): ascending multiples of 0.1 s after an empty town's time 0.
 
     Actors are "cav<i>" (sedans, under way from the start), "veh<i>", "ped<i>" and "parked<i>"; those absent at all of
-    `times_s` are left out. Before `FILL_S` the town is still filling. The same arguments give the same trace.
-    Raises `InputError` for other times, and for more CAVs than are on the road by the first of them.
+    `times_s` are left out. Before `FILL_S` the town is still filling. The same arguments give the same trace. Whoever
+    takes part in one of the `scenarios` and was made for it is called "scripted<i>".
+    Raises `InputError` for other times, for more CAVs than are on the road by the first of them, and for a scenario
+    that found no place.
     """
     times_s = np.asarray(times_s, dtype=np.float64)
     steps = np.rint(times_s / STEP_S).astype(np.int64)
@@ -46,8 +51,12 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray) -> Trace:
     demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, until_s=float(times_s[-1]), fill_s=FILL_S)
     before, now, after = (_windows(steps + offset) for offset in (-1, 0, 1))
     read = np.unique((before, now, after))
-    raw = _run(town.net, demand, child_seed(seed, "sumo"), read)
-    parked = park(net, town.parameters, stream(seed, "parked"))
+    raw = _run(town.net, demand, child_seed(seed, "sumo"), read, scenarios)
+    for scenario, begun in zip(scenarios, raw["begun"]):
+        if not begun:
+            until = f"between {scenario.at_s:g} s and {times_s[-1]:g} s"
+            raise InputError(f"scenario '{scenario.kind}' found no place near {scenario.near or 'any CAV'} {until}")
+    parked = _beside(raw, park(net, town.parameters, stream(seed, "parked")))
     rows = tuple(np.searchsorted(read, window) for window in (before, now, after))
     trace = _trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
     under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
@@ -61,12 +70,16 @@ def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
 
 
-def _run(net: Path, demand: str, seed: int, steps: NDArray[np.int64]) -> dict[str, NDArray]:
+def _run(
+    net: Path, demand: str, seed: int, steps: NDArray[np.int64], scenarios: Sequence[Scenario]
+) -> dict[str, NDArray]:
     with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
         folder = Path(name)
         routes, job, out = folder / "routes.rou.xml", folder / "job.json", folder / "out.npz"
         routes.write_text(demand, encoding="utf-8")
-        job.write_text(json.dumps({"net": str(net), "routes": str(routes), "seed": seed, "steps": steps.tolist()}))
+        asked = [scenario.model_dump() for scenario in scenarios]
+        values = {"net": str(net), "routes": str(routes), "seed": seed, "steps": steps.tolist(), "scenarios": asked}
+        job.write_text(json.dumps(values))
         command = [sys.executable, "-m", "flcav.world.sumo_process", str(job), str(out)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
@@ -159,6 +172,24 @@ def _rates(before: Array, now: Array, after: Array) -> Array:
     known = ~np.isnan(changes)
     mean = np.where(known, changes, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.where(np.isnan(now), np.nan, mean / STEP_S)
+
+
+def _beside(raw: dict[str, NDArray], parked: list[Parked]) -> list[Parked]:
+    """Return the parked vehicles that are in nobody's way who was made for a scenario."""
+    scripted = np.flatnonzero(np.char.startswith(raw["id"], "scripted"))
+    ways = []
+    for actor in scripted:
+        at = raw["state"][raw["row"][:, 1] == actor]
+        category, _, shape = str(raw["type"][actor]).partition(".")
+        length, width = next(row[1:3] for row in SHAPES[category] if row.name == shape)
+        yaw = np.pi / 2 - np.radians(at[:, 2])
+        middle = at[:, :2] - length / 2 * np.stack((np.cos(yaw), np.sin(yaw)), axis=1)
+        ways += [footprint(x, y, turn, length, width).buffer(0.3) for (x, y), turn in zip(middle, yaw)]
+    taken = shapely.union_all(ways)
+    room = [(car, SHAPES[car.category][car.shape]) for car in parked]
+    return [
+        car for car, size in room if not footprint(car.x, car.y, car.yaw, size.length, size.width).intersects(taken)
+    ]
 
 
 def _pavement(town: Town) -> BaseGeometry:

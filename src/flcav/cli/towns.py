@@ -1,0 +1,70 @@
+"""flcav towns: what towns there are, their maps, and new ones from OpenDRIVE."""
+
+from pathlib import Path
+
+import typer
+
+towns = typer.Typer(help="Towns: list them, draw their maps, import new ones from OpenDRIVE.", no_args_is_help=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.add_typer(towns, name="towns")
+
+
+@towns.command("list")
+def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead.")) -> None:
+    """List the towns that come with flcav, and what they have."""
+    import json
+
+    from flcav.world.census import census
+    from flcav.world.town import TOWNS, load_town
+
+    found = {name: load_town(name) for name in TOWNS}
+    counts = {name: census(town) for name, town in found.items()}
+    if as_json:
+        rows = [{"name": name, "description": found[name].parameters.description, **counts[name]} for name in TOWNS]
+        typer.echo(json.dumps({"towns": rows}))
+        return
+    for name, town in found.items():
+        typer.echo(f"{name}: {town.parameters.description}")
+        typer.echo(f"    {summary(counts[name])}")
+
+
+@towns.command()
+def show(
+    town: str = typer.Argument(help="A town's name, or its folder."),
+    out: Path = typer.Option(..., "--out", help="PNG file to write."),
+) -> None:
+    """Draw a town's map: roads, lanes, markings, buildings, trees, signs, lights, and the numbered candidate poles."""
+    from flcav.files import write_bytes
+    from flcav.report.town_map import town_map
+    from flcav.world.census import census
+    from flcav.world.town import load_town
+
+    loaded = load_town(town)
+    write_bytes(out, town_map(loaded))
+    typer.echo(f"{out}: map of {loaded.name}: {summary(census(loaded))}")
+
+
+@towns.command("import")
+def import_(
+    xodr: Path = typer.Argument(help="OpenDRIVE map (.xodr)."),
+    out: Path = typer.Option(..., "--out", help="New folder of the town; recipes name it as `town: DIR`."),
+) -> None:
+    """Make a town from an OpenDRIVE map, CARLA's included: streets as in the map, furnished like the other towns."""
+    from flcav.world.census import census
+    from flcav.world.opendrive.importing import import_town
+
+    imported = import_town(xodr, out)
+    typer.echo(f"{out}: {summary(census(imported.town))}")
+    for note in imported.notes:
+        typer.echo(f"    {note}")
+
+
+def summary(counts: dict[str, float]) -> str:
+    """Return a town's counts as one line."""
+    extent = f"{counts['width_m']:.0f} m x {counts['height_m']:.0f} m"
+    lengths = f"{counts['driving_km']:g} km of lanes"
+    shown = ("junctions", "lights", "crossings", "buildings", "trees", "signs", "poles", "vehicles", "pedestrians")
+    return ", ".join((extent, lengths, *(f"{counts[name]:g} {name}" for name in shown)))

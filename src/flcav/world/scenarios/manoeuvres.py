@@ -1,0 +1,165 @@
+"""What drivers do to each other: pushing in, and running a red light."""
+
+import math
+from collections.abc import Generator
+from typing import NamedTuple
+
+from flcav.world.roads import Lane
+from flcav.world.scenarios.scenario import Scenario
+from flcav.world.scenarios.stage import STEP_S, Spot, Stage
+from flcav.world.shapes import SHAPES
+
+CLOSE_M = 7.0  # bumper to bumper, when somebody pushes in
+MOVES_OVER_S = 2.2
+FAST = 4.0  # [m/s] slower egos are not worth pushing in before
+ROOM_M = 45.0  # of lane ahead
+KERB_GAP_M = 0.25  # between a standing car and the lane
+CLEAR_M = 2.0  # nobody has ever been so close to where a car from the kerb stands
+DEFAULT_CAR = "car.hatchback"
+LIGHT_M = (6.0, 45.0)  # a runner is so far from the stop line
+SEEN_M = 70.0  # and so far from the vehicle under test
+RUNS_AT = 9.0  # [m/s]
+IGNORES_LIGHTS = 7  # SUMO's speed mode: keeps its distance and its physics, goes by no light and no right of way
+NORMAL = 31
+
+
+class CutIn(NamedTuple):
+    """Who pushes in before whom: a car of the next lane, or one from the kerb."""
+
+    ego: str
+    spot: Spot
+    neighbour: str | None
+
+
+def cast_cut_in(stage: Stage, scenario: Scenario) -> CutIn | None:
+    """Return a vehicle under test with room ahead, and who is beside that room."""
+    for ego in stage.egos(scenario):
+        spot = stage.spot(ego)
+        if not spot or stage.state(ego)[3] < FAST or spot.left < ROOM_M or stage.leader(ego, 25.0):
+            continue
+        neighbour = _beside(stage, spot)
+        if neighbour is not None:
+            return CutIn(ego, spot, neighbour)
+        kind = scenario.actors.get("car", DEFAULT_CAR)
+        x, y, _ = stage.point(spot.lane, _stands_at(spot, kind), _kerb(spot.lane, kind))
+        driving = spot.edge.lanes_of("driving")
+        if len(driving) == 1 and stage.untouched(x, y, CLEAR_M):
+            return CutIn(ego, spot, None)
+    return None
+
+
+def cut_in(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, None, None]:
+    """Move over into the lane of the vehicle under test, right before it, a little slower than it."""
+    if roles.neighbour is None:
+        yield from _pull_out(stage, scenario, roles)
+        return
+    vehicle, name = stage.sumo.vehicle, roles.neighbour
+    stage.take(name)
+    vehicle.setLaneChangeMode(name, 0)
+    lane = int(roles.spot.lane.id.rpartition("_")[2])
+    vehicle.changeLane(name, lane, 20.0)
+    for _ in range(round(2 * MOVES_OVER_S / STEP_S)):
+        if roles.ego in vehicle.getIDList():
+            vehicle.setSpeed(name, max(0.8 * vehicle.getSpeed(roles.ego), 3.0))
+        yield
+    vehicle.setSpeed(name, -1.0)
+    vehicle.setLaneChangeMode(name, 1621)
+
+
+def _beside(stage: Stage, ego: Spot) -> str | None:
+    """Return a vehicle on a neighbouring lane whose rear is just ahead of the ego's front."""
+    driving = list(ego.edge.lanes_of("driving"))
+    here = driving.index(ego.lane) if ego.lane in driving else -9
+    for name in stage.sumo.vehicle.getIDList():
+        spot = stage.spot(name)
+        if name.startswith(("cav", "scripted")) or not spot or spot.edge is not ego.edge or spot.lane not in driving:
+            continue
+        gap = spot.along - stage.sumo.vehicle.getLength(name) - ego.along
+        if abs(driving.index(spot.lane) - here) == 1 and 2.0 <= gap <= CLOSE_M and stage.state(name)[3] > FAST:
+            return name
+    return None
+
+
+def _stands_at(ego: Spot, kind: str) -> float:
+    return ego.along + CLOSE_M + length_of(kind)
+
+
+def _kerb(lane: Lane, kind: str) -> float:
+    """Return how far left of a lane's middle a vehicle stands that is parked at its right."""
+    return -(lane.width / 2 + KERB_GAP_M + width_of(kind) / 2)
+
+
+def _pull_out(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, None, None]:
+    kind = scenario.actors.get("car", DEFAULT_CAR)
+    name, lane, along = stage.cast(kind), roles.spot.lane, _stands_at(roles.spot, kind)
+    aside = _kerb(lane, kind)
+    stage.stood(name, *stage.point(lane, along, aside))
+    speed = 0.7 * stage.state(roles.ego)[3]
+    stage.enter(name, kind, (lane, along), stage.onward(roles.ego), 1.0)
+    steps = round(MOVES_OVER_S / STEP_S)
+    for i in range(steps):
+        left, rate = ease(i / steps)
+        moving = max(stage.state(name)[3], 1.0)
+        turn = math.atan2(-aside * rate / MOVES_OVER_S, moving)
+        stage.shifted[name] = (aside * (1 - left), min(turn, math.radians(25.0)))
+        stage.sumo.vehicle.setSpeed(name, speed * min(1.0, 0.3 + i / steps))
+        yield
+    del stage.shifted[name]
+    stage.sumo.vehicle.setSpeed(name, -1.0)
+
+
+class Runner(NamedTuple):
+    """Who runs which light."""
+
+    name: str
+    light: str
+
+
+def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
+    """Return a vehicle near one under test, first before a red light and still moving."""
+    egos = stage.egos(scenario)
+    for name in stage.sumo.vehicle.getIDList():
+        lights = stage.sumo.vehicle.getNextTLS(name)
+        if not lights or name.startswith("cav") or not stage.spot(name):
+            continue
+        light, _, distance, state = lights[0]
+        near = any(math.dist(stage.state(name)[:2], stage.state(ego)[:2]) <= SEEN_M for ego in egos)
+        first = stage.leader(name, distance + 12.0) is None
+        if near and first and state == "r" and LIGHT_M[0] <= distance <= LIGHT_M[1] and stage.state(name)[3] > FAST:
+            return Runner(name, light)
+    return None
+
+
+def run_the_light(stage: Stage, scenario: Scenario, runner: Runner) -> Generator[None, None, None]:
+    """Drive over the stop line without a look at the light, then by the rules again."""
+    vehicle, name = stage.sumo.vehicle, runner.name
+    stage.take(name)
+    vehicle.setSpeedMode(name, IGNORES_LIGHTS)
+    vehicle.setSpeed(name, max(RUNS_AT, stage.state(name)[3]))
+    while name in vehicle.getIDList() and any(light[0] == runner.light for light in vehicle.getNextTLS(name)[:1]):
+        yield
+    for _ in range(round(1.0 / STEP_S)):
+        yield
+    if name in vehicle.getIDList():
+        vehicle.setSpeedMode(name, NORMAL)
+        vehicle.setSpeed(name, -1.0)
+
+
+def length_of(kind: str) -> float:
+    """Return the length of a vehicle type, "category.shape" [m]."""
+    return _shape(kind)[0]
+
+
+def width_of(kind: str) -> float:
+    """Return the width of a vehicle type, "category.shape" [m]."""
+    return _shape(kind)[1]
+
+
+def _shape(kind: str) -> tuple[float, float]:
+    category, _, name = kind.partition(".")
+    return next((shape.length, shape.width) for shape in SHAPES[category] if shape.name == name)
+
+
+def ease(share: float) -> tuple[float, float]:
+    """Return how much of a smooth move is done after `share` of its time, and the rate then."""
+    return share**2 * (3 - 2 * share), 6 * share * (1 - share)

@@ -1,0 +1,92 @@
+"""Somebody runs out into the road from behind a parked van."""
+
+import math
+from collections.abc import Generator
+from typing import NamedTuple
+
+from flcav.world.roads import Edge
+from flcav.world.scenarios.manoeuvres import KERB_GAP_M, length_of, width_of
+from flcav.world.scenarios.scenario import Scenario
+from flcav.world.scenarios.stage import STEP_S, Spot, Stage
+
+VAN, PEDESTRIAN = "van.high_van", "pedestrian.child"
+FAST = 4.0  # [m/s] slower vehicles are no danger
+AHEAD_M = (22.0, 45.0)  # of the vehicle under test, where the pedestrian crosses
+BEFORE_VAN_M = 0.9  # the pedestrian comes so close before the van's bumper
+RUNS_AT = 2.6  # [m/s]
+NOTICED_S = 0.9  # the run begins so many seconds before the last moment to brake
+WALK_ON_M = 1.5  # beyond the far kerb
+CLEAR_M = 2.2  # nobody has ever been so close to where the van stands
+
+
+class BehindVan(NamedTuple):
+    """Before whom somebody runs out, and where."""
+
+    ego: str
+    spot: Spot
+    along: float  # of the crossing, on the ego's lane [m]
+    kinds: tuple[str, str]  # van, pedestrian
+
+
+def cast_behind_van(stage: Stage, scenario: Scenario) -> BehindVan | None:
+    """Return a vehicle under test that drives freely on the right lane, with room for a van at the kerb ahead."""
+    kinds = scenario.actors.get("van", VAN), scenario.actors.get("pedestrian", PEDESTRIAN)
+    for ego in stage.egos(scenario):
+        spot, speed = stage.spot(ego), stage.state(ego)[3]
+        if not spot or speed < FAST or spot.lane is not spot.edge.lanes_of("driving")[0]:
+            continue
+        along = spot.along + min(max(AHEAD_M[0], 3.2 * speed), AHEAD_M[1])
+        if along + 12.0 > spot.along + spot.left or stage.leader(ego, along - spot.along + 6.0):
+            continue
+        x, y, _ = stage.point(spot.lane, along - BEFORE_VAN_M - length_of(kinds[0]) / 2, _beside(spot, kinds[0]))
+        if stage.untouched(x, y, CLEAR_M):
+            return BehindVan(ego, spot, along, kinds)
+    return None
+
+
+def _beside(spot: Spot, van: str) -> float:
+    """Return how far left of the lane's middle the van stands: it is to the right."""
+    return -(spot.lane.width / 2 + KERB_GAP_M + width_of(van) / 2)
+
+
+def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[None, None, None]:
+    """Wait behind the van until the vehicle is near, run across its lane and on to the other side; traffic brakes."""
+    lane, vehicle = roles.spot.lane, stage.sumo.vehicle
+    van, pedestrian = (stage.cast(kind) for kind in roles.kinds)
+    hidden = _beside(roles.spot, roles.kinds[0])
+    stands = stage.point(lane, roles.along - BEFORE_VAN_M, hidden)
+    stage.stood(van, *stands)
+    stage.stood(pedestrian, *_walker(stage, roles, hidden))
+    at, far = hidden, _far_kerb(stage, roles.spot.edge, lane.width) + WALK_ON_M
+    running = False
+    while True:
+        yield
+        stage.place(van, *stands, 0.0)
+        gone = roles.ego not in vehicle.getIDList() or vehicle.getLaneID(roles.ego) != lane.id
+        if not running and not gone:
+            speed = stage.state(roles.ego)[3]
+            brakes = speed**2 / (2 * 4.5) + 0.7 * speed + 4.0
+            to_lane = (-lane.width / 2 - hidden) / RUNS_AT
+            distance = roles.along - vehicle.getLanePosition(roles.ego)
+            running = distance < brakes + speed * max(NOTICED_S - to_lane, 0.0)
+        crossing = running and at < far
+        at = min(at + RUNS_AT * STEP_S, far) if running else at
+        x, y, heading = _walker(stage, roles, at)
+        stage.place(pedestrian, x, y, heading, RUNS_AT if crossing else 0.0)
+        if crossing and at > -lane.width / 2 - 0.8:
+            stage.brake_for(*stage.point(lane, roles.along, at)[:2], half_width_m=2.2)
+        elif running and not crossing:
+            stage.drive_on()
+
+
+def _walker(stage: Stage, roles: BehindVan, left: float) -> tuple[float, float, float]:
+    x, y, heading = stage.point(roles.spot.lane, roles.along, left)
+    return x, y, heading + math.pi / 2
+
+
+def _far_kerb(stage: Stage, edge: Edge, width: float) -> float:
+    """Return how far the other side of the street is to the left of the middle of an edge's right lane [m]."""
+    ours = sum(lane.width for lane in edge.lanes_of("driving"))
+    back = [other for other in stage.net.streets if (other.start, other.end) == (edge.end, edge.start)]
+    theirs = sum(lane.width for other in back[:1] for lane in other.lanes if lane.kind != "sidewalk")
+    return ours - width / 2 + theirs

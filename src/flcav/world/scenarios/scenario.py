@@ -1,0 +1,44 @@
+"""What a user asks to happen."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from flcav.config import Config
+from flcav.world.shapes import SHAPES
+
+Kind = Literal[
+    "cut_in",  # a car pushes in less than a few metres ahead, from the next lane or from the kerb
+    "overtaking",  # an oncoming car overtakes and meets one in one's own lane
+    "pedestrian_behind_van",  # somebody runs out from behind a parked van
+    "red_light_runner",  # somebody crosses the stop line on red
+    "stalled_vehicle",  # the vehicle ahead breaks down and stays
+    "crash",  # a vehicle runs into the one before it, and both stay
+]
+ROLES: dict[str, tuple[str, ...]] = {  # what takes part and is made for it -> categories it may be of
+    "car": ("car", "van", "motorcycle"),
+    "van": ("van", "truck", "bus"),
+    "pedestrian": ("pedestrian",),
+}
+NEAR_M = 50.0  # of a position
+
+
+class Scenario(Config):
+    """One corner case of a recipe: as soon after `at_s` as the traffic around `near` lends itself to it."""
+
+    kind: Kind
+    at_s: Annotated[float, Field(gt=0)]  # of the traffic's clock, as `warmup_s`; not before
+    near: Annotated[str, Field(pattern=r"^cav\d+$")] | None = None  # None: whichever vehicle under test is first
+    position: tuple[float, float] | None = None  # only while that vehicle is within NEAR_M of it [m]
+    lasts_s: Annotated[float, Field(gt=0)] | None = None  # a stalled vehicle drives on then; None: never
+    actors: dict[str, str] = Field(default={})  # role -> "category.shape", e.g. van: van.high_van
+
+    @model_validator(mode="after")
+    def _known_actors(self) -> "Scenario":
+        for role, name in self.actors.items():
+            if role not in ROLES:
+                raise ValueError(f"unknown role {role!r}; known roles: {', '.join(ROLES)}")
+            kinds = [f"{category}.{shape.name}" for category in ROLES[role] for shape in SHAPES[category]]
+            if name not in kinds:
+                raise ValueError(f"{role}: unknown {name!r}; allowed: {', '.join(kinds)}")
+        return self
