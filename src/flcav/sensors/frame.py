@@ -40,10 +40,10 @@ class CameraImage:
 class Views:
     """How the M annotated actors appear to one camera; pixels, with the centre of the first one at (0, 0)."""
 
-    amodal_box: Array  # (M, 4) x1 y1 x2 y2 of the whole actor, not clipped to the image; NaN behind the camera
+    amodal_box: Array  # (M, 4) x1 y1 x2 y2 of the whole actor, not clipped to the image; NaN where it does not touch it
     visible_box: Array  # (M, 4) of its visible pixels, their outer edges; NaN where there are none
     pixels: NDArray[np.int64]  # (M,) visible ones
-    truncation: Array  # (M,) share of the amodal box outside the image; 1 behind the camera
+    truncation: Array  # (M,) share of the amodal box outside the image; 1 where that is all
     occlusion: Array  # (M,) 1 - visible pixels / those an empty world would show; 1 where none is visible
 
 

@@ -12,8 +12,11 @@ from flcav.seeds import stream
 from flcav.sensors.calibration import CalibrationError, assume, calibration_of
 from flcav.sensors.camera import photograph
 from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
+from flcav.sensors.gnss import fix
+from flcav.sensors.imu import reading
 from flcav.sensors.labels.annotate import Sight, Sweep, annotate
 from flcav.sensors.lidar import Lidar, cast, draw_passes, measure
+from flcav.sensors.radar import radar_sweep
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
 from flcav.world.scene import Scene
 from flcav.world.weather import WEATHERS, Weather
@@ -44,18 +47,30 @@ def observe(
     def rng(sensor: str) -> np.random.Generator:
         return stream(seed, scene_name, index, agent, sensor)
 
-    lidar, sweeps = {}, {}
+    def bias_rng(sensor: str) -> np.random.Generator:
+        return stream(seed, scene_name, agent, sensor)
+
+    lidar, sweeps, exposures, sights, radar, echoes, gnss, imu = {}, {}, {}, {}, {}, {}, {}, {}
     for name, mounted in rig.lidars.items():
         lidar[name], sweeps[name] = _sweep(carrier, name, mounted.settings, weather, rng(name))
-    exposures, sights = {}, {}
     for name, mounted in rig.cameras.items():
         at = carrier.go_to(name)
         exposures[name] = photograph(scene, at, mounted.settings, weather, rng(name), hidden=carrier.own)
         sights[name] = Sight(mounted.settings, at, scene.offset_s, exposures[name].instance)
+    for name, mounted in rig.radars.items():
+        at = carrier.go_to(name)
+        radar[name], actor = radar_sweep(
+            scene, at, carrier.velocity(at), mounted.settings, rng(name), hidden=carrier.own, weather=weather
+        )
+        echoes[name] = np.bincount(actor + 1, minlength=len(scene.trace.actor) + 1)[1:]
+    for name, mounted in rig.gnss.items():
+        gnss[name] = fix(scene, carrier.go_to(name), mounted.settings, rng(name), bias_rng(name))
+    for name, mounted in rig.imus.items():
+        imu[name] = reading(scene, carrier.go_to(name), carrier.own, mounted.settings, rng(name), bias_rng(name))
 
     scene.move_to(index)
     annotations, actors = annotate(
-        scene, carrier.own, within=_within_range(carrier, rig), sweeps=sweeps, sights=sights, echoes={}
+        scene, carrier.own, within=_within_range(carrier, rig), sweeps=sweeps, sights=sights, echoes=echoes
     )
     row = np.zeros(len(scene.trace.actor) + 1, np.uint16)
     row[actors + 1] = np.arange(1, len(actors) + 1)
@@ -73,6 +88,9 @@ def observe(
             name: CameraImage(seen.rgb, seen.depth_m, seen.semantic, row[np.maximum(seen.instance, 0)])
             for name, seen in exposures.items()
         },
+        radar=radar,
+        gnss=gnss,
+        imu=imu,
         weather=weather,
         agent_at_trigger=carrier.poses_at_triggers(),
     )
@@ -101,6 +119,16 @@ class _Carrier:
         """Move the scene to the instant at which `sensor` looks and return its (4, 4) `world_from_sensor` then."""
         self.scene.move_to(self.index, self.calibration.offset_ms[sensor] / 1e3)
         return self.pose() @ self.calibration.agent_from_sensor[sensor]
+
+    def velocity(self, world_from_sensor: Array) -> Array:
+        """Return the (3,) velocity of a sensor where the scene stands [m/s]."""
+        if self.own is None:
+            return np.zeros(3)
+        trace, offset_s = self.scene.trace, self.scene.offset_s
+        arm = world_from_sensor[:3, 3] - self.pose()[:3, 3]
+        spin = np.array((0.0, 0.0, trace.yaw_rate[self.index, self.own]))
+        velocity = trace.velocity[self.index, self.own] + offset_s * trace.acceleration[self.index, self.own]
+        return velocity + np.cross(spin, arm)
 
     def poses_at_triggers(self) -> dict[str, Array]:
         """Return `world_from_agent` at the triggers of the sensors that do not look at the spin; moves the scene."""

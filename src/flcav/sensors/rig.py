@@ -11,7 +11,10 @@ from pydantic import Field, model_validator
 from flcav.config import Config
 from flcav.geometry import pose
 from flcav.sensors.camera import Camera
+from flcav.sensors.gnss import Gnss
+from flcav.sensors.imu import Imu
 from flcav.sensors.lidar import Lidar
+from flcav.sensors.radar import Radar
 
 CAMERA_RANGE_M = (
     100.0  # of labels, where an agent has cameras alone; what shows in an image is labelled at any distance
@@ -57,11 +60,32 @@ class MountedCamera(Mounted):
     settings: Camera = Camera()
 
 
+class MountedRadar(Mounted):
+    """A radar and where it is."""
+
+    settings: Radar = Radar()
+
+
+class MountedGnss(Mounted):
+    """The antenna of a satellite receiver and where it is."""
+
+    settings: Gnss = Gnss()
+
+
+class MountedImu(Mounted):
+    """An inertial measurement unit and where it is."""
+
+    settings: Imu = Imu()
+
+
 class Rig(Config):
     """The sensors of one agent, by name. A car's frame is at its ground centre, a pole's at its mount."""
 
     lidars: dict[str, MountedLidar] = Field(default_factory=dict)
     cameras: dict[str, MountedCamera] = Field(default_factory=dict)
+    radars: dict[str, MountedRadar] = Field(default_factory=dict)
+    gnss: dict[str, MountedGnss] = Field(default_factory=dict)
+    imus: dict[str, MountedImu] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_names(self) -> "Rig":
@@ -95,9 +119,15 @@ def lidar_pole() -> Rig:
 
 
 def car(cameras: Mapping[str, MountedCamera] | None = None) -> Rig:
-    """Return a car's LiDAR and a camera that looks ahead, or the `cameras` given."""
+    """Return a car's LiDAR, a camera that looks ahead (or the `cameras` given), a front radar, GNSS and IMU."""
     ahead = {"camera": MountedCamera(mount=Mount(x=0.5, z=1.5))}
-    return Rig(lidars=lidar32().lidars, cameras=dict(ahead if cameras is None else cameras))
+    return Rig(
+        lidars=lidar32().lidars,
+        cameras=dict(ahead if cameras is None else cameras),
+        radars={"radar": MountedRadar(mount=Mount(x=2.3, z=0.5))},
+        gnss={"gnss": MountedGnss(mount=Mount(x=-0.5, z=1.6))},
+        imus={"imu": MountedImu(mount=Mount(z=0.5))},
+    )
 
 
 def car_surround() -> Rig:
@@ -126,9 +156,12 @@ def kitti() -> Rig:
     Intrinsics and offsets are those of the recordings of 26 September 2011, rotations of less than a degree apart.
     """
     camera = Camera(width=1242, height=375, fx=721.5377, fy=721.5377, cx=609.5593, cy=172.854)
+    unit = Mount(x=-0.81, y=0.32, z=0.93)
     return Rig(
         lidars={"velodyne": MountedLidar(mount=Mount(z=1.73), settings=Lidar(beams="hdl64e"))},
         cameras={"image_2": MountedCamera(mount=Mount(x=0.27, y=0.06, z=1.65), settings=camera)},
+        gnss={"gnss": MountedGnss(mount=unit)},
+        imus={"imu": MountedImu(mount=unit)},
     )
 
 

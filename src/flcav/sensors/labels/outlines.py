@@ -41,12 +41,13 @@ def amodal_boxes(
 ) -> Array:
     """Return (M, 4) x1 y1 x2 y2 [px] around all of each of `actors` (M,) that lies in front of the camera.
 
-    Not clipped to the image; NaN where nothing lies in front. `world_from_camera` (4, 4) is of the optical frame.
+    Not clipped to the image, but NaN where they do not touch it. `world_from_camera` (4, 4) is of the optical frame.
     """
     camera_from_world = inverse(world_from_camera)
     boxes = np.full((len(actors), 4), np.nan)
     outlines: dict[int, Array] = {}
-    for row, actor in enumerate(actors):
+    for row in np.flatnonzero(_may_show(scene, camera_from_world, lens, actors)):
+        actor = actors[row]
         model = hull(str(scene.trace.category[actor]), int(scene.trace.shape[actor]))
         points = transform_points(camera_from_world @ scene.world_from_actor(int(actor)), model.vertices)
         points = points if points[:, 2].min() >= near_m else _in_front(points, model.edges, near_m)
@@ -57,6 +58,7 @@ def amodal_boxes(
         first = np.cumsum([0, *(len(points) for points in outlines.values())])[:-1]
         lowest, highest = np.minimum.reduceat(pixels, first), np.maximum.reduceat(pixels, first)
         boxes[list(outlines)] = np.concatenate((lowest, highest), axis=1)
+    boxes[truncation(boxes, lens) == 1] = np.nan
     return boxes
 
 
@@ -75,6 +77,26 @@ def truncation(boxes: Array, lens: Lens) -> Array:
 
 def _area(boxes: Array) -> Array:
     return (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+
+
+def _may_show(scene: Scene, camera_from_world: Array, lens: Lens, actors: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return (M,) false for actors whose bounding sphere lies outside the pyramid that the image sees."""
+    trace, index = scene.trace, scene.index
+    size = trace.size[actors]
+    drift = abs(scene.offset_s) * np.linalg.norm(np.nan_to_num(trace.velocity[index, actors]), axis=1)
+    radius = np.linalg.norm(size, axis=1) / 2 + 2 * drift
+    x, y, z = transform_points(camera_from_world, trace.position[index, actors] + size * (0, 0, 0.5)).T
+    right, down = np.abs(unproject(lens, _border(lens))).max(axis=0)
+    aside = (np.abs(x) - right * z) / np.hypot(1, right)  # distances beyond the planes through the image's edges
+    above = (np.abs(y) - down * z) / np.hypot(1, down)
+    return (z > -radius) & (aside < radius) & (above < radius)
+
+
+def _border(lens: Lens) -> Array:
+    """Return pixels on the edges of the image."""
+    u, v = np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)
+    across = [np.column_stack((u, np.full(9, edge))) for edge in (0, lens.height - 1)]
+    return np.concatenate((*across, *(np.column_stack((np.full(9, edge), v)) for edge in (0, lens.width - 1))))
 
 
 def _in_front(points: Array, edges: NDArray[np.int64], near_m: float) -> Array:
