@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import shapely
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from matplotlib.lines import Line2D
@@ -94,7 +95,8 @@ def symbols(town: Town) -> list[tuple[str, dict[str, Any], Array]]:
 
 def shadow(house: Array, height: float) -> Array:
     """Return the ground (K, 2) in the shadow of a house, with the house."""
-    return np.asarray(MultiPoint(np.concatenate((house, house + SUN * height / SHADOW))).convex_hull.exterior.coords)
+    both = MultiPoint(np.concatenate((house, house + SUN * height / SHADOW)))
+    return shapely.get_coordinates(both.convex_hull)
 
 
 def footprint(x: float, y: float, yaw: float, length: float, width: float) -> Array:

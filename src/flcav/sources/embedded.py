@@ -87,7 +87,8 @@ class EmbeddedSource:
         """Return the scene's traffic at the times of its spins."""
         if self._last_trace is None or self._last_trace[0] != scene:
             seed = child_seed(self.recipe.seed, "traffic", self.scenes().index(scene))
-            trace = simulate(self.town, seed=seed, cavs=self.recipe.cavs, times_s=self.recipe.times_s())
+            times_s, scenarios = self.recipe.times_s(), self.recipe.scenarios
+            trace = simulate(self.town, seed=seed, cavs=self.recipe.cavs, times_s=times_s, scenarios=scenarios)
             self._last_trace = scene, trace
         return self._last_trace[1]
 

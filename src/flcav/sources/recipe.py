@@ -4,11 +4,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from flcav.config import Config
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
+from flcav.world.scenarios.scenario import Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
 STEP_S = 0.1  # of the traffic
@@ -60,6 +61,16 @@ class Recipe(Config):
     pole_rig: NamedRig = RIGS["lidar_pole"]
     weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])
     calibration_error: CalibrationError = CalibrationError()
+    scenarios: tuple[Scenario, ...] = ()  # corner cases that happen in every scene
+
+    @model_validator(mode="after")
+    def _scenarios_can_happen(self) -> "Recipe":
+        for scenario in self.scenarios:
+            if scenario.near and int(scenario.near.removeprefix("cav")) >= self.cavs:
+                raise ValueError(f"scenarios: '{scenario.kind}' is near {scenario.near}, but cavs = {self.cavs}")
+            if scenario.at_s >= self.times_s()[-1]:
+                raise ValueError(f"scenarios: '{scenario.kind}' is at {scenario.at_s:g} s, after the last spin")
+        return self
 
     def times_s(self) -> NDArray[np.float64]:
         """Return the (spins_per_scene,) times of the spins in each run [s]."""
