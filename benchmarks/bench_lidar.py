@@ -1,7 +1,8 @@
 """The whole LiDAR sensor against bare Embree tracing of the same rays, in one run and one thread.
 
 The reference traces the sweep's rays, and those that pass glass again behind each pane; the sensor also looks up
-materials, applies the power equation, noise and dropout, and writes points.
+materials, applies the power equation, noise and dropout, and writes points. Beside that: the sensor in rain and in fog,
+and over a spin that takes time.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from flcav.world.materials import Material
 from flcav.world.scene import Scene
 from flcav.world.town import load_town
 from flcav.world.traffic import simulate
+from flcav.world.weather import WEATHERS
 
 
 def cpu_ms(works: Sequence[Callable[[], object]], repeats: int) -> list[float]:
@@ -56,11 +58,15 @@ def measure(scene: Scene, rig_name: str, agent: str, repeats: int) -> dict[str, 
         queries.append((np.ascontiguousarray(rays[through]), near))
         hits = scene.cast(at, *queries[-1][:1], near_m=near, far_m=lidar.range_m, hidden=own)
 
-    first, bare, sensor, whole = cpu_ms(
+    roll = lidar.model_copy(update={"rolling": True})
+    first, bare, sensor, rain, fog, rolling, whole = cpu_ms(
         (
             lambda: trace(*queries[0]),
             lambda: [trace(*query) for query in queries],
             lambda: scan(scene, at, lidar, rng, own),
+            lambda: scan(scene, at, lidar, rng, own, WEATHERS["heavy_rain"]),
+            lambda: scan(scene, at, lidar, rng, own, WEATHERS["fog"]),
+            lambda: scan(scene, at, roll, rng, own),
             lambda: observe(scene, rig, agent, index, scene_name="bench", seed=0),
         ),
         repeats,
@@ -72,6 +78,9 @@ def measure(scene: Scene, rig_name: str, agent: str, repeats: int) -> dict[str, 
         "first_trace_mray_per_s": len(rays) / first / 1e3,
         "bare_ms": bare,
         "sensor_ms": sensor,
+        "sensor_in_rain_ms": rain,
+        "sensor_in_fog_ms": fog,
+        "sensor_rolling_ms": rolling,
         "observe_ms": whole,
         "bare_over_sensor": bare / sensor,
     }
@@ -85,7 +94,7 @@ def main() -> None:
     arguments = parser.parse_args()
     town = load_town(arguments.town)
     scene = Scene(town, simulate(town, seed=1, cavs=1, times_s=np.array([60.0])))
-    agents = {"car": "cav0", "roadside": f"pole{town.poles.id[0]}"}
+    agents = {"lidar32": "cav0", "lidar_pole": f"pole{town.poles.id[0]}"}
     figures = {name: measure(scene, name, agent, arguments.repeats) for name, agent in agents.items()}
     if arguments.json:
         print(json.dumps(figures, indent=1))
@@ -93,9 +102,11 @@ def main() -> None:
     print(f"{town.name}, {len(scene.trace.actor)} actors; CPU-ms of one thread, median of {arguments.repeats}")
     for name, row in figures.items():
         print(
-            f"{name:9} {row['rays']:6.0f} rays ({row['rays_through_glass']:.0f} through glass): "
+            f"{name:10} {row['rays']:6.0f} rays ({row['rays_through_glass']:.0f} through glass): "
             f"bare {row['bare_ms']:.2f} ms ({row['first_trace_mray_per_s']:.1f} Mray/s), "
             f"sensor {row['sensor_ms']:.2f} ms, ratio {row['bare_over_sensor']:.2f} (aim 0.50), "
+            f"in rain {row['sensor_in_rain_ms']:.2f}, in fog {row['sensor_in_fog_ms']:.2f}, "
+            f"rolling {row['sensor_rolling_ms']:.2f} ms, "
             f"annotated frame {row['observe_ms']:.2f} ms"
         )
 
