@@ -1,13 +1,22 @@
 """`flcav fit`: learning curves from a history of training runs."""
 
 import json
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 if TYPE_CHECKING:
+    from flcav.optimization.history import History
     from flcav.optimization.learning_curve import Fit
+
+
+class Model(StrEnum):
+    """How the stages add up."""
+
+    additive = "additive"
+    effective = "effective"
 
 
 def register(app: typer.Typer) -> None:
@@ -16,63 +25,111 @@ def register(app: typer.Typer) -> None:
 
 
 def fit(
-    history: Path = typer.Argument(..., help="CSV: task, stage (pretrain, edge, cloud), resource, accuracy[, weight]."),
+    history: Path = typer.Argument(
+        ..., help="CSV: task, stage (pretrain, edge, cloud), resource, accuracy[, weight]; or [task,] samples, "
+        "edge_rounds, cloud_rounds, accuracy[, weight]."
+    ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
-) -> None:
-    """Fit how the error falls with samples and rounds, one curve per task."""
-    import numpy as np
-
-    from flcav.cli.tables import numbers, read_table
+    model: Model = typer.Option(Model.additive, "--model", help="How the stages add up."),
+    at: list[str] = typer.Option(
+        [], "--at", help="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]] to predict the error at; may be given several times."
+    ),
+    group_samples: float = typer.Option(0.0, "--group-samples", min=0, help="effective: samples that vehicles hold."),
+    alpha: float = typer.Option(0.1, "--alpha", min=1e-9, help="effective: worth of a pretraining sample."),
+    beta: float | None = typer.Option(None, "--beta", min=0, help="effective: worth of a held sample; else fitted."),
+    k: int = typer.Option(1, "--edge-rounds-per-cloud-round", min=0, help="effective: edge rounds in a cloud round."),
+    level: float = typer.Option(0.9, "--level", min=0.01, max=0.999, help="Share of repeats between the bands."),
+    repeats: int = typer.Option(200, "--repeats", min=20, help="Bootstrap repeats of the bands."),
+    seed: int = typer.Option(0, "--seed", min=0, help="Seed of the bootstrap."),
+) -> None:  # fmt: skip
+    """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
+    from flcav.cli.tables import read_table
     from flcav.config import InputError
-    from flcav.optimization.curves import STAGES
-    from flcav.optimization.learning_curve import fit_additive, resources_in_order
+    from flcav.optimization.bands import bands
+    from flcav.optimization.history import histories
+    from flcav.optimization.learning_curve import fit_additive, fit_effective
 
-    table = read_table(history, ("task", "stage", "resource", "accuracy"))
-    stages = table["stage"].to_pylist()
-    for row, stage in enumerate(stages, start=1):
-        if stage not in STAGES:
-            raise InputError(f"{history}: row {row}: stage = {stage!r} must be one of {', '.join(STAGES)}")
-    values = numbers(table, ("resource", "accuracy"), history)
-    weight = np.ones(len(values))
-    if "weight" in table.column_names:
-        weight = numbers(table, ("weight",), history)[:, 0]
-    for name, column, least, most in (
-        ("resource", values[:, 0], 0.0, np.inf),
-        ("accuracy", values[:, 1], 0.0, 1.0),
-        ("weight", weight, 0.0, np.inf),
-    ):
-        wrong = np.flatnonzero((column < least) | (column > most))
-        if len(wrong):
-            allowed = "at least 0" if most == np.inf else "from 0 to 1"
-            raise InputError(f"{history}: row {wrong[0] + 1}: {name} = {column[wrong[0]]:g} must be {allowed}")
-    tasks = table["task"].to_pylist()
-    fits: dict[str, Fit] = {}
-    for task in dict.fromkeys(tasks):
-        rows = [row for row, name in enumerate(tasks) if name == task]
-        spent = resources_in_order([stages[row] for row in rows], values[rows, 0])
+    def fitted(points: "History") -> "Fit":
+        samples, edge_rounds, cloud_rounds = points.resources.T
+        columns = (samples, edge_rounds, cloud_rounds, points.accuracy, points.weight)
+        if model is Model.additive:
+            return fit_additive(*columns)
+        if group_samples == 0 and (edge_rounds.any() or cloud_rounds.any()):
+            raise InputError("--model effective needs --group-samples, as the history has rounds")
+        return fit_effective(*columns, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
+
+    asked = [_counts(text) for text in at]
+    answers, shown = [], []
+    for task, points in histories(read_table(history, ("accuracy",)).to_pydict(), str(history), history.stem).items():
         try:
-            fits[str(task)] = fit_additive(spent[:, 0], spent[:, 1], spent[:, 2], values[rows, 1], weight[rows])
+            found = fitted(points)
         except InputError as error:
             raise InputError(f"{history}: task {task!r}: {error}") from None
+        band = bands(found, level=level, repeats=repeats, seed=seed, k=k)
+        answers.append(_answer(task, found, band, points.resources, asked, k))
+        shown.append(found)
     if as_json:
-        typer.echo(json.dumps({"curves": [_as_json(task, each) for task, each in fits.items()]}))
+        typer.echo(json.dumps({"curves": answers}))
     else:
-        _show(fits)
+        _show(answers, shown)
 
 
-def _as_json(task: str, each: "Fit") -> dict:
-    return {"task": task, **each.curve.model_dump(), "rmse": each.rmse, "points": each.points}
+def _counts(text: str) -> list[float]:
+    from flcav.config import InputError
+
+    try:
+        counts = [float(part) for part in text.split(",")]
+    except ValueError:
+        counts = []
+    if not 1 <= len(counts) <= 3 or not all(0 <= count < float("inf") for count in counts):
+        raise InputError(f"--at {text!r} must be SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]], each 0 or more")
+    return counts + [0.0] * (3 - len(counts))
 
 
-def _show(fits: dict[str, "Fit"]) -> None:
+def _answer(
+    task: str, fit: "Fit", found: Any, measured: Any, asked: list[list[float]], k: int
+) -> dict[str, Any]:  # fmt: skip
+    import numpy as np
+
+    from flcav.optimization.bands import METHOD, pointwise, upper_curve
+
+    band = None
+    if found is not None:
+        band = {
+            **{"method": METHOD, "level": found.level, "repeats": len(found.curves), "seed": found.seed},
+            "at": pointwise(fit, found, np.unique(measured, axis=0), k),
+        }
+    predicted = pointwise(fit, found, np.array(asked).reshape(-1, 3), k)
+    extrapolated = [fit.beyond(*counts) for counts in asked]
+    return {
+        "task": task,
+        **fit.curve.model_dump(),
+        **{"rmse": fit.rmse, "points": fit.points, "r_squared": fit.r_squared, "aicc": fit.aicc},
+        "measured": fit.measured,
+        "band": band,
+        "upper": None if found is None else upper_curve(fit, found).model_dump(),
+        "asked": [{**row, "warning": warning} for row, warning in zip(predicted, extrapolated)],
+        "warnings": [*fit.warnings, *filter(None, extrapolated)],
+    }
+
+
+def _show(answers: list[dict[str, Any]], fits: list["Fit"]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("task", "floor", "pretrain", "edge", "cloud", "rmse", "points")
-    for task, each in fits.items():
-        cells = [
-            f"{decay.a:.4g} (x + {decay.x0:.4g})^-{decay.b:.4g}" if decay.a > 0 else "-"
-            for decay in each.curve.decays()
-        ]
-        table.add_row(task, f"{each.curve.floor:.4g}", *cells, f"{each.rmse:.4f}", str(each.points))
-    Console().print(table)
+    console = Console()
+    table = Table("task", "error", "rmse", "R²", "points")
+    for answer, fit in zip(answers, fits):
+        table.add_row(answer["task"], str(fit.curve), f"{fit.rmse:.4f}", f"{fit.r_squared:.3f}", str(fit.points))
+    console.print(table)
+    for answer in answers:
+        for row in answer["asked"]:
+            between = (
+                ""
+                if row["low"] is None
+                else f", {answer['band']['level']:.0%} band {row['low']:.4f} to {row['high']:.4f}"
+            )
+            counts = f"{row['samples']:g} samples, {row['edge_rounds']:g} edge, {row['cloud_rounds']:g} cloud rounds"
+            console.print(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}", highlight=False)
+        for warning in answer["warnings"]:
+            console.print(f"{answer['task']}: {warning}", highlight=False)

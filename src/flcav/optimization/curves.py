@@ -21,6 +21,10 @@ class Decay(Config):
     b: Positive = 1.0
     x0: NonNegative = 0.0
 
+    def __str__(self) -> str:
+        """Return the formula."""
+        return f"{self.a:.4g} {f'(x + {self.x0:.4g})' if self.x0 else 'x'}^-{self.b:.4g}"
+
     @property
     def infinite_at_0(self) -> bool:
         """Return whether the error is infinite before the first sample or round."""
@@ -41,6 +45,11 @@ class Additive(Config):
     pretrain: Decay = Decay()
     edge: Decay = Decay()
     cloud: Decay = Decay()
+
+    def __str__(self) -> str:
+        """Return the formula: x samples, y edge rounds, z cloud rounds."""
+        parts = [str(decay).replace("x", name) for name, decay in zip("xyz", self.decays()) if decay.a > 0]
+        return " + ".join([f"{self.floor:.4g}"] * (self.floor > 0) + parts) or "0"
 
     def decays(self) -> tuple[Decay, Decay, Decay]:
         """Return the decays in the order of `STAGES`."""
@@ -66,6 +75,12 @@ class Effective(Config):
     alpha: Positive
     beta: NonNegative
     group_samples: NonNegative
+
+    def __str__(self) -> str:
+        """Return the formula: x samples, t rounds."""
+        floor = f"{self.floor:.4g} + " if self.floor else ""
+        held = f"{self.beta * self.group_samples:.4g} (1 - 1/(t + 1))"
+        return f"{floor}{self.a:.4g} ({self.alpha:.4g} x + {held})^-{self.b:.4g}"
 
     def error(
         self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1

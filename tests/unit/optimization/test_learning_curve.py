@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
-from flcav.optimization.learning_curve import fit_additive, fit_power, resources_in_order
+from flcav.optimization.history import article_histories, resources_in_order
+from flcav.optimization.learning_curve import fit_additive, fit_power
 
 PUBLISHED = {
     "weather": (11.84, 1.23, {20: 0.703, 50: 0.903, 200: 0.983, 500: 0.998, 1000: 1.0, 2500: 1.0}),
