@@ -126,7 +126,7 @@ def test_bad_settings_get_one_sentence(values: dict[str, Any], message: str):
 
 
 def test_carlas_returns(walled: Scene):
-    exact = {"noise_m": 0.0, "glass_pass": 0.0, "azimuth_steps": 2000}
+    exact: dict[str, Any] = {"noise_m": 0.0, "glass_pass": 0.0, "azimuth_steps": 2000}
     settings = CarlaReturns(dropoff_general_rate=0.0, dropoff_zero_intensity=0.0)
     whole = sweep(walled, carla=settings, **exact)
     distance = np.linalg.norm(whole[:, :3], axis=1)
@@ -180,6 +180,11 @@ def test_a_moving_actor_is_where_it_is_when_the_beams_pass(driving: Scene):
         truck = points[actor == 1]
         back = truck[:, 0] * np.cos(facing) - 30.0 * point_times_s(lidar, truck)
         assert back.min() == pytest.approx(10 - 3.9, abs=0.25)
+
+
+def test_a_spin_of_few_columns_has_fewer_sectors(walled: Scene):
+    coarse: dict[str, Any] = {"azimuth_steps": 7, "channels": 16}
+    np.testing.assert_allclose(sweep(walled, rolling=True, **coarse), sweep(walled, **coarse), atol=1e-5)
 
 
 def test_a_spin_may_begin_between_instants(driving: Scene):
