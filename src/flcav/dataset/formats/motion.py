@@ -3,19 +3,16 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.layout import trace_path
 from flcav.dataset.store import Dataset
-from flcav.world.trace import Trace
 
 
 def agent_velocities(dataset: Dataset, scene: str) -> dict[tuple[str, int], NDArray[np.float64]]:
     """Return (agent, spin) -> (3,) velocity, world [m/s]; zero of an agent that is not in the scene's traffic."""
     keys = [dataset.keys[i] for i in dataset.select(scenes=[scene])]
     velocities = {(key.agent, key.index): np.zeros(3) for key in keys}
-    path = dataset.folder / trace_path(scene)
-    if not path.is_file():
+    trace = dataset.trace(scene)
+    if trace is None:
         return velocities
-    trace = Trace.load(path)
     actors = {name: a for a, name in enumerate(trace.actor.tolist())}
     for key in keys:
         if key.agent in actors:
