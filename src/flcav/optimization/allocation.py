@@ -16,6 +16,7 @@ from flcav.optimization.curves import Curve, Shared
 from flcav.optimization.fairness import least_largest
 from flcav.optimization.instance import Infeasible as Infeasible
 from flcav.optimization.instance import Instance, cost_of, instance
+from flcav.optimization.instance import stage_plan as stage_plan
 from flcav.optimization.problem import Problem, Task
 from flcav.optimization.terms import terms_of
 from flcav.optimization.weighted import least_weighted

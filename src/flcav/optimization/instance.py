@@ -125,11 +125,15 @@ def instance(problem: Problem) -> Instance:
     return Instance(powers, effective, floor)
 
 
+def stage_plan(problem: Problem, task: Task, counts: Sequence[int]) -> StagePlan:
+    """Return the plan of `task` with `counts` = samples, edge rounds, cloud rounds."""
+    samples, edge_rounds, cloud_rounds = counts
+    return StagePlan(samples, edge_rounds, cloud_rounds, task.edge_groups, problem.edge_rounds_per_cloud_round)
+
+
 def cost_of(problem: Problem, task: Task, counts: Sequence[int]) -> Price:
     """Return what `counts` of samples, edge rounds and cloud rounds of `task` cost."""
-    samples, edge_rounds, cloud_rounds = counts
-    plan = StagePlan(samples, edge_rounds, cloud_rounds, task.edge_groups, problem.edge_rounds_per_cloud_round)
-    return price(plan, MessageSizes(task.sample_mb, task.model_mb))
+    return price(stage_plan(problem, task, counts), MessageSizes(task.sample_mb, task.model_mb))
 
 
 def unit_costs(problem: Problem) -> Array:

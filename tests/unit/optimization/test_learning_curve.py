@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
-from flcav.optimization.history import article_histories, resources_in_order
+from flcav.optimization.history import resources_in_order
 from flcav.optimization.learning_curve import fit_additive, fit_power
 
 PUBLISHED = {
