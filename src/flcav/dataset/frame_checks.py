@@ -4,12 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from flcav.geometry import points_in_boxes, transform_points, wrap_angle
+from flcav.geometry import is_rigid, points_in_boxes, transform_points, wrap_angle
 from flcav.sensors.frame import Frame
 from flcav.world.trace import CATEGORIES, Trace
 
 MARGIN_M = 0.15  # a return may lie so far outside its actor's box: range noise, mirrors
 INSIDE = 0.95  # share of an actor's returns that must lie in its box, grown by the margin
+GAP_DEG = 30.0  # a whole spin has returns in every sector so wide
+FORCE = 200.0  # [m/s^2] no vehicle survives
+RATE = 20.0  # [rad/s]
 EXACT = 1e-6  # of what is stored twice [m], [rad], [m/s]
 
 
@@ -21,7 +24,7 @@ def check_values(frame: Frame) -> Iterator[str]:
             yield f"{frame.key}: '{name}' has a point that is not finite"
         elif ((points[:, 3] < 0) | (points[:, 3] > 1)).any():
             yield f"{frame.key}: '{name}' has an intensity outside 0 to 1"
-    if not _rigid(frame.world_from_agent):
+    if not is_rigid(frame.world_from_agent):
         yield f"{frame.key}: the pose of {frame.agent} is not a rigid transform"
     for category in sorted(set(truth.boxes.label.tolist()) - set(CATEGORIES)):
         yield f"{frame.key}: unknown class '{category}'; known: {', '.join(CATEGORIES)}"
@@ -39,16 +42,48 @@ def check_values(frame: Frame) -> Iterator[str]:
         yield f"{frame.key}: the annotation of '{track}' has negative returns, or an occlusion outside 0 to 1"
 
 
-def check_points(frame: Frame) -> Iterator[str]:
-    """Check that each box, grown by the margin, holds as many points as its actor is said to have returned."""
+def check_sweeps(frame: Frame) -> Iterator[str]:
+    """Check that each LiDAR has seen all round."""
+    for name, points in frame.lidar.items():
+        azimuth = np.sort(np.degrees(np.arctan2(points[:, 1], points[:, 0])))
+        gap = np.diff(azimuth, append=azimuth[:1] + 360.0).max(initial=0.0) if len(points) else 360.0
+        if gap > GAP_DEG:
+            yield f"{frame.key}: '{name}' is no whole spin, nothing comes back from a sector of {gap:.0f} degrees"
+
+
+def check_measurements(frame: Frame) -> Iterator[str]:
+    """Check that what radars, satellite receivers and inertial units report is possible."""
+    for name, detections in frame.radar.items():
+        if not np.isfinite(detections).all() or (detections[:, 0] <= 0).any():
+            yield f"{frame.key}: '{name}' has a detection that is not finite, or at no range"
+        if (np.abs(detections[:, 1]) > np.pi).any() or (np.abs(detections[:, 2]) > np.pi / 2).any():
+            yield f"{frame.key}: '{name}' has a detection at an impossible angle"
+    for name, (latitude, longitude, altitude) in frame.gnss.items():
+        if not (abs(latitude) <= 90 and abs(longitude) <= 180 and np.isfinite(altitude)):
+            yield f"{frame.key}: '{name}' is nowhere on Earth"
+    for name, values in frame.imu.items():
+        if not (np.abs(values[:3]).max() < FORCE and np.abs(values[3:]).max() < RATE):
+            yield f"{frame.key}: '{name}' reports a motion that nothing survives"
+
+
+def check_points(frame: Frame, spin_s: float = 0.0) -> Iterator[str]:
+    """Check that each box, grown by the margin, holds as many points as its actor is said to have returned.
+
+    A LiDAR that takes `spin_s` for a spin sees moving actors up to half of it before and after their boxes' time.
+    """
+    if not frame.lidar:
+        return
     boxes, returns = frame.annotations.boxes, frame.annotations.returns
     clouds = [
         transform_points(frame.world_from_sensor(name), points[:, :3].astype(np.float64))
         for name, points in frame.lidar.items()
     ]
     seen = np.flatnonzero(returns > 0)
-    inside = points_in_boxes(np.concatenate(clouds), boxes[seen], MARGIN_M).sum(axis=1)
-    for i, count in zip(seen, inside):
+    everything = np.concatenate(clouds)
+    own_speed = np.linalg.norm(frame.annotations.velocity, axis=1)
+    for i in seen:
+        margin_m = MARGIN_M + spin_s * own_speed[i]
+        count = int(points_in_boxes(everything, boxes[[i]], margin_m).sum())
         if count < INSIDE * returns[i]:
             track, label = frame.annotations.track[i], boxes.label[i]
             yield f"{frame.key}: points lie outside the box of {label} '{track}': {count} of {returns[i]} within"
@@ -82,13 +117,3 @@ def check_traffic(frame: Frame, trace: Trace) -> Iterator[str]:
             )
         if truth.boxes.label[i] != trace.category[a]:
             yield f"{frame.key}: '{track}' is annotated as {truth.boxes.label[i]}, it is a {trace.category[a]}"
-
-
-def _rigid(matrix: np.ndarray) -> bool:
-    rotation = matrix[:3, :3]
-    return bool(
-        np.isfinite(matrix).all()
-        and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
-        and np.linalg.det(rotation) > 0
-        and np.array_equal(matrix[3], (0, 0, 0, 1))
-    )

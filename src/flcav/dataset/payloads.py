@@ -39,7 +39,7 @@ def payloads(frame: Frame) -> Iterator[Payload]:
         for plane, suffix in PLANES.items():
             yield Payload(payload_path(name, frame.key, suffix), encode_plane(plane, getattr(image, plane)))
     for name, image in frame.infrared.items():
-        yield Payload(payload_path(name, frame.key, INFRARED), _png(image))
+        yield Payload(payload_path(name, frame.key, INFRARED), encode_png(image))
     for name, detections in frame.radar.items():
         yield Payload(payload_path(name, frame.key, RADAR), encode_rows(detections))
 
@@ -55,7 +55,7 @@ def encode_plane(plane: str, pixels: NDArray) -> bytes:
         data = io.BytesIO()
         Image.fromarray(pixels).save(data, "webp", lossless=True, quality=0, method=0)
         return data.getvalue()
-    return encode_depth(pixels) if plane == "depth_m" else _png(pixels)
+    return encode_depth(pixels) if plane == "depth_m" else encode_png(pixels)
 
 
 def encode_depth(depth_m: NDArray[np.float32]) -> bytes:
@@ -111,7 +111,8 @@ def _read_depth(path: Path) -> NDArray[np.float32]:
         raise InputError(f"{path}: not a readable depth image ({error})") from None
 
 
-def _png(pixels: NDArray) -> bytes:
+def encode_png(pixels: NDArray) -> bytes:
+    """Return a PNG of (H, W, 3) red, green, blue or (H, W) levels of 8 or 16 bits."""
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "png", compress_level=1)
     return data.getvalue()

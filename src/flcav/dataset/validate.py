@@ -2,12 +2,14 @@
 
 import contextlib
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError
-from flcav.dataset.frame_checks import check_points, check_traffic, check_values
+from flcav.dataset.calibration_checks import check_calibrations
+from flcav.dataset.frame_checks import check_measurements, check_points, check_sweeps, check_traffic, check_values
+from flcav.dataset.image_checks import check_images
 from flcav.dataset.layout import FILES, MANIFEST, FrameKey, read_manifest, table_path, trace_path
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import read_table
@@ -34,13 +36,15 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
         return [*problems, str(error)]
     problems += check_order(dataset.keys)
     problems += _other_counts(dataset)
+    problems += check_calibrations(dataset.calibrations, manifest["recipe"])
+    spin_s = _longest_spin_s(manifest["recipe"])
 
     traces: dict[str, Trace | None] = {}
     for i, key in enumerate(dataset.keys):
         if key.scene not in traces:
             traces = {key.scene: _trace(dataset, key.scene, damaged)}
         try:
-            problems += _frame_problems(dataset.frame(i), traces[key.scene])
+            problems += _frame_problems(dataset.frame(i), traces[key.scene], spin_s)
         except InputError as error:  # a file that cannot be read
             if not any(str(error).startswith(str(folder / name)) for name in damaged):
                 problems.append(str(error))
@@ -48,11 +52,21 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
     return problems
 
 
-def _frame_problems(frame: Frame, trace: Trace | None) -> Iterator[str]:
+def _frame_problems(frame: Frame, trace: Trace | None, spin_s: float) -> Iterator[str]:
     yield from check_values(frame)
-    yield from check_points(frame)
+    yield from check_sweeps(frame)
+    yield from check_points(frame, spin_s)
+    yield from check_measurements(frame)
+    yield from check_images(frame)
     if trace is not None:
         yield from check_traffic(frame, trace)
+
+
+def _longest_spin_s(recipe: Mapping[str, Any]) -> float:
+    """Return how long a spin of the recipe's rolling LiDARs takes at most, 0 where none rolls."""
+    rigs = (recipe.get("vehicle_rig") or {}, recipe.get("pole_rig") or {})
+    settings = [lidar["settings"] for rig in rigs for lidar in rig.get("lidars", {}).values()]
+    return max((1 / lidar["rate_hz"] for lidar in settings if lidar.get("rolling")), default=0.0)
 
 
 def check_order(keys: Sequence[FrameKey]) -> list[str]:

@@ -1,12 +1,13 @@
 """Poses, boxes, projections; the only implementation of each."""
 
 from flcav.geometry.boxes import Boxes, concatenate, points_in_boxes
-from flcav.geometry.poses import inverse, pose, transform_points, wrap_angle, yaw_of
+from flcav.geometry.poses import inverse, is_rigid, pose, transform_points, wrap_angle, yaw_of
 
 __all__ = [
     "Boxes",
     "concatenate",
     "inverse",
+    "is_rigid",
     "points_in_boxes",
     "pose",
     "transform_points",

@@ -41,6 +41,17 @@ def inverse(target_from_source: Array) -> Array:
     return out
 
 
+def is_rigid(target_from_source: Array) -> bool:
+    """Return whether a (4, 4) matrix is a rotation and a shift, to 1e-6."""
+    rotation = target_from_source[:3, :3]
+    return bool(
+        np.isfinite(target_from_source).all()
+        and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+        and np.linalg.det(rotation) > 0
+        and np.array_equal(target_from_source[3], (0, 0, 0, 1))
+    )
+
+
 def yaw_of(target_from_source: Array) -> float:
     """Return the heading [rad] of the source's x axis in the target's x-y plane."""
     return float(np.arctan2(target_from_source[1, 0], target_from_source[0, 0]))

@@ -46,7 +46,7 @@ def amodal_boxes(
     camera_from_world = inverse(world_from_camera)
     boxes = np.full((len(actors), 4), np.nan)
     outlines: dict[int, Array] = {}
-    for row in np.flatnonzero(_may_show(scene, camera_from_world, lens, actors)):
+    for row in np.flatnonzero(_may_show(scene, camera_from_world, lens, actors)).tolist():
         actor = actors[row]
         model = hull(str(scene.trace.category[actor]), int(scene.trace.shape[actor]))
         points = transform_points(camera_from_world @ scene.world_from_actor(int(actor)), model.vertices)
