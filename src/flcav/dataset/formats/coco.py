@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.dataset.formats.exporter import ExportOptions, lacks
-from flcav.dataset.formats.images import png
 from flcav.dataset.formats.rectangles import CLASSES, rectangles
 from flcav.dataset.formats.splits import split_scenes
+from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
 from flcav.sensors.frame import Frame
@@ -31,7 +31,7 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
         for camera, picture in frame.images.items():
             path = out / "images" / split / f"{frame.key}_{camera}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(png(picture.rgb))
+            path.write_bytes(encode_png(picture.rgb))
             counts["images"] += 1
             image = _image(frame, camera, path.name, counts["images"])
             for labels in CLASSES:

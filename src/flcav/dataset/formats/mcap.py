@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 
 from flcav.dataset.formats.colours import COLOURS, OTHER
 from flcav.dataset.formats.exporter import ExportOptions
-from flcav.dataset.formats.images import png
 from flcav.dataset.formats.mounts import quaternion
+from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
 from flcav.progress import Report
@@ -129,7 +129,7 @@ def messages(frame: Frame) -> Iterator[tuple[str, Message | dict[str, Any], floa
             P=np.column_stack((intrinsics, np.zeros(3))).ravel().tolist(),
         )
         yield f"{name}/calibration", calibration, of(name)
-        yield f"{name}/image", CompressedImage(**place(name), data=png(picture.rgb), format="png"), of(name)
+        yield f"{name}/image", CompressedImage(**place(name), data=encode_png(picture.rgb), format="png"), of(name)
     for name, echoes in frame.radar.items():
         yield f"{name}/points", _cloud(radar_points(echoes), RADAR_FIELDS, **place(name)), of(name)
     for name, (latitude, longitude, altitude) in frame.gnss.items():

@@ -13,10 +13,10 @@ import yaml
 from numpy.typing import NDArray
 
 from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks
-from flcav.dataset.formats.images import png
 from flcav.dataset.formats.motion import agent_velocities
 from flcav.dataset.formats.mounts import channels, optical_yaw
 from flcav.dataset.formats.splits import split_scenes
+from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
 from flcav.progress import Report
@@ -93,7 +93,7 @@ def _write_frame(frame: Frame, folder: Path, numbers: dict[str, int], speed_m_s:
     about: dict[str, Any] = {}
     for name, camera in sorted(cameras.items(), key=lambda pair: pair[1]):
         check_rectified(frame, name, "OPV2V")
-        (folder / f"{time}_{camera}.png").write_bytes(png(frame.images[name].rgb))
+        (folder / f"{time}_{camera}.png").write_bytes(encode_png(frame.images[name].rgb))
         world_from_camera = frame.world_from_sensor(name) @ BODY_FROM_OPTICAL.T
         about[camera] = {
             "cords": carla_pose(world_from_camera),

@@ -9,9 +9,9 @@ from pathlib import Path
 import yaml
 
 from flcav.dataset.formats.exporter import ExportOptions, lacks
-from flcav.dataset.formats.images import png
 from flcav.dataset.formats.rectangles import CLASSES, Rectangles, rectangles
 from flcav.dataset.formats.splits import SPLITS, split_scenes
+from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
 
@@ -27,7 +27,7 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
             found = rectangles(frame, camera, options.labels, options.min_pixels)
             height, width = picture.rgb.shape[:2]
             name = f"{frame.key}_{camera}"
-            _write(out / "images" / split / f"{name}.png", png(picture.rgb))
+            _write(out / "images" / split / f"{name}.png", encode_png(picture.rgb))
             _write(out / "labels" / split / f"{name}.txt", label_text(found, width, height).encode())
             counts.update(images=1, objects=len(found))
         progress(i + 1, len(dataset), "")

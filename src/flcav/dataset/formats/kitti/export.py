@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks
-from flcav.dataset.formats.images import png
 from flcav.dataset.formats.mounts import front_camera
 from flcav.dataset.formats.splits import SPLITS, split_scenes
+from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, transform_points, wrap_angle
 from flcav.progress import Report
@@ -78,7 +78,7 @@ def _write_frame(frame: Frame, camera: str, folder: Path, number: str) -> int:
         ),
     )
     _write(folder / "velodyne" / f"{number}.bin", frame.lidar[lidar].astype("<f4").tobytes())
-    _write(folder / "image_2" / f"{number}.png", png(frame.images[camera].rgb))
+    _write(folder / "image_2" / f"{number}.png", encode_png(frame.images[camera].rgb))
     return len(labels)
 
 

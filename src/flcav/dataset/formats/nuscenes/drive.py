@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.dataset.formats.exporter import check_rectified
-from flcav.dataset.formats.images import png
 from flcav.dataset.formats.mounts import channels, optical_yaw, quaternion
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, lidar_bin, radar_pcd
 from flcav.dataset.formats.nuscenes.tables import CAMERAS, CATEGORIES, RADARS, Row, attribute, chain, token, visibility
+from flcav.dataset.payloads import encode_png
 from flcav.geometry import pose, transform_points, yaw_of
 from flcav.sensors.frame import Frame
 
@@ -53,7 +53,7 @@ class Drive:
             self._add_data(frame, name, channel, "pcd.bin", lidar_bin(points, elevations))
         for name, channel in channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS).items():
             check_rectified(frame, name, "nuScenes")
-            self._add_data(frame, name, channel, "png", png(frame.images[name].rgb))
+            self._add_data(frame, name, channel, "png", encode_png(frame.images[name].rgb))
         for name, channel in channels({name: yaw_of(mounts[name]) for name in frame.radar}, RADARS).items():
             radar_from_world = frame.world_from_sensor(name)[:3, :3].T
             self._add_data(frame, name, channel, "pcd", radar_pcd(frame.radar[name], radar_from_world @ velocity))

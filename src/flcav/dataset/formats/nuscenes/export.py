@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.formats.exporter import ExportOptions, lacks
-from flcav.dataset.formats.images import png
 from flcav.dataset.formats.motion import agent_velocities
 from flcav.dataset.formats.nuscenes.drive import Drive
 from flcav.dataset.formats.nuscenes.files import RESOLUTION_M, map_mask
 from flcav.dataset.formats.nuscenes.tables import constant_rows, token
 from flcav.dataset.formats.splits import split_scenes
+from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
 from flcav.progress import Report
@@ -96,5 +96,5 @@ def _write_map(dataset: Dataset, path: Path) -> Array:
         mask = np.zeros((height, width), np.uint8)
     else:
         low, mask = np.array(town.bounds[:2]), map_mask(town)
-    path.write_bytes(png(mask))
+    path.write_bytes(encode_png(mask))
     return pose(-low[0], -low[1])
