@@ -49,7 +49,7 @@ def fit(
     from flcav.optimization.history import histories
     from flcav.optimization.learning_curve import fit_additive, fit_effective
 
-    def fitted(points: "History") -> "Fit":
+    def fitted(points: "History") -> "Fit[Any]":
         samples, edge_rounds, cloud_rounds = points.resources.T
         columns = (samples, edge_rounds, cloud_rounds, points.accuracy, points.weight)
         if model is Model.additive:
@@ -87,7 +87,7 @@ def _counts(text: str) -> list[float]:
 
 
 def _answer(
-    task: str, fit: "Fit", found: Any, measured: Any, asked: list[list[float]], k: int
+    task: str, fit: "Fit[Any]", found: Any, measured: Any, asked: list[list[float]], k: int
 ) -> dict[str, Any]:  # fmt: skip
     import numpy as np
 
@@ -113,7 +113,7 @@ def _answer(
     }
 
 
-def _show(answers: list[dict[str, Any]], fits: list["Fit"]) -> None:
+def _show(answers: list[dict[str, Any]], fits: list["Fit[Any]"]) -> None:
     from rich.console import Console
     from rich.table import Table
 

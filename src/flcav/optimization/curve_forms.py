@@ -7,7 +7,7 @@ are bounded to be >= 0, so every curve falls with every resource.
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from flcav.config import InputError
 from flcav.optimization.curves import STAGES, Additive, Decay, Effective
 
 Array = NDArray[np.float64]
+CurveT = TypeVar("CurveT", Additive, Effective, covariant=True)
 
 STEEPEST = 10.0  # largest exponent tried
 STARTS = (0.1, 0.5, 1.5)  # exponents to start from
@@ -23,7 +24,7 @@ LARGEST_BETA = 1e3
 DEFAULT_BETA = 0.5  # of the article
 
 
-class Form(Protocol):
+class Form(Protocol[CurveT]):
     """A family of curves with bounded parameters p."""
 
     @property
@@ -43,7 +44,7 @@ class Form(Protocol):
         """Return the errors (n,) at `resources` (n, 3)."""
         ...
 
-    def curve(self, p: Array) -> Additive | Effective:
+    def curve(self, p: Array) -> CurveT:
         """Return the curve of parameters p."""
         ...
 

@@ -7,13 +7,14 @@ the loss is soft L1 around three standard deviations. `bands` says how far curve
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Generic
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from flcav.config import InputError
-from flcav.optimization.curve_forms import STEEPEST, AdditiveForm, Form, additive_forms, effective_forms
+from flcav.optimization.curve_forms import STEEPEST, AdditiveForm, CurveT, Form, additive_forms, effective_forms
 from flcav.optimization.curves import STAGES, Additive, Decay, Effective
 
 Array = NDArray[np.float64]
@@ -24,14 +25,14 @@ QUANTITIES = ("samples", "edge_rounds", "cloud_rounds")
 
 
 @dataclass(frozen=True)
-class Fit:
+class Fit(Generic[CurveT]):
     """A curve and how well it describes the points."""
 
-    curve: Additive | Effective
+    curve: CurveT
     rmse: float  # of the accuracy
     points: int
     aicc: float
-    fitted: "Fitted | None" = None
+    fitted: "Fitted[CurveT] | None" = None
 
     @property
     def r_squared(self) -> float:
@@ -84,10 +85,10 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class Fitted(Generic[CurveT]):
     """What a fit was made from: all that repeating it needs."""
 
-    form: Form
+    form: Form[CurveT]
     parameters: Array  # (P,)
     resources: Array  # (n, 3)
     error: Array  # (n,)
@@ -111,7 +112,7 @@ def fit_additive(
     cloud_rounds: ArrayLike,
     accuracy: ArrayLike,
     weight: ArrayLike | None = None,
-) -> Fit:
+) -> Fit[Additive]:
     """Return the additive curve fitted jointly to accuracies (n,) after so much of each stage (n,).
 
     A stage that never varies is left out. Raises `InputError` where there are too few points.
@@ -131,7 +132,7 @@ def fit_effective(
     k: int = 1,
     alpha: float = 0.1,
     beta: float | None = None,
-) -> Fit:
+) -> Fit[Effective]:
     """Return the effective-samples curve fitted to accuracies (n,) after so much of each stage (n,).
 
     `group_samples` are those that the vehicles of all groups hold. Only beta / alpha can be told from the data: alpha
@@ -141,7 +142,7 @@ def fit_effective(
     return _chosen(effective_forms(spent, alpha, beta, group_samples, k), spent, accuracy, weight)
 
 
-def refitted(fitted: Fitted, error: Array) -> Array:
+def refitted(fitted: Fitted[Any], error: Array) -> Array:
     """Return the parameters fitted to other errors (n,) at the same resources, from the old ones on."""
     start, scale = fitted.parameters, fitted.scale
     return _least(fitted.form, fitted.resources, error, fitted.weight, [start], scale, ROUGH)[1]
@@ -151,7 +152,7 @@ def _columns(*columns: ArrayLike) -> Array:
     return np.stack([np.asarray(each, dtype=np.float64) for each in columns], axis=1)
 
 
-def _chosen(forms: Sequence[Form], spent: Array, accuracy: ArrayLike, weight: ArrayLike | None) -> Fit:
+def _chosen(forms: Sequence[Form[CurveT]], spent: Array, accuracy: ArrayLike, weight: ArrayLike | None) -> Fit[CurveT]:
     """Return the fit of least AICc: roughly of all forms, then exactly of the best."""
     error = 1 - np.asarray(accuracy, dtype=np.float64)
     weights = np.ones(len(error)) if weight is None else np.asarray(weight, dtype=np.float64)
@@ -162,7 +163,9 @@ def _chosen(forms: Sequence[Form], spent: Array, accuracy: ArrayLike, weight: Ar
     return _measured(_solved(forms[int(np.argmin(rough))], spent, error, weights, robust))
 
 
-def _solved(form: Form, spent: Array, error: Array, weight: Array, robust: bool, tolerance: float = EXACT) -> Fitted:
+def _solved(
+    form: Form[CurveT], spent: Array, error: Array, weight: Array, robust: bool, tolerance: float = EXACT
+) -> Fitted[CurveT]:
     """Return the curve of least squares from several starts; then, if `robust`, of least soft L1 loss."""
     starts = form.starts(max(float(np.median(error)), 1e-3))
     _, p = _least(form, spent, error, weight, starts, None, tolerance)
@@ -175,7 +178,7 @@ def _solved(form: Form, spent: Array, error: Array, weight: Array, robust: bool,
 
 
 def _least(
-    form: Form,
+    form: Form[Any],
     spent: Array,
     error: Array,
     weight: Array,
@@ -202,7 +205,7 @@ def _least(
     return float(best.cost), best.x
 
 
-def _measured(fitted: Fitted) -> Fit:
+def _measured(fitted: Fitted[CurveT]) -> Fit[CurveT]:
     form, weight = fitted.form, fitted.weight
     residual = form.predict(fitted.parameters, fitted.resources) - fitted.error
     mean_square = float((weight * residual**2).sum() / weight.sum())
