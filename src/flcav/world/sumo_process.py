@@ -20,8 +20,8 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
     """Simulate up to the last of `steps` (ascending, of 0.1 s) and write what was read at each to `out` (.npz).
 
     Arrays: `id`, `type` (A,); `row` (N, 2) instant and actor index; `state` (N, 4) SUMO's x, y [m], angle [deg
-    clockwise from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of each light's links; `begun`
-    the step at which each scenario began, 0 where it never did.
+    clockwise from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of each light's links; `events`
+    the scenarios that happened, as JSON.
     """
     import libsumo
 
@@ -66,9 +66,7 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
                 note(instant, name, domain.getTypeID(name), director.stage.seen(name, state) if director else state)
         light_states.append([libsumo.trafficlight.getRedYellowGreenState(light) for light in lights])
     libsumo.close()
-    begun = [0] * len(scenarios)
     if director:
-        begun = [director.begun.get(i, 0) for i in range(len(scenarios))]
         for instant, step in enumerate(steps):  # only now: a script may say where somebody has been all along
             for prop in director.props(step):
                 note(instant, *prop)
@@ -80,7 +78,7 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
         state=np.array(states, dtype=np.float64).reshape(-1, 4),
         light=np.array(lights, dtype=np.str_),
         light_state=np.array(light_states, dtype=np.str_).reshape(len(steps), len(lights)),
-        begun=np.array(begun, dtype=np.int64),
+        events=np.array(json.dumps(director.events if director else [])),
     )
 
 

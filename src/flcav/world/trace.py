@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -24,6 +25,14 @@ STATE = (
 )
 
 
+class Event(NamedTuple):
+    """A scripted corner case that happened."""
+
+    kind: str
+    begins_s: float  # when those who take part begin to act
+    actors: tuple[str, ...]  # track ids; may name somebody absent at all of the trace's instants
+
+
 @dataclass(frozen=True)
 class Trace:
     """T instants of A actors; an actor's pose is its ground centre, world frame."""
@@ -42,6 +51,7 @@ class Trace:
     yaw_rate: Array  # (T, A) [rad/s]; NaN where absent
     light: NDArray[np.str_]  # (L,) traffic light ids (junction:link index)
     light_state: NDArray[np.str_]  # (T, L) one SUMO state letter: G g y r ...
+    events: tuple[Event, ...] = ()
 
     def save(self, path: Path) -> None:
         """Write the trace as one Parquet file: a row per instant and present actor, the rest in the file's metadata."""
@@ -61,6 +71,8 @@ class Trace:
             "light": self.light.tolist(),
             "light_state": [[i, "".join(self.light_state[i])] for i in changed if i < len(self.time_s)],
         }
+        if self.events:
+            rest["events"] = [event._asdict() for event in self.events]
         table = pa.table(columns).replace_schema_metadata({METADATA: json.dumps(rest)})
         with atomic_path(path) as temporary:
             pq.write_table(table, temporary)
@@ -104,4 +116,5 @@ class Trace:
             yaw_rate=state[..., 10],
             light=np.array(rest["light"], dtype=np.str_),
             light_state=light_state,
+            events=tuple(Event(row["kind"], row["begins_s"], tuple(row["actors"])) for row in rest.get("events", [])),
         )

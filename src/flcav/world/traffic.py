@@ -24,7 +24,7 @@ from flcav.world.shapes import SHAPES
 from flcav.world.sumo_process import STEP_S
 from flcav.world.surfaces import footprint
 from flcav.world.town import KERB_M, Town
-from flcav.world.trace import Trace
+from flcav.world.trace import Event, Trace
 
 Array = NDArray[np.float64]
 
@@ -37,9 +37,10 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
 
     Actors are "cav<i>" (sedans, under way from the start), "veh<i>", "ped<i>" and "parked<i>"; those absent at all of
     `times_s` are left out. Before `FILL_S` the town is still filling. The same arguments give the same trace. Whoever
-    takes part in one of the `scenarios` and was made for it is called "scripted<i>".
-    Raises `InputError` for other times, for more CAVs than are on the road by the first of them, and for a scenario
-    that found no place.
+    takes part in one of the `scenarios` and was made for it is called "scripted<i>"; `events` of the trace says which
+    of them happened, and when: each waits from its `at_s` on until the traffic lends itself to it.
+    Raises `InputError` for other times, for more CAVs than are on the road by the first of them, and for somebody who
+    is to run a red light in a town without lights.
     """
     times_s = np.asarray(times_s, dtype=np.float64)
     steps = np.rint(times_s / STEP_S).astype(np.int64)
@@ -47,15 +48,13 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
         raise InputError(f"times_s = {times_s}: must be ascending multiples of {STEP_S} s above 0")
     if cavs < 0:
         raise InputError(f"cavs = {cavs}: must be 0 or more")
+    if any(scenario.kind == "red_light_runner" for scenario in scenarios) and not town.signals.link:
+        raise InputError(f"scenario 'red_light_runner': {town.name} has no traffic lights")
     net = read_net(town.net)
     demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, until_s=float(times_s[-1]), fill_s=FILL_S)
     before, now, after = (_windows(steps + offset) for offset in (-1, 0, 1))
     read = np.unique((before, now, after))
     raw = _run(town.net, demand, child_seed(seed, "sumo"), read, scenarios)
-    for scenario, begun in zip(scenarios, raw["begun"]):
-        if not begun:
-            until = f"between {scenario.at_s:g} s and {times_s[-1]:g} s"
-            raise InputError(f"scenario '{scenario.kind}' found no place near {scenario.near or 'any CAV'} {until}")
     parked = _beside(raw, park(net, town.parameters, stream(seed, "parked")))
     rows = tuple(np.searchsorted(read, window) for window in (before, now, after))
     trace = _trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
@@ -129,6 +128,9 @@ def _trace(
         yaw_rate=rates[..., 3],
         light=np.array([f"{light}:{i}" for light, links in lights for i in range(links)], dtype=np.str_),
         light_state=np.array(letters, dtype="<U1").reshape(len(time_s), -1),
+        events=tuple(
+            Event(row["kind"], row["begins_s"], tuple(row["actors"])) for row in json.loads(str(raw["events"]))
+        ),
     )
 
 

@@ -16,11 +16,9 @@ class Director:
     def __init__(self, sumo: Any, net: Path, scenarios: list[Scenario]) -> None:
         """Stand at the start of a run; `sumo` is the libsumo module."""
         self.stage = Stage(sumo, read_net(net))
-        self.begun: dict[int, int] = {}  # scenario -> step
+        self.events: list[dict[str, Any]] = []  # as `Event`, of those that happened, in order of time
         self._scenarios = scenarios
-        self._scripts: list[Generator[None, None, None] | None] = [
-            self._play(i, scenario) for i, scenario in enumerate(scenarios)
-        ]
+        self._scripts: list[Generator[None, None, None] | None] = [self._play(scenario) for scenario in scenarios]
 
     def direct(self) -> None:
         """Advance every script by the step that SUMO just made."""
@@ -32,12 +30,19 @@ class Director:
                 except StopIteration:
                     self._scripts[i] = None
 
-    def _play(self, number: int, scenario: Scenario) -> Generator[None, None, None]:
+    def _play(self, scenario: Scenario) -> Generator[None, None, None]:
         cast, act = SCRIPTS[scenario.kind]
         while (roles := cast(self.stage, scenario)) is None:
             yield
-        self.begun[number] = self.stage.step
-        yield from act(self.stage, scenario, roles)
+        there, known = set(self.stage.sumo.vehicle.getIDList()), set(self.stage.props)
+        playing = act(self.stage, scenario, roles)
+        next(playing)
+        found = [roles] if isinstance(roles, str) else [role for role in roles if isinstance(role, str)]
+        actors = [name for name in found if name in there] + [name for name in self.stage.props if name not in known]
+        begins_s = round(self.stage.step * STEP_S, 1)
+        self.events.append({"kind": scenario.kind, "begins_s": begins_s, "actors": actors})
+        yield
+        yield from playing
 
     def props(self, step: int) -> list[tuple[str, str, State]]:
         """Return name, vehicle type and state of every prop at a step."""

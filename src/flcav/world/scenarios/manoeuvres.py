@@ -18,6 +18,7 @@ CLEAR_M = 2.0  # nobody has ever been so close to where a car from the kerb stan
 DEFAULT_CAR = "car.hatchback"
 LIGHT_M = (6.0, 45.0)  # a runner is so far from the stop line
 SEEN_M = 70.0  # and so far from the vehicle under test
+IMPATIENT_S = 8.0  # or has stood there for so long
 RUNS_AT = 9.0  # [m/s]
 IGNORES_LIGHTS = 7  # SUMO's speed mode: keeps its distance and its physics, goes by no light and no right of way
 NORMAL = 31
@@ -116,7 +117,7 @@ class Runner(NamedTuple):
 
 
 def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
-    """Return a vehicle near one under test, first before a red light and still moving."""
+    """Return a vehicle near one under test, first before a red light: still moving, or tired of waiting."""
     egos = stage.egos(scenario)
     for name in stage.sumo.vehicle.getIDList():
         lights = stage.sumo.vehicle.getNextTLS(name)
@@ -125,7 +126,9 @@ def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
         light, _, distance, state = lights[0]
         near = any(math.dist(stage.state(name)[:2], stage.state(ego)[:2]) <= SEEN_M for ego in egos)
         first = stage.leader(name, distance + 12.0) is None
-        if near and first and state == "r" and LIGHT_M[0] <= distance <= LIGHT_M[1] and stage.state(name)[3] > FAST:
+        moving = LIGHT_M[0] <= distance <= LIGHT_M[1] and stage.state(name)[3] > FAST
+        waited = stage.sumo.vehicle.getWaitingTime(name) > IMPATIENT_S
+        if near and first and state == "r" and (moving or waited):
             return Runner(name, light)
     return None
 

@@ -6,19 +6,20 @@ from typing import NamedTuple
 
 from flcav.world.scenarios.manoeuvres import ease, length_of
 from flcav.world.scenarios.scenario import Scenario
-from flcav.world.scenarios.stage import STEP_S, Spot, Stage
+from flcav.world.scenarios.stage import STEP_S, Spot, Stage, State
 
 KIND = "car.sedan"
 BEHIND_M = 5.0  # bumper to bumper, before it pulls out
 AHEAD_M = 4.0  # and before it moves back
 MEETS_M = (45.0, 120.0)  # how far away the vehicle under test is then
-ASIDE_M = 9.0  # and at most so far off its line
-ROOM_M = 62.0  # of lane for the manoeuvre
+STREETS = 3  # on one of so many next edges of its route
+ROOM_M = 50.0  # of lane for the manoeuvre
+FREE_M = 28.0  # ahead of the slow one
 SLOW = 3.0  # [m/s] what is overtaken is slow
 FASTER = 7.0  # [m/s] by so much it is overtaken
-GAINS_MPS2 = 3.5
+GAINS_MPS2, SLOWS_MPS2 = 3.5, 2.5
 SWINGS_S = 1.8  # from one lane to the other
-OPPOSITE = math.radians(150.0)  # at least, between headings
+SEEN_STEPS = 100  # how far back it matters where somebody was
 
 
 class Overtaking(NamedTuple):
@@ -31,24 +32,32 @@ class Overtaking(NamedTuple):
 def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
     """Return somebody oncoming to a vehicle under test, with nobody behind and room ahead."""
     for ego in stage.egos(scenario):
-        x, y, angle, speed = stage.state(ego)
-        heading = math.radians(90.0 - angle)
-        for name in stage.sumo.vehicle.getIDList() if speed > SLOW else ():
+        if stage.state(ego)[3] <= SLOW:
+            continue
+        ahead = [stage.net.edges[edge] for edge in stage.onward(ego)[:STREETS]]
+        oncoming = {(edge.end, edge.start) for edge in ahead}
+        for name in stage.sumo.vehicle.getIDList():
             spot = stage.spot(name)
             if name.startswith("cav") or not spot or spot.left < ROOM_M or len(spot.edge.lanes_of("driving")) > 1:
                 continue
-            to_x, to_y, their_angle, their_speed = stage.state(name)
-            dx, dy = to_x - x, to_y - y
-            ahead = dx * math.cos(heading) + dy * math.sin(heading)
-            aside = -dx * math.sin(heading) + dy * math.cos(heading)
-            turned = abs((their_angle - angle + 180.0) % 360.0 - 180.0)
-            meets = MEETS_M[0] <= ahead <= MEETS_M[1] and 0.0 < aside < ASIDE_M and math.radians(turned) > OPPOSITE
-            if meets and their_speed > SLOW / 2 and not stage.leader(name, 40.0) and _alone(stage, name, spot):
+            if (spot.edge.start, spot.edge.end) not in oncoming or stage.leader(name, FREE_M):
+                continue
+            if _meets(stage.state(name), stage.state(ego)) and _alone(stage, name):
                 return Overtaking(name, spot)
     return None
 
 
-def _alone(stage: Stage, name: str, spot: Spot) -> bool:
+def _meets(one: State, other: State) -> bool:
+    """Say whether two drive towards each other, still far enough apart."""
+    dx, dy = other[0] - one[0], other[1] - one[1]
+    (x, y), (other_x, other_y) = (
+        (math.sin(math.radians(state[2])), math.cos(math.radians(state[2]))) for state in (one, other)
+    )
+    facing = dx * x + dy * y > 0.0 > dx * other_x + dy * other_y
+    return facing and MEETS_M[0] <= math.hypot(dx, dy) <= MEETS_M[1] and one[3] > SLOW / 2
+
+
+def _alone(stage: Stage, name: str) -> bool:
     """Say whether nobody follows close behind, so that somebody could have all along."""
     behind = BEHIND_M + stage.sumo.vehicle.getLength(name)
     trail = dict(stage.trail(name, behind))
@@ -58,7 +67,7 @@ def _alone(stage: Stage, name: str, spot: Spot) -> bool:
         if other != name:
             for step, (x, y, _, _) in states:
                 at = trail.get(step)
-                if at is not None and math.hypot(at[0] - x, at[1] - y) < 5.5 and step > stage.step - 150:
+                if at is not None and math.hypot(at[0] - x, at[1] - y) < 5.5 and step > stage.step - SEEN_STEPS:
                     return False
     return True
 
@@ -72,11 +81,11 @@ def overtake(stage: Stage, scenario: Scenario, roles: Overtaking) -> Generator[N
     for step, (x, y, angle, speed) in stage.trail(slow, BEHIND_M + slow_length):
         stage.place(name, x, y, math.radians(90.0 - angle), speed, step)
     stage.take(slow)
-    vehicle.slowDown(slow, SLOW, 1.5)
     at = vehicle.getLanePosition(slow) - slow_length - BEHIND_M
     speed, out, back = stage.state(slow)[3], 0.0, 0.0
     while back < 1.0:
         yield
+        vehicle.setSpeed(slow, max(SLOW, stage.state(slow)[3] - SLOWS_MPS2 * STEP_S))
         ahead_of = vehicle.getLanePosition(slow) if vehicle.getLaneID(slow) == lane.id else at - length
         passed = at - length > ahead_of + AHEAD_M
         speed = min(speed + GAINS_MPS2 * STEP_S, SLOW + FASTER)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from flcav.world.roads import Edge
 from flcav.world.scenarios.manoeuvres import KERB_GAP_M, length_of, width_of
 from flcav.world.scenarios.scenario import Scenario
-from flcav.world.scenarios.stage import STEP_S, Spot, Stage
+from flcav.world.scenarios.stage import CAREFUL_MPS2, STEP_S, Spot, Stage
 
 VAN, PEDESTRIAN = "van.high_van", "pedestrian.child"
 FAST = 4.0  # [m/s] slower vehicles are no danger
@@ -65,7 +65,7 @@ def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[Non
         gone = roles.ego not in vehicle.getIDList() or vehicle.getLaneID(roles.ego) != lane.id
         if not running and not gone:
             speed = stage.state(roles.ego)[3]
-            brakes = speed**2 / (2 * 4.5) + 0.7 * speed + 4.0
+            brakes = speed**2 / (2 * CAREFUL_MPS2) + 0.45 * speed + 3.0
             to_lane = (-lane.width / 2 - hidden) / RUNS_AT
             distance = roles.along - vehicle.getLanePosition(roles.ego)
             running = distance < brakes + speed * max(NOTICED_S - to_lane, 0.0)
