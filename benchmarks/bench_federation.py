@@ -13,10 +13,11 @@ from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.strategies.fedavg import average
 from flcav.network.ledger import Budget, Ledger
-from flcav.perception.objects.client import ObjectsClient
+from flcav.perception.client import TaskClient
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import sample_from_frame
-from flcav.perception.objects.weights import to_arrays
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.weights import to_arrays
 from flcav.seeds import child_seed
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
@@ -24,7 +25,7 @@ from flcav.sources.recipe import Recipe
 STEPS, REPEATS = 20, 3
 
 
-def bare(clients: dict[str, ObjectsClient], weights, schedule: Schedule) -> None:
+def bare(clients: dict[str, TaskClient], weights, schedule: Schedule) -> None:
     work = schedule.work(1)
     updates = [
         client.train(weights, steps=work.steps, learning_rate=work.learning_rate, seed=child_seed(work.seed, name))
@@ -39,7 +40,7 @@ def main() -> None:
     source = EmbeddedSource(Recipe(town="suburb", seed=1, cavs=2, spins_per_scene=4))
     samples = [sample_from_frame(frame, network.config) for frame in source.frames(source.scenes()[0])]
     weights = to_arrays(network)
-    clients = {f"cav{i}": ObjectsClient(network.config, samples[i::2]) for i in range(2)}
+    clients = {f"cav{i}": TaskClient(OBJECTS, network.config, samples[i::2]) for i in range(2)}
     schedule = Schedule(rounds=1, steps=STEPS, learning_rate=1e-3, final_learning_rate=1e-3, seed=0)
     account = Account(Ledger(Budget(1e6, 1e6)), "edge", "objects", "wireless")
     federate(clients, weights, schedule, account)  # warm-up

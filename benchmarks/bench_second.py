@@ -14,7 +14,9 @@ import numpy as np
 import torch
 
 from flcav.perception.objects import Sample, detect, sample_from_frame, second_tiny
-from flcav.perception.objects.train import GLOBAL, adamw, draw, step
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.training import adamw, step
+from flcav.seeds import stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
@@ -46,8 +48,13 @@ def _alone(sample: Sample) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _step(network, optimizer, samples: list[Sample], number: int) -> None:
-    drawn = [draw(samples[(BATCH * number + i) % FRAMES], GLOBAL, 0, number, i) for i in range(BATCH)]
-    step(network, optimizer, drawn)
+    drawn = [_drawn(network, samples, number, place) for place in range(BATCH)]
+    step(OBJECTS, network, optimizer, drawn)
+
+
+def _drawn(network, samples: list[Sample], number: int, place: int) -> Sample:
+    random = stream(0, "augment", number, place)
+    return OBJECTS.draw(samples, (BATCH * number + place) % FRAMES, network.config, random)
 
 
 def _median_ms(run: Callable[[int], object]) -> float:

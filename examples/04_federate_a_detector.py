@@ -14,10 +14,11 @@ from flcav.dataset.store import Dataset
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
 from flcav.network.ledger import Budget, Ledger
-from flcav.perception.objects.client import ObjectsClient
+from flcav.perception.client import TaskClient
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import sample_from_frame
-from flcav.perception.objects.weights import from_arrays, save_network, to_arrays
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.weights import from_arrays, save_network, to_arrays
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
@@ -34,7 +35,7 @@ def main(out: Path) -> None:
     clients = {}
     for vehicle in VEHICLES:
         frames = (data.frame(i) for i in data.select(agents=[vehicle]))
-        clients[vehicle] = ObjectsClient(network.config, [sample_from_frame(f, network.config) for f in frames])
+        clients[vehicle] = TaskClient(OBJECTS, network.config, [sample_from_frame(f, network.config) for f in frames])
 
     ledger = Ledger(Budget(wireless_mb=6.0, wireline_mb=0.0))
     account = Account(ledger, stage="edge", task="objects", link="wireless")
@@ -46,7 +47,7 @@ def main(out: Path) -> None:
         on_round=lambda number, weights, loss: print(f"round {number}: mean loss {loss:.3f}"),
     )
     from_arrays(network, result.weights)
-    save_network(network, out / "weights.safetensors")
+    save_network(OBJECTS, network, out / "weights.safetensors")
 
     for entry in ledger.entries:
         print(f"round {entry.round} {entry.direction:>4} {entry.client}: {entry.bytes / 1e6:.3f} MB")

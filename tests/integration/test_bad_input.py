@@ -20,7 +20,9 @@ from safetensors.torch import save_file
 from flcav.cli.main import run
 from flcav.dataset.recorder import record
 from flcav.perception.objects.model import second_paper, second_tiny
-from flcav.perception.objects.weights import CONFIG_KEY, save_network
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.weights import save_network
+from flcav.perception.weights import config_key
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
@@ -159,7 +161,7 @@ def test_an_empty_dataset(data: Path, weights: Path, tmp_path: Path, refused: Ca
 def test_weights_of_another_network(data: Path, weights: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
     save_file({"layer": torch.zeros(3)}, tmp_path / "foreign.safetensors")
     with safe_open(weights, framework="pt") as file:
-        config = {CONFIG_KEY: file.metadata()[CONFIG_KEY]}
+        config = {config_key(OBJECTS): file.metadata()[config_key(OBJECTS)]}
     tensors = {name: tensor.contiguous() for name, tensor in second_paper().state_dict().items()}
     save_file(tensors, tmp_path / "mixed.safetensors", config)
     whole = weights.read_bytes()
@@ -203,7 +205,7 @@ def test_a_full_disk_while_weights_are_written(data: Path, tmp_path: Path) -> No
     done = shell("train", "objects", "--data", data, "--out", out, "--epochs", 1, file_bytes=BUDGET_B)
     assert done.returncode == 1
     assert one_sentence(done.stderr) == f"{out / 'weights.safetensors'}: File too large"
-    assert left_in(out) == []
+    assert all(name.startswith("events/") for name in left_in(out))  # curves, whole as far as they go
 
 
 def test_a_full_disk_while_a_picture_is_written(data: Path, tmp_path: Path) -> None:

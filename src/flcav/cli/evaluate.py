@@ -12,27 +12,20 @@ def register(app: typer.Typer) -> None:
 
 
 def evaluate(
-    task: str = typer.Argument(help="What was learned: objects."),
+    task: str = typer.Argument(help="What was learned: weather, signs or objects."),
     data: Path = typer.Option(..., "--data", help="Dataset folder."),
     weights: Path | None = typer.Option(None, "--weights", help="Weights (safetensors) that flcav train wrote."),
     as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
 ) -> None:
-    """Evaluate a network on recorded frames: average precision with its 95 % interval over scenes."""
+    """Evaluate a network on recorded frames: accuracy of weather, mAP of signs, average precision of objects."""
     from flcav import progress
     from flcav.cli.tasks import task_named, weights_given
     from flcav.dataset.store import Dataset
+    from flcav.perception.weights import load_network
 
     learner = task_named(task)
-    network = learner.load(weights_given(weights, task))
-    dataset = Dataset.open(data)
-    frames = (dataset.frame(i) for i in range(len(dataset)))
+    network = load_network(learner, weights_given(weights, task))
     with progress.live(f"evaluate {task}") as report:
-        result = learner.evaluate(network, frames, total=len(dataset), progress=report)
-    if as_json:
-        typer.echo(json.dumps(result, allow_nan=False))
-        return
-    typer.echo(f"{result['frames']} frames of {result['scenes']} scenes")
-    for row in result["scores"]:
-        ap = "nothing to find" if row["ap"] is None else f"AP {row['ap']:.3f} [{row['low']:.3f}, {row['high']:.3f}]"
-        counts = f"{row['targets']} objects, {row['hidden']} more without a return"
-        typer.echo(f"{row['class']:<12}{row['kind']:>4} IoU {row['iou']:.1f}  {ap}  ({counts})")
+        result = learner.evaluate(network, Dataset.open(data), progress=report)
+    lines = [json.dumps(result, allow_nan=False)] if as_json else learner.evaluation_lines(result)
+    typer.echo("\n".join(lines))

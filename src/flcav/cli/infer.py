@@ -1,9 +1,13 @@
-"""flcav infer: a network on point clouds."""
+"""flcav infer: a network on what sensors saw."""
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
+
+if TYPE_CHECKING:
+    from flcav.perception.task import Finding
 
 
 def register(app: typer.Typer) -> None:
@@ -12,24 +16,40 @@ def register(app: typer.Typer) -> None:
 
 
 def infer(
-    task: str = typer.Argument(help="What to find: objects."),
-    inputs: list[Path] = typer.Argument(help="KITTI .bin files, folders of them, or dataset folders."),
+    task: str = typer.Argument(help="What to find: weather, signs or objects."),
+    inputs: list[Path] = typer.Argument(
+        help="KITTI .bin files (objects) or PNG and JPEG files, folders of them, or dataset folders."
+    ),
     weights: Path | None = typer.Option(None, "--weights", help="Weights (safetensors) that flcav train wrote."),
     threshold: float = typer.Option(0.3, "--threshold", min=0.0, max=1.0, help="Lowest score shown."),
+    pictures: Path | None = typer.Option(None, "--pictures", help="Folder for a picture of each input with findings."),
     as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
 ) -> None:
-    """Find objects in point clouds: boxes in the LiDAR frame, x forward, y left, z up, metres and radians."""
+    """Run a network on files or datasets.
+
+    Boxes of objects are in the LiDAR frame: x forward, y left, z up, metres and radians. Boxes of signs are in pixels
+    from the upper left corner of the picture.
+    """
     from flcav.cli.tasks import task_named, weights_given
+    from flcav.perception.weights import load_network
 
     learned = task_named(task)
-    network = learned.load(weights_given(weights, task))
-    results = [result for path in inputs for result in learned.infer(network, path, threshold)]
+    network = load_network(learned, weights_given(weights, task))
+    results = []
+    for number, finding in enumerate(found for path in inputs for found in learned.infer(network, path, threshold)):
+        results.append({"path": str(finding.path), **finding.result})
+        if pictures is not None:
+            _draw(task, finding, pictures / f"{number:05d}_{finding.path.stem}.png")
     if as_json:
         typer.echo(json.dumps({"inputs": results}, allow_nan=False))
         return
     for result in results:
-        typer.echo(f"{result['path']}: {len(result['boxes'])} objects")
-        for box in result["boxes"]:
-            place = f"at ({box['x']:.1f}, {box['y']:.1f}, {box['z']:.1f}) m, yaw {box['yaw']:.2f} rad"
-            size = f"{box['length']:.1f} x {box['width']:.1f} x {box['height']:.1f} m"
-            typer.echo(f"  {box['class']:<11}{box['score']:.2f}  {place}, {size}")
+        typer.echo("\n  ".join([f"{result['path']}:", *learned.finding_lines(result)]))
+
+
+def _draw(task: str, finding: "Finding", path: Path) -> None:
+    from flcav.files import write_bytes
+    from flcav.report import style
+    from flcav.report.inference import DRAWINGS
+
+    write_bytes(path, style.png(DRAWINGS[task](finding.seen, finding.result, finding.path.name)))

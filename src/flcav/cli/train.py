@@ -11,26 +11,34 @@ def register(app: typer.Typer) -> None:
 
 
 def train(
-    task: str = typer.Argument(help="What to learn: objects."),
+    task: str = typer.Argument(help="What to learn: weather, signs or objects."),
     data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
     out: Path = typer.Option(..., "--out", help="Folder of the weights; an interrupted training goes on."),
-    network: str = typer.Option("tiny", "--network", help="tiny or paper."),
+    validation: Path | None = typer.Option(
+        None, "--validation", help="Dataset of other scenes: keeps the epoch that is best on it, and may stop early."
+    ),
+    network: str | None = typer.Option(
+        None, "--network", help="weather and objects: tiny (default) or paper; signs: n (default) or s."
+    ),
     epochs: int = typer.Option(10, "--epochs", min=1, help="Passes through the data."),
+    patience: int = typer.Option(5, "--patience", min=1, help="Epochs without a better validation before it stops."),
     seed: int = typer.Option(0, "--seed", help="Initial weights, order and augmentation."),
 ) -> None:
-    """Train a network on recorded frames with their ground truth; writes OUT/weights.safetensors."""
+    """Train a network on recorded frames with their ground truth; writes OUT/weights.safetensors and its card.
+
+    Curves for TensorBoard go to OUT/events.
+    """
     from flcav import progress
-    from flcav.cli.tasks import DatasetSamples, task_named
+    from flcav.cli.tasks import task_named
     from flcav.dataset.store import Dataset
-    from flcav.files import write_json
+    from flcav.perception.training.run import Request, train_network
 
     learner = task_named(task)
-    net = learner.network(network, seed)
-    samples = DatasetSamples([Dataset.open(folder) for folder in data], learner, net)
+    held = Dataset.open(validation) if validation else None
+    request = Request([Dataset.open(folder) for folder in data], held, network, epochs, patience, seed)
     with progress.live(f"train {task}") as report:
-        loss = learner.train(net, samples, epochs=epochs, seed=seed, checkpoint=out / "checkpoint.pt", progress=report)
-    weights = out / "weights.safetensors"
-    learner.save(net, weights)
-    settings = {"task": task, "network": network, "epochs": epochs, "seed": seed, "data": [str(path) for path in data]}
-    write_json(out / "training.json", settings | {"samples": len(samples), "loss": loss})
-    typer.echo(f"{weights}: trained on {len(samples)} samples, {epochs} epochs, mean loss of the last {loss:.3f}")
+        card = train_network(learner, request, out, report)
+    told = f"{out / 'weights.safetensors'}: trained on {card.samples} samples, {card.training['steps']} steps"
+    typer.echo(f"{told}, mean loss of the last epoch {card.training['loss']:.3f}")
+    if card.metrics:
+        typer.echo("\n".join(["on the validation data:", *learner.evaluation_lines(card.metrics)]))

@@ -20,7 +20,8 @@ from flcav.files import write_bytes, write_json
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.objects.model import Second, second
 from flcav.perception.objects.samples import sample_from_frame
-from flcav.perception.objects.weights import from_arrays, load_network, save_network, to_arrays
+from flcav.perception.objects.weights import load_network, save_network
+from flcav.perception.weights import from_arrays, to_arrays
 from flcav.seeds import child_seed
 
 ROUND = "round.json"

@@ -20,7 +20,7 @@ from flcav.optimization.allocation import allocate
 from flcav.optimization.learning_curve import Fit, fit_additive
 from flcav.optimization.problem import Problem
 from flcav.perception.objects.model import second_tiny
-from flcav.perception.objects.weights import to_arrays
+from flcav.perception.weights import to_arrays
 
 COLUMNS = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
 HISTORY = resources.files("flcav.experiments") / "data" / "history.csv"

@@ -19,8 +19,9 @@ from flcav.perception.objects.detect import detect_all
 from flcav.perception.objects.evaluate import Evaluation, evaluate, truth_of
 from flcav.perception.objects.model import Second, second_tiny
 from flcav.perception.objects.samples import Sample, sample_from_frame
-from flcav.perception.objects.train import train_steps
+from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.weights import load_network, load_weights, save_network
+from flcav.perception.training import train_steps
 from flcav.seeds import child_seed, stream
 
 WEIGHTS, LEDGER, CURVE = "weights.safetensors", "ledger.parquet", "curve.json"
@@ -75,6 +76,7 @@ def _train_until_level(
     while (factor := next_factor([row["ap50"] for row in curve], training)) is not None:
         block = len(curve) + 1
         loss = train_steps(
+            OBJECTS,
             network,
             samples,
             steps=training.block_steps,
@@ -122,6 +124,7 @@ def train_on(
     for round_ in range(1, rounds + 1):
         task = schedule.work(round_)
         train_steps(
+            OBJECTS,
             network,
             samples,
             steps=task.steps,

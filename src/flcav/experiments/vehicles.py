@@ -12,9 +12,10 @@ from flcav.experiments.steps import Work
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, road_view
 from flcav.network.ledger import Ledger, LedgerEntry
-from flcav.perception.objects.client import ObjectsClient
+from flcav.perception.client import TaskClient
 from flcav.perception.objects.detect import detect_all
 from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.weights import load_network
 from flcav.world.town import load_town
 
@@ -36,7 +37,7 @@ def grouped(work: Work, town: str, setting: Protocol) -> list[int]:
 
 def region(
     work: Work, town: str, pole: int | None, setting: Protocol, book: Ledger | None = None
-) -> dict[str, ObjectsClient]:
+) -> dict[str, TaskClient]:
     """Return a region's vehicles with their frames, labelled without ground truth.
 
     The road's views are booked as downlink where a `book` is given (once: the labels are kept through the stages).
@@ -56,10 +57,13 @@ def region(
             for view in told:
                 book.enter(LedgerEntry("edge", TASK, "wireless", "down", 0, name, len(view.message())))
         work.report(done, len(chosen), "labels")
-    return {name: ObjectsClient(frozen.config, samples[name], batch=setting.training.batch) for name in sorted(samples)}
+    return {
+        name: TaskClient(OBJECTS, frozen.config, samples[name], batch=setting.training.batch)
+        for name in sorted(samples)
+    }
 
 
-def held(clients: Mapping[str, ObjectsClient]) -> int:
+def held(clients: Mapping[str, TaskClient]) -> int:
     """Return how many sweeps the vehicles hold together."""
     return sum(len(client.samples) for client in clients.values())
 

@@ -1,54 +1,132 @@
-"""What a perception task is: how to make its network, its samples, its training and its measure."""
+"""What a perception task is: its networks, its samples, its loss and its measure. All else is the same for every task.
 
-from collections.abc import Iterable, Sequence
+Training is `flcav.perception.training`, files of weights are `flcav.perception.weights`, a federation's client is
+`flcav.perception.client`: each works with any `Task`, and so do the command line and the federation.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from flcav.progress import Report
-from flcav.sensors.frame import Frame
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
-NetworkT = TypeVar("NetworkT")
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.progress import Report, silent
+from flcav.seeds import child_seed
+
+ConfigT = TypeVar("ConfigT")
+NetworkT = TypeVar("NetworkT", bound=nn.Module)
 SampleT = TypeVar("SampleT")
 
 
-class Task(Protocol[NetworkT, SampleT]):
-    """One thing to learn from frames. The command line and the experiments work with any of them."""
+@dataclass(frozen=True)
+class Practice:
+    """How a task is trained unless one is told otherwise."""
 
-    name: str
+    batch: int
+    learning_rate: float  # of AdamW, at its peak
+    schedule: str = "one_cycle"
 
-    def network(self, variant: str, seed: int) -> NetworkT:
-        """Return a fresh network; raises `InputError` for an unknown variant."""
+
+@dataclass(frozen=True)
+class Finding:
+    """What a network found in one input."""
+
+    path: Path  # the input's own
+    seen: NDArray[Any]  # point cloud (N, 4) or image (H, W, 3) u8
+    result: dict[str, Any]  # as JSON knows it, without the path
+
+
+class Task(Protocol[ConfigT, NetworkT, SampleT]):
+    """One thing to learn from recorded frames.
+
+    A network carries its configuration as `config`, a pydantic dataclass from which `build` makes it again.
+    """
+
+    @property
+    def name(self) -> str:
+        """Return the task's name on the command line."""
         ...
 
-    def load(self, path: Path) -> NetworkT:
-        """Return the network saved at `path`; raises `InputError` where the file is of another one."""
+    @property
+    def family(self) -> str:
+        """Return the name of the networks' architecture: files of weights are marked with it."""
         ...
 
-    def save(self, network: NetworkT, path: Path) -> None:
-        """Write the network so that `load` returns it."""
+    @property
+    def configurations(self) -> Mapping[str, ConfigT]:
+        """Return the networks one can ask for by name, the default first."""
         ...
 
-    def sample(self, frame: Frame, network: NetworkT) -> SampleT:
-        """Return the frame as the network learns from it."""
+    @property
+    def practice(self) -> Practice:
+        """Return how the task is trained by default."""
         ...
 
-    def train(
-        self,
-        network: NetworkT,
-        samples: Sequence[SampleT],
-        *,
-        epochs: int,
-        seed: int,
-        checkpoint: Path,
-        progress: Report,
-    ) -> float:
-        """Train in place, going on from `checkpoint` if it exists; return the mean loss of the last epoch."""
+    def build(self, config: ConfigT) -> NetworkT:
+        """Return a fresh network; torch's global generator draws its weights."""
         ...
 
-    def evaluate(self, network: NetworkT, frames: Iterable[Frame], *, total: int, progress: Report) -> dict[str, Any]:
-        """Return the task's numbers on `frames`, as JSON knows them."""
+    def samples(self, data: Dataset, config: ConfigT, frames: Sequence[int] | None = None) -> Sequence[SampleT]:
+        """Return what a network of `config` learns from the frames of these numbers (None: all).
+
+        Raises `InputError` where the dataset lacks what the task needs.
+        """
         ...
 
-    def infer(self, network: NetworkT, path: Path, threshold: float) -> list[dict[str, Any]]:
-        """Return one entry {"path": ..., ...} per input that `path` names; raises `InputError` for a bad one."""
+    def draw(self, samples: Sequence[SampleT], index: int, config: ConfigT, rng: np.random.Generator) -> SampleT:
+        """Return sample `index` as one training step sees it: augmented by what `rng` draws."""
         ...
+
+    def loss(self, network: NetworkT, samples: Sequence[SampleT]) -> Tensor:
+        """Return the loss of a batch, differentiable in the network's parameters."""
+        ...
+
+    def evaluate(
+        self, network: NetworkT, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
+    ) -> dict[str, Any]:
+        """Return the task's numbers on frames of a dataset, as JSON knows them."""
+        ...
+
+    def score(self, result: Mapping[str, Any]) -> float:
+        """Return the one number of an evaluation that training is to raise."""
+        ...
+
+    def infer(self, network: NetworkT, path: Path, threshold: float) -> Iterator[Finding]:
+        """Yield what is found in each input that `path` names; raises `InputError` for a bad one."""
+        ...
+
+    def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
+        """Return an evaluation in words."""
+        ...
+
+    def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
+        """Return the result of a `Finding` in words."""
+        ...
+
+
+def configuration(task: Task[ConfigT, Any, Any], name: str | None) -> ConfigT:
+    """Return the configuration of that name, the default for None; raises `InputError` for an unknown one."""
+    known = task.configurations
+    if name is None:
+        return next(iter(known.values()))
+    if name not in known:
+        raise InputError(f"network '{name}': choose one of {', '.join(known)}")
+    return known[name]
+
+
+def fresh(task: Task[ConfigT, NetworkT, Any], config: ConfigT, seed: int) -> NetworkT:
+    """Return a new network, its weights drawn from `seed`."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(child_seed(seed, "weights"))
+        return task.build(config)
+
+
+def of_frames(data: Dataset, frames: Sequence[int] | None) -> Sequence[int]:
+    """Return the frame numbers: `frames`, or all of `data` for None."""
+    return range(len(data)) if frames is None else frames

@@ -13,7 +13,7 @@ from flcav.optimization.curves import Additive, Decay
 from flcav.optimization.learning_curve import Fit
 from flcav.optimization.problem import Problem
 from flcav.perception.objects.model import second_tiny
-from flcav.perception.objects.weights import to_arrays
+from flcav.perception.weights import to_arrays
 
 CURVE = Additive(pretrain=Decay(a=2.0, b=0.3), edge=Decay(a=0.2, b=0.7, x0=1), cloud=Decay(a=0.1, b=0.7, x0=1))
 FIT = Fit(CURVE, 0.0, 20, 0.0)

@@ -15,8 +15,9 @@ import pytest
 
 from flcav.cli.main import run
 from flcav.dataset.recorder import record
-from flcav.perception.objects.task import ObjectsTask
-from flcav.perception.objects.weights import load_network, save_network, to_arrays
+from flcav.perception.objects.model import second_tiny
+from flcav.perception.objects.weights import load_network, save_network
+from flcav.perception.weights import to_arrays
 
 from .frames import cloud_in, detections, frame
 
@@ -57,7 +58,7 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
-    save_network(ObjectsTask().network("tiny", seed=0), path)
+    save_network(second_tiny(), path)
     return path
 
 
@@ -70,7 +71,7 @@ def called(*arguments: object) -> int:
 def test_train_writes_weights_that_evaluate_and_infer_take(data, tmp_path, capsys):
     out = tmp_path / "run"
     assert called("train", "objects", "--data", data, "--data", data, "--out", out, "--epochs", 1) == 0
-    assert json.loads((out / "training.json").read_text())["samples"] == 16
+    assert "- samples: 16" in (out / "card.md").read_text()
     weights = out / "weights.safetensors"
     capsys.readouterr()
     assert called("evaluate", "objects", "--data", data, "--weights", weights, "--json") == 0
@@ -125,7 +126,7 @@ def test_other_bad_input_is_one_sentence(data, weights, tmp_path, capsys):
     (tmp_path / "broken").write_bytes(b"no weights")
     (tmp_path / "empty").mkdir()
     cases = {
-        "choose one of objects": ("train", "poetry", "--data", data, "--out", tmp_path / "o"),
+        "choose one of weather": ("train", "poetry", "--data", data, "--out", tmp_path / "o"),
         "choose one of tiny, paper": ("train", "objects", "--data", data, "--out", tmp_path / "o", "--network", "huge"),
         "manifest": ("train", "objects", "--data", tmp_path / "empty", "--out", tmp_path / "o"),
         "damaged": ("evaluate", "objects", "--data", data, "--weights", tmp_path / "broken"),

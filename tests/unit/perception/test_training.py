@@ -6,12 +6,15 @@ import torch
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
-from flcav.perception.objects import detect_all, train_steps
-from flcav.perception.objects.client import ObjectsClient
+from flcav.perception.client import TaskClient
+from flcav.perception.objects import detect_all
+from flcav.perception.objects.batch import batch_loss
 from flcav.perception.objects.evaluate import Truth, score_detections
-from flcav.perception.objects.task import ObjectsTask
-from flcav.perception.objects.train import Checkpointing, batch_loss, batches, one_cycle, train
-from flcav.perception.objects.weights import to_arrays
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import configuration, fresh
+from flcav.perception.training import Checkpointing, batches, train, train_steps
+from flcav.perception.training.schedules import one_cycle
+from flcav.perception.weights import to_arrays
 
 from .toy import spin, toy_sample
 
@@ -23,8 +26,8 @@ def samples():
     return [toy_sample(seed, RAYS) for seed in range(5)]
 
 
-def fresh():
-    return ObjectsTask().network("tiny", seed=1)
+def tiny(seed=1):
+    return fresh(OBJECTS, configuration(OBJECTS, "tiny"), seed)
 
 
 def same(one, other):
@@ -32,9 +35,9 @@ def same(one, other):
 
 
 def test_one_seed_one_result(samples):
-    networks = [fresh(), fresh(), fresh()]
+    networks = [tiny(), tiny(), tiny()]
     for network, seed in zip(networks, (3, 3, 4), strict=True):
-        train_steps(network, samples, steps=2, learning_rate=1e-3, seed=seed)
+        train_steps(OBJECTS, network, samples, steps=2, learning_rate=1e-3, seed=seed)
     assert same(networks[0], networks[1])
     assert not same(networks[0], networks[2])
 
@@ -45,8 +48,8 @@ class Killed(Exception):
 
 def test_a_killed_run_goes_on_to_the_same_weights(samples, tmp_path):
     settings = {"steps": 5, "seed": 3, "learning_rate": 1e-3}
-    whole, cut = fresh(), fresh()
-    losses = train(whole, samples, **settings)
+    whole, cut = tiny(), tiny()
+    losses = train(OBJECTS, whole, samples, **settings).losses
     checkpointing = Checkpointing(tmp_path / "checkpoint.pt", every=2)
 
     def kill(done, total, note):
@@ -54,34 +57,34 @@ def test_a_killed_run_goes_on_to_the_same_weights(samples, tmp_path):
             raise Killed
 
     with pytest.raises(Killed):
-        train(cut, samples, checkpointing=checkpointing, progress=kill, **settings)
-    resumed = fresh()
+        train(OBJECTS, cut, samples, checkpointing=checkpointing, progress=kill, **settings)
+    resumed = tiny()
     seen = []
     again = train(
-        resumed, samples, checkpointing=checkpointing, progress=lambda done, *_: seen.append(done), **settings
+        OBJECTS, resumed, samples, checkpointing=checkpointing, progress=lambda done, *_: seen.append(done), **settings
     )
     assert seen == [3, 4, 5]
-    assert np.array_equal(losses, again)
+    assert np.array_equal(losses, again.losses)
     assert same(whole, resumed)
 
 
 def test_a_checkpoint_of_another_run_is_refused(samples, tmp_path):
     checkpointing = Checkpointing(tmp_path / "checkpoint.pt", every=1)
-    train(fresh(), samples, steps=1, seed=0, checkpointing=checkpointing)
+    train(OBJECTS, tiny(), samples, steps=1, seed=0, checkpointing=checkpointing)
     with pytest.raises(InputError, match="other settings"):
-        train(fresh(), samples, steps=1, seed=1, checkpointing=checkpointing)
+        train(OBJECTS, tiny(), samples, steps=1, seed=1, checkpointing=checkpointing)
     checkpointing.path.write_bytes(b"garbage")
     with pytest.raises(InputError, match="not a checkpoint"):
-        train(fresh(), samples, steps=1, seed=0, checkpointing=checkpointing)
+        train(OBJECTS, tiny(), samples, steps=1, seed=0, checkpointing=checkpointing)
 
 
 def test_no_samples_and_unknown_schedules_are_refused(samples):
     with pytest.raises(InputError, match="0 samples"):
-        train(fresh(), [], steps=1, seed=0)
+        train(OBJECTS, tiny(), [], steps=1, seed=0)
     with pytest.raises(InputError, match="one_cycle"):
-        train(fresh(), samples, steps=1, seed=0, schedule="spiral")
+        train(OBJECTS, tiny(), samples, steps=1, seed=0, schedule="spiral")
     with pytest.raises(InputError, match="0 samples"):
-        ObjectsClient(fresh().config, [])
+        TaskClient(OBJECTS, tiny().config, [])
 
 
 def test_batches_are_shuffled_passes():
@@ -101,14 +104,14 @@ def test_one_cycle_rises_then_falls():
 
 def test_scenes_without_objects_train(samples):
     empty = type(samples[0])(samples[0].points, Boxes.empty())
-    loss = batch_loss(fresh(), [empty, samples[1]])
+    loss = batch_loss(tiny(), [empty, samples[1]])
     loss.backward()
     assert torch.isfinite(loss)
 
 
 def test_a_client_returns_its_update_and_keeps_nothing(samples):
-    client = ObjectsClient(fresh().config, samples)
-    weights = to_arrays(fresh())
+    client = TaskClient(OBJECTS, tiny().config, samples)
+    weights = to_arrays(tiny())
     first = client.train(weights, steps=2, learning_rate=1e-3, seed=5)
     again = client.train(weights, steps=2, learning_rate=1e-3, seed=5)
     assert list(first.weights) == list(weights)
@@ -121,8 +124,8 @@ def test_a_client_returns_its_update_and_keeps_nothing(samples):
 @pytest.mark.slow
 def test_it_learns_the_toy():
     rays = spin(beams=32, azimuths=900, field_of_view_deg=90)
-    network = ObjectsTask().network("tiny", seed=0)
-    losses = train(network, [toy_sample(seed, rays) for seed in range(60)], steps=200, seed=0)
+    network = tiny(seed=0)
+    losses = train(OBJECTS, network, [toy_sample(seed, rays) for seed in range(60)], steps=200, seed=0).losses
     test = [toy_sample(10**6 + seed, rays) for seed in range(24)]
     truths = [Truth(f"s{i // 3}", sample.boxes, sample.ignore, Boxes.empty()) for i, sample in enumerate(test)]
     found = detect_all(network, [sample.points for sample in test], score_threshold=0.05)

@@ -4,7 +4,6 @@ from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect, detect_all
 from flcav.perception.objects.model import Second, second, second_paper, second_tiny
 from flcav.perception.objects.samples import Sample, sample_from_frame
-from flcav.perception.objects.train import train_steps
 
 __all__ = [
     "Sample",
@@ -16,5 +15,4 @@ __all__ = [
     "second",
     "second_paper",
     "second_tiny",
-    "train_steps",
 ]

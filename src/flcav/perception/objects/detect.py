@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, concatenate
 from flcav.perception.objects.anchors import anchor_boxes, anchor_classes
+from flcav.perception.objects.batch import predict
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.targets import decode
-from flcav.perception.objects.train import predict
 from flcav.perception.ops.rotated import nms
 
 CANDIDATES = 256  # best-scoring anchors per class that suppression looks at

@@ -143,41 +143,44 @@ def second(config: SecondConfig) -> Second:
     return Second(config)
 
 
+def tiny_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -> SecondConfig:
+    """Return what the demo trains on a CPU: 0.33 M parameters, 0-48 m ahead, 24 m to either side."""
+    return SecondConfig(
+        anchors=_anchors(classes),
+        range_m=(0, -24, -3, 48, 24, 1),
+        voxel_m=(0.1, 0.1, 0.1),
+        sparse_channels=(16, 16, 32, 32),
+        sparse_out=32,
+        bev_layers=(2, 2),
+        bev_channels=(32, 64),
+        bev_up_channels=(48, 48),
+        ground_z_m=ground_z_m,
+    )
+
+
 def second_tiny(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -> Second:
-    """Return the network the demo trains on a CPU: 0.33 M parameters, 0-48 m ahead, 24 m to either side."""
-    return second(
-        SecondConfig(
-            anchors=_anchors(classes),
-            range_m=(0, -24, -3, 48, 24, 1),
-            voxel_m=(0.1, 0.1, 0.1),
-            sparse_channels=(16, 16, 32, 32),
-            sparse_out=32,
-            bev_layers=(2, 2),
-            bev_channels=(32, 64),
-            bev_up_channels=(48, 48),
-            ground_z_m=ground_z_m,
-        )
+    """Return a fresh network of `tiny_config`."""
+    return second(tiny_config(classes, ground_z_m))
+
+
+def paper_config(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), ground_z_m: float = -1.8) -> SecondConfig:
+    """Return the published widths: 5.3 M parameters, 0-70.4 m ahead, 40 m to either side."""
+    return SecondConfig(
+        anchors=_anchors(classes),
+        range_m=(0, -40, -3, 70.4, 40, 1),
+        voxel_m=(0.05, 0.05, 0.1),
+        sparse_channels=(16, 32, 64, 64),
+        sparse_out=128,
+        bev_layers=(5, 5),
+        bev_channels=(128, 256),
+        bev_up_channels=(256, 256),
+        ground_z_m=ground_z_m,
     )
 
 
 def second_paper(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), ground_z_m: float = -1.8) -> Second:
-    """Return the published widths: 5.3 M parameters, 0-70.4 m ahead, 40 m to either side."""
-    return second(
-        SecondConfig(
-            anchors=_anchors(classes),
-            range_m=(0, -40, -3, 70.4, 40, 1),
-            voxel_m=(0.05, 0.05, 0.1),
-            sparse_channels=(16, 32, 64, 64),
-            sparse_out=128,
-            bev_layers=(5, 5),
-            bev_channels=(128, 256),
-            bev_up_channels=(256, 256),
-            ground_z_m=ground_z_m,
-        )
-    )
-
-
-NETWORKS = {"tiny": second_tiny, "paper": second_paper}
+    """Return a fresh network of `paper_config`."""
+    return second(paper_config(classes, ground_z_m))
 
 
 def _anchors(classes: tuple[str, ...]) -> tuple[Anchor, ...]:
@@ -185,3 +188,6 @@ def _anchors(classes: tuple[str, ...]) -> tuple[Anchor, ...]:
     if unknown or not classes:
         raise InputError(f"classes = {classes!r}: choose one or more of {', '.join(ANCHORS)}")
     return tuple(ANCHORS[name] for name in classes)
+
+
+CONFIGURATIONS = {"tiny": tiny_config(), "paper": paper_config()}

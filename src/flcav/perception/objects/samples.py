@@ -1,12 +1,15 @@
 """What the detector learns from: a point cloud, the boxes to find, the places to leave out of the loss."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse
 from flcav.perception.objects.config import Augmentation, SecondConfig
 from flcav.sensors.frame import Frame
@@ -50,6 +53,19 @@ def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = No
     learn = boxes[wanted]
     learn = Boxes(learn.center, learn.size, learn.yaw, label[wanted])
     return Sample(near_range(frame.lidar[name], config), learn, boxes[neutral])
+
+
+class RecordedSweeps(Sequence[Sample]):
+    """The frames of a dataset as samples with their ground truth, read when asked for."""
+
+    def __init__(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> None:
+        self._data, self._config, self._frames = data, config, frames
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: Any) -> Any:
+        return sample_from_frame(self._data.frame(self._frames[index]), self._config)
 
 
 def detection_labels(category: NDArray[np.str_], classes: tuple[str, ...]) -> NDArray[np.str_]:

@@ -1,83 +1,85 @@
 """Object detection as a `Task`."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
+from torch import Tensor
 
-from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.perception.objects.augment import augment
+from flcav.perception.objects.batch import GLOBAL, batch_loss
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import evaluate
 from flcav.perception.objects.infer import box_rows, point_clouds
-from flcav.perception.objects.model import NETWORKS, Second
-from flcav.perception.objects.samples import Sample, sample_from_frame
-from flcav.perception.objects.train import Checkpointing, train
-from flcav.perception.objects.weights import load_network, save_network
+from flcav.perception.objects.model import CONFIGURATIONS, Second, second
+from flcav.perception.objects.samples import RecordedSweeps, Sample
+from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
-from flcav.seeds import child_seed
-from flcav.sensors.frame import Frame
-
-BATCH = 2
 
 
 class ObjectsTask:
     """3D boxes of road users in a LiDAR sweep."""
 
     name = "objects"
+    family = "second"
+    configurations = CONFIGURATIONS
+    practice = Practice(batch=2, learning_rate=2e-3)
 
-    def network(self, variant: str = "tiny", seed: int = 0) -> Second:
-        """Return a fresh network, `tiny` or `paper`, its weights drawn from `seed`."""
-        if variant not in NETWORKS:
-            raise InputError(f"network '{variant}': choose one of {', '.join(NETWORKS)}")
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(child_seed(seed, "weights"))
-            return NETWORKS[variant]()
+    def build(self, config: SecondConfig) -> Second:
+        """Return a fresh network."""
+        return second(config)
 
-    def load(self, path: Path) -> Second:
-        """Return the network saved at `path`; raises `InputError` where the file is of another one."""
-        return load_network(path)
+    def samples(self, data: Dataset, config: SecondConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
+        """Return each frame's sweep with its ground truth as labels, read when asked for."""
+        return RecordedSweeps(data, config, of_frames(data, frames))
 
-    def save(self, network: Second, path: Path) -> None:
-        """Write configuration and weights as safetensors."""
-        save_network(network, path)
+    def draw(self, samples: Sequence[Sample], index: int, config: SecondConfig, rng: np.random.Generator) -> Sample:
+        """Return the sample mirrored, turned and scaled at random."""
+        return augment(samples[index], GLOBAL, rng)
 
-    def sample(self, frame: Frame, network: Second) -> Sample:
-        """Return the frame's sweep with its ground truth as labels."""
-        return sample_from_frame(frame, network.config)
-
-    def train(
-        self,
-        network: Second,
-        samples: Sequence[Sample],
-        *,
-        epochs: int,
-        seed: int,
-        checkpoint: Path,
-        progress: Report = silent,
-    ) -> float:
-        """Train in place over `epochs` passes, one learning-rate cycle; return the mean loss of the last pass."""
-        per_epoch = max(1, len(samples) // BATCH)
-        losses = train(
-            network,
-            samples,
-            steps=epochs * per_epoch,
-            batch=BATCH,
-            seed=seed,
-            checkpointing=Checkpointing(checkpoint),
-            progress=progress,
-        )
-        return float(losses[-per_epoch:].mean())
+    def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
+        """Return SECOND's loss of a batch."""
+        return batch_loss(network, samples)
 
     def evaluate(
-        self, network: Second, frames: Iterable[Frame], *, total: int = 0, progress: Report = silent
+        self, network: Second, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
     ) -> dict[str, Any]:
         """Return AP per class, kind of overlap and IoU, with intervals over scenes."""
-        return evaluate(network, frames, total=total, progress=progress).summary()
+        numbers = of_frames(data, frames)
+        return evaluate(network, map(data.frame, numbers), total=len(numbers), progress=progress).summary()
 
-    def infer(self, network: Second, path: Path, threshold: float = 0.3) -> list[dict[str, Any]]:
-        """Return {"path", "boxes": [...]} for each point cloud of `path`, see `infer.point_clouds`."""
-        return [
-            {"path": str(origin), "boxes": box_rows(detect(network, points, score_threshold=threshold))}
-            for origin, points in point_clouds(path)
-        ]
+    def score(self, result: Mapping[str, Any]) -> float:
+        """Return the mean over classes of AP in 3D at IoU 0.5; 0 where there was nothing to find."""
+        known = [row["ap"] for row in result["scores"] if (row["kind"], row["iou"]) == ("3d", 0.5) and row["ap"]]
+        return float(np.mean(known)) if known else 0.0
+
+    def infer(self, network: Second, path: Path, threshold: float = 0.3) -> Iterator[Finding]:
+        """Yield {"boxes": [...]} for each point cloud of `path`, see `infer.point_clouds`."""
+        for origin, points in point_clouds(path):
+            yield Finding(origin, points, {"boxes": box_rows(detect(network, points, score_threshold=threshold))})
+
+    def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
+        """Return one line per class, kind of overlap and IoU."""
+        lines = [f"{result['frames']} frames of {result['scenes']} scenes"]
+        for row in result["scores"]:
+            found = "nothing to find"
+            if row["ap"] is not None:
+                found = f"AP {row['ap']:.3f} [{row['low']:.3f}, {row['high']:.3f}]"
+            counts = f"{row['targets']} objects, {row['hidden']} more without a return"
+            lines.append(f"{row['class']:<12}{row['kind']:>4} IoU {row['iou']:.1f}  {found}  ({counts})")
+        return lines
+
+    def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
+        """Return one line per box."""
+        lines = [f"{len(result['boxes'])} objects"]
+        for box in result["boxes"]:
+            place = f"at ({box['x']:.1f}, {box['y']:.1f}, {box['z']:.1f}) m, yaw {box['yaw']:.2f} rad"
+            size = f"{box['length']:.1f} x {box['width']:.1f} x {box['height']:.1f} m"
+            lines.append(f"{box['class']:<11}{box['score']:.2f}  {place}, {size}")
+        return lines
+
+
+OBJECTS = ObjectsTask()

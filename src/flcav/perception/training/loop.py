@@ -1,0 +1,179 @@
+"""The training loop: samples in, changed weights out, the same for the same seed, wherever it was interrupted."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from flcav.config import InputError
+from flcav.perception.task import NetworkT, SampleT, Task
+from flcav.perception.training.checkpoint import Progress, load_checkpoint, save_checkpoint
+from flcav.perception.training.schedules import SCHEDULES
+from flcav.progress import Report, silent
+from flcav.seeds import stream
+
+CLIP_NORM = 10.0
+
+Watch = Callable[[int, Mapping[str, float]], None]  # steps taken, numbers by name
+
+
+def _unwatched(step: int, values: Mapping[str, float]) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Checkpointing:
+    """Where a run leaves off, and how often it says so."""
+
+    path: Path
+    every: int = 50  # steps
+
+
+@dataclass(frozen=True)
+class Validation:
+    """When to look how good the network is, and when to give up hope of a better one."""
+
+    score: Callable[[Any], float]  # of a network; the higher, the better
+    every: int  # steps
+    patience: int  # validations without a new best after which training ends
+
+    def over(self, scores: Sequence[float]) -> bool:
+        """Return whether the last `patience` of `scores` brought nothing above those before."""
+        return len(scores) > self.patience and max(scores[-self.patience :]) <= max(scores[: -self.patience])
+
+
+@dataclass(frozen=True)
+class History:
+    """How a training went."""
+
+    losses: NDArray[np.float64]  # (steps,) of each batch; fewer than asked for where validation ended it
+    scores: NDArray[np.float64]  # (validations,)
+
+
+def train(
+    task: Task[Any, NetworkT, SampleT],
+    network: NetworkT,
+    samples: Sequence[SampleT],
+    *,
+    steps: int,
+    batch: int | None = None,
+    learning_rate: float | None = None,
+    schedule: str | None = None,
+    seed: int,
+    checkpointing: Checkpointing | None = None,
+    validation: Validation | None = None,
+    watch: Watch = _unwatched,
+    progress: Report = silent,
+) -> History:
+    """Train `network` in place for `steps` batches; what is not given is the task's practice.
+
+    Batches go through the samples in a random order, drawn anew each time round. With `validation`, training may end
+    early, and the network is left with the weights that scored best. With `checkpointing`, a run that was cut off goes
+    on from its file to the very same weights. Raises `InputError` without samples, for an unknown schedule, and where
+    the checkpoint is of another run.
+    """
+    batch = task.practice.batch if batch is None else batch
+    learning_rate = task.practice.learning_rate if learning_rate is None else learning_rate
+    schedule = task.practice.schedule if schedule is None else schedule
+    if not samples:
+        raise InputError("training on 0 samples: at least one is wanted")
+    if schedule not in SCHEDULES:
+        raise InputError(f"schedule '{schedule}': choose one of {', '.join(SCHEDULES)}")
+    network.train()
+    optimizer = adamw(network, learning_rate)
+    waits = None if validation is None else (validation.every, validation.patience)
+    settings = [task.name, repr(network.config), steps, batch, learning_rate, schedule, seed, waits]
+    identity = f"{json.dumps(settings)} on {len(samples)} samples"
+    done = load_checkpoint(checkpointing.path, identity, network, optimizer) if checkpointing else Progress()
+    order = batches(len(samples), batch, steps, seed)
+    for number in range(len(done.losses), steps):
+        if validation and validation.over(done.scores):
+            break
+        rate = learning_rate * SCHEDULES[schedule](number / steps)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        drawn = [
+            task.draw(samples, int(index), network.config, stream(seed, "augment", number, place))
+            for place, index in enumerate(order[number])
+        ]
+        done.losses.append(step(task, network, optimizer, drawn))
+        watch(number + 1, {"loss": done.losses[-1], "learning rate": rate})
+        if validation and (number + 1) % validation.every == 0:
+            _validate(validation, network, done)
+            watch(number + 1, {"score": done.scores[-1]})
+        progress(number + 1, steps, _note(done))
+        if checkpointing and (number + 1) % checkpointing.every == 0:
+            save_checkpoint(checkpointing.path, identity, done, network, optimizer)
+    if done.best is not None:
+        network.load_state_dict(done.best)
+    return History(np.array(done.losses), np.array(done.scores))
+
+
+def train_steps(
+    task: Task[Any, NetworkT, SampleT],
+    network: NetworkT,
+    samples: Sequence[SampleT],
+    *,
+    steps: int,
+    batch: int | None = None,
+    learning_rate: float,
+    seed: int,
+) -> float:
+    """Train `network` in place at a constant learning rate, as a federation's client does; return the mean loss."""
+    history = train(
+        task,
+        network,
+        samples,
+        steps=steps,
+        batch=batch,
+        learning_rate=learning_rate,
+        schedule="constant",
+        seed=seed,
+    )
+    return float(history.losses.mean()) if steps else 0.0
+
+
+def adamw(network: nn.Module, learning_rate: float) -> torch.optim.AdamW:
+    """Return the optimiser that every task is trained with."""
+    return torch.optim.AdamW(network.parameters(), learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True)
+
+
+def step(
+    task: Task[Any, NetworkT, SampleT],
+    network: NetworkT,
+    optimizer: torch.optim.Optimizer,
+    samples: Sequence[SampleT],
+) -> float:
+    """Take one optimiser step on a batch and return its loss."""
+    loss = task.loss(network, samples)
+    optimizer.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)
+    optimizer.step()
+    return float(loss.detach())
+
+
+def batches(samples: int, batch: int, steps: int, seed: int) -> NDArray[np.int64]:
+    """Return (steps, batch) sample indices: one shuffled pass after another, cut into batches."""
+    batch = min(batch, samples)
+    passes = [stream(seed, "order", i).permutation(samples) for i in range(-(-steps * batch // samples))]
+    order = np.concatenate([np.zeros(0, dtype=np.int64), *passes])
+    return order[: steps * batch].reshape(steps, batch)
+
+
+def _validate(validation: Validation, network: nn.Module, done: Progress) -> None:
+    score = validation.score(network)
+    if score > max(done.scores, default=-np.inf):
+        done.best = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    done.scores.append(score)
+
+
+def _note(done: Progress) -> str:
+    loss = f"loss {np.mean(done.losses[-20:]):.3f}"
+    return f"{loss}, score {done.scores[-1]:.3f} (best {max(done.scores):.3f})" if done.scores else loss

@@ -1,0 +1,1 @@
+"""Weather from a camera picture (LeNet-5)."""

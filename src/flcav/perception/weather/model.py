@@ -1,0 +1,92 @@
+"""LeNet-5: LeCun et al., "Gradient-Based Learning Applied to Document Recognition", Proc. IEEE 1998, sec. II-B.
+
+Two things differ from the paper in both configurations: pictures have three channels, and the output layer is linear
+with a softmax, where digits had radial basis functions towards drawn prototypes.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from flcav.perception.weather.config import LeNetConfig
+
+SIDE = 32  # pixels
+# Table I: which of the six maps of S2 each of the sixteen maps of C3 sees
+_RUNS = [[i % 6, (i + 1) % 6, (i + 2) % 6] for i in range(6)]
+_LONGER_RUNS = [[(i + k) % 6 for k in range(4)] for i in range(6)]
+_PAIRS = [[i, i + 1, (i + 3) % 6, (i + 4) % 6] for i in range(3)]
+SEEN_MAPS = tuple(tuple(sorted(maps)) for maps in (*_RUNS, *_LONGER_RUNS, *_PAIRS, range(6)))
+
+
+class PartlyConnected(nn.Module):
+    """Layer C3: a 5 x 5 convolution whose maps see only some of the maps before, `SEEN_MAPS`."""
+
+    place: Tensor  # (60,) index of each kernel among the (16 x 6) of a full convolution
+
+    def __init__(self) -> None:
+        super().__init__()
+        place = [6 * out + into for out, maps in enumerate(SEEN_MAPS) for into in maps]
+        self.register_buffer("place", torch.tensor(place), persistent=False)
+        inputs = torch.tensor([25 * len(SEEN_MAPS[i // 6]) for i in place], dtype=torch.float32)
+        self.weight = nn.Parameter(uniform_over(inputs[:, None, None].expand(-1, 5, 5)))
+        self.bias = nn.Parameter(torch.zeros(16))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return (B, 16, 10, 10) from (B, 6, 14, 14)."""
+        kernels = self.weight.new_zeros(16 * 6, 5, 5).index_copy(0, self.place, self.weight)
+        return functional.conv2d(maps, kernels.reshape(16, 6, 5, 5), self.bias)
+
+
+class Subsampling(nn.Module):
+    """Layers S2 and S4: means over 2 x 2 pixels, times a trained factor, plus a trained bias, per map."""
+
+    def __init__(self, maps: int) -> None:
+        super().__init__()
+        self.factor = nn.Parameter(torch.ones(maps, 1, 1))
+        self.bias = nn.Parameter(torch.zeros(maps, 1, 1))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return maps of half the size."""
+        return functional.avg_pool2d(maps, 2) * self.factor + self.bias
+
+
+class ScaledTanh(nn.Module):
+    """The paper's squashing function, 1.7159 tanh(2/3 a)."""
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return the maps squashed."""
+        return 1.7159 * torch.tanh(maps * (2 / 3))
+
+
+class LeNet(nn.Module):
+    """Class scores of RGB pictures of 32 x 32 pixels."""
+
+    def __init__(self, config: LeNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        act = ScaledTanh if config.original else nn.ReLU
+        self.layers = nn.Sequential(
+            nn.Conv2d(3, 6, 5),  # C1: 28 x 28
+            *_halved(6, act, config.original),  # S2: 14 x 14
+            PartlyConnected() if config.original else nn.Conv2d(6, 16, 5),  # C3: 10 x 10
+            *_halved(16, act, config.original),  # S4: 5 x 5
+            nn.Conv2d(16, 120, 5),  # C5: 1 x 1
+            act(),
+            nn.Flatten(),
+            nn.Linear(120, 84),  # F6
+            act(),
+            nn.Linear(84, len(config.classes)),
+        )
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Return (B, classes) logits of (B, 3, 32, 32) pictures in [-1, 1]."""
+        return self.layers(pictures)
+
+
+def uniform_over(inputs: Tensor) -> Tensor:
+    """Return weights drawn evenly from -/+ 2.4 / inputs, the paper's initialisation (appendix A)."""
+    return (2 * torch.rand(inputs.shape) - 1) * 2.4 / inputs
+
+
+def _halved(maps: int, act: type[nn.Module], original: bool) -> tuple[nn.Module, nn.Module]:
+    return (Subsampling(maps), act()) if original else (act(), nn.MaxPool2d(2))

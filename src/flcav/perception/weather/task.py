@@ -1,0 +1,120 @@
+"""Weather classification as a `Task`."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.perception.images import Picture, pictures, recorded
+from flcav.perception.task import Finding, Practice
+from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
+from flcav.perception.weather.evaluate import classification
+from flcav.perception.weather.model import LeNet
+from flcav.perception.weather.samples import Sample, augment, batched, small
+from flcav.progress import Report, silent
+from flcav.world.weather import weather_class
+
+BATCH = 256  # pictures at once where nothing is learned
+
+
+class WeatherTask:
+    """Which of the classes of weather a picture shows."""
+
+    name = "weather"
+    family = "lenet"
+    configurations = CONFIGURATIONS
+    practice = Practice(batch=32, learning_rate=2e-3)
+
+    def build(self, config: LeNetConfig) -> LeNet:
+        """Return a fresh network."""
+        return LeNet(config)
+
+    def samples(self, data: Dataset, config: LeNetConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
+        """Return every camera's pictures with their weather, small enough to be kept; those of no class are left out.
+
+        Raises `InputError` where there are no pictures, no record of the weather, or none of `config`'s classes.
+        """
+        found, recorded_weather = [], False
+        for frame, _, rgb in recorded(data, frames):
+            recorded_weather |= frame.weather is not None
+            name = weather_class(frame.weather) if frame.weather else None
+            if name in config.classes:
+                found.append(Sample(small(rgb), config.classes.index(name), frame.scene))
+        if not recorded_weather:
+            raise InputError(f"{data.folder}: the weather was not recorded, which '{self.name}' needs")
+        if not found:
+            raise InputError(f"{data.folder}: no picture in any of the weathers {', '.join(config.classes)}")
+        return found
+
+    def draw(self, samples: Sequence[Sample], index: int, config: LeNetConfig, rng: np.random.Generator) -> Sample:
+        """Return the sample mirrored, moved and lit at random."""
+        return augment(samples[index], rng)
+
+    def loss(self, network: LeNet, samples: Sequence[Sample]) -> Tensor:
+        """Return the cross entropy of a batch."""
+        logits = network(_tensor(network, [sample.picture for sample in samples]))
+        return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
+
+    def evaluate(
+        self, network: LeNet, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
+    ) -> dict[str, Any]:
+        """Return accuracy, recall per class and the confusion matrix, see `classification`."""
+        samples = self.samples(data, network.config, frames)
+        found = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
+        truth = np.array([sample.label for sample in samples])
+        return classification(truth, found, [sample.scene for sample in samples], network.config.classes)
+
+    def score(self, result: Mapping[str, Any]) -> float:
+        """Return the accuracy."""
+        return float(result["accuracy"])
+
+    def infer(self, network: LeNet, path: Path, threshold: float = 0.0) -> Iterator[Finding]:
+        """Yield {"class", "probabilities"} for each picture; the likeliest class, however unlikely."""
+        classes = network.config.classes
+        for origin, rgb in pictures(path):
+            shares = probabilities(network, [small(rgb)])[0]
+            rows = {name: float(share) for name, share in zip(classes, shares, strict=True)}
+            yield Finding(origin, rgb, {"class": classes[int(shares.argmax())], "probabilities": rows})
+
+    def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
+        """Return accuracy, then recall and confusions class by class."""
+        interval = f"[{result['low']:.3f}, {result['high']:.3f}]"
+        seen = f"{result['pictures']} pictures of {result['scenes']} scenes"
+        lines = [f"{seen}: accuracy {result['accuracy']:.3f} {interval}"]
+        for name, row in zip(result["classes"], result["confusion"], strict=True):
+            recall = result["recall"][name]
+            taken = [f"{other} {count}" for other, count in zip(result["classes"], row) if count and other != name]
+            known = "no pictures" if recall is None else f"recall {recall:.3f} of {sum(row)}"
+            lines.append(f"{name:<12}{known}" + (f"; taken for {', '.join(taken)}" if taken else ""))
+        return lines
+
+    def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
+        """Return the class and its probability."""
+        return [f"{result['class']} ({result['probabilities'][result['class']]:.2f})"]
+
+
+WEATHER = WeatherTask()
+
+
+def probabilities(network: LeNet, small_pictures: Sequence[Picture], progress: Report = silent) -> np.ndarray:
+    """Return (N, classes) probabilities of pictures of 32 x 32 pixels; the network's mode is left as it was."""
+    training = network.training
+    network.eval()
+    parts = []
+    with torch.inference_mode():
+        for first in range(0, len(small_pictures), BATCH):
+            logits = network(_tensor(network, list(small_pictures[first : first + BATCH])))
+            parts.append(logits.softmax(1).cpu().numpy())
+            progress(min(first + BATCH, len(small_pictures)), len(small_pictures), "")
+    network.train(training)
+    return np.concatenate(parts)
+
+
+def _tensor(network: LeNet, small_pictures: list[Picture]) -> Tensor:
+    return torch.from_numpy(batched(small_pictures)).to(next(network.parameters()).device)

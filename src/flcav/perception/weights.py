@@ -1,0 +1,109 @@
+"""Weights on disk and as arrays: safetensors files that say which network they are of, and how it came about."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import nn
+
+from flcav.config import InputError
+from flcav.files import write_bytes
+from flcav.perception.card import CARD_KEY, Card
+from flcav.perception.task import ConfigT, NetworkT, Task
+
+PREFIX = "flcav."
+
+
+def config_key(task: Task[Any, Any, Any]) -> str:
+    """Return the metadata entry that holds the network's configuration as JSON."""
+    return PREFIX + task.family
+
+
+def save_network(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path, card: Card | None = None) -> None:
+    """Write the network's configuration, weights and card to a safetensors file, atomically."""
+    tensors = {name: tensor.contiguous().cpu() for name, tensor in network.state_dict().items()}
+    metadata = {config_key(task): _adapter(task).dump_json(network.config).decode()}
+    if card is not None:
+        metadata[CARD_KEY] = card.model_dump_json()
+    write_bytes(path, save(tensors, metadata))
+
+
+def load_network(task: Task[ConfigT, NetworkT, Any], path: Path) -> NetworkT:
+    """Return the network that `save_network` wrote, in evaluation mode; raises `InputError` for any other file."""
+    config, tensors = _read(task, path)
+    with torch.random.fork_rng(devices=[]):
+        network = task.build(config)
+    _fill(network, tensors, path)
+    return network.eval()
+
+
+def load_weights(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path) -> None:
+    """Load the weights at `path` into `network`; raises `InputError` where they are of another one."""
+    config, tensors = _read(task, path)
+    if config != network.config:
+        raise InputError(f"{path}: weights of another network ({_difference(config, network.config)})")
+    _fill(network, tensors, path)
+
+
+def to_arrays(network: nn.Module) -> dict[str, NDArray[Any]]:
+    """Return copies of parameters and buffers by name."""
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in network.state_dict().items()}
+
+
+def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Set parameters and buffers from what `to_arrays` returned; raises `InputError` where they do not fit."""
+    state = network.state_dict()
+    if set(arrays) != set(state):
+        odd = sorted(set(arrays) ^ set(state))
+        raise InputError(f"weights of another network: {len(odd)} arrays missing or unknown, the first is '{odd[0]}'")
+    for name, array in arrays.items():
+        if array.shape != tuple(state[name].shape):
+            raise InputError(
+                f"weights of another network: '{name}' has shape {array.shape}, not {tuple(state[name].shape)}"
+            )
+        state[name].copy_(torch.from_numpy(np.ascontiguousarray(array)))
+
+
+def _adapter(task: Task[Any, Any, Any]) -> TypeAdapter[Any]:
+    return TypeAdapter(type(next(iter(task.configurations.values()))))
+
+
+def _read(task: Task[ConfigT, Any, Any], path: Path) -> tuple[ConfigT, dict[str, torch.Tensor]]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except (SafetensorError, OSError):
+        raise InputError(f"{path}: not a safetensors file, or a damaged one") from None
+    key = config_key(task)
+    if key not in metadata:
+        found = [name.removeprefix(PREFIX) for name in metadata if name.startswith(PREFIX) and name != CARD_KEY]
+        said = f"of '{found[0]}'" if found else f"no '{key}' in the file's metadata"
+        raise InputError(f"{path}: weights of another network ({said}); '{task.name}' takes those of '{task.family}'")
+    try:
+        return _adapter(task).validate_json(metadata[key]), tensors
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{path}: weights of another network (field '{field}': {first['msg']})") from None
+
+
+def _fill(network: nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: weights of another network ({reason})") from None
+
+
+def _difference(theirs: Any, ours: Any) -> str:
+    names = [name for name in vars(ours) if not name.startswith("_") and getattr(theirs, name) != getattr(ours, name)]
+    return ", ".join(f"{name} {getattr(theirs, name)} instead of {getattr(ours, name)}" for name in names)[:300]
