@@ -10,6 +10,7 @@ class Target(StrEnum):
     """What can be reproduced."""
 
     demo_arms = "demo-arms"
+    fig3a = "fig3a"
     fig6a_allocation = "fig6a-allocation"
 
 
@@ -33,9 +34,23 @@ def reproduce(
     jobs: int = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each."),
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
+    if target == Target.fig3a:
+        _fig3a(out)
+        return
     run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
     run(out, range(1, (seeds or SEEDS[target]) + 1), scale.value, jobs)
     typer.echo(f"{out / 'result.json'}: the numbers of {seeds or SEEDS[target]} seeds")
+
+
+def _fig3a(out: Path) -> None:
+    from flcav.experiments.fig3a import draw_fig3a, fig3a
+    from flcav.files import write_bytes, write_json
+
+    results = fig3a()
+    write_json(out / "result.json", results)
+    write_bytes(out / "fig3a.png", draw_fig3a(results))
+    for sentence in results["findings"]:
+        typer.echo(sentence)
 
 
 def _demo_arms(out: Path, seeds: range, scale: str, jobs: int) -> None:

@@ -9,7 +9,7 @@ from flcav.experiments.protocol import TASK
 from flcav.files import atomic_path
 
 HISTORY_FILE = "history.csv"
-POINT: tuple[str, ...] = ("task", "stage", "resource", "accuracy", "weight", "run")
+POINT: tuple[str, ...] = ("task", "samples", "edge_rounds", "cloud_rounds", "accuracy", "weight", "run")
 
 
 def points_of(values: Mapping[str, Any], run: str, town: str = "grid") -> list[dict[str, Any]]:
@@ -19,22 +19,19 @@ def points_of(values: Mapping[str, Any], run: str, town: str = "grid") -> list[d
     """
     planned = values["plan"]["tasks"][0]
     points: list[dict[str, Any]] = []
-
-    def add(stage: str, resource: int, accuracy: float, frames: int) -> None:
-        point = (TASK, stage, resource, f"{accuracy:.4f}", frames, run)
-        points.append(dict(zip(POINT, point, strict=True)))
-
-    for stage, arm, resource in (
-        ("pretrain", "pretrain", planned["samples"]),
-        ("edge", f"{town}-edge-chosen", planned["edge_rounds"]),
-        ("cloud", "cloud", planned["cloud_rounds"]),
+    spent: tuple[int, ...] = ()
+    for arm, resource in (
+        ("pretrain", planned["samples"]),
+        (f"{town}-edge-chosen", planned["edge_rounds"]),
+        ("cloud", planned["cloud_rounds"]),
     ):
         test = values.get(f"test-{arm}-{town}")
-        for row in values.get(f"rounds-{arm}-{town}", []):
-            if test is None or row["round"] < resource:
-                add(stage, row["round"], row["ap50"], row["frames"])
-        if test is not None:
-            add(stage, resource, test["ap50"], test["frames"])
+        rows = [row for row in values.get(f"rounds-{arm}-{town}", []) if test is None or row["round"] < resource]
+        for row in [*rows, *([{"round": resource, **test}] if test is not None else [])]:
+            counts = (*spent, row["round"], 0, 0)[:3]
+            point = (TASK, *counts, f"{row['ap50']:.4f}", row["frames"], run)
+            points.append(dict(zip(POINT, point, strict=True)))
+        spent = (*spent, resource)
     return points
 
 

@@ -7,7 +7,7 @@ The graph is a plain `networkx.Graph` whose nodes (kind, name) and edges carry t
 JSON, and it holds all that an allocation problem needs.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -55,7 +55,7 @@ class VehicleNode(Config):
     """A vehicle: its edge server, its own link, and what it holds."""
 
     edge: str
-    uplink_mbps: Uplink
+    uplink_mbps: Uplink | None = None  # None: not known
     holds: Annotated[Mapping[str, Held], Field(min_length=1)]
 
 
@@ -111,8 +111,7 @@ def build(layers: Layers) -> nx.Graph:
     for name, modality in layers.modalities.items():
         graph.add_node(("modality", name), kind="modality", sample_mb=modality.sample_mb)
     for name, vehicle in layers.vehicles.items():
-        link = vehicle.uplink_mbps.model_dump(mode="json")
-        graph.add_node(("vehicle", name), kind="vehicle", edge=vehicle.edge, uplink_mbps=link)
+        graph.add_node(("vehicle", name), kind="vehicle", **vehicle.model_dump(mode="json", exclude={"holds"}))
         for modality, held in vehicle.holds.items():
             graph.add_edge(("modality", modality), ("vehicle", name), layer=3, **held.model_dump(mode="json"))
     return graph
@@ -191,7 +190,8 @@ def to_problem(graph: nx.Graph) -> Problem:
     """Return the allocation problem: a task per cluster, named after its tasks and weighing what they weigh together.
 
     Its groups are the vehicles, by edge server, that hold every modality of its network: a vehicle's samples are those
-    it has of all of them, their quality the least among them. A sample is one of each modality.
+    it has of all of them, their quality the least among them. A sample is one of each modality. Vehicles are named
+    where all their links are known.
     """
     layers = describe(graph)
     tasks = []
@@ -201,7 +201,6 @@ def to_problem(graph: nx.Graph) -> Problem:
         edges = list(dict.fromkeys(each.edge for each in fleet.values()))
         ordered = {key: each for edge in edges for key, each in fleet.items() if each.edge == edge}
         held = {key: [each.holds[modality] for modality in network.modalities] for key, each in ordered.items()}
-        counted = {key: [h.samples for h in own if h.samples is not None] for key, own in held.items()}
         tasks.append(
             {
                 "name": " + ".join(tasks_of),
@@ -209,12 +208,23 @@ def to_problem(graph: nx.Graph) -> Problem:
                 "sample_mb": sum(layers.modalities[modality].sample_mb for modality in network.modalities),
                 "model_mb": network.model_mb,
                 "edge_groups": [sum(each.edge == edge for each in ordered.values()) for edge in edges],
-                "uplink_mbps": {key: each.uplink_mbps.model_dump() for key, each in ordered.items()},
-                "samples_held": {key: min(samples) for key, samples in counted.items() if samples},
-                "data_quality": {key: min(h.quality for h in own) for key, own in held.items()},
+                **_named(ordered, held),
                 "limits": network.limits.model_dump(),
                 "curve": network.curve.model_dump(),
             }
         )
     shared = ("budgets_mb", "edge_rounds_per_cloud_round", "horizon_s")
     return parse_config(Problem, {**{name: graph.graph[name] for name in shared}, "tasks": tasks}, "graph")
+
+
+def _named(fleet: Mapping[str, VehicleNode], held: Mapping[str, Sequence[Held]]) -> dict[str, Any]:
+    """Return what a task says of its vehicles; nothing where a link is not known."""
+    links = {key: each.uplink_mbps.model_dump() for key, each in fleet.items() if each.uplink_mbps is not None}
+    if len(links) < len(fleet):
+        return {}
+    counted = {key: [each.samples for each in own if each.samples is not None] for key, own in held.items()}
+    return {
+        "uplink_mbps": links,
+        "samples_held": {key: min(samples) for key, samples in counted.items() if samples},
+        "data_quality": {key: min(each.quality for each in own) for key, own in held.items()},
+    }

@@ -19,23 +19,23 @@ VALUES = {
 
 def rows(path: Path) -> list[tuple[str, ...]]:
     with path.open() as file:
-        return [tuple(row.values())[1:5] for row in csv.DictReader(file)]
+        return [tuple(row.values())[1:6] for row in csv.DictReader(file)]
 
 
 def test_a_run_leaves_a_point_per_round_the_last_of_a_stage_on_all_test_frames(tmp_path: Path) -> None:
     append_points(tmp_path / "history.csv", points_of(VALUES, "seed1"))
     assert rows(tmp_path / "history.csv") == [
-        ("pretrain", "200", "0.5000", "240"),
-        ("edge", "1", "0.5600", "30"),
-        ("edge", "2", "0.5700", "30"),
-        ("edge", "3", "0.6000", "240"),
-        ("cloud", "1", "0.6500", "240"),
+        ("200", "0", "0", "0.5000", "240"),
+        ("200", "1", "0", "0.5600", "30"),
+        ("200", "2", "0", "0.5700", "30"),
+        ("200", "3", "0", "0.6000", "240"),
+        ("200", "3", "1", "0.6500", "240"),
     ]
 
 
 def test_rounds_that_were_not_tested_have_no_point() -> None:
     partial = {name: value for name, value in VALUES.items() if "rounds" not in name and "cloud" not in name}
-    assert [point["stage"] for point in points_of(partial, "seed1")] == ["pretrain", "edge"]
+    assert [point["edge_rounds"] for point in points_of(partial, "seed1")] == [0, 3]
 
 
 def test_points_are_appended_once(tmp_path: Path) -> None:
@@ -49,7 +49,7 @@ def test_fit_reads_what_a_run_left(tmp_path: Path, capsys: pytest.CaptureFixture
     path = tmp_path / "history.csv"
     append_points(path, points_of(VALUES, "seed1"))
     with pytest.raises(SystemExit) as stopped:
-        run(["fit", str(path), "--json"])
+        run(["fit", str(path), "--json", "--repeats", "20"])
     assert not stopped.value.code
     (curve,) = json.loads(capsys.readouterr().out)["curves"]
     assert (curve["task"], curve["points"]) == ("objects", 5)

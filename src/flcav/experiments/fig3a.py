@@ -1,0 +1,135 @@
+"""Fig. 3a of Wang et al. (IEEE Network 37(3), 2023): the three-layer graph, and learning curves with points and bands.
+
+Curves of the article's own points, in its form accuracy = 1 - a x^(-b); and of the history that our own runs wrote, in
+the additive form that plans are made from.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import parse_config
+from flcav.dataset.layout import package_versions
+from flcav.experiments.planning import history_fit, history_table
+from flcav.optimization.bands import Bands, bands
+from flcav.optimization.curves import Additive
+from flcav.optimization.graph import Layers, build
+from flcav.optimization.history import History, article_histories
+from flcav.optimization.learning_curve import Fit, fit_additive
+from flcav.report import curve_charts, style
+
+Array = NDArray[np.float64]
+
+PRINTED = {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}  # a and b of its software
+NEAR = 0.03  # relative: how near to the printed constants a plain least-squares fit is to come
+LEVEL = 0.95  # of the bands
+
+
+def fig3a() -> dict[str, Any]:
+    """Return the curves, points and bands, and how near the fits come to the printed constants."""
+    article = {task: _article_curve(points, PRINTED[task]) for task, points in article_histories().items()}
+    results = {"article": article, "own": _own_curves(), "level": LEVEL, "versions": package_versions()}
+    return results | {"findings": _findings(results)}
+
+
+def _article_curve(points: History, printed: tuple[float, float]) -> dict[str, Any]:
+    samples, edge_rounds, cloud_rounds = points.resources.T
+    fit = fit_additive(samples, edge_rounds, cloud_rounds, points.accuracy)
+    assert isinstance(fit.curve, Additive)
+    decay = fit.curve.pretrain
+    grid = np.geomspace(samples.min(), samples.max(), 60)
+    return {
+        "points": np.column_stack((samples, points.accuracy)).tolist(),
+        "fitted": fit.curve.model_dump(),
+        "printed": dict(zip("ab", printed, strict=True)),
+        "off": {"a": decay.a / printed[0] - 1, "b": decay.b / printed[1] - 1},
+        "rmse": fit.rmse,
+        "resource": grid.tolist(),
+        **_line(fit, bands(fit, level=LEVEL), np.column_stack((grid, np.zeros_like(grid), np.zeros_like(grid)))),
+    }
+
+
+def _line(fit: Fit, found: Bands | None, where: Array) -> dict[str, list[float]]:
+    """Return the accuracy at `where` (n, 3), and its band."""
+    accuracy = 1 - fit.curve.error(*where.T)
+    low, high = (accuracy, accuracy) if found is None else (1 - error for error in found.between(where)[::-1])
+    return {"accuracy": accuracy.tolist(), "low": low.tolist(), "high": high.tolist()}
+
+
+def _own_curves() -> dict[str, Any]:
+    """Return a line per number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
+    table = history_table()
+    samples, edge_rounds, cloud_rounds, _ = table.T
+    fit = history_fit()
+    found = bands(fit, level=LEVEL)
+    route = [(e, 0) for e in range(int(edge_rounds.max()) + 1)]
+    route += [(int(edge_rounds.max()), c) for c in range(1, int(cloud_rounds.max()) + 1)]
+    place = {each: number for number, each in enumerate(route)}
+    return {
+        "route": route,
+        "curve": fit.curve.model_dump(),
+        "rmse": fit.rmse,
+        "lines": [
+            {
+                "samples": int(count),
+                **_line(fit, found, np.array([(count, *each) for each in route], dtype=np.float64)),
+                "points": [(place[int(e), int(c)], float(y)) for x, e, c, y in table if x == count],
+            }
+            for count in np.unique(samples)
+        ],
+    }
+
+
+def _findings(results: Mapping[str, Any]) -> list[str]:
+    """Return what the numbers say, in sentences."""
+    off = {(task, name): value for task, each in results["article"].items() for name, value in each["off"].items()}
+    (task, name), worst = max(off.items(), key=lambda item: abs(item[1]))
+    near = all(abs(value) <= NEAR for value in off.values())
+    own = results["own"]
+    points = sum(len(line["points"]) for line in own["lines"])
+    counts = ", ".join(str(line["samples"]) for line in own["lines"])
+    return [
+        f"Refitted to the article's points, a and b come {'' if near else 'not '}within {NEAR:.0%} of the printed "
+        f"constants; the farthest is {name} of {task}, {worst:+.1%} off.",
+        f"Our own history has {points} points at {len(own['lines'])} sample sizes ({counts}); its curve is off them by "
+        f"{own['rmse']:.3f} AP50 (root mean square).",
+    ]
+
+
+def article_graph() -> nx.Graph:
+    """Return the graph of the article's experiments: three tasks, seven vehicles, two edge servers, links not known."""
+    networks = {
+        "CNN": ("weather", 23.0, "camera", 700),
+        "YOLOv5": ("signs", 14.0, "camera", 7000),
+        "SECOND": ("objects", 60.0, "lidar", 3500),
+    }
+    limits = {"samples": (100, 5000), "edge_rounds": (0, 100), "cloud_rounds": (0, 100)}
+    vehicles = {f"CAV {number}": "Town05" if number <= 4 else "Town03" for number in range(1, 8)}
+    values = {
+        "budgets_mb": {"wireless": 4000, "wireline": 4000},
+        "tasks": {task: {"network": name, "weight": 1 / 3} for name, (task, *_) in networks.items()},
+        "networks": {
+            name: {
+                "model_mb": model_mb,
+                "modalities": [modality],
+                "limits": limits,
+                "curve": _effective(*PRINTED[task], group_samples),
+            }
+            for name, (task, model_mb, modality, group_samples) in networks.items()
+        },
+        "modalities": {"camera": {"sample_mb": 0.7}, "lidar": {"sample_mb": 1.6}},
+        "vehicles": {name: {"edge": edge, "holds": {"camera": {}, "lidar": {}}} for name, edge in vehicles.items()},
+    }
+    return build(parse_config(Layers, values, "the article's graph"))
+
+
+def _effective(a: float, b: float, group_samples: int) -> dict[str, Any]:
+    return {"model": "effective", "a": a, "b": b, "alpha": 0.1, "beta": 0.5, "group_samples": group_samples}
+
+
+def draw_fig3a(results: Mapping[str, Any]) -> bytes:
+    """Return the figure as a PNG: the graph on the left, the article's curves, our own."""
+    return style.png(curve_charts.fig3a(results, article_graph()))

@@ -1,0 +1,27 @@
+"""Numbers as Markdown."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return a table of `rows` below `header`."""
+    lines = [f"| {' | '.join(map(str, line))} |" for line in (header, *rows)]
+    lines.insert(1, "|" + "---|" * len(header))
+    return "\n".join(line.replace("|  |", "| |") for line in lines)
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Return a list of `lines`."""
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def interval(value: Mapping[str, float], *, sign: bool = False) -> str:
+    """Return mean, low and high, with their signs if asked."""
+    mean, low, high = (f"{value[key]:{'+' if sign else ''}.3f}" for key in ("mean", "low", "high"))
+    return f"{mean} ({low} to {high})"
+
+
+def signed(value: float, digits: int = 3) -> str:
+    """Return the number with its sign."""
+    return f"{value:+.{digits}f}"

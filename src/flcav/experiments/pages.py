@@ -1,0 +1,52 @@
+"""The tables of a reproduction's page, from its numbers: `python -m flcav.experiments.pages reproductions/NAME`.
+
+A page (README.md) marks where they go, `<!-- NAME -->` to `<!-- end -->`; what stands between is replaced by what the
+folder's result.json says. The words around the tables are the authors'.
+"""
+
+import json
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from flcav.config import InputError
+from flcav.experiments import arms_tables, fig3a_tables, fig6a_tables
+from flcav.files import write_bytes
+
+Tables = Mapping[str, str]
+TABLES: dict[str, Callable[[Mapping[str, Any]], Tables]] = {
+    "demo": arms_tables.tables,
+    "fig3a": fig3a_tables.tables,
+    "fig6a-allocation": fig6a_tables.tables,
+}
+_SPAN = re.compile(r"<!-- (?P<name>[a-z ]+) -->\n.*?<!-- end -->", re.DOTALL)
+
+
+def fill(page: str, tables: Tables) -> str:
+    """Return `page` with what stands between its marks replaced by the tables of those names; raises `InputError`."""
+
+    def filled(span: re.Match[str]) -> str:
+        name = span["name"]
+        if name not in tables:
+            raise InputError(f"page: no table {name!r}, only {', '.join(tables)}")
+        return f"<!-- {name} -->\n{tables[name]}\n<!-- end -->"
+
+    return _SPAN.sub(filled, page)
+
+
+def fill_folder(folder: Path) -> str:
+    """Return the page of a reproduction as its result.json has it."""
+    results = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    return fill((folder / "README.md").read_text(encoding="utf-8"), TABLES[folder.name](results))
+
+
+def main(folders: Sequence[str]) -> None:
+    """Fill the pages of the folders anew."""
+    for folder in map(Path, folders):
+        write_bytes(folder / "README.md", fill_folder(folder).encode())
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

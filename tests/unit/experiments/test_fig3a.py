@@ -1,0 +1,46 @@
+import json
+
+import numpy as np
+import pytest
+
+from flcav.experiments.fig3a import article_graph, draw_fig3a, fig3a
+from flcav.experiments.planning import history_table
+from flcav.optimization.graph import to_problem
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def results() -> dict:
+    return fig3a()
+
+
+def test_refits_come_within_3_percent_of_the_printed_constants(results: dict) -> None:
+    assert set(results["article"]) == {"weather", "signs", "objects"}
+    for each in results["article"].values():
+        assert all(abs(off) < 0.03 for off in each["off"].values())
+    assert "come within 3% of the printed" in results["findings"][0]
+
+
+def test_bands_hold_their_curve_and_curves_rise(results: dict) -> None:
+    lines = [*results["article"].values(), *results["own"]["lines"]]
+    for line in lines:
+        low, accuracy, high = (np.array(line[name]) for name in ("low", "accuracy", "high"))
+        assert np.all(low <= accuracy + 1e-3)
+        assert np.all(accuracy <= high + 1e-3)
+        assert np.all(np.diff(accuracy) >= -1e-9)
+
+
+def test_every_point_of_our_own_history_is_drawn(results: dict) -> None:
+    drawn = sum(len(line["points"]) for line in results["own"]["lines"])
+    assert drawn == len(history_table())
+
+
+def test_the_figure_is_drawn_from_what_the_file_holds(results: dict) -> None:
+    assert draw_fig3a(json.loads(json.dumps(results))) == draw_fig3a(results)
+
+
+def test_the_articles_graph_is_its_problem() -> None:
+    problem = to_problem(article_graph())
+    assert [task.name for task in problem.tasks] == ["weather", "signs", "objects"]
+    assert all(task.edge_groups == (4, 3) and task.uplink_mbps is None for task in problem.tasks)

@@ -1,0 +1,46 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from flcav.config import InputError
+from flcav.experiments.markdown import interval, table
+from flcav.experiments.pages import TABLES, fill, fill_folder
+
+PAGES = [folder for folder in (Path(__file__).parents[3] / "reproductions").iterdir() if folder.name in TABLES]
+MADE = [folder for folder in PAGES if (folder / "result.json").exists()]
+
+
+@pytest.mark.parametrize("folder", MADE, ids=lambda folder: folder.name)
+def test_committed_tables_are_those_of_the_committed_numbers(folder: Path) -> None:
+    assert fill_folder(folder) == (folder / "README.md").read_text()
+
+
+@pytest.mark.parametrize("folder", PAGES, ids=lambda folder: folder.name)
+def test_pages_have_the_fixed_form(folder: Path) -> None:
+    page = (folder / "README.md").read_text()
+    parts = ["**Claim.**", "**Command.**", "**Expected.**", "## Obtained", "## Limits"]
+    places = [page.index(part) for part in parts]
+    assert places == sorted(places)
+    assert "<!-- end -->" in page
+
+
+def test_every_table_is_on_its_page() -> None:
+    for folder in MADE:
+        results = json.loads((folder / "result.json").read_text())
+        page = (folder / "README.md").read_text()
+        assert all(f"<!-- {name} -->" in page for name in TABLES[folder.name](results)), folder.name
+
+
+def test_filling_replaces_what_stood_there_and_names_what_is_not_known() -> None:
+    page = "words\n<!-- a -->\nold\n<!-- end -->\nmore\n<!-- b -->\n<!-- end -->\n"
+    filled = fill(page, {"a": "1", "b": "2"})
+    assert filled == "words\n<!-- a -->\n1\n<!-- end -->\nmore\n<!-- b -->\n2\n<!-- end -->\n"
+    assert fill(filled, {"a": "1", "b": "2"}) == filled
+    with pytest.raises(InputError, match="no table 'b', only a"):
+        fill(page, {"a": "1"})
+
+
+def test_markdown() -> None:
+    assert table(("x", "y"), [[1, ""], ["b", 2]]) == "| x | y |\n|---|---|\n| 1 | |\n| b | 2 |"
+    assert interval({"mean": 0.1, "low": -0.2, "high": 0.4}, sign=True) == "+0.100 (-0.200 to +0.400)"
