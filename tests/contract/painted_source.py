@@ -5,7 +5,7 @@ code with the camera of the simulator; the 2D truth is counted from the pictures
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ MOUNTS = {
     "gnss": pose(0.0, 0.0, 1.9),
     "imu": pose(-0.3, 0.0, 0.4),
 }
+ASSUMED_LIDAR = MOUNTS["lidar"] @ pose(0.1, 0.0)
 CATEGORIES = ["car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "car", "car"]
 LOCAL = np.array(  # x, y, z, length, width, height, yaw against the agent, whose ground is z = 0
     [
@@ -89,12 +90,14 @@ class PaintedSource:
         lidar = _points(boxes, world_from_agent @ MOUNTS["lidar"], rng)
         radar = np.column_stack([rng.uniform(low, high, 4) for low, high in RADAR_RANGES]).astype(np.float32)
         names = ["lidar", *cameras, "radar", "gnss", "imu"] if agent == "cav0" else ["lidar"]
+        mounts = {name: MOUNTS[name] for name in names}
         calibration = Calibration(
-            {name: MOUNTS[name] for name in names},
+            mounts,
             intrinsics=dict.fromkeys(cameras, INTRINSICS),
             distortion=dict.fromkeys(cameras, np.zeros(5)),
             offset_ms=dict.fromkeys(cameras, 40.0),
         )
+        believed = replace(calibration, agent_from_sensor=mounts | {"lidar": ASSUMED_LIDAR})
         return Frame(
             scene=scene,
             index=index,
@@ -102,7 +105,7 @@ class PaintedSource:
             agent=agent,
             world_from_agent=world_from_agent,
             calibration=calibration,
-            assumed=calibration,
+            assumed=believed,
             lidar={"lidar": lidar} if self.lidar else {},
             annotations=Annotations(
                 track=np.array([f"veh{i}" for i in range(len(boxes))]),

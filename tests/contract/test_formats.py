@@ -257,6 +257,19 @@ def test_small_things_can_be_left_out(dataset: Dataset, tmp_path: Path):
     assert {note["area"] for note in notes} == {9, 6}
 
 
+@pytest.mark.parametrize("name", READERS)
+def test_the_assumed_calibration_moves_the_sensors_only(name: str, dataset: Dataset, tmp_path: Path):
+    """The source assumes the LiDAR 0.1 m too far ahead, so that boxes come 0.1 m too near to it."""
+    export(dataset, name, tmp_path / "true")
+    export(dataset, name, tmp_path / "assumed", ExportOptions(calibration="assumed"))
+    true, assumed = (READERS[name](tmp_path / which) for which in ("true", "assumed"))
+    for key, frame in true.items():
+        away = frame.boxes.center - assumed[key].boxes.center
+        np.testing.assert_array_equal(frame.points, assumed[key].points)
+        if key.endswith("cav0"):
+            np.testing.assert_allclose(np.linalg.norm(away, axis=1), 0.1, atol=2e-4)
+
+
 @pytest.mark.parametrize("name", EXPORTERS)
 def test_an_export_that_ends_early_leaves_nothing(name: str, dataset: Dataset, tmp_path: Path):
     def full_disk(done: int, total: int, note: str) -> None:

@@ -17,6 +17,7 @@ def export(
     labels: str = typer.Option("signs", "--labels", help="What YOLO labels: signs (and lights) or actors."),
     validation: float = typer.Option(0.2, "--validation", help="Share of the scenes kept for validation."),
     min_pixels: int = typer.Option(1, "--min-pixels", help="2D labels of what shows fewer pixels are left out."),
+    calibration: str = typer.Option("true", "--calibration", help="Which to write: true, or assumed by the agents."),
 ) -> None:
     """Write a dataset in a format that other software reads: docs/formats.md has the tables."""
     from flcav import progress
@@ -25,7 +26,7 @@ def export(
     from flcav.dataset.formats.exporter import ExportOptions
     from flcav.dataset.store import Dataset
 
-    asked = {"labels": labels, "validation": validation, "min_pixels": min_pixels}
+    asked = {"labels": labels, "validation": validation, "min_pixels": min_pixels, "calibration": calibration}
     options = parse_config(ExportOptions, asked, "export")
     dataset = Dataset.open(folder)
     with progress.live(f"export {out}") as report:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import ExportOptions, lacks
+from flcav.dataset.formats.exporter import ExportOptions, lacks, read_frame
 from flcav.dataset.formats.rectangles import CLASSES, rectangles
 from flcav.dataset.formats.splits import split_scenes
 from flcav.dataset.payloads import encode_png
@@ -26,7 +26,7 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     tables = {(labels, split): _empty(labels) for labels in CLASSES for split in split_of.values()}
     counts: Counter[str] = Counter(images=0, signs=0, actors=0)
     for i, key in enumerate(dataset.keys):
-        frame = dataset.frame(i)
+        frame = read_frame(dataset, i, options)
         split = split_of[key.scene]
         for camera, picture in frame.images.items():
             path = out / "images" / split / f"{frame.key}_{camera}.png"

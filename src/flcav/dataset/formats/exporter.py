@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -20,11 +21,18 @@ class ExportOptions(Config):
     labels: Literal["signs", "actors"] = "signs"  # YOLO has one list of classes
     validation: float = Field(default=0.2, ge=0, lt=1)  # share of the scenes that validate
     min_pixels: int = Field(default=1, ge=1)  # 2D labels of what shows fewer are left out
+    calibration: Literal["true", "assumed"] = "true"  # which of a frame's two calibrations is written
 
 
 # Writes a dataset in one format into an empty folder and returns counts of what it wrote, by name. Raises `InputError`
 # where the dataset lacks what the format needs.
 Exporter = Callable[[Dataset, Path, ExportOptions, Report], Counter[str]]
+
+
+def read_frame(dataset: Dataset, i: int, options: ExportOptions) -> Frame:
+    """Return frame `i` with the calibration that is asked for in the place of the true one."""
+    frame = dataset.frame(i)
+    return frame if options.calibration == "true" else replace(frame, calibration=frame.assumed)
 
 
 def lacks(dataset: Dataset, name: str, needed: str) -> InputError:

@@ -35,7 +35,7 @@ from mcap_protobuf.schema import register_schema
 from numpy.typing import NDArray
 
 from flcav.dataset.formats.colours import COLOURS, OTHER
-from flcav.dataset.formats.exporter import ExportOptions
+from flcav.dataset.formats.exporter import ExportOptions, read_frame
 from flcav.dataset.formats.mounts import quaternion
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
@@ -56,7 +56,7 @@ def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: R
         with (out / f"{scene}.mcap").open("wb") as file:
             log = _Log(Writer(file))
             for i in dataset.select(scenes=[scene]):
-                frame = dataset.frame(i)
+                frame = read_frame(dataset, i, options)
                 for topic, message, offset_ms in messages(frame):
                     log.write(f"/{frame.agent}/{topic}", message, frame.time_s + offset_ms / 1000)
                     counts["messages"] += 1

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks
+from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks, read_frame
 from flcav.dataset.formats.motion import agent_velocities
 from flcav.dataset.formats.mounts import channels, optical_yaw
 from flcav.dataset.formats.splits import split_scenes
@@ -48,7 +48,7 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
         numbers = agent_numbers(sorted({dataset.keys[i].agent for i in selected}))
         speeds = agent_velocities(dataset, scene)
         for i in selected:
-            frame = dataset.frame(i)
+            frame = read_frame(dataset, i, options)
             if not frame.lidar:
                 raise lacks(dataset, "OPV2V", f"a LiDAR on every agent; '{frame.agent}' has none")
             for track in frame.annotations.track.tolist():

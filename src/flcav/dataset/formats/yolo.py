@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from flcav.dataset.formats.exporter import ExportOptions, lacks
+from flcav.dataset.formats.exporter import ExportOptions, lacks, read_frame
 from flcav.dataset.formats.rectangles import CLASSES, Rectangles, rectangles
 from flcav.dataset.formats.splits import SPLITS, split_scenes
 from flcav.dataset.payloads import encode_png
@@ -21,7 +21,7 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     split_of = split_scenes(dataset, options.validation)
     counts: Counter[str] = Counter(images=0, objects=0)
     for i, key in enumerate(dataset.keys):
-        frame = dataset.frame(i)
+        frame = read_frame(dataset, i, options)
         split = split_of[key.scene]
         for camera, picture in frame.images.items():
             found = rectangles(frame, camera, options.labels, options.min_pixels)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks
+from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks, read_frame
 from flcav.dataset.formats.mounts import front_camera
 from flcav.dataset.formats.splits import SPLITS, split_scenes
 from flcav.dataset.payloads import encode_png
@@ -41,7 +41,7 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
     rows = []
     counts: Counter[str] = Counter(frames=0, objects=0, left_out=0)
     for i, key in enumerate(dataset.keys):
-        frame = dataset.frame(i)
+        frame = read_frame(dataset, i, options)
         camera = front_camera({name: frame.calibration.agent_from_sensor[name] for name in frame.images})
         if camera is None or not frame.lidar:
             counts["left_out"] += 1

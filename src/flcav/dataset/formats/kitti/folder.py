@@ -27,7 +27,7 @@ class KittiFrame:
 
 
 class KittiFolder:
-    """The frames of `training`: of one list of `ImageSets`, or all that have a point cloud."""
+    """The frames of `training`: of one list of `ImageSets`, or all that have a point cloud; of "test", `testing`."""
 
     def __init__(self, folder: Path, names: list[str]) -> None:
         self.folder = folder
@@ -35,10 +35,11 @@ class KittiFolder:
 
     @classmethod
     def open(cls, path: Path | str, split: str | None = None) -> "KittiFolder":
-        """Return the folder `path` that holds `training`; raises `InputError` where a file of a frame is missing."""
-        root, folder = Path(path), Path(path) / "training"
+        """Return the KITTI folder `path`; raises `InputError` where a file of a frame is missing."""
+        root, part_of = Path(path), "testing" if split == "test" else "training"
+        folder = root / part_of
         if not folder.is_dir():
-            raise InputError(f"{root}: no KITTI folder; it holds no 'training'")
+            raise InputError(f"{root}: no KITTI folder; it holds no '{part_of}'")
         if split is None:
             names = sorted(file.stem for file in (folder / "velodyne").glob("*.bin"))
         else:

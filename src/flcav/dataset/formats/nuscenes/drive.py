@@ -1,6 +1,8 @@
 """What one agent sees of a scene, as a scene of nuScenes: its files and rows."""
 
 from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,29 +18,35 @@ from flcav.sensors.frame import Frame
 
 Array = NDArray[np.float64]
 
+NO_CHANNELS = np.zeros(0)
 UNDATED = "1970-01-01"  # simulated time has no date
 
 
+@dataclass
 class Drive:
     """One nuScenes scene under way."""
 
-    def __init__(self, number: int, scene: str, agent: str, location: str, out: Path, global_from_world: Array) -> None:
-        self.number = number
-        self.name = f"scene-{number:04d}"
-        self.scene = scene
-        self.agent = agent
-        self.location = location
-        self.out = out
-        self.global_from_world = global_from_world
-        self.samples: list[Row] = []
-        self.sensors: dict[str, Row] = {}
-        self.calibrated: dict[str, Row] = {}
-        self.poses: list[Row] = []
-        self.data: dict[str, list[Row]] = defaultdict(list)  # by channel
-        self.annotations: dict[str, list[Row]] = defaultdict(list)  # by track
-        self.category: dict[str, str] = {}  # of each track
+    number: int  # of the scene, from 1
+    scene: str  # of the dataset
+    agent: str
+    location: str
+    out: Path
+    global_from_world: Array  # (4, 4)
+    elevations: Mapping[str, Array]  # LiDAR -> elevations of its channels: see `lidar_bin`
+    samples: list[Row] = field(default_factory=list)
+    sensors: dict[str, Row] = field(default_factory=dict)  # by channel
+    calibrated: dict[str, Row] = field(default_factory=dict)  # by channel
+    poses: list[Row] = field(default_factory=list)
+    data: dict[str, list[Row]] = field(default_factory=lambda: defaultdict(list))  # by channel
+    annotations: dict[str, list[Row]] = field(default_factory=lambda: defaultdict(list))  # by track
+    category: dict[str, str] = field(default_factory=dict)  # of each track
 
-    def add(self, frame: Frame, velocity: Array, elevations: Array) -> None:
+    @property
+    def name(self) -> str:
+        """Return the name of the scene."""
+        return f"scene-{self.number:04d}"
+
+    def add(self, frame: Frame, velocity: Array) -> None:
         """Write the files of a frame and add its rows; the agent moves with `velocity` (3,) in the world [m/s]."""
         self.samples.append(
             {
@@ -50,7 +58,7 @@ class Drive:
         mounts = frame.calibration.agent_from_sensor
         for i, (name, points) in enumerate(frame.lidar.items()):
             channel = "LIDAR_TOP" if i == 0 else f"LIDAR_{name.upper()}"
-            self._add_data(frame, name, channel, "pcd.bin", lidar_bin(points, elevations))
+            self._add_data(frame, name, channel, "pcd.bin", lidar_bin(points, self.elevations.get(name, NO_CHANNELS)))
         for name, channel in channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS).items():
             check_rectified(frame, name, "nuScenes")
             self._add_data(frame, name, channel, "png", encode_png(frame.images[name].rgb))

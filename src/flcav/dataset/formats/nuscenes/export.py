@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.formats.exporter import ExportOptions, lacks
+from flcav.dataset.formats.exporter import ExportOptions, lacks, read_frame
 from flcav.dataset.formats.motion import agent_velocities
 from flcav.dataset.formats.nuscenes.drive import Drive
 from flcav.dataset.formats.nuscenes.files import RESOLUTION_M, map_mask
@@ -45,13 +45,14 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
         for agent in dict.fromkeys(dataset.keys[i].agent for i in dataset.select(scenes=[scene])):
             selected = dataset.select(agents=[agent], scenes=[scene])
             counts["scenes"] += 1
-            drive = Drive(counts["scenes"], scene, agent, location, out, global_from_world)
+            elevations = _elevations(dataset, agent)
+            drive = Drive(counts["scenes"], scene, agent, location, out, global_from_world, elevations)
             splits[f"flcav_{split}"].append(drive.name)
             for i in selected:
-                frame = dataset.frame(i)
+                frame = read_frame(dataset, i, options)
                 if not frame.lidar:
                     raise lacks(dataset, "nuScenes", f"a LiDAR on every agent; '{agent}' has none")
-                drive.add(frame, velocities[agent, frame.index], _elevations(dataset, agent))
+                drive.add(frame, velocities[agent, frame.index])
                 counts.update(samples=1, objects=len(frame.annotations))
                 progress(counts["samples"], len(dataset), "")
             for table, rows in drive.rows().items():
@@ -73,14 +74,15 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
     return counts
 
 
-def _elevations(dataset: Dataset, agent: str) -> Array:
-    """Return the elevations [rad] of the channels of an agent's first LiDAR, from the lowest; none if not recorded."""
+def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:
+    """Return LiDAR name -> elevations [rad] of its channels from the lowest, as far as the recipe has the rig."""
     rig = dataset.manifest["recipe"].get("pole_rig" if agent.startswith("pole") else "vehicle_rig", {})
-    lidar = next(iter(rig.get("lidars", {}).values()), None)
-    if lidar is None:
-        return np.zeros(0)
-    settings = Lidar.model_validate(lidar["settings"])
-    return np.arcsin(ray_pattern(settings)[:: settings.azimuth_steps, 2].astype(np.float64))[::-1]
+    elevations = {}
+    for name, lidar in rig.get("lidars", {}).items():
+        settings = Lidar.model_validate(lidar["settings"])
+        first = ray_pattern(settings)[:: settings.azimuth_steps].astype(np.float64)  # of each channel
+        elevations[name] = np.arcsin(first[::-1, 2])
+    return elevations
 
 
 def _write_map(dataset: Dataset, path: Path) -> Array:
