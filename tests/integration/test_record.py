@@ -66,6 +66,41 @@ def test_two_processes_record_the_same_bytes_as_one(recipe: Path, reference: Pat
     assert digests(tmp_path / "data") == digests(reference)
 
 
+@pytest.mark.slow
+def test_a_scene_s_frames_are_recorded_by_several_processes(recipe: Path, tmp_path: Path):
+    """Two frames to a part: the traffic of the one scene is simulated once and replayed by whoever is free."""
+    long = {**SMALL, "scenes": 1, "spins_per_scene": 20, "every_s": 0.1}
+    one, two = tmp_path / "one", tmp_path / "two"
+    record(EmbeddedSource(Recipe.model_validate(long)), one)
+    recipe.write_text(yaml.safe_dump(long))
+    process = subprocess.Popen([*FLCAV, "record", recipe, "--out", two, "--jobs", "2"])
+    traffic = two / ".recording" / "suburb-4-000" / "traffic.parquet"
+    while not list(traffic.parent.glob("0000[0-9]")):
+        assert process.poll() is None
+        time.sleep(0.002)
+    process.kill()
+    process.wait(20)
+    simulated = traffic.stat().st_mtime_ns
+    record(EmbeddedSource(Recipe.model_validate(long)), two, jobs=1)
+    assert digests(one) == digests(two)
+    assert (two / "traces" / "suburb-4-000.parquet").stat().st_mtime_ns == simulated
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_records_the_same_bytes(recipe: Path, reference: Path, tmp_path: Path):
+    pytest.importorskip("ray", reason="the extra 'ray' is not installed")
+    command = [*FLCAV, "record", recipe, "--out", tmp_path / "data", "--engine", "ray", "--jobs", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert digests(tmp_path / "data") == digests(reference)
+
+
+def test_an_unknown_engine_exits_2(recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert flcav("record", recipe, "--out", tmp_path / "data", "--engine", "steam") == 2
+    assert "engine 'steam': unknown; known engines: processes, ray" in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_interrupted_then_finished(recipe: Path, reference: Path, tmp_path: Path, number: int):
     out = tmp_path / "data"
@@ -172,11 +207,13 @@ def test_birdseye_draws_the_frame_asked_for(reference: Path, tmp_path: Path, cap
     assert not (tmp_path / "no.png").exists()
 
 
-@pytest.mark.parametrize("town", ["suburb", "grid", "ring"])
-def test_the_recipes_we_ship_run_at_toy_scale(town: str, tmp_path: Path):
-    recipe = read_config(Recipe, RECIPES / f"{town}.yaml")
-    toy = recipe.model_copy(update={"warmup_s": 30.1, "frames": recipe.cavs + 1})
+@pytest.mark.parametrize("name", ["suburb", "grid", "ring", "kitti", "weather", "signs", "signs_suburb", "cooperative"])
+def test_the_recipes_we_ship_run_at_toy_scale(name: str, tmp_path: Path):
+    recipe = read_config(Recipe, RECIPES / f"{name}.yaml")
+    frames = recipe.cavs + 1
+    toy = recipe.model_copy(update={"warmup_s": 30.1, "frames": frames})
     record(EmbeddedSource(toy), tmp_path / "data")
     dataset = Dataset.open(tmp_path / "data")
-    assert len(dataset) == recipe.cavs + 1
+    assert len(dataset) == frames
+    assert dataset.manifest["counts"]["images"] >= frames * bool(recipe.vehicle_rig.cameras)
     assert flcav("validate", tmp_path / "data") == 0

@@ -15,9 +15,10 @@ def record(
     out: Path = typer.Option(..., "--out", help="Folder of the dataset; an interrupted recording goes on."),
     frames: int | None = typer.Option(None, "--frames", help="Record exactly this many frames instead."),
     seed: int | None = typer.Option(None, "--seed", help="Seed instead of the recipe's."),
-    jobs: int = typer.Option(1, "--jobs", help="Processes; the dataset is the same whatever their number."),
+    jobs: int = typer.Option(1, "--jobs", help="Workers; the dataset is the same whatever their number."),
+    engine: str = typer.Option("processes", "--engine", help="Who works: processes here, or a cluster by ray."),
 ) -> None:
-    """Record a dataset: traffic in a town, seen by LiDARs on vehicles and poles, with ground truth."""
+    """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
     from flcav import progress
     from flcav.config import parse_config, read_config
     from flcav.dataset.layout import read_manifest
@@ -29,7 +30,7 @@ def record(
     asked = read_config(Recipe, recipe)
     source = EmbeddedSource(parse_config(Recipe, asked.model_dump() | changes, str(recipe)))
     with progress.live(f"record {out}") as report:
-        written = write(source, out, jobs=jobs, progress=report)
+        written = write(source, out, jobs=jobs, engine=engine, progress=report)
     manifest = read_manifest(out)
     counts = manifest["counts"]
     done = "recorded" if written else "already recorded, nothing to do:"

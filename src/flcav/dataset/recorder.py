@@ -26,6 +26,7 @@ from flcav.dataset.layout import (
     table_path,
     trace_path,
 )
+from flcav.dataset.ray_engine import ray_cluster
 from flcav.dataset.schedule import pending, record_scenes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, join_tables, write_table
 from flcav.dataset.tasks import PAYLOADS, TRAFFIC, parts
@@ -34,12 +35,13 @@ from flcav.files import sha256, write_json
 from flcav.progress import Report, silent
 from flcav.sources.source import Source
 
+ENGINES = {"processes": processes, "ray": ray_cluster}
 HEADER = "recipe.json"
 JOINED = "joined"  # below `.recording`: what becomes of the parts
 
 
 def record(source: Source, out: Path, *, jobs: int = 1, engine: str = "processes", progress: Report = silent) -> bool:
-    """Record `source` into the folder `out`; returns whether there was anything to do.
+    """Record `source` into the folder `out` by `jobs` workers of one of ENGINES; returns whether anything was left.
 
     False says that `out` already held this very dataset. A folder whose recording was interrupted is finished.
     Raises `InputError` where `out` holds anything else, `OSError` where it cannot be written.
@@ -59,9 +61,6 @@ def record(source: Source, out: Path, *, jobs: int = 1, engine: str = "processes
             error.filename = str(out)
         raise
     return True
-
-
-ENGINES = {"processes": processes}
 
 
 def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report) -> None:

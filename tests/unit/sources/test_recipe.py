@@ -6,6 +6,7 @@ import pytest
 from flcav.config import InputError, parse_config, read_config
 from flcav.sensors.rig import RIGS
 from flcav.sources.recipe import Recipe
+from flcav.world.town import load_town
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 
@@ -59,6 +60,7 @@ def test_bad_values_get_one_sentence(fields: dict, message: str):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("town", ["suburb", "grid", "ring"])
-def test_the_recipes_we_ship_are_valid(town: str):
-    assert read_config(Recipe, RECIPES / f"{town}.yaml").town == town
+@pytest.mark.parametrize("path", sorted(RECIPES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_recipes_we_ship_are_valid(path: Path):
+    recipe = read_config(Recipe, path)
+    assert load_town(recipe.town).name == recipe.town
