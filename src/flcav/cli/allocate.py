@@ -3,17 +3,31 @@
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 if TYPE_CHECKING:
     from flcav.optimization.allocation import Allocation
+    from flcav.optimization.baselines import Baseline
     from flcav.optimization.problem import Problem
     from flcav.optimization.vehicles import VehicleShare
 
     Shares = Mapping[str, Sequence[VehicleShare]]
+
+
+MEASURES = {"weighted": "weighted error", "max-min": "largest error", "area": "area"}
+
+
+class Compared(StrEnum):
+    """What the optimum can be compared with."""
+
+    equal_stages = "equal-stages"
+    equal_tasks = "equal-tasks"
+    max_throughput = "max-throughput"
+    article = "article"
 
 
 def register(app: typer.Typer) -> None:
@@ -26,14 +40,23 @@ def allocate(
         ..., help="YAML: budgets, sizes, limits and learning curves of every task; or a three-layer graph."
     ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
+    baseline: Compared | None = typer.Option(None, "--baseline", help="A plan to compare with, in the same call."),
+    progress: Path | None = typer.Option(
+        None, "--progress", help="YAML: what is spent and observed so far; the plan goes on from there."
+    ),
     out: Path | None = typer.Option(None, "--out", help="Write a page about the plan (HTML): where megabytes go, why."),
 ) -> None:
-    """Split both uplink budgets over tasks and training stages so that the weighted error is least."""
+    """Split both uplink budgets over tasks and training stages so that they err least, by the problem's objective."""
+    from flcav.config import read_config
     from flcav.optimization import allocation
+    from flcav.optimization.baselines import baseline as compared
     from flcav.optimization.graph import read_problem
+    from flcav.optimization.replanning import Progress, going_on
     from flcav.optimization.vehicles import vehicle_shares
 
     asked = read_problem(problem)
+    if progress is not None:
+        asked = going_on(asked, read_config(Progress, progress))
     try:
         plan = allocation.allocate(asked)
         shares = vehicle_shares(asked, plan.tasks)
@@ -46,48 +69,74 @@ def allocate(
         from flcav.files import write_bytes
 
         write_bytes(out, plan_page(asked, plan, shares).encode())
+    beside = None if baseline is None else compared(asked, baseline.value)
     if as_json:
-        typer.echo(json.dumps(_as_json(plan, shares)))
-    else:
-        _show(asked, plan)
-        _show_vehicles(shares)
+        typer.echo(json.dumps(_as_json(plan, shares) | ({} if beside is None else {"baseline": _plain(beside)})))
+        return
+    _show(asked, plan)
+    _show_vehicles(shares)
+    if beside is not None:
+        _show_baseline(beside, plan)
 
 
 def _as_json(plan: "Allocation", shares: "Shares") -> dict:
-    values = dataclasses.asdict(plan)
+    values = _plain(plan)
     for task in values["tasks"]:
         if task["name"] in shares:
             task["vehicles"] = [dataclasses.asdict(share) for share in shares[task["name"]]]
+    return values
+
+
+def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
+    """Return the plan as JSON has it: links by name, and without optional fields that say nothing."""
+    values = dataclasses.asdict(plan)
     values["tasks"] = [_given(task, "upper_error", "members") for task in values["tasks"]]
     for name in ("used_mb", "marginal_error_per_gb"):
-        values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
+        if name in values:
+            values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
     return _given(values, "note", "warnings")
 
 
-def _given(values: dict, *optional: str) -> dict:
-    """Return `values` without those of `optional` that say nothing."""
+def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name not in optional or value}
 
 
 def _show(problem: "Problem", plan: "Allocation") -> None:
     from rich.console import Console
+
+    console = Console(highlight=False)
+    console.print(_table(plan))
+    proven = "no certificate" if plan.gap is None else f"proven within {plan.gap:.2%}"
+    console.print(f"{MEASURES[problem.objective]} {plan.objective:.6g}, {plan.status} ({proven})")
+    budgets, gained = problem.budgets_mb, "save" if plan.gap is not None else "add"
+    for link, used, budget, rate in (
+        ("wireless", plan.used_mb.wireless_mb, budgets.wireless, plan.marginal_error_per_gb.wireless_mb),
+        ("wireline", plan.used_mb.wireline_mb, budgets.wireline, plan.marginal_error_per_gb.wireline_mb),
+    ):
+        console.print(f"{link}: {used:.1f} of {budget:.6g} MB; 1000 MB more would {gained} about {rate:.4f}")
+    for sentence in filter(None, (plan.note, *plan.warnings)):
+        console.print(sentence)
+
+
+def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    console.print(_table(beside))
+    console.print(f"{beside.name}: {beside.objective:.6g}; the plan above: {plan.objective:.6g}")
+
+
+def _table(plan: "Allocation | Baseline") -> Any:
     from rich.table import Table
 
     table = Table("task", *("samples", "edge rounds", "cloud rounds", "error", "wireless MB", "wireline MB"))
     for task in plan.tasks:
         counts = (str(task.samples), str(task.edge_rounds), str(task.cloud_rounds))
-        table.add_row(
-            task.name, *counts, f"{task.predicted_error:.4f}", f"{task.wireless_mb:.1f}", f"{task.wireline_mb:.1f}"
-        )
-    console = Console()
-    console.print(table)
-    console.print(f"weighted error {plan.objective:.6g}, {plan.status} (proven within {plan.gap:.2%})")
-    budgets = problem.budgets_mb
-    for link, used, budget, rate in (
-        ("wireless", plan.used_mb.wireless_mb, budgets.wireless, plan.marginal_error_per_gb.wireless_mb),
-        ("wireline", plan.used_mb.wireline_mb, budgets.wireline, plan.marginal_error_per_gb.wireline_mb),
-    ):
-        console.print(f"{link}: {used:.1f} of {budget:.6g} MB; 1000 MB more would save about {rate:.4f} of error")
+        error = f"{task.predicted_error:.4f}" + ("" if task.upper_error is None else f" (up to {task.upper_error:.4f})")
+        table.add_row(task.name, *counts, error, f"{task.wireless_mb:.1f}", f"{task.wireline_mb:.1f}")
+        for member in task.members:
+            table.add_row(f"  {member.name}", "", "", "", f"{member.predicted_error:.4f}", "", "")
+    return table
 
 
 def _show_vehicles(shares: "Shares") -> None:

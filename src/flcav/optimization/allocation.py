@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.network.plan import Price
-from flcav.optimization.area import largest_area
+from flcav.optimization.area import area, largest_area
 from flcav.optimization.curves import Curve, Shared
 from flcav.optimization.fairness import least_largest
 from flcav.optimization.instance import Infeasible as Infeasible
@@ -145,6 +145,18 @@ def weighted_error(problem: Problem, plans: Sequence[TaskPlan]) -> float:
     """Return the weighted sum of the predicted errors, of the upper ones where they are what counts."""
     errors = (plan.predicted_error if plan.upper_error is None else plan.upper_error for plan in plans)
     return sum(task.weight * error for task, error in zip(problem.tasks, errors, strict=True))
+
+
+def score(problem: Problem, plans: Sequence[TaskPlan]) -> float:
+    """Return what the problem's objective makes of the plans: a weighted or the largest error, or an area."""
+    if problem.objective == "weighted":
+        return weighted_error(problem, plans)
+    counts = [(plan.samples, plan.edge_rounds, plan.cloud_rounds) for plan in plans]
+    k = problem.edge_rounds_per_cloud_round
+    errors = [
+        float(learner.curve.error(*own, k=k)) for task, own in zip(problem.tasks, counts) for learner in task.learners
+    ]
+    return max(errors) if problem.objective == "max-min" else area(1 - np.array(errors))
 
 
 def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:

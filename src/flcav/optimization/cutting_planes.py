@@ -69,16 +69,12 @@ class Cuts:
             self._lines.update(dict.fromkeys((number, line) for line in term.lines(x)))
         return len(self._lines) > known
 
-    def relax(self) -> tuple[Array, float, Array]:
-        """Return the optimum over fractional x, its value and the (2,) multipliers of the budgets."""
+    def relax(self) -> tuple[Array, float]:
+        """Return the optimum over fractional x and its value."""
         matrix, limit = self._rows()
         bounds = np.stack((self._low(), self._high()), axis=1)
         result = linprog(self._objective(), A_ub=matrix, b_ub=limit, bounds=bounds, method="highs")
-        return (
-            result.x[: len(self.program.low)],
-            float(result.fun) / self._scale,
-            -result.ineqlin.marginals[:2] / self._scale,
-        )
+        return result.x[: len(self.program.low)], float(result.fun) / self._scale
 
     def solve(self, gap: float) -> tuple[Array, float]:
         """Return the optimum over whole x to a relative `gap`, and the proven bound."""
@@ -115,22 +111,30 @@ class Cuts:
         return coo_array((values, (rows, columns)), shape=(len(limit), n + len(program.terms))).tocsr(), limit
 
 
+def continuous_optimum(
+    program: Program, starts: Sequence[Array], gap: float, floor: float = 0.0
+) -> tuple[Array, float, Cuts]:
+    """Return the fractional x that is within `gap` of the least, a proven lower bound, and the lines that prove it."""
+    cuts = Cuts(program)
+    for x in starts:
+        cuts.add(x)
+    x, bound = cuts.relax()
+    for _ in range(40):
+        if program.value(x) - bound <= 0.1 * gap * (bound + floor) or not cuts.add(x):
+            break
+        x, bound = cuts.relax()
+    return x, bound, cuts
+
+
 def outer_approximation(
     program: Program, starts: Sequence[Array], gap: float, floor: float = 0.0
-) -> tuple[list[Array], float, Array]:
-    """Return the whole points visited, a proven lower bound and the (2,) multipliers of the relaxed problem.
+) -> tuple[list[Array], float]:
+    """Return the whole points visited and a proven lower bound.
 
     A point may overspend by the solver's tolerance (1e-7 of a budget): the caller trims it. It ends when the best point
     is within `gap` of the bound, relative to the bound plus `floor`, or adds no line: then it is optimal.
     """
-    cuts = Cuts(program)
-    for x in starts:
-        cuts.add(x)
-    x, bound, multipliers = cuts.relax()
-    for _ in range(40):
-        if program.value(x) - bound <= 0.1 * gap * (bound + floor) or not cuts.add(x):
-            break
-        x, bound, multipliers = cuts.relax()
+    _, bound, cuts = continuous_optimum(program, starts, gap, floor)
     visited: list[Array] = []
     best = np.inf
     for _ in range(40):
@@ -139,4 +143,4 @@ def outer_approximation(
         bound, best = max(bound, below), min(best, program.value(x))
         if best - bound <= gap * (bound + floor) or not cuts.add(x):
             break
-    return visited, bound, multipliers / program.budget
+    return visited, bound

@@ -110,7 +110,7 @@ def _closed(instance: Instance, terms: Sequence[Term], best: Solution, gap: floa
     program = Program(terms, low, high, instance.cost, instance.budget)
     starts = [np.minimum(low + step, high) for step in range(int(min((high - low).max(), 40)) + 1)]
     starts += [np.floor(low + (high - low) * share) for share in np.linspace(0, 1, 9)]
-    visited, proven, _ = outer_approximation(program, [*starts, np.clip(best.x, low, high)], gap, instance.floor)
+    visited, proven = outer_approximation(program, [*starts, np.clip(best.x, low, high)], gap, instance.floor)
     prices = instance.separable.prices(best.multipliers) + 1e-300
     points = [best.x, *(fill(instance, trim(instance, x, prices), prices) for x in visited)]
     errors = [instance.error(x) for x in points]
