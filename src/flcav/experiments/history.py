@@ -11,25 +11,18 @@ from pathlib import Path
 from flcav.experiments.demo import demo_protocol
 from flcav.experiments.pipeline import cloud_step, edge_step, rounds_step, shared_steps, test_step
 from flcav.experiments.planning import HISTORY, fixed_plan
-from flcav.experiments.protocol import REGIONS, Training
+from flcav.experiments.protocol import REGIONS
 from flcav.experiments.steps import Step, run_side_by_side
 from flcav.files import atomic_path
 
-PLANS = (  # seed, samples, edge rounds, cloud rounds
-    (101, 320, 6, 3),
-    (102, 120, 6, 3),
-    (101, 120, 0, 0),
-    (102, 320, 0, 0),
-    (101, 40, 0, 0),
-    (102, 40, 0, 0),
-)
+PLANS = ((101, 320, 6, 3), (102, 80, 6, 3), (101, 80, 0, 0), (102, 320, 0, 0))  # seed, samples, edge, cloud rounds
 COLUMNS = ("seed", "samples", "edge_rounds", "cloud_rounds", "accuracy")
 FRAMES = 10_000  # every test frame, so that all points are on the same ones
 
 
 def steps_for(seed: int, samples: int, edge_rounds: int, cloud_rounds: int) -> list[Step]:
     """Return the steps of one run of the history."""
-    update = {"wireless_mb": 1e4, "wireline_mb": 1e4, "training": Training()}  # by hand: nothing binds
+    update = {"wireless_mb": 1e4, "wireline_mb": 1e4}  # by hand: nothing binds
     protocol = demo_protocol(seed).model_copy(update=update)
     chosen = {"samples": samples, "edge_rounds": edge_rounds, "cloud_rounds": cloud_rounds}
     steps = shared_steps(protocol, Step("plan", fixed_plan, chosen))
