@@ -18,7 +18,6 @@ from flcav.optimization.instance import Infeasible as Infeasible
 from flcav.optimization.instance import Instance, cost_of, instance
 from flcav.optimization.instance import stage_plan as stage_plan
 from flcav.optimization.problem import Problem, Task
-from flcav.optimization.terms import terms_of
 from flcav.optimization.weighted import least_weighted
 
 Array = NDArray[np.float64]
@@ -171,7 +170,7 @@ def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:
 
 
 def _weighted(problem: Problem, made: Instance, gap: float) -> _Best:
-    found = least_weighted(made, terms_of(problem), gap)
+    found = least_weighted(made, gap)
     return _Best(
         found.x, weighted_error(problem, described(problem, found.x)), found.bound + made.floor, found.multipliers
     )

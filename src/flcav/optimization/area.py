@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from flcav.optimization.curves import Shared
 from flcav.optimization.instance import instance
 from flcav.optimization.problem import Problem
-from flcav.optimization.terms import terms_of
 from flcav.optimization.weighted import least_weighted
 
 Array = NDArray[np.float64]
@@ -51,7 +50,7 @@ def _climb(problem: Problem, weights: Array, gap: float) -> Polygon:
     best = Polygon(np.zeros(0), -np.inf, np.zeros(2))
     for _ in range(STEPS):
         weighed = _weighed(problem, np.maximum(weights, LEAST_WEIGHT))
-        found = least_weighted(instance(weighed), terms_of(weighed), gap)
+        found = least_weighted(instance(weighed), gap)
         accuracy = _accuracy(problem, found.x)
         reached = Polygon(found.x, area(accuracy), found.multipliers)
         if reached.area <= best.area * (1 + gap):

@@ -54,7 +54,7 @@ def equal_stages(problem: Problem, made: Instance) -> Array:
         most = np.where(np.arange(3) == stage, high, x)
         budget = x.ravel() @ made.cost + np.where(uses[stage, :], share, 0.0)
         limited = _limited(problem, x, most, budget)
-        x = least_weighted(instance(limited), terms_of(limited), GAP).x.reshape(-1, 3)
+        x = least_weighted(instance(limited), GAP).x.reshape(-1, 3)
     return x.ravel()
 
 
@@ -68,7 +68,7 @@ def equal_tasks(problem: Problem, made: Instance) -> Array:
         alone = problem.model_copy(update={"tasks": (task,)})
         own = slice(number, number + 1)
         limited = _limited(alone, low[own], high[own], low[number] @ cost[number] + share)
-        x[number] = least_weighted(instance(limited), terms_of(limited), GAP).x
+        x[number] = least_weighted(instance(limited), GAP).x
     return x.ravel()
 
 
@@ -93,7 +93,7 @@ def article(problem: Problem, made: Instance) -> Array:
     if made.effective is None:
         x = relax(made.separable).x
     else:
-        program = Program(terms_of(problem), made.low, made.high, made.cost, made.budget)
+        program = Program(terms_of(made), made.low, made.high, made.cost, made.budget)
         starts = [made.low + (made.high - made.low) * share for share in np.linspace(0, 1, 6) ** 3]
         x, _, _ = continuous_optimum(program, starts, GAP)
     return trim(made, np.clip(np.floor(x + 1e-9), made.low, made.high), np.ones(len(x)))

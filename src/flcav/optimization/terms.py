@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.curves import Effective
 from flcav.optimization.cutting_planes import Line, Term
-from flcav.optimization.problem import Problem
+from flcav.optimization.instance import Instance
 
 Array = NDArray[np.float64]
 
@@ -42,39 +41,41 @@ class PowerTerm:
 
 @dataclass(frozen=True)
 class EffectiveTerm:
-    """The weighted error above its floor of one task, of x[first : first + 3]; its lines are tangents."""
+    """gain * (alpha x + group (1 - 1 / (t + 1)))^(-b) of x[first : first + 3], t = y + k z; its lines are tangents."""
 
     first: int
-    weight: float
-    curve: Effective
+    gain: float
+    b: float
+    alpha: float
+    group: float
     k: int
 
     def value(self, x: Array) -> float:
         """Return the term at x (n,)."""
         samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
-        return self.weight * float(self.curve.error(samples, edge_rounds, cloud_rounds, self.k) - self.curve.floor)
+        return self.gain * self._effective(samples, edge_rounds + self.k * cloud_rounds) ** -self.b
 
     def lines(self, x: Array) -> list[Line]:
         """Return the tangent at x (n,)."""
-        counts, curve = x[self.first : self.first + 3], self.curve
-        effective = float(curve.effective_samples(counts[0], counts[1], counts[2], self.k))
-        per_round = curve.beta * curve.group_samples / (counts[1] + self.k * counts[2] + 1) ** 2
-        gain = self.weight * curve.a * curve.b * effective ** (-curve.b - 1)
-        slope = -gain * np.array((curve.alpha, per_round, self.k * per_round))
+        samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
+        t = edge_rounds + self.k * cloud_rounds
+        per_round = self.group / (t + 1) ** 2
+        fall = self.gain * self.b * self._effective(samples, t) ** (-self.b - 1)
+        slope = -fall * np.array((self.alpha, per_round, self.k * per_round))
         index = (self.first, self.first + 1, self.first + 2)
-        return [Line(index, tuple(map(float, slope)), self.value(x) - float(slope @ counts))]
+        return [Line(index, tuple(map(float, slope)), self.value(x) - float(slope @ x[self.first : self.first + 3]))]
+
+    def _effective(self, samples: float, t: float) -> float:
+        return float(self.alpha * samples + self.group * (1 - 1 / (t + 1)))
 
 
-def terms_of(problem: Problem) -> list[Term]:
+def terms_of(instance: Instance) -> list[Term]:
     """Return the terms whose sum is the weighted error above the floors."""
-    terms: list[Term] = []
-    for number, task in enumerate(problem.tasks):
-        for learner in task.learners:
-            if isinstance(learner.curve, Effective):
-                k = problem.edge_rounds_per_cloud_round
-                terms.append(EffectiveTerm(3 * number, learner.weight, learner.curve, k))
-                continue
-            for stage, decay in enumerate(learner.curve.decays()):
-                if decay.a > 0:
-                    terms.append(PowerTerm(3 * number + stage, learner.weight * decay.a, decay.b, decay.x0))
+    powers, effective = instance.separable, instance.effective
+    of = np.arange(len(powers.a)) if powers.of is None else powers.of
+    rows = zip(of.tolist(), powers.a.tolist(), powers.b.tolist(), powers.x0.tolist())
+    terms: list[Term] = [PowerTerm(*row) for row in rows if row[1] > 0]
+    if effective is not None:
+        columns = (effective.quantity, effective.gain, effective.b, effective.alpha, effective.group)
+        terms += [EffectiveTerm(*row, k=effective.k) for row in zip(*(column[:, 0].tolist() for column in columns))]
     return terms

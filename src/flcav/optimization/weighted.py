@@ -5,7 +5,7 @@ optimal where tasks are many. Where they are few, every quantity that would cost
 exact program over the few that are left (`cutting_planes`) closes it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 
@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from flcav.optimization.cutting_planes import Program, Term, outer_approximation
+from flcav.optimization.cutting_planes import Program, outer_approximation
 from flcav.optimization.instance import Instance
 from flcav.optimization.rounding import fill, trim
-from flcav.optimization.separable import newton_step, relax
+from flcav.optimization.separable import Separable, newton_step, relax
+from flcav.optimization.terms import terms_of
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,12 @@ class Solution:
         return float(self.error > self.bound)
 
 
-def least_weighted(instance: Instance, terms: Sequence[Term], gap: float) -> Solution:
+def whole_plan(problem: Separable, gap: float = 1e-4) -> Solution:
+    """Return whole quantities of `problem` within a relative `gap` of the least error: on arrays, without any task."""
+    return least_weighted(Instance(problem, None, 0.0), gap)
+
+
+def least_weighted(instance: Instance, gap: float) -> Solution:
     """Return whole quantities within a relative `gap` of the least error (up to `EXACT_TASKS` tasks: of `EXACT`)."""
     gap = gap if len(instance.low) > 3 * EXACT_TASKS else min(gap, EXACT)
     best = Solution(instance.low, instance.error(instance.low), -np.inf, np.zeros(2))
@@ -62,7 +68,7 @@ def least_weighted(instance: Instance, terms: Sequence[Term], gap: float) -> Sol
         )
         if best.gap(instance.floor) <= gap:
             return best
-    return _closed(instance, terms, best, gap)
+    return _closed(instance, best, gap)
 
 
 def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
@@ -103,11 +109,11 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
     yield from ((multipliers[i], proven[i]) for i in islice(order, CORRECTIONS))
 
 
-def _closed(instance: Instance, terms: Sequence[Term], best: Solution, gap: float) -> Solution:
+def _closed(instance: Instance, best: Solution, gap: float) -> Solution:
     """Return `best` or better, within `gap`, by an exact program over what can still be in an optimal plan."""
     _, bound = instance.cheapest(best.multipliers)
     low, high = instance.narrowed(best.multipliers, (best.error - bound) * (1 + 1e-9) + 1e-15)
-    program = Program(terms, low, high, instance.cost, instance.budget)
+    program = Program(terms_of(instance), low, high, instance.cost, instance.budget)
     starts = [np.minimum(low + step, high) for step in range(int(min((high - low).max(), 40)) + 1)]
     starts += [np.floor(low + (high - low) * share) for share in np.linspace(0, 1, 9)]
     visited, proven = outer_approximation(program, [*starts, np.clip(best.x, low, high)], gap, instance.floor)
