@@ -137,11 +137,10 @@ def _stages(parts: Sequence[Mapping[str, Any]]) -> str:
 
 def _budgets(objective: float, both: Sequence[BudgetPoint]) -> str:
     at = {point.factor: point.objective for point in both}
-    half = f"{at[0.5]:.4f}" if 0.5 in at else "nothing: the least that the limits allow does not fit"
-    double = f"{at[2.0]:.4f}"
-    return (
-        f"With half of both budgets the error would be {half}; with these it is {objective:.4f}; with double, {double}."
-    )
+    half = "With half of both budgets no plan fits the limits"
+    if 0.5 in at:
+        half = f"With half of both budgets the error would be {at[0.5]:.4f}"
+    return f"{half}; with these it is {objective:.4f}; with double, {at[2.0]:.4f}."
 
 
 def _stragglers(vehicles: Sequence[Mapping[str, Any]], horizon_s: float | None) -> str:

@@ -1,0 +1,168 @@
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flcav.experiments.fig6a_allocation import (
+    COUNTS,
+    PLANS,
+    STAGES,
+    _recordings,
+    _share,
+    allocation_protocol,
+    draw_allocation,
+    plan_steps,
+    summarise,
+)
+from flcav.experiments.fig6a_findings import EQUAL, JOINT, allocation_findings
+from flcav.experiments.fig6a_tables import tables
+from flcav.experiments.steps import Step, run_steps
+
+PREDICTED = {EQUAL: (0.49, 0.60, 0.62), JOINT: (0.53, 0.63, 0.66)}
+HISTORY = {"samples": [80.0, 320.0], "edge_rounds": [0.0, 6.0], "cloud_rounds": [0.0, 3.0]}
+
+
+def seed_of(number: int, equal: tuple[float, ...], joint: tuple[float, ...]) -> dict[str, Any]:
+    """Return what one seed reached: AP50 after each stage with either plan."""
+    reached = {EQUAL: equal, JOINT: joint}
+    realised = {name: {s: {"ap50": ap} for s, ap in zip(STAGES, aps)} for name, aps in reached.items()}
+    differences = {
+        s: {"mean": b - a, "low": b - a - 0.05, "high": b - a + 0.05} for s, a, b in zip(STAGES, equal, joint)
+    }
+    plan = dict(zip(COUNTS, (118, 6, 6))) | {"predicted_error": 0.38}
+    book = {
+        "wireless": {"budget_mb": 180.0, "planned_mb": 175.0, "used_mb": 176.0},
+        "wireline": {"budget_mb": 110.0, "planned_mb": 70.0, "used_mb": 69.5},
+    }
+    return {
+        "seed": number,
+        "plans": {EQUAL: plan, JOINT: plan | {"samples": 118, "edge_rounds": 12, "cloud_rounds": 1}},
+        "predicted": {name: dict(zip(STAGES, aps)) for name, aps in PREDICTED.items()},
+        "realised": dict.fromkeys(("grid", "ring"), realised),
+        "differences": dict.fromkeys(("grid", "ring"), differences),
+        "poles": {name: {"grid": 3, "ring": 5} for name in PLANS},
+        "ledger": {name: copy.deepcopy(book) for name in PLANS},
+    }
+
+
+def results_of(*seeds: tuple[tuple[float, ...], tuple[float, ...]]) -> dict[str, Any]:
+    rows = [seed_of(number, *aps) for number, aps in enumerate(seeds, start=1)]
+    results = {"history": HISTORY, "seeds": rows, "summary": summarise(rows)}
+    return results | {"findings": allocation_findings(results)}
+
+
+RIGHT = results_of(
+    ((0.48, 0.58, 0.60), (0.52, 0.62, 0.65)),
+    ((0.50, 0.60, 0.61), (0.53, 0.64, 0.67)),
+    ((0.49, 0.59, 0.63), (0.52, 0.63, 0.68)),
+)
+WRONG = results_of(
+    ((0.48, 0.58, 0.60), (0.52, 0.55, 0.56)),
+    ((0.50, 0.60, 0.61), (0.53, 0.56, 0.57)),
+    ((0.49, 0.59, 0.63), (0.52, 0.56, 0.58)),
+)
+
+
+def verdicts(results: dict[str, Any]) -> list[str]:
+    return [finding["verdict"] for finding in results["findings"]]
+
+
+def test_differences_are_paired_by_seed() -> None:
+    found = RIGHT["summary"]["realised_difference"]["grid"]["cloud"]
+    assert found["mean"] == pytest.approx(np.mean([0.05, 0.06, 0.05]))
+    assert found["low"] == pytest.approx(found["mean"] - 4.302653 * np.std([0.05, 0.06, 0.05], ddof=1) / np.sqrt(3))
+    assert RIGHT["summary"]["predicted_difference"]["cloud"] == pytest.approx(0.04)
+
+
+def test_a_prediction_that_came_true_is_said_to_have_held() -> None:
+    assert verdicts(RIGHT) == ["held", "held", "held", "held"]
+    better, ranking, accuracy, budgets = (finding["sentence"] for finding in RIGHT["findings"])
+    assert "0.613 with equal stages and 0.667 with the joint plan: +0.053" in better
+    assert "predicts +0.040 for the joint plan; 3 of 3 seeds agree in sign, and so does their mean" in ranking
+    assert "off its prediction by 0.013 on average" in accuracy
+    assert "within its budgets, at 63% to 98%" in budgets
+    assert "−0.50 to +1.00 MB" in budgets
+
+
+def test_a_wrong_ranking_is_said_and_why() -> None:
+    better, ranking, *_ = WRONG["findings"]
+    assert (better["verdict"], ranking["verdict"]) == ("did not hold", "did not hold")
+    assert "0 of 3 seeds agree in sign, and their mean does not. They part most in edge FL" in ranking["sentence"]
+    assert "was to have −0.010 more than equal stages, and had −0.067" in ranking["sentence"]
+    assert "extrapolated for edge rounds 12 of the joint plan (history: 0 to 6)" in ranking["sentence"]
+
+
+def test_seeds_that_disagree_decide_nothing() -> None:
+    mixed = results_of(((0.48, 0.58, 0.60), (0.5, 0.6, 0.65)), ((0.5, 0.6, 0.65), (0.5, 0.6, 0.63)))
+    assert verdicts(mixed)[:2] == ["undecided", "undecided"]
+    assert (
+        "1 of 2 seeds agree in sign, and so does their mean, but its interval contains 0"
+        in (mixed["findings"][1]["sentence"])
+    )
+
+
+def test_one_seed_is_judged_by_its_scenes() -> None:
+    single = results_of(((0.48, 0.58, 0.60), (0.5, 0.6, 0.63)))
+    sentence = single["findings"][0]["sentence"]
+    assert "over test scenes of one seed, in which training does not vary" in sentence
+    assert single["findings"][0]["verdict"] == "undecided"
+
+
+def test_a_budget_that_was_exceeded_is_said() -> None:
+    broken = copy.deepcopy(RIGHT)
+    broken["seeds"][0]["ledger"][JOINT]["wireline"]["used_mb"] = 111.0
+    found = allocation_findings(broken)[-1]
+    assert found["verdict"] == "did not hold"
+    assert "above its budgets" in found["sentence"]
+
+
+def test_tables_hold_a_row_per_run() -> None:
+    found = tables(RIGHT)
+    assert found["plans"].count("\n") == 1 + 6
+    assert "| 1 | joint | 118 | 12 | 1 | 0.620 | 3 / 5 |" in found["plans"]
+    assert "| cloud FL | joint | 0.660 | 0.667 (" in found["accuracy"]
+    assert "| grid | cloud FL | +0.040 | +0.053 (" in found["differences"]
+    assert "| 2 | joint | wireline | 110.0 | 70.0 | 69.5 | -0.50 |" in found["megabytes"]
+    assert found["findings"].count("\n- ") == 3
+
+
+def test_the_picture_is_a_png() -> None:
+    assert draw_allocation(WRONG).startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("scale", ["paper", "quick"])
+def test_every_step_comes_after_what_it_needs(scale: str) -> None:
+    for name in PLANS:
+        before: set[str] = set()
+        for step in plan_steps(allocation_protocol(1, scale), name):
+            assert set(step.needs) <= before, step.name
+            before.add(step.name)
+
+
+def test_both_plans_share_recordings_that_no_plan_decides() -> None:
+    protocol = allocation_protocol(1, "quick")
+    shared = {step.name: step.fingerprint({}) for step in _recordings(protocol)}
+    assert {"suburb-pool", "suburb-validation", "grid-registry", "grid-test", "ring-test"} <= set(shared)
+    for name in PLANS:
+        steps = {step.name: step for step in plan_steps(protocol, name)}
+        assert all(steps[key].fingerprint({}) == value for key, value in shared.items())
+    plans = [next(step for step in plan_steps(protocol, name) if step.name == "plan") for name in PLANS]
+    assert plans[0].run is not plans[1].run
+
+
+def _write(work: Any, text: str) -> str:
+    (work.folder / "data").write_text(text)
+    return text
+
+
+def test_shared_steps_are_done_where_they_are_linked(tmp_path: Path) -> None:
+    steps = [Step("frames", _write, {"text": "recorded"})]
+    run_steps(steps, tmp_path / "frames", jobs=1, notify=lambda *told: None)
+    for _ in range(2):  # a second start finds the links
+        _share(steps, tmp_path / "frames", tmp_path / "run")
+    told: list[tuple[str, str]] = []
+    values = run_steps(steps, tmp_path / "run", jobs=1, notify=lambda step, a, b, note: told.append((step, note)))
+    assert values == {"frames": "recorded"}
+    assert told == [("frames", "done before")]
