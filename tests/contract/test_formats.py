@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import painted_source
 import pytest
+import shapely
 import yaml
 from format_readers import READERS, Seen
 from painted_source import CATEGORIES, RETURNS, PaintedSource
 from PIL import Image
-from shapely.geometry import MultiPoint, Point
+from shapely.geometry import MultiPoint
 
 from flcav.config import InputError
 from flcav.dataset.formats.export import EXPORTERS, export
@@ -123,7 +124,7 @@ def test_boxes_project_onto_their_pixels(name: str, dataset: Dataset, seen: dict
                 projected = np.column_stack((corners, np.ones(8))) @ projection.T
                 assert (projected[:, 2] > 0).all()
                 hull = MultiPoint(projected[:, :2] / projected[:, 2:]).convex_hull
-                assert all(hull.distance(Point(pixel)) < BRUSH_PX for pixel in zip(u, v))
+                assert (shapely.distance(hull, shapely.points(u, v)) < BRUSH_PX).all()
                 views = next(view for view in source.annotations.views.values() if view.pixels[row])
                 if views.occlusion[row] + views.truncation[row] == 0:
                     assert len(u) > 0.9 * hull.area

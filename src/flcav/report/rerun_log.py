@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 LIDAR_COLOURS = colormaps["turbo"]
 RADAR_COLOURS = colormaps["coolwarm"]
 RADAR_M_S = 15.0  # Doppler at which the colours end
+BEHIND_M = (-28.0, 0.0, 16.0)  # where the eye is at first, in the agent's frame
 AGENTS = "world/agents"
 
 
@@ -59,28 +60,32 @@ def log_scene(
 
 
 def blueprint(spin: Sequence[Frame]) -> Any:
-    """Return the layout in which a scene opens: the world, and the cameras of the first agent that has any."""
-    world = rrb.Spatial3DView(origin="world", name="world")
-    frame = next((frame for frame in spin if frame.images or frame.infrared), None)
-    if frame is None:
-        return rrb.Blueprint(world)
+    """Return the layout in which a scene opens: the world seen from above and behind one agent, beside it its cameras.
+
+    The agent is the first of the frames `spin` that has cameras, or the first of all.
+    """
+    frame = next((frame for frame in spin if frame.images or frame.infrared), spin[0])
+    behind, agent = frame.world_from_agent @ (*BEHIND_M, 1.0), frame.world_from_agent[:3, 3]
+    eye = rrb.EyeControls3D(position=behind[:3], look_target=agent, eye_up=(0, 0, 1))
+    world = rrb.Spatial3DView(origin="world", name="world", eye_controls=eye)
     pictures = [
         rrb.Spatial2DView(origin=f"{AGENTS}/{frame.agent}/{name}", name=f"{frame.agent} {name}")
         for name in (*frame.images, *frame.infrared)
     ]
-    return rrb.Blueprint(rrb.Horizontal(world, rrb.Grid(*pictures), column_shares=[3, 2]))
+    views = rrb.Horizontal(world, rrb.Grid(*pictures), column_shares=[3, 2]) if pictures else world
+    return rrb.Blueprint(views, rrb.TimePanel(state="collapsed", timeline="spin"), collapse_panels=True)
 
 
 def _log_map(recording: Any, layers: MapLayers) -> None:
     outlines = {
-        "roads": (layers.roads, (90, 90, 95)),
+        "roads": (layers.roads, (110, 110, 115)),
         "sidewalks": (layers.sidewalks, (150, 140, 120)),
         "crossings": ([crossing.outline for crossing in layers.crossings], (220, 220, 220)),
     }
     for name, (polygons, colour) in outlines.items():
         _log_lines(recording, f"world/map/{name}", [np.vstack((line, line[:1])) for line in polygons], colour)
     lanes = [lane.centre_line for lane in layers.lanes if lane.kind != "walkingarea"]
-    _log_lines(recording, "world/map/lanes", lanes, (60, 110, 150))
+    _log_lines(recording, "world/map/lanes", lanes, (35, 60, 80))
     _log_lines(recording, "world/map/markings", [marking.line for marking in layers.markings], (235, 235, 235))
 
 
@@ -124,10 +129,7 @@ def _log_radar(recording: Any, path: str, echoes: NDArray[np.float32]) -> None:
     level = np.cos(elevation)
     ray = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
     colours = RADAR_COLOURS(0.5 + doppler / (2 * RADAR_M_S), bytes=True)
-    positions = distance[:, None] * ray
-    recording.log(path, rr.Points3D(positions, colors=colours, radii=0.25))
-    arrows = rr.Arrows3D(origins=positions, vectors=doppler[:, None] * ray * 0.3, colors=colours)
-    recording.log(f"{path}/doppler", arrows)
+    recording.log(path, rr.Points3D(distance[:, None] * ray, colors=colours, radii=0.12))
 
 
 def _log_pinhole(recording: Any, path: str, intrinsics: Array, picture: NDArray) -> None:
@@ -136,7 +138,7 @@ def _log_pinhole(recording: Any, path: str, intrinsics: Array, picture: NDArray)
         image_from_camera=intrinsics,
         resolution=[width, height],
         camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=2.0,
+        image_plane_distance=1.2,
     )
     recording.log(path, pinhole)
 
@@ -161,7 +163,9 @@ def _log_rectangles(recording: Any, path: str, frame: Frame, camera: str) -> Non
 
 def _log_boxes(recording: Any, path: str, boxes: Array, labels: list[str], colours: list) -> None:
     from_corner = boxes.reshape(-1, 4) + 0.5  # Rerun's first pixel begins, ours has its centre at 0
-    rectangles = rr.Boxes2D(array=from_corner, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=colours)
+    rectangles = rr.Boxes2D(
+        array=from_corner, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=colours, show_labels=False
+    )
     recording.log(path, rectangles)
 
 
