@@ -56,7 +56,7 @@ def import_town(xodr: Path, out: Path) -> Imported:
         if streets.sidewalks_added:
             notes.append("The map has no sidewalks: added along its town streets.")
         if streets.offset_m != (0.0, 0.0):
-            notes.append(f"Moved to the origin: town = map + ({dx:g}, {dy:g}) m.")
+            notes.append(f"Moved to the origin: town = map + ({dx:.0f}, {dy:.0f}) m.")
         parameters = furnish(
             net,
             description=f"Imported from {xodr.name}.",

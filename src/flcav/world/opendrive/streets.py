@@ -19,6 +19,8 @@ SIDEWALK_M = 2.0  # width of an added sidewalk
 PARKING_M = 1.9  # a shoulder as wide as this beside a town's street is parked on
 SHORT_M = 60.0  # an edge shorter than this has no room to change lanes
 ARTERIAL = 16.0  # [m/s] a street as fast as this, or of several lanes a direction, is one
+WALKED = ("sidewalk", "walking")
+SHARED = ("allow", "disallow", "width", "speed")
 PRIORITY = {"arterial": "3", "open": "3", "street": "2"}
 ALLOWED = {
     "driving": {"disallow": "pedestrian"},
@@ -48,7 +50,7 @@ def rewrite(prefix: Path, document: Document, origin: Path) -> Rewritten:
     """Rewrite the parts beside `prefix` in place; raises `InputError` naming `origin` where no car can drive."""
     nodes, edges, connections = (ElementTree.parse(f"{prefix}.{part}.xml") for part in ("nod", "edg", "con"))
     rows = edges.getroot().findall("edge")
-    add = not any("sidewalk" in lane.get("type", "") for row in rows for lane in row.iterfind("lane"))
+    add = not any(lane.get("type") in WALKED for row in rows for lane in _plain_lanes(row))
     kept: dict[str, dict[int, int]] = {}  # edge -> lane index in the map -> in the town, of lanes with traffic
     for row in rows:
         road = _road(row.attrib["id"], document)
@@ -85,7 +87,7 @@ def _road(edge: str, document: Document) -> Road:
 
 def _lanes(row: ElementTree.Element, road: Road, add_sidewalk: bool) -> list[_Lane]:
     """Return an edge's lanes from the kerb to the middle."""
-    found = sorted(row.iterfind("lane"), key=lambda lane: int(lane.attrib["index"]))
+    found = _plain_lanes(row)
     kinds = [_kind(lane) for lane in found]
     town = road.kind not in OPEN_ROADS
     first_driven = kinds.index("driving") if "driving" in kinds else 0
@@ -101,9 +103,19 @@ def _lanes(row: ElementTree.Element, road: Road, add_sidewalk: bool) -> list[_La
     return out
 
 
-def _kind(lane: ElementTree.Element) -> str:
+def _plain_lanes(row: ElementTree.Element) -> list[dict[str, str]]:
+    """Return the attributes of an edge's lanes by index; netconvert writes what they share at the edge."""
+    own = {int(lane.attrib["index"]): lane.attrib for lane in row.iterfind("lane")}
+    shared = {name: row.attrib[name] for name in SHARED if name in row.attrib}
+    count = int(row.get("numLanes", len(own) or 1))
+    types = row.get("type", "").split("|")
+    each = types if len(types) == count else types[:1] * count
+    return [{"type": each[i], **shared, **own.get(i, {})} for i in range(count)]
+
+
+def _kind(lane: dict[str, str]) -> str:
     kind = lane.get("type", "driving")
-    if kind in ("sidewalk", "walking"):
+    if kind in WALKED:
         return "sidewalk"
     if kind == "biking":
         return "bicycle"
@@ -115,13 +127,15 @@ def _kind(lane: ElementTree.Element) -> str:
 
 
 def _write_edge(row: ElementTree.Element, lanes: list[_Lane], road: Road) -> None:
-    old = {int(lane.attrib["index"]): lane for lane in row.iterfind("lane")}
+    old = _plain_lanes(row)
     driven = [lane.before for lane in lanes if lane.kind == "driving" and lane.before is not None]
     speed = road.speed or float(old[driven[0]].get("speed", "13.89"))
     busy = len(driven) > 1 or speed >= ARTERIAL
     kind = "open" if road.kind in OPEN_ROADS else "arterial" if busy else "street"
     for child in list(row):
         row.remove(child)
+    for name in SHARED:
+        row.attrib.pop(name, None)
     row.attrib |= {"type": kind, "priority": PRIORITY[kind], "numLanes": str(len(lanes)), "speed": f"{speed:.2f}"}
     for i, lane in enumerate(lanes):
         ElementTree.SubElement(row, "lane", {"index": str(i), "width": f"{lane.width:.2f}", **ALLOWED[lane.kind]})

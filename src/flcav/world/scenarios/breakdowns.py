@@ -14,7 +14,7 @@ APART_M = (4.0, 25.0)  # before it, the two are so far apart
 ROOM_M = 50.0  # and have so much of their lane left
 FAST = 5.0  # at least [m/s]
 BRAKES_MPS2 = 6.5  # the first one, sharply
-OVERLAP_M = 0.15  # how far metal gives way
+OVERLAP_M = 0.05  # how far metal gives way
 TWIST = (math.radians(5.0), math.radians(-3.0))  # how far they are turned by it: who ran into it, and whom
 TWIST_S = 0.4
 

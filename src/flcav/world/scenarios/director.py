@@ -9,6 +9,8 @@ from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.scripts import SCRIPTS
 from flcav.world.scenarios.stage import STEP_S, Stage, State
 
+LOOKS_AGAIN = 3  # steps after which a scenario tries again to find its place
+
 
 class Director:
     """The scenarios of one run."""
@@ -33,7 +35,8 @@ class Director:
     def _play(self, scenario: Scenario) -> Generator[None, None, None]:
         cast, act = SCRIPTS[scenario.kind]
         while (roles := cast(self.stage, scenario)) is None:
-            yield
+            for _ in range(LOOKS_AGAIN):
+                yield
         there, known = set(self.stage.sumo.vehicle.getIDList()), set(self.stage.props)
         playing = act(self.stage, scenario, roles)
         next(playing)

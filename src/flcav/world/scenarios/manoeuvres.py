@@ -10,9 +10,13 @@ from flcav.world.scenarios.stage import STEP_S, Spot, Stage
 from flcav.world.shapes import SHAPES
 
 CLOSE_M = 7.0  # bumper to bumper, when somebody pushes in
+NARROW_M = 1.5  # and at least
+NEXT_M = (-6.0, 16.0)  # when a car of the next lane begins to pass or to fall back for it
+FALLS_BACK_S = 5.0
 MOVES_OVER_S = 2.2
 FAST = 4.0  # [m/s] slower egos are not worth pushing in before
-ROOM_M = 45.0  # of lane ahead
+ROOM_M = 45.0  # of lane ahead, for a car from the kerb
+NEXT_ROOM_M = 30.0  # and for one from the next lane
 KERB_GAP_M = 0.25  # between a standing car and the lane
 CLEAR_M = 2.0  # nobody has ever been so close to where a car from the kerb stands
 DEFAULT_CAR = "car.hatchback"
@@ -20,6 +24,7 @@ LIGHT_M = (6.0, 45.0)  # a runner is so far from the stop line
 SEEN_M = 70.0  # and so far from the vehicle under test
 IMPATIENT_S = 8.0  # or has stood there for so long
 RUNS_AT = 9.0  # [m/s]
+TURN = 6  # where SUMO's links have the direction: who turns right on red surprises nobody
 IGNORES_LIGHTS = 7  # SUMO's speed mode: keeps its distance and its physics, goes by no light and no right of way
 NORMAL = 31
 
@@ -36,15 +41,16 @@ def cast_cut_in(stage: Stage, scenario: Scenario) -> CutIn | None:
     """Return a vehicle under test with room ahead, and who is beside that room."""
     for ego in stage.egos(scenario):
         spot = stage.spot(ego)
-        if not spot or stage.state(ego)[3] < FAST or spot.left < ROOM_M or stage.leader(ego, 25.0):
+        if not spot or stage.state(ego)[3] < FAST or spot.left < NEXT_ROOM_M or stage.leader(ego, 15.0):
             continue
         neighbour = _beside(stage, spot)
         if neighbour is not None:
             return CutIn(ego, spot, neighbour)
+        if spot.left < ROOM_M or stage.leader(ego, 25.0):
+            continue
         kind = scenario.actors.get("car", DEFAULT_CAR)
         x, y, _ = stage.point(spot.lane, _stands_at(spot, kind), _kerb(spot.lane, kind))
-        driving = spot.edge.lanes_of("driving")
-        if len(driving) == 1 and stage.untouched(x, y, CLEAR_M):
+        if spot.lane is spot.edge.lanes_of("driving")[0] and stage.untouched(x, y, CLEAR_M):
             return CutIn(ego, spot, None)
     return None
 
@@ -58,17 +64,22 @@ def cut_in(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, No
     stage.take(name)
     vehicle.setLaneChangeMode(name, 0)
     lane = int(roles.spot.lane.id.rpartition("_")[2])
-    vehicle.changeLane(name, lane, 20.0)
-    for _ in range(round(2 * MOVES_OVER_S / STEP_S)):
+    close = False
+    for _ in range(round((FALLS_BACK_S + 2 * MOVES_OVER_S) / STEP_S)):
         if roles.ego in vehicle.getIDList():
-            vehicle.setSpeed(name, max(0.8 * vehicle.getSpeed(roles.ego), 3.0))
+            gap = vehicle.getLanePosition(name) - vehicle.getLength(name) - vehicle.getLanePosition(roles.ego)
+            passes = gap < NARROW_M and not close
+            vehicle.setSpeed(name, max((1.3 if passes else 0.8) * vehicle.getSpeed(roles.ego), 3.0))
+            if NARROW_M <= gap <= CLOSE_M and not close:
+                close = True
+                vehicle.changeLane(name, lane, 20.0)
         yield
     vehicle.setSpeed(name, -1.0)
     vehicle.setLaneChangeMode(name, 1621)
 
 
 def _beside(stage: Stage, ego: Spot) -> str | None:
-    """Return a vehicle on a neighbouring lane whose rear is just ahead of the ego's front."""
+    """Return a vehicle on a neighbouring lane that is beside the ego or a little ahead."""
     driving = list(ego.edge.lanes_of("driving"))
     here = driving.index(ego.lane) if ego.lane in driving else -9
     for name in stage.sumo.vehicle.getIDList():
@@ -76,7 +87,7 @@ def _beside(stage: Stage, ego: Spot) -> str | None:
         if name.startswith(("cav", "scripted")) or not spot or spot.edge is not ego.edge or spot.lane not in driving:
             continue
         gap = spot.along - stage.sumo.vehicle.getLength(name) - ego.along
-        if abs(driving.index(spot.lane) - here) == 1 and 2.0 <= gap <= CLOSE_M and stage.state(name)[3] > FAST:
+        if abs(driving.index(spot.lane) - here) == 1 and NEXT_M[0] <= gap <= NEXT_M[1] and stage.state(name)[3] > FAST:
             return name
     return None
 
@@ -120,8 +131,8 @@ def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
     """Return a vehicle near one under test, first before a red light: still moving, or tired of waiting."""
     egos = stage.egos(scenario)
     for name in stage.sumo.vehicle.getIDList():
-        lights = stage.sumo.vehicle.getNextTLS(name)
-        if not lights or name.startswith("cav") or not stage.spot(name):
+        lights, ways = stage.sumo.vehicle.getNextTLS(name), stage.sumo.vehicle.getNextLinks(name)
+        if not lights or not ways or name.startswith("cav") or not stage.spot(name) or ways[0][TURN] in "rR":
             continue
         light, _, distance, state = lights[0]
         near = any(math.dist(stage.state(name)[:2], stage.state(ego)[:2]) <= SEEN_M for ego in egos)

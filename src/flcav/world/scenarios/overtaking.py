@@ -9,17 +9,21 @@ from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Spot, Stage, State
 
 KIND = "car.sedan"
-BEHIND_M = 5.0  # bumper to bumper, before it pulls out
-AHEAD_M = 4.0  # and before it moves back
-MEETS_M = (45.0, 120.0)  # how far away the vehicle under test is then
+BEHIND_M = 4.0  # bumper to bumper, before it pulls out
+AHEAD_M = 3.0  # and before it moves back
+MEETS_M = (50.0, 120.0)  # how far away the vehicle under test is then
 STREETS = 3  # on one of so many next edges of its route
-ROOM_M = 50.0  # of lane for the manoeuvre
+ROOM_M = 42.0  # of lane for the manoeuvre
 FREE_M = 28.0  # ahead of the slow one
 SLOW = 3.0  # [m/s] what is overtaken is slow
-FASTER = 7.0  # [m/s] by so much it is overtaken
-GAINS_MPS2, SLOWS_MPS2 = 3.5, 2.5
+ROLLS = 1.0  # [m/s] at least, whoever they meet
+FASTER = 8.0  # [m/s] by so much it is overtaken
+GAINS_MPS2, SLOWS_MPS2 = 4.5, 2.5
 SWINGS_S = 1.8  # from one lane to the other
-SEEN_STEPS = 100  # how far back it matters where somebody was
+WAY_M = (4.0, 12.0, 20.0, 28.0)  # ahead of it, where others see that they must give way
+OUT = 0.6  # of it before it accelerates
+NEIGHBOUR_M = 4.8  # from the front of whoever follows to another's
+SEEN_STEPS = 60  # how far back it matters where somebody was
 
 
 class Overtaking(NamedTuple):
@@ -32,7 +36,7 @@ class Overtaking(NamedTuple):
 def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
     """Return somebody oncoming to a vehicle under test, with nobody behind and room ahead."""
     for ego in stage.egos(scenario):
-        if stage.state(ego)[3] <= SLOW:
+        if stage.state(ego)[3] < ROLLS:
             continue
         ahead = [stage.net.edges[edge] for edge in stage.onward(ego)[:STREETS]]
         oncoming = {(edge.end, edge.start) for edge in ahead}
@@ -40,7 +44,8 @@ def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
             spot = stage.spot(name)
             if name.startswith("cav") or not spot or spot.left < ROOM_M or len(spot.edge.lanes_of("driving")) > 1:
                 continue
-            if (spot.edge.start, spot.edge.end) not in oncoming or stage.leader(name, FREE_M):
+            follows_on_lane = spot.along > stage.sumo.vehicle.getLength(name) + BEHIND_M + 1.0
+            if (spot.edge.start, spot.edge.end) not in oncoming or not follows_on_lane or stage.leader(name, FREE_M):
                 continue
             if _meets(stage.state(name), stage.state(ego)) and _alone(stage, name):
                 return Overtaking(name, spot)
@@ -67,7 +72,7 @@ def _alone(stage: Stage, name: str) -> bool:
         if other != name:
             for step, (x, y, _, _) in states:
                 at = trail.get(step)
-                if at is not None and math.hypot(at[0] - x, at[1] - y) < 5.5 and step > stage.step - SEEN_STEPS:
+                if at is not None and math.hypot(at[0] - x, at[1] - y) < NEIGHBOUR_M and step > stage.step - SEEN_STEPS:
                     return False
     return True
 
@@ -81,14 +86,16 @@ def overtake(stage: Stage, scenario: Scenario, roles: Overtaking) -> Generator[N
     for step, (x, y, angle, speed) in stage.trail(slow, BEHIND_M + slow_length):
         stage.place(name, x, y, math.radians(90.0 - angle), speed, step)
     stage.take(slow)
+    room = roles.spot.along + roles.spot.left
     at = vehicle.getLanePosition(slow) - slow_length - BEHIND_M
     speed, out, back = stage.state(slow)[3], 0.0, 0.0
     while back < 1.0:
         yield
         vehicle.setSpeed(slow, max(SLOW, stage.state(slow)[3] - SLOWS_MPS2 * STEP_S))
-        ahead_of = vehicle.getLanePosition(slow) if vehicle.getLaneID(slow) == lane.id else at - length
-        passed = at - length > ahead_of + AHEAD_M
-        speed = min(speed + GAINS_MPS2 * STEP_S, SLOW + FASTER)
+        on_lane = vehicle.getLaneID(slow) == lane.id and at < room - length
+        passed = not on_lane or at - length > vehicle.getLanePosition(slow) + AHEAD_M
+        faster = min(speed + GAINS_MPS2 * STEP_S, SLOW + FASTER)
+        speed = faster if out >= OUT else min(faster, stage.state(slow)[3] + 0.5)
         at += speed * STEP_S
         out = min(out + STEP_S / SWINGS_S, 1.0)
         back = back + STEP_S / SWINGS_S if passed and out >= 1.0 else back
@@ -96,8 +103,7 @@ def overtake(stage: Stage, scenario: Scenario, roles: Overtaking) -> Generator[N
         turn = math.atan2(lane.width * rate / SWINGS_S, speed) * (1 if back == 0.0 else -1)
         x, y, heading = stage.point(lane, at, lane.width * share)
         stage.place(name, x, y, heading + turn, speed)
-        reach_x, reach_y, _ = stage.point(lane, at + 8.0, lane.width)
-        stage.brake_for(reach_x, reach_y, half_width_m=1.5)
+        stage.brake_for([stage.point(lane, at + reach, lane.width)[:2] for reach in WAY_M], half_width_m=2.0)
     stage.drive_on()
-    stage.enter(name, kind, (lane, min(at, roles.spot.along + roles.spot.left - 1.0)), stage.onward(slow), speed)
+    stage.enter(name, kind, (lane, min(at, room - 1.0)), stage.onward(slow), speed)
     vehicle.setSpeed(slow, -1.0)

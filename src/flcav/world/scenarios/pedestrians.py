@@ -74,7 +74,7 @@ def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[Non
         x, y, heading = _walker(stage, roles, at)
         stage.place(pedestrian, x, y, heading, RUNS_AT if crossing else 0.0)
         if crossing and at > -lane.width / 2 - 0.8:
-            stage.brake_for(*stage.point(lane, roles.along, at)[:2], half_width_m=2.2)
+            stage.brake_for([stage.point(lane, roles.along, at)[:2]], half_width_m=2.2)
         elif running and not crossing:
             stage.drive_on()
 

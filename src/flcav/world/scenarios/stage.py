@@ -6,7 +6,7 @@ speed [m/s].
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -138,16 +138,17 @@ class Stage:
         gap = found[1] + self.sumo.vehicle.getMinGap(name)
         return (found[0], gap) if gap <= within_m else None
 
-    def brake_for(self, x: float, y: float, half_width_m: float = 2.0) -> None:
-        """Have everybody brake who drives towards a place and could not stop before it any later."""
+    def brake_for(self, places: Sequence[tuple[float, float]], half_width_m: float) -> None:
+        """Have everybody brake who drives towards one of the places and could not stop before it any later."""
+        at = np.array(places)
         for name in self.sumo.vehicle.getIDList():
-            front_x, front_y, angle, speed = self.state(name)
+            x, y, angle, speed = self.state(name)
             heading = math.radians(90.0 - angle)
-            dx, dy = x - front_x, y - front_y
+            dx, dy = at[:, 0] - x, at[:, 1] - y
             ahead = dx * math.cos(heading) + dy * math.sin(heading)
-            aside = -dx * math.sin(heading) + dy * math.cos(heading)
+            aside = np.abs(-dx * math.sin(heading) + dy * math.cos(heading))
             reach = 4.0 + 0.7 * speed + speed**2 / (2 * CAREFUL_MPS2)
-            if -1.0 < ahead < reach and abs(aside) < half_width_m:
+            if ((ahead > -1.0) & (ahead < reach) & (aside < half_width_m)).any():
                 self.take(name)
                 self.sumo.vehicle.setSpeed(name, 0.0)
                 self._braking.add(name)
