@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 
 LARGEST_STEP = 4.0  # of a multiplier's logarithm in one iteration
 BUDGET_SLACK = 1e-12  # relative: rounding of the sums, not room to overspend
+CONVERGED = 1e-10  # relative: overspend, and what the slack of a priced budget is worth
+ALMOST = 1e-9  # relative: what a converged optimum may overspend
+ROUNDING = 1e-14  # relative: noise of the dual's value
+VANISHED = 1e-9  # of its first value: a multiplier of a budget that does not bind
 NO_DECAY = -1e9  # stands for the logarithm of a = 0
 
 
@@ -158,12 +162,16 @@ def relax(problem: Separable) -> Relaxed:
     if problem.fits(everything.x):
         return everything
     scarce = int(np.argmax(problem.spent(everything.x) / problem.budget))
-    best = everything
-    for binding in ([scarce], [1 - scarce], [0, 1]):
-        best = _ascend(problem, binding, _start(problem, binding) if len(binding) == 1 else best.multipliers)
-        if problem.fits(best.x * (1 - 1e-9)):
-            break
-    return best
+    other = 1 - scarce
+    best = _ascend(problem, [scarce], _start(problem, [scarce]))
+    if problem.fits(best.x * (1 - ALMOST)):
+        return best
+    start = best.multipliers.copy()
+    start[other] = 0.5 * start[scarce] * problem.budget[scarce] / problem.budget[other]
+    both = _ascend(problem, [0, 1], start)
+    if both.multipliers[scarce] > VANISHED * start[scarce]:
+        return both
+    return _ascend(problem, [other], _start(problem, [other]))
 
 
 def _value(problem: Separable, multipliers: Array) -> Relaxed:
@@ -183,23 +191,25 @@ def _start(problem: Separable, binding: list[int]) -> Array:
 
 def _ascend(problem: Separable, binding: list[int], start: Array) -> Relaxed:
     """Return the best dual point at which only the `binding` budgets have a multiplier: Newton in its logarithm."""
-    fresh = _start(problem, binding)
-    now = _value(problem, np.where(start[binding].min() > 0, start, fresh))
+    now = _value(problem, start)
+    overspend = (problem.spent(now.x) - problem.budget)[binding]
     for _ in range(200):
-        overspend = (problem.spent(now.x) - problem.budget)[binding]
-        if np.all(np.abs(overspend) <= 1e-10 * problem.budget[binding]):
+        slack = float(now.multipliers[binding] @ np.abs(overspend))
+        done = np.all(overspend <= CONVERGED * problem.budget[binding]) and slack <= CONVERGED * abs(now.bound)
+        if done or np.any(now.multipliers[binding] < VANISHED * start[binding]):
             break
         step = newton_step(problem, now.x, now.multipliers, binding, overspend)
-        following = now
-        for shrink in 0.5 ** np.arange(40):
+        for shrink in 0.5 ** np.arange(20):
             multipliers = now.multipliers.copy()
             multipliers[binding] *= np.exp(step * shrink)
             following = _value(problem, multipliers)
-            if following.bound > now.bound:
+            left = (problem.spent(following.x) - problem.budget)[binding]
+            nearer = multipliers[binding] @ np.abs(left) < slack
+            if following.bound > now.bound - nearer * ROUNDING * abs(now.bound):
                 break
         else:
             break
-        now = following
+        now, overspend = following, left
     return now
 
 
