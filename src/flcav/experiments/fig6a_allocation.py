@@ -27,8 +27,7 @@ from flcav.experiments.protocol import REGIONS, Protocol
 from flcav.experiments.steps import Notify, Step, Work, run_side_by_side
 from flcav.experiments.testing import difference
 from flcav.network.ledger import LINKS, Ledger
-from flcav.network.plan import MessageSizes, price
-from flcav.optimization.allocation import TaskPlan, stage_plan
+from flcav.optimization.baselines import baseline
 from flcav.optimization.problem import Problem
 from flcav.report import plans, style
 
@@ -45,24 +44,7 @@ def allocation_protocol(seed: int, scale: str) -> Protocol:
 
 def equal_stages(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
     """Choose as many samples, edge rounds and cloud rounds as equal shares of each link's budget buy."""
-    return {"tasks": [asdict(_equal_shares(run_problem(work, protocol)))]}
-
-
-def _equal_shares(problem: Problem) -> TaskPlan:
-    task, budgets = problem.tasks[0], problem.budgets_mb
-    vehicles, servers = sum(task.edge_groups), len(task.edge_groups)
-    wireless, wireline = budgets.wireless / 3, budgets.wireline / 2  # stage II does not use the wireline
-    k = max(problem.edge_rounds_per_cloud_round, 1)
-    bought = (
-        min(wireless, wireline) / task.sample_mb,
-        wireless / (vehicles * task.model_mb),
-        min(wireless / (k * vehicles), wireline / servers) / task.model_mb,
-    )
-    limits = (task.limits.samples, task.limits.edge_rounds, task.limits.cloud_rounds)
-    counts = [int(min(max(count, low), high)) for count, (low, high) in zip(bought, limits, strict=True)]
-    cost = price(stage_plan(problem, task, counts), MessageSizes(task.sample_mb, task.model_mb))
-    error = float(task.curve.error(counts[0], counts[1], counts[2], problem.edge_rounds_per_cloud_round))
-    return TaskPlan(task.name, counts[0], counts[1], counts[2], error, cost.wireless_mb, cost.wireline_mb)
+    return asdict(baseline(run_problem(work, protocol), EQUAL))
 
 
 def plan_steps(protocol: Protocol, name: str) -> list[Step]:

@@ -1,10 +1,10 @@
 """The three-layer graph: tasks - networks - modalities - vehicles (Wang et al., IEEE Network 37(3), 2023, Fig. 3a).
 
 Layer 1 joins each task to the network that it shares with others: they are a cluster, one resource serves them all, and
-its loss is the sum of theirs by weight. Layer 2 joins a network to the modalities that it reads, at the size of one
-sample. Layer 3 joins a modality to the vehicles that record it, with the samples they hold and how good these are.
-The graph is a plain `networkx.Graph` whose nodes (kind, name) and edges carry these numbers; it is saved as node-link
-JSON, and it holds all that an allocation problem needs.
+its loss is the sum of theirs by weight; a task may have a curve of its own. Layer 2 joins a network to the modalities
+that it reads, at the size of one sample. Layer 3 joins a modality to the vehicles that record it, with the samples they
+hold and how good these are. The graph is a plain `networkx.Graph` whose nodes (kind, name) and edges carry these
+numbers; it is saved as node-link JSON, and it holds all that an allocation problem needs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,9 +16,10 @@ from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.files import write_json
-from flcav.optimization.curves import Curve, Positive
+from flcav.optimization.curves import Additive, Effective, Positive
 from flcav.optimization.problem import Budgets, Count, Limits, Problem, Uplink
 
+OwnCurve = Annotated[Additive | Effective, Field(discriminator="model")]
 KINDS = ("task", "network", "modality", "vehicle")  # a layer joins neighbours
 
 
@@ -27,15 +28,16 @@ class TaskNode(Config):
 
     network: str
     weight: Positive = 1.0
+    curve: OwnCurve | None = None  # None: its network's
 
 
 class NetworkNode(Config):
-    """A network: its size, what it reads, and the curve of its cluster's weighted mean error."""
+    """A network: its size, what it reads, and the curve of its tasks that have none of their own."""
 
     model_mb: Positive
     modalities: Annotated[tuple[str, ...], Field(min_length=1)]
     limits: Limits
-    curve: Curve
+    curve: OwnCurve | None = None
 
 
 class ModalityNode(Config):
@@ -74,6 +76,8 @@ class Layers(Config):
     def _joined(self) -> Self:
         for name, task in self.tasks.items():
             _known(f"tasks.{name}.network", task.network, self.networks)
+            if task.curve is None and self.networks[task.network].curve is None:
+                raise ValueError(f"tasks.{name}.curve is missing, and networks.{task.network} has none either")
         for name, network in self.networks.items():
             for modality in network.modalities:
                 _known(f"networks.{name}.modalities", modality, self.modalities)
@@ -100,7 +104,7 @@ def build(layers: Layers) -> nx.Graph:
         horizon_s=layers.horizon_s,
     )
     for name, task in layers.tasks.items():
-        graph.add_node(("task", name), kind="task")
+        graph.add_node(("task", name), kind="task", curve=task.model_dump(mode="json")["curve"])
         graph.add_edge(("task", name), ("network", task.network), layer=1, weight=task.weight)
     for name, network in layers.networks.items():
         own = network.model_dump(mode="json", exclude={"modalities"})
@@ -125,7 +129,11 @@ def describe(graph: nx.Graph) -> Layers:
             raise InputError(f"graph: task {key[1]!r} is joined to {graph.degree[key]} networks, not to one")
     try:
         tasks = {
-            key[1]: {"network": network[1], "weight": graph.edges[key, network]["weight"]}
+            key[1]: {
+                "network": network[1],
+                "weight": graph.edges[key, network]["weight"],
+                "curve": graph.nodes[key]["curve"],
+            }
             for key in nodes["task"]
             for network in graph[key]
         }
@@ -210,11 +218,25 @@ def to_problem(graph: nx.Graph) -> Problem:
                 "edge_groups": [sum(each.edge == edge for each in ordered.values()) for edge in edges],
                 **_named(ordered, held),
                 "limits": network.limits.model_dump(),
-                "curve": network.curve.model_dump(),
+                "curve": _cluster_curve(layers, name, tasks_of),
             }
         )
     shared = ("budgets_mb", "edge_rounds_per_cloud_round", "horizon_s")
     return parse_config(Problem, {**{name: graph.graph[name] for name in shared}, "tasks": tasks}, "graph")
+
+
+def _cluster_curve(layers: Layers, network: str, tasks: Mapping[str, float]) -> dict[str, Any]:
+    """Return the curve of a cluster's mean error by weight: the network's alone where no task has one of its own."""
+    shared = layers.networks[network].curve
+    own = {name: layers.tasks[name].curve or shared for name in tasks}
+    members = [
+        {"name": name, "weight": tasks[name], "curve": curve.model_dump()}
+        for name, curve in own.items()
+        if curve is not None
+    ]
+    if all(curve == own[members[0]["name"]] for curve in own.values()):
+        return members[0]["curve"]
+    return {"model": "shared", "members": members}
 
 
 def _named(fleet: Mapping[str, VehicleNode], held: Mapping[str, Sequence[Held]]) -> dict[str, Any]:

@@ -52,6 +52,22 @@ def test_a_cluster_shares_one_resource_and_weighs_what_its_tasks_weigh() -> None
     assert plan.objective == pytest.approx(sum(weights[name] * errors[name].predicted_error for name in weights))
 
 
+def test_tasks_of_a_cluster_may_have_curves_of_their_own() -> None:
+    changed = values()
+    floors = {"weather": 0.02, "lights": 0.1}
+    for task, floor in floors.items():
+        curve = {"model": "additive", "floor": floor, "pretrain": {"a": 2.0, "b": 0.5}, "edge": {"a": 0.1, "x0": 1}}
+        changed["tasks"][task]["curve"] = curve
+    del changed["networks"]["classifier"]["curve"]
+    graph = build(parse_config(Layers, changed, "test"))
+    plan = allocate(to_problem(graph)).tasks[0]
+    errors = {member.name: member.predicted_error for member in plan.members}
+    assert errors["lights"] - errors["weather"] == pytest.approx(0.08)
+    mean = (0.2 * errors["weather"] + 0.133 * errors["lights"]) / 0.333
+    assert plan.predicted_error == pytest.approx(mean)
+    assert describe(graph).tasks["lights"].curve is not None
+
+
 def test_groups_are_the_vehicles_that_hold_every_modality_of_the_network() -> None:
     changed = values()
     changed["networks"]["lidar detector"]["modalities"] = ["camera", "lidar"]
@@ -86,6 +102,7 @@ def test_the_vehicles_of_a_graph_carry_its_plan() -> None:
         (("modalities", "camera", "sample_mb"), -1, "greater than 0"),
         (("networks", "idle"), {**values()["networks"]["classifier"]}, "networks.idle serves no task"),
         (("vehicles",), {"car 1": values()["vehicles"]["car 1"] | {"holds": {"camera": {}}}}, "no vehicle holds"),
+        (("networks", "classifier", "curve"), None, "tasks.weather.curve is missing"),
         (("colour",), "red", "unknown field 'colour'"),
     ],
 )
