@@ -1,6 +1,6 @@
 """A frame as rows of the tables."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,21 @@ from flcav.sensors.frame import Frame, SignViews, Views
 Columns = Mapping[str, Any]
 
 
-def rows_of(frame: Frame) -> dict[str, pa.Table]:
-    """Return the rows of `frame` in each table, by the table's name."""
-    return {name: pa.table(dict(columns(frame)), schema=SCHEMAS[name]) for name, columns in COLUMNS.items()}
+def rows_of(frame: Frame) -> dict[str, Columns]:
+    """Return the columns of the rows of `frame` in each table, by the table's name."""
+    return {name: columns(frame) for name, columns in COLUMNS.items()}
+
+
+def table_of(name: str, parts: Sequence[Columns]) -> pa.Table:
+    """Return the table `name` of the rows of several frames."""
+    schema = SCHEMAS[name]
+    return pa.table({column: _stack([part[column] for part in parts]) for column in schema.names}, schema=schema)
+
+
+def _stack(parts: Sequence[Any]) -> Any:
+    if parts and all(isinstance(part, np.ndarray) for part in parts):
+        return np.concatenate(parts)
+    return [value for part in parts for value in part]
 
 
 def _frames(frame: Frame) -> Columns:

@@ -16,7 +16,7 @@ import pyarrow as pa
 from flcav.dataset.calibration import to_json
 from flcav.dataset.layout import CALIBRATION, FILES, TRACES, table_path
 from flcav.dataset.payloads import payloads
-from flcav.dataset.rows import rows_of
+from flcav.dataset.rows import rows_of, table_of
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
 from flcav.files import write_json
 from flcav.sensors.frame import Frame
@@ -84,7 +84,7 @@ def _frames(source: Source, task: Part, work: Path) -> Iterator[Frame]:
 
 def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callable[[], None]) -> None:
     files: list[tuple[str, int, str]] = []
-    tables = {name: [schema.empty_table()] for name, schema in SCHEMAS.items()}
+    tables = {name: [] for name in SCHEMAS}
     calibrations = {}
     written = set()
     for frame in frames:
@@ -104,7 +104,7 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
             raise ValueError(f"{frame.key}: the sensors of {frame.agent} moved on their mounts within a dataset")
         wrote_frame()
     for name, rows in tables.items():
-        write_table(pa.concat_tables(rows), part / table_path(name))
+        write_table(table_of(name, rows), part / table_path(name))
     listing = pa.table(dict(zip(FILES_SCHEMA.names, zip(*files) if files else ([], [], []))), schema=FILES_SCHEMA)
     write_table(listing, part / table_path(FILES))
     write_json(part / CALIBRATION, calibrations)

@@ -169,7 +169,7 @@ def _sweep(
     count = len(scene.trace.actor)
     returns = np.bincount(actor + 1, minlength=count + 1)[1:]
     visible = np.bincount(echoes.instance + 1, minlength=count + 2)[2:]  # without what is missed, and the town
-    return points, Sweep(lidar, world_from_sensor, passes, returns, visible)
+    return points, Sweep(lidar, world_from_sensor, passes, echoes.distance, returns, visible)
 
 
 def _within_range(carrier: _Carrier, rig: Rig) -> NDArray[np.bool_]:

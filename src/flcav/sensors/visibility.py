@@ -1,11 +1,11 @@
-"""How much of each actor a sensor would see if nothing stood in the way: its rays, traced against it alone."""
+"""How much more of each actor a sensor would see if nothing stood in the way: rays stopped before it, traced on."""
 
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import inverse
+from flcav.geometry import inverse, pose
 from flcav.sensors.echoes import cast_through_glass
 from flcav.sensors.lidar import Lidar, ray_pattern
 from flcav.world.rays.compiled import compiled
@@ -14,27 +14,38 @@ from flcav.world.scene import Scene
 BOX_MARGIN_M = 0.01
 
 
-def unoccluded_rays(
+def occluded_rays(
     scene: Scene,
     world_from_sensor: NDArray[np.float64],
     lidar: Lidar,
     passes: NDArray[np.bool_],
+    distance: NDArray[np.float32],
     actors: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """Return, for each of `actors` (K,), how many rays of the sweep would come back from it in an empty world."""
-    return np.array([_alone(scene, world_from_sensor, lidar, passes, int(actor)) for actor in actors], np.int64)
+    """Return, for each of `actors` (K,), how many more rays of the sweep would come back from it in an empty world.
+
+    `distance` (N,) is where the rays ended.
+    """
+    poses = scene.poses()
+    return np.array(
+        [
+            _stopped(scene, inverse(pose(*poses[a])) @ world_from_sensor, lidar, passes, distance, int(a))
+            for a in actors
+        ],
+        np.int64,
+    )
 
 
-def _alone(
+def _stopped(
     scene: Scene,
-    world_from_sensor: NDArray[np.float64],
+    body_from_sensor: NDArray[np.float64],
     lidar: Lidar,
     passes: NDArray[np.bool_],
+    distance: NDArray[np.float32],
     actor: int,
 ) -> int:
-    body_from_sensor = inverse(scene.world_from_actor(actor)) @ world_from_sensor
-    directions = ray_pattern(lidar)
-    rays = rays_into_box(directions, lidar.azimuth_steps, body_from_sensor, scene.trace.size[actor], BOX_MARGIN_M)
+    directions, size = ray_pattern(lidar), scene.trace.size[actor]
+    rays = rays_into_box(directions, lidar.azimuth_steps, body_from_sensor, size, BOX_MARGIN_M, distance)
     if not len(rays):
         return 0
     trace = partial(scene.cast_alone, actor, body_from_sensor, far_m=lidar.range_m)
@@ -45,11 +56,11 @@ def _alone(
 
 
 @compiled
-def rays_into_box(directions, steps, body_from_sensor, size, margin):
-    """Return the numbers of the rays of a spinning pattern (channels * steps, 3) that enter a box.
+def rays_into_box(directions, steps, body_from_sensor, size, margin, distance):
+    """Return the numbers of the rays of a spinning pattern (channels * steps, 3) that end before a box they would enter.
 
-    The box of `size` (3,), grown by `margin` [m], stands on the body's origin. Only the columns between its corners'
-    azimuths are tried.
+    They end at `distance` (N,) [m]. The box of `size` (3,), grown by `margin` [m], stands on the body's origin. Only the
+    columns between its corners' azimuths are tried.
     """
     low = np.array([-size[0] / 2, -size[1] / 2, 0.0]) - margin
     high = np.array([size[0] / 2, size[1] / 2, size[2]]) + margin
@@ -73,7 +84,7 @@ def rays_into_box(directions, steps, body_from_sensor, size, margin):
                 other = (high[axis] - body_from_sensor[axis, 3]) / along
                 enter = max(enter, min(one, other))
                 leave = min(leave, max(one, other))
-            if enter <= leave:
+            if enter <= leave and distance[ray] <= enter:
                 found[count] = ray
                 count += 1
     return found[:count]

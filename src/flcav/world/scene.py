@@ -57,8 +57,9 @@ class Scene:
         """
         if abs(offset_s) > OFFSET_S:
             raise ValueError(f"offset_s = {offset_s}: must lie within -{OFFSET_S} and {OFFSET_S}")
-        self.index, self.offset_s = index, offset_s
-        self._place()
+        if (index, offset_s) != (self.index, self.offset_s):
+            self.index, self.offset_s = index, offset_s
+            self._place()
 
     def poses(self) -> NDArray[np.float64]:
         """Return (A, 4) x, y, z, yaw of every actor at the scene's time; NaN where absent."""

@@ -155,7 +155,7 @@ def test_rays_into_a_box_are_found_by_brute_force_too(seed: int):
     rays, size = ray_pattern(lidar), rng.uniform(0.5, 8.0, 3)
     body_from_sensor = pose(*rng.uniform((-12, -12, -1, -0.3, -0.3, -0.3), (12, 12, 8, 0.3, 0.3, 0.3)))
     body_from_sensor[:3, :3] = pose(0, 0, 0, rng.uniform(-np.pi, np.pi))[:3, :3] @ body_from_sensor[:3, :3]
-    found = rays_into_box(rays, lidar.azimuth_steps, body_from_sensor, size, 0.0)
+    found = rays_into_box(rays, lidar.azimuth_steps, body_from_sensor, size, 0.0, np.zeros(len(rays), np.float32))
     steps = np.linspace(0, 40, 1001)[:, None, None]
     points = body_from_sensor[:3, 3] + steps * (rays.astype(float) @ body_from_sensor[:3, :3].T)
     low, high = np.array([-size[0] / 2, -size[1] / 2, 0]), np.array([size[0] / 2, size[1] / 2, size[2]])

@@ -13,7 +13,7 @@ from flcav.sensors.labels.signs import view_signs
 from flcav.sensors.labels.views import view_actors
 from flcav.sensors.lens import Lens
 from flcav.sensors.lidar import Lidar
-from flcav.sensors.visibility import unoccluded_rays
+from flcav.sensors.visibility import occluded_rays
 from flcav.world.scene import Scene
 
 
@@ -23,6 +23,7 @@ class Sweep(NamedTuple):
     lidar: Lidar
     world_from_sensor: Array  # (4, 4)
     passes: NDArray[np.bool_]  # see `draw_passes`
+    distance: NDArray[np.float32]  # (N,) where the rays ended [m]
     returns: NDArray[np.int64]  # (A,) points of each of the scene's actors
     visible: NDArray[np.int64]  # (A,) rays that come back from it, detected or not
 
@@ -83,10 +84,12 @@ def annotate(
 
 def _occlusion(scene: Scene, sweeps: list[Sweep], actors: NDArray[np.int64]) -> Array:
     """Return (K,) the share of each actor that is hidden from all LiDARs together; 1 where nothing is visible."""
-    visible, unoccluded = np.zeros((2, len(actors)), np.int64)
+    visible, occluded = np.zeros((2, len(actors)), np.int64)
     for sweep in sweeps:
         visible += sweep.visible[actors]
     seen = np.flatnonzero(visible)  # of the others nothing is visible, whatever they would show
     for sweep in sweeps:
-        unoccluded[seen] += unoccluded_rays(scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, actors[seen])
-    return 1 - visible / np.maximum(np.maximum(unoccluded, visible), 1)
+        occluded[seen] += occluded_rays(
+            scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, sweep.distance, actors[seen]
+        )
+    return 1 - visible / np.maximum(visible + occluded, 1)
