@@ -5,10 +5,11 @@ from typing import Any
 
 from flcav.config import InputError
 from flcav.perception.objects.task import OBJECTS
+from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
 
-TASKS: dict[str, Task[Any, Any, Any]] = {task.name: task for task in (WEATHER, OBJECTS)}
+TASKS: dict[str, Task[Any, Any, Any]] = {task.name: task for task in (WEATHER, SIGNS, OBJECTS)}
 
 
 def task_named(name: str) -> Task[Any, Any, Any]:

@@ -1,0 +1,98 @@
+"""Windows of pictures at random places and scales, four of them as a mosaic, in random colours. Never mirrored.
+
+The mosaic is that of Bochkovskiy et al., "YOLOv4", 2020, sec. 3.3, of windows at their own scale: signs are few and
+small, so that windows are drawn around them, and pictures are not made smaller.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.perception.images import resized
+from flcav.perception.signs.config import SignsConfig
+from flcav.perception.signs.samples import Sample, size_px
+
+GREY = 114  # what lies beyond a picture
+MOSAIC = 0.5  # share of the samples that are mosaics
+AROUND_A_SIGN = 0.8  # share of the windows drawn so that they hold one, where the picture has any
+SCALE = (0.7, 1.5)
+WHOLE = 0.5  # share of a box that must lie in the window for it to be found
+GAIN, SATURATION = (0.7, 1.3), (0.6, 1.4)
+
+
+def draw(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
+    """Return sample `index` as a training step sees it: a window of it, or a mosaic with windows of three others."""
+    width, height = config.window_px
+    if rng.random() >= MOSAIC:
+        return recoloured(window(samples[index], width, height, config, rng), rng)
+    across = int(rng.uniform(0.3, 0.7) * width)
+    down = int(rng.uniform(0.3, 0.7) * height)
+    others = rng.integers(0, len(samples), 3)
+    parts = []
+    for place, number in enumerate((index, *others)):
+        left, top = place % 2, place // 2
+        size = (width - across if left else across, height - down if top else down)
+        part = window(samples[int(number)], *size, config, rng)
+        parts.append((part, across if left else 0, down if top else 0))
+    return recoloured(joined(parts, width, height), rng)
+
+
+def joined(parts: Sequence[tuple[Sample, int, int]], width: int, height: int) -> Sample:
+    """Return one sample of parts that lie at (x, y) [px] in it."""
+    picture = np.full((height, width, 3), GREY, np.uint8)
+    for part, x, y in parts:
+        picture[y : y + part.picture.shape[0], x : x + part.picture.shape[1]] = part.picture
+    moves = [np.array([x, y, x, y]) for _, x, y in parts]
+    boxes = np.concatenate([part.boxes + move for (part, *_), move in zip(parts, moves, strict=True)])
+    ignore = np.concatenate([part.ignore + move for (part, *_), move in zip(parts, moves, strict=True)])
+    return Sample(picture, boxes, np.concatenate([part.label for part, *_ in parts]), ignore)
+
+
+def window(sample: Sample, width: int, height: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
+    """Return a window of `width` x `height` of the sample, scaled and placed at random, often around a sign."""
+    scale = rng.uniform(*SCALE)
+    size = np.array([width, height]) / scale
+    full = np.array(sample.picture.shape[1::-1], dtype=float)
+    if len(sample.boxes) and rng.random() < AROUND_A_SIGN:
+        box = sample.boxes[rng.integers(len(sample.boxes))]
+        corner = (box[:2] + box[2:]) / 2 - rng.uniform(0.15, 0.85, 2) * size
+    else:
+        corner = rng.uniform(0, 1, 2) * (full - size)
+    corner = np.where(size < full, np.clip(corner, 0, full - size), (full - size) / 2)
+    x, y = np.round(corner).astype(int)
+    across, down = np.maximum(np.round(size).astype(int), 1)
+    return cut(sample, (int(x), int(y), int(across), int(down)), (width, height), config)
+
+
+def cut(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], config: SignsConfig) -> Sample:
+    """Return the part x, y, width, height [px] of a sample at another size; what lies outside is grey.
+
+    Boxes of which less than half remains, or that become too small, are ignored.
+    """
+    x, y, across, down = part
+    canvas = np.full((down, across, 3), GREY, np.uint8)
+    height, width = sample.picture.shape[:2]
+    x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + across, width), min(y + down, height)
+    canvas[y0 - y : y1 - y, x0 - x : x1 - x] = sample.picture[y0:y1, x0:x1]
+    factor = np.array([size[0] / across, size[1] / down] * 2)
+
+    def moved(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+        clipped = np.clip(boxes - [x, y, x, y], 0, [across, down, across, down])
+        return clipped * factor
+
+    boxes, ignore = moved(sample.boxes), moved(sample.ignore)
+    before = size_px(sample.boxes) ** 2 * factor[:2].prod()
+    left = size_px(boxes) ** 2
+    found = (left >= WHOLE * before) & (size_px(boxes) >= config.smallest_px)
+    ignore = np.concatenate((ignore[size_px(ignore) > 0], boxes[~found & (left > 0)]))
+    return Sample(resized(canvas, *size), boxes[found], sample.label[found], ignore)
+
+
+def recoloured(sample: Sample, rng: np.random.Generator) -> Sample:
+    """Return the sample brighter or darker, and more or less colourful; hues stay, since they tell lights apart."""
+    gain, saturation = rng.uniform(*GAIN), rng.uniform(*SATURATION)
+    pixels = sample.picture.astype(np.float32)
+    grey = pixels.mean(2, keepdims=True)
+    changed = (grey + (pixels - grey) * np.float32(saturation)) * np.float32(gain)
+    return Sample(np.clip(changed, 0, 255).astype(np.uint8), sample.boxes, sample.label, sample.ignore)

@@ -1,0 +1,37 @@
+"""Which network finds signs, and of what it is trained to find."""
+
+from typing import Annotated
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from flcav.dataset.formats.rectangles import SIGNS
+
+STRIDES = (8, 16, 32)  # pixels between the cells of each level
+Size = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]  # width, height [px]
+Level = tuple[Size, Size, Size]
+
+# Signs are about square, signal heads three times as high as wide.
+ANCHORS_PX: tuple[Level, Level, Level] = (
+    ((5.0, 8.0), (9.0, 10.0), (8.0, 20.0)),
+    ((16.0, 17.0), (14.0, 34.0), (26.0, 27.0)),
+    ((26.0, 62.0), (45.0, 47.0), (80.0, 90.0)),
+)
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SignsConfig:
+    """A detector on pictures of any size; sizes are in the pixels of the picture."""
+
+    width: Annotated[float, Field(gt=0)]  # times the channels of the largest published network
+    depth: Annotated[float, Field(gt=0)]  # times its bottlenecks
+    classes: Annotated[tuple[str, ...], Field(min_length=1)] = SIGNS  # in the order of the scores
+    anchors_px: tuple[Level, Level, Level] = ANCHORS_PX  # the shapes boxes are regressed from, at each of STRIDES
+    window_px: tuple[int, int] = (320, 192)  # width, height of what one training step sees of a picture
+    smallest_px: Annotated[float, Field(ge=0)] = 6.0  # root of a box's area from which on it is to be found
+
+
+CONFIGURATIONS = {
+    "n": SignsConfig(width=0.25, depth=0.33),
+    "s": SignsConfig(width=0.5, depth=0.33),
+}

@@ -1,0 +1,74 @@
+"""Boxes from pictures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from flcav.perception.images import Picture
+from flcav.perception.ops.rectangles import nms
+from flcav.perception.signs.augment import GREY
+from flcav.perception.signs.config import STRIDES
+from flcav.perception.signs.model import SignDetector, decode
+
+CANDIDATES = 512  # best-scoring places that suppression looks at
+MOST_OVERLAP = 0.5  # IoU above which two boxes are the same sign, whatever class they say
+MOST_FOUND = 100
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What was found in one picture, best first."""
+
+    box: NDArray[np.float64]  # (N, 4) x1 y1 x2 y2 [px] from the upper left corner
+    label: NDArray[np.int64]  # (N,) number of the class
+    score: NDArray[np.float64]  # (N,) in [0, 1]
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+def detect(network: SignDetector, picture: Picture, *, threshold: float) -> Detections:
+    """Return the boxes found in a picture of any size with a score of `threshold` or more.
+
+    The network's mode is left as it was.
+    """
+    training = network.training
+    network.eval()
+    with torch.inference_mode():
+        raw = network(tensor_of([padded(picture)], network))
+        cells = [
+            torch.cat((decode(maps, level, network.config), maps[..., 4:].sigmoid()), -1)[0].flatten(0, 2)
+            for level, maps in enumerate(raw)
+        ]
+        found = _chosen(torch.cat(cells), threshold, picture)
+    network.train(training)
+    return found
+
+
+def padded(picture: Picture) -> Picture:
+    """Return the picture with grey to its right and below, so that its sides are multiples of the largest stride."""
+    down, across = (-side % STRIDES[-1] for side in picture.shape[:2])
+    return np.pad(picture, ((0, down), (0, across), (0, 0)), constant_values=GREY)
+
+
+def tensor_of(pictures: Sequence[Picture], network: SignDetector) -> torch.Tensor:
+    """Return pictures of one size as the network takes them, (B, 3, H, W) in 0..1, on its device."""
+    stacked = torch.from_numpy(np.stack(pictures)).to(next(network.parameters()).device)
+    return stacked.permute(0, 3, 1, 2).float() / 255
+
+
+def _chosen(cells: torch.Tensor, threshold: float, picture: Picture) -> Detections:
+    share, label = cells[:, 5:].max(1)
+    score = share * cells[:, 4]
+    likely = score.topk(min(CANDIDATES, len(score))).indices
+    likely = likely[score[likely] >= threshold]
+    height, width = picture.shape[:2]
+    box = cells[likely, :4].clamp(min=0).minimum(cells.new_tensor([width, height, width, height]))
+    kept = nms(box, score[likely], MOST_OVERLAP)[:MOST_FOUND]
+    chosen = likely[kept]
+    return Detections(
+        box[kept].double().cpu().numpy(), label[chosen].cpu().numpy(), score[chosen].double().cpu().numpy()
+    )

@@ -1,0 +1,110 @@
+"""How well boxes agree with the truth: COCO's mean average precision, by class and by size."""
+
+import contextlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from faster_coco_eval import COCO, COCOeval_faster
+from numpy.typing import NDArray
+
+from flcav.perception.signs.detect import Detections
+from flcav.perception.signs.samples import size_px
+
+EDGES_PX = (12.0, 24.0)  # between small, medium and large: roots of a box's area
+LARGEST_PX = 1e5
+ALL, FIFTY = 0, 0  # area range that holds all sizes; IoU threshold 0.5
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What one picture holds."""
+
+    box: NDArray[np.float64]  # (N, 4) x1 y1 x2 y2 [px]
+    label: NDArray[np.int64]  # (N,)
+    neutral: NDArray[np.float64]  # (K, 4) to find them, as whatever, is neither right nor wrong
+
+
+def mean_average_precision(
+    found: Sequence[Detections], truths: Sequence[Truth], classes: Sequence[str], smallest_px: float
+) -> dict[str, Any]:
+    """Return mAP at IoU 0.5 and averaged over 0.5 to 0.95, by class and by size of the true box.
+
+    Boxes found that are smaller than `smallest_px`, or mostly within a neutral one (a "crowd" in COCO's words), are
+    neither right nor wrong. None where there is nothing to find.
+    """
+    edges = (smallest_px, *EDGES_PX, LARGEST_PX)
+    ranges = [(smallest_px, LARGEST_PX), *pairwise(edges)]
+    evaluated = _evaluated(found, truths, classes, ranges)
+    precision = evaluated.eval["precision"][..., -1]  # (IoU, recall, class, range); -1 where nothing is to be found
+    sizes = np.concatenate([np.zeros(0), *(size_px(truth.box) for truth in truths)])
+    label = np.concatenate([np.zeros(0, np.int64), *(truth.label for truth in truths)])
+    return {
+        "map50": _mean(precision[FIFTY, :, :, ALL]),
+        "map50_95": _mean(precision[:, :, :, ALL]),
+        "classes": [
+            {
+                "class": name,
+                "ap50": _mean(precision[FIFTY, :, number, ALL]),
+                "ap50_95": _mean(precision[:, :, number, ALL]),
+                "targets": int((label == number).sum()),
+            }
+            for number, name in enumerate(classes)
+        ],
+        "sizes": [
+            {
+                "from_px": low,
+                "to_px": None if high == LARGEST_PX else high,
+                "map50": _mean(precision[FIFTY, :, :, 1 + number]),
+                "targets": int(((sizes >= low) & (sizes < high)).sum()),
+            }
+            for number, (low, high) in enumerate(pairwise(edges))
+        ],
+        "neutral": sum(len(truth.neutral) for truth in truths),
+        "pictures": len(truths),
+    }
+
+
+def _evaluated(
+    found: Sequence[Detections], truths: Sequence[Truth], classes: Sequence[str], ranges: Sequence[tuple[float, float]]
+) -> COCOeval_faster:
+    annotations = [
+        {"image_id": image, "category_id": number, "bbox": _corner_and_size(box), "iscrowd": int(crowd)}
+        for image, truth in enumerate(truths)
+        for number in range(len(classes))
+        for crowd, boxes in ((False, truth.box[truth.label == number]), (True, truth.neutral))
+        for box in boxes
+    ]
+    detections = [
+        {"image_id": image, "category_id": int(label), "bbox": _corner_and_size(box), "score": float(score)}
+        for image, one in enumerate(found)
+        for box, label, score in zip(one.box, one.label, one.score, strict=True)
+    ]
+    for number, row in enumerate(annotations):
+        row |= {"id": number + 1, "area": row["bbox"][2] * row["bbox"][3]}
+    with contextlib.redirect_stdout(io.StringIO()):
+        truth = COCO(
+            {
+                "images": [{"id": image} for image in range(len(truths))],
+                "annotations": annotations,
+                "categories": [{"id": number, "name": name} for number, name in enumerate(classes)],
+            }
+        )
+        evaluation = COCOeval_faster(truth, truth.loadRes(detections), "bbox", print_function=lambda *_: None)
+        evaluation.params.areaRng = [[low**2, high**2] for low, high in ranges]
+        evaluation.params.areaRngLbl = [f"{low:g}" for low, _ in ranges]
+        evaluation.evaluate()
+        evaluation.accumulate()
+    return evaluation
+
+
+def _corner_and_size(box: NDArray[np.float64]) -> list[float]:
+    return [float(value) for value in (*box[:2], *(box[2:] - box[:2]))]
+
+
+def _mean(precision: NDArray[np.float64]) -> float | None:
+    known = precision[precision > -1]
+    return round(float(known.mean()), 6) if known.size else None

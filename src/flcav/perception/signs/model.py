@@ -1,0 +1,142 @@
+"""A one-stage detector of the YOLOv5 kind, in the parts it is described by in the literature.
+
+A backbone of cross-stage partial stages (Wang et al., "CSPNet", CVPRW 2020), spatial pyramid pooling by repeated
+maxima (He et al., "Spatial Pyramid Pooling in Deep Convolutional Networks", ECCV 2014), a path-aggregation neck (Liu et
+al., "Path Aggregation Network for Instance Segmentation", CVPR 2018), and three levels of anchors; how these are put
+together, and the widths and depths, is surveyed by Terven et al., "A Comprehensive Review of YOLO Architectures", 2023.
+With 80 classes the widths `n` and `s` have the published 1.87 M and 7.23 M parameters.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from flcav.perception.signs.config import STRIDES, SignsConfig
+
+CHANNELS = (64, 128, 256, 512, 1024)  # after each halving, at width 1
+DEPTHS = (3, 6, 9, 3)  # bottlenecks of the backbone's stages, at depth 1
+NECK_DEPTH = 3
+EXPECTED_OBJECTS = 1e-3  # share of cells that hold one, which a fresh network starts from
+
+
+def unit(into: int, out: int, kernel: int = 1, stride: int = 1, padding: int | None = None) -> nn.Sequential:
+    """Return a convolution, its normalisation and a SiLU."""
+    padding = kernel // 2 if padding is None else padding
+    convolution = nn.Conv2d(into, out, kernel, stride, padding, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(out, eps=1e-3), nn.SiLU())
+
+
+class Bottleneck(nn.Module):
+    """Two convolutions, around which the input may go unchanged."""
+
+    def __init__(self, channels: int, shortcut: bool) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(unit(channels, channels), unit(channels, channels, 3))
+        self.shortcut = shortcut
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return maps of the same shape."""
+        return maps + self.layers(maps) if self.shortcut else self.layers(maps)
+
+
+class Partial(nn.Module):
+    """A cross-stage partial stage: half of the channels go through the bottlenecks, half go past them."""
+
+    def __init__(self, into: int, out: int, depth: int, shortcut: bool = True) -> None:
+        super().__init__()
+        half = out // 2
+        self.through = nn.Sequential(unit(into, half), *(Bottleneck(half, shortcut) for _ in range(depth)))
+        self.past = unit(into, half)
+        self.merge = unit(2 * half, out)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return (B, out, H, W) from (B, into, H, W)."""
+        return self.merge(torch.cat((self.through(maps), self.past(maps)), 1))
+
+
+class Pyramid(nn.Module):
+    """Maxima over 5, 9 and 13 pixels beside the input, each by another pooling over 5."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.reduce = unit(channels, channels // 2)
+        self.largest = nn.MaxPool2d(5, 1, 2)
+        self.merge = unit(2 * channels, channels)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return maps of the same shape."""
+        parts = [self.reduce(maps)]
+        for _ in range(3):
+            parts.append(self.largest(parts[-1]))
+        return self.merge(torch.cat(parts, 1))
+
+
+class SignDetector(nn.Module):
+    """Raw predictions for every anchor of every cell at three strides."""
+
+    def __init__(self, config: SignsConfig) -> None:
+        super().__init__()
+        self.config = config
+        c1, c2, c3, c4, c5 = (_multiple_of_8(channels * config.width) for channels in CHANNELS)
+        d2, d3, d4, d5, neck = (max(1, round(depth * config.depth)) for depth in (*DEPTHS, NECK_DEPTH))
+        self.to_8 = nn.Sequential(
+            unit(3, c1, 6, 2, 2), unit(c1, c2, 3, 2), Partial(c2, c2, d2), unit(c2, c3, 3, 2), Partial(c3, c3, d3)
+        )
+        self.to_16 = nn.Sequential(unit(c3, c4, 3, 2), Partial(c4, c4, d4))
+        self.to_32 = nn.Sequential(unit(c4, c5, 3, 2), Partial(c5, c5, d5), Pyramid(c5))
+        self.up = nn.Upsample(scale_factor=2, mode="nearest")
+        self.narrow_32, self.narrow_16 = unit(c5, c4), unit(c4, c3)
+        self.down_16, self.down_8 = Partial(2 * c4, c4, neck, False), Partial(2 * c3, c3, neck, False)
+        self.stride_8, self.stride_16 = unit(c3, c3, 3, 2), unit(c4, c4, 3, 2)
+        self.up_16, self.up_32 = Partial(2 * c3, c4, neck, False), Partial(2 * c4, c5, neck, False)
+        self.fields = 5 + len(config.classes)  # x, y, width, height, objectness, classes
+        per_cell = len(config.anchors_px[0]) * self.fields
+        self.heads = nn.ModuleList(nn.Conv2d(channels, per_cell, 1) for channels in (c3, c4, c5))
+        self._start_with_few_objects()
+
+    def forward(self, pictures: Tensor) -> list[Tensor]:
+        """Return, for each of `STRIDES`, (B, anchors, H / stride, W / stride, fields) of pictures (B, 3, H, W) in 0..1.
+
+        H and W are multiples of 32.
+        """
+        at_8 = self.to_8(pictures)
+        at_16 = self.to_16(at_8)
+        narrow_32 = self.narrow_32(self.to_32(at_16))
+        narrow_16 = self.narrow_16(self.down_16(torch.cat((self.up(narrow_32), at_16), 1)))
+        fine = self.down_8(torch.cat((self.up(narrow_16), at_8), 1))
+        middle = self.up_16(torch.cat((self.stride_8(fine), narrow_16), 1))
+        coarse = self.up_32(torch.cat((self.stride_16(middle), narrow_32), 1))
+        raw = [head(maps) for head, maps in zip(self.heads, (fine, middle, coarse), strict=True)]
+        return [maps.unflatten(1, (-1, self.fields)).permute(0, 1, 3, 4, 2) for maps in raw]
+
+    @torch.no_grad()
+    def _start_with_few_objects(self) -> None:
+        for head in self.heads:
+            bias = head.bias.view(-1, self.fields)  # pyright: ignore[reportCallIssue]
+            bias[:, 4] = math.log(EXPECTED_OBJECTS)
+            bias[:, 5:] = math.log(1 / max(len(self.config.classes) - 1, 1))
+
+
+def decode(raw: Tensor, level: int, config: SignsConfig) -> Tensor:
+    """Return boxes (B, anchors, rows, columns, 4) x1 y1 x2 y2 [px] of one level's raw predictions.
+
+    A centre lies within half a cell around its own, a size is at most four times the anchor's.
+    """
+    stride, (rows, columns) = STRIDES[level], raw.shape[2:4]
+    across = torch.arange(columns, device=raw.device)
+    down = torch.arange(rows, device=raw.device)
+    cell = torch.stack((across.expand(rows, -1), down[:, None].expand(-1, columns)), -1)  # (rows, columns, 2)
+    return boxes_of(raw[..., :4], cell, raw.new_tensor(config.anchors_px[level])[:, None, None], stride)
+
+
+def boxes_of(raw: Tensor, cell: Tensor, anchor: Tensor, stride: int) -> Tensor:
+    """Return boxes (..., 4) [px] from raw (..., 4), cells (..., 2) column, row, and anchors (..., 2) [px]."""
+    share = raw.sigmoid()
+    center = (2 * share[..., :2] - 0.5 + cell) * stride
+    half = (2 * share[..., 2:]).square() * anchor / 2
+    return torch.cat((center - half, center + half), -1)
+
+
+def _multiple_of_8(channels: float) -> int:
+    return math.ceil(channels / 8) * 8

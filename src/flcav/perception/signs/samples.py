@@ -1,0 +1,74 @@
+"""What the detector learns from: pictures, the boxes to find, the places to leave out of the loss."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.formats.rectangles import CLASSES, rectangles
+from flcav.dataset.store import Dataset
+from flcav.perception.images import Picture, checked_picture
+from flcav.perception.signs.config import SignsConfig
+from flcav.perception.task import of_frames
+from flcav.sensors.frame import Frame
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One labelled picture; boxes are x1 y1 x2 y2 [px] from its upper left corner."""
+
+    picture: Picture
+    boxes: NDArray[np.float64]  # (N, 4) to be found
+    label: NDArray[np.int64]  # (N,) number of the class
+    ignore: NDArray[np.float64]  # (K, 4) neither to be found nor to be kept apart
+
+
+class RecordedPictures(Sequence[Sample]):
+    """Every camera's pictures in frames of a dataset with their ground truth, read when asked for.
+
+    Raises `InputError` where no frame has a camera.
+    """
+
+    def __init__(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> None:
+        self._data, self._config = data, config
+        self._of = [(number, camera) for number in of_frames(data, frames) for camera in data.frame(number).images]
+        if not self._of:
+            raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
+
+    def __len__(self) -> int:
+        return len(self._of)
+
+    def __getitem__(self, index: Any) -> Any:
+        number, camera = self._of[index]
+        picture = self._data.plane(number, camera, "rgb")
+        frame = self._data.frame(number)
+        return sample_of(frame, camera, checked_picture(picture, f"{self._data.folder} {frame.key}"), self._config)
+
+    def scene(self, index: int) -> str:
+        """Return the scene of a picture."""
+        return self._data.keys[self._of[index][0]].scene
+
+
+def sample_of(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
+    """Return a camera's picture with its signs and lights.
+
+    Those smaller than `config.smallest_px` are ignored, and so are those that the picture's edge cuts off: what a lamp
+    shows may lie outside.
+    """
+    shown = rectangles(frame, camera, "signs", min_pixels=1)
+    names = [CLASSES["signs"][number] for number in shown.label]
+    known = np.array([name in config.classes for name in names], dtype=bool)
+    label = np.array([config.classes.index(name) for name, ok in zip(names, known) if ok], dtype=np.int64)
+    box = shown.box[known]
+    height, width = picture.shape[:2]
+    whole = (box[:, :2] > 0).all(1) & (box[:, 2:] < (width, height)).all(1)
+    wanted = whole & (size_px(box) >= config.smallest_px)
+    return Sample(picture, box[wanted], label[wanted], box[~wanted])
+
+
+def size_px(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N,) the root of each box's area."""
+    return np.sqrt((boxes[:, 2:] - boxes[:, :2]).clip(min=0).prod(1))
