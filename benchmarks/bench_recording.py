@@ -238,7 +238,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="the two ratios alone")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    figures: dict[str, object] = {"recording": whole_recording(arguments.repeats)}
+    whole = whole_recording(arguments.repeats)
+    figures: dict[str, object] = {"recording": whole}
     if not arguments.quick:
         figures |= {
             "two_cores_spins_per_s": {"lidar": two_cores(False), "cameras": two_cores(True)},
@@ -250,12 +251,10 @@ def main() -> None:
     if arguments.json:
         print(json.dumps(figures, indent=1))
         return
-    row = whole = figures["recording"]
-    assert isinstance(whole, dict)
     print(f"5 vehicles + 9 roadside suites, LiDAR 64 x 1024, CPU-ms per spin, median of {arguments.repeats}")
-    print(f"  bare trace of the LiDAR rays {row['bare_ms']:.0f}")
-    print(f"  whole recording {row['lidar_ms']:.0f}: ratio {row['lidar_over_bare']:.2f} (at most 3)")
-    print(f"  with five cameras {row['cameras_ms']:.0f}: ratio {row['cameras_over_bare']:.2f} (at most 12)")
+    print(f"  bare trace of the LiDAR rays {whole['bare_ms']:.0f}")
+    print(f"  whole recording {whole['lidar_ms']:.0f}: ratio {whole['lidar_over_bare']:.2f} (at most 3)")
+    print(f"  with five cameras {whole['cameras_ms']:.0f}: ratio {whole['cameras_over_bare']:.2f} (at most 12)")
     for name, values in figures.items():
         if name != "recording":
             print(f"{name}: {json.dumps(values)}")

@@ -5,6 +5,7 @@ is one task. What they write lies below `work/scene`: the traffic, and a folder 
 """
 
 import hashlib
+import json
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from flcav.dataset.layout import CALIBRATION, FILES, TRACES, table_path
 from flcav.dataset.payloads import payloads
 from flcav.dataset.rows import rows_of, table_of
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
-from flcav.files import write_json
+from flcav.files import write_bytes
 from flcav.sensors.frame import Frame
 from flcav.sources.source import Replayable, Source
 from flcav.world.trace import Trace
@@ -107,7 +108,7 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
         write_table(table_of(name, rows), part / table_path(name))
     listing = pa.table(dict(zip(FILES_SCHEMA.names, zip(*files) if files else ([], [], []))), schema=FILES_SCHEMA)
     write_table(listing, part / table_path(FILES))
-    write_json(part / CALIBRATION, calibrations)
+    write_bytes(part / CALIBRATION, json.dumps(calibrations).encode())
 
 
 def _check_names(frame: Frame, scene: str) -> None:

@@ -57,10 +57,10 @@ def _stopped(
 
 @compiled
 def rays_into_box(directions, steps, body_from_sensor, size, margin, distance):
-    """Return the numbers of the rays of a spinning pattern (channels * steps, 3) that end before a box they would enter.
+    """Return the numbers of the rays of a spinning pattern (channels * steps, 3) that end before a box on their way.
 
-    They end at `distance` (N,) [m]. The box of `size` (3,), grown by `margin` [m], stands on the body's origin. Only the
-    columns between its corners' azimuths are tried.
+    They end at `distance` (N,) [m]. The box of `size` (3,), grown by `margin` [m], stands on the body's origin. Only
+    the columns between its corners' azimuths are tried.
     """
     low = np.array([-size[0] / 2, -size[1] / 2, 0.0]) - margin
     high = np.array([size[0] / 2, size[1] / 2, size[2]]) + margin
