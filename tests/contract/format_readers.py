@@ -168,6 +168,15 @@ def mcap(out: Path) -> dict[str, Seen]:
     return seen
 
 
+def mcap_topics(path: Path) -> dict[str, list]:
+    """Return topic -> messages of one file."""
+    topics = defaultdict(list)
+    with path.open("rb") as file:
+        for _, channel, _, decoded in make_reader(file, decoder_factories=[_Decoder()]).iter_decoded_messages():
+            topics[channel.topic].append(decoded)
+    return topics
+
+
 class _Decoder(DecoderFactory):
     """MCAP's decoder for protobuf, which knows JSON too."""
 
@@ -204,7 +213,7 @@ def _mcap_frame(spin: int, messages: list) -> Seen:
         labels.append(next(item.value for item in entity.metadata if item.key == "class"))
     images = []
     for topic, message in topics.items():
-        if topic.endswith("/image"):
+        if topic.endswith("/image") and message.DESCRIPTOR.name == "CompressedImage":
             assert message.format == "png"
             calibration = topics[topic.replace("/image", "/calibration")]
             pixels = np.asarray(Image.open(BytesIO(message.data)))

@@ -16,6 +16,7 @@ from shapely.geometry import MultiPoint
 from flcav.geometry import Boxes, pose
 from flcav.seeds import stream
 from flcav.sensors.frame import Annotations, Calibration, CameraImage, Frame, SignViews, Views
+from flcav.world.weather import Weather
 
 WIDTH, HEIGHT, FOCAL = 320, 160, 200.0
 INTRINSICS = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1.0]])
@@ -24,6 +25,7 @@ MOUNTS = {
     "lidar": pose(0.1, -0.05, 1.8, 0.02),
     "front": pose(0.6, 0.1, 1.5) @ OPTICAL,
     "back": pose(-0.6, 0.0, 1.5, np.pi) @ OPTICAL,
+    "thermal": pose(0.6, 0.1, 1.5) @ OPTICAL,
     "radar": pose(2.0, 0.0, 0.5),
     "gnss": pose(0.0, 0.0, 1.9),
     "imu": pose(-0.3, 0.0, 0.4),
@@ -44,6 +46,7 @@ LOCAL = np.array(  # x, y, z, length, width, height, yaw against the agent, whos
     ]
 )
 RETURNS = np.array([60, 50, 40, 30, 20, 10, 15, 5, 0])
+WEATHER = Weather(rain_mm_h=3.0)
 SIGNS = (("stop", "", 5), ("speed_60", "", 9), ("signal", "red", 6), ("signal", "green", 4), ("signal", "off", 7))
 
 
@@ -85,17 +88,18 @@ class PaintedSource:
         world_from_agent = pose(float(x), float(y), yaw=float(rng.uniform(-3, 3)))
         boxes = Boxes.from_array(LOCAL, CATEGORIES).transformed(world_from_agent)
         cameras = ["front", "back"] if self.cameras and agent == "cav0" else []
-        triggered = {name: world_from_agent @ pose(0.4, 0.03, yaw=0.02) for name in cameras}
-        pictures = {name: _picture(boxes, triggered[name] @ MOUNTS[name]) for name in cameras}
+        optical = [*cameras, *(["thermal"] if cameras else [])]
+        then = world_from_agent @ pose(0.4, 0.03, yaw=0.02)
+        pictures = {name: _picture(boxes, then @ MOUNTS[name]) for name in cameras}
         lidar = _points(boxes, world_from_agent @ MOUNTS["lidar"], rng)
         radar = np.column_stack([rng.uniform(low, high, 4) for low, high in RADAR_RANGES]).astype(np.float32)
-        names = ["lidar", *cameras, "radar", "gnss", "imu"] if agent == "cav0" else ["lidar"]
+        names = ["lidar", *optical, "radar", "gnss", "imu"] if agent == "cav0" else ["lidar"]
         mounts = {name: MOUNTS[name] for name in names}
         calibration = Calibration(
             mounts,
-            intrinsics=dict.fromkeys(cameras, INTRINSICS),
-            distortion=dict.fromkeys(cameras, np.zeros(5)),
-            offset_ms=dict.fromkeys(cameras, 40.0),
+            intrinsics=dict.fromkeys(optical, INTRINSICS),
+            distortion=dict.fromkeys(optical, np.zeros(5)),
+            offset_ms=dict.fromkeys(optical, 40.0),
         )
         believed = replace(calibration, agent_from_sensor=mounts | {"lidar": ASSUMED_LIDAR})
         return Frame(
@@ -115,13 +119,15 @@ class PaintedSource:
                 returns=RETURNS * self.lidar,
                 occlusion=np.linspace(0, 1, len(boxes)),
                 points={"lidar": RETURNS} | ({"radar": np.arange(len(boxes))} if agent == "cav0" else {}),
-                views={name: picture.views for name, picture in pictures.items()},
+                views={name: pictures[name if name in pictures else "front"].views for name in optical},
                 signs={name: _signs() for name in cameras},
             ),
             images={name: picture.image for name, picture in pictures.items()},
+            infrared={name: 28_000 + pictures["front"].image.instance for name in optical if name not in pictures},
             radar={"radar": radar} if agent == "cav0" else {},
             gnss={"gnss": np.array([49.001, 8.402, 113.5])} if agent == "cav0" else {},
-            agent_at_trigger=triggered,
+            weather=WEATHER,
+            agent_at_trigger=dict.fromkeys(optical, then),
             imu={"imu": np.array([0.1, -0.2, 9.81, 0.01, 0.02, -0.03])} if agent == "cav0" else {},
         )
 

@@ -9,7 +9,7 @@ import painted_source
 import pytest
 import shapely
 import yaml
-from format_readers import READERS, Seen
+from format_readers import READERS, Seen, mcap_topics
 from painted_source import CATEGORIES, RETURNS, PaintedSource
 from PIL import Image
 from shapely.geometry import MultiPoint
@@ -256,6 +256,45 @@ def test_small_things_can_be_left_out(dataset: Dataset, tmp_path: Path):
     export(dataset, "coco", tmp_path / "out", ExportOptions(min_pixels=6))
     notes = json.loads((tmp_path / "out" / "annotations" / "signs_train.json").read_text())["annotations"]
     assert {note["area"] for note in notes} == {9, 6}
+
+
+def test_mcap_holds_every_modality(dataset: Dataset, exported: dict[str, Path]):
+    topics = mcap_topics(exported["mcap"] / "painted-0-000.mcap")
+    frame = dataset.frame(0)
+    clouds = topics["/cav0/radar/points"]
+    assert len(clouds) == 2
+    assert [field.name for field in clouds[0].fields][3:] == [
+        "range_m",
+        "azimuth_rad",
+        "elevation_rad",
+        "doppler_m_s",
+        "rcs_dbsm",
+    ]
+    rows = np.frombuffer(clouds[0].data, "<f4").reshape(-1, 8)
+    np.testing.assert_array_equal(rows[:, 3:], frame.radar["radar"])
+    np.testing.assert_allclose(np.linalg.norm(rows[:, :3], axis=1), rows[:, 3], rtol=1e-5)
+    fix = topics["/cav0/gnss/fix"][0]
+    assert [fix.latitude, fix.longitude, fix.altitude] == frame.gnss["gnss"].tolist()
+    imu = topics["/cav0/imu/imu"][0]
+    halves = (imu["linear_acceleration"], imu["angular_velocity"])
+    assert [half[axis] for half in halves for axis in "xyz"] == frame.imu["imu"].tolist()
+    thermal = topics["/cav0/thermal/image"][0]
+    assert thermal.encoding == "mono16"
+    pixels = np.frombuffer(thermal.data, "<u2").reshape(thermal.height, thermal.step // 2)
+    np.testing.assert_array_equal(pixels, frame.infrared["thermal"])
+    assert topics["/cav0/weather"][0]["rain_mm_h"] == 3.0
+    loops = topics["/cav0/front/labels"][0].points
+    found = {}
+    for loop in loops:
+        about = {item.key: item.value for item in loop.metadata}
+        xy = [(point.x, point.y) for point in loop.points]
+        found[about.get("track", about["class"] + about.get("state", ""))] = (*min(xy), *max(xy))
+    views, signs = frame.annotations.views["front"], frame.annotations.signs["front"]
+    expected = {f"veh{i}": views.visible_box[i] for i in np.flatnonzero(views.pixels)}
+    expected |= {f"{kind}{state}": box for kind, state, box in zip(signs.kind, signs.state, signs.box)}
+    assert found.keys() == expected.keys()
+    for name, box in expected.items():
+        np.testing.assert_allclose(found[name], box + 0.5)
 
 
 @pytest.mark.parametrize("name", READERS)

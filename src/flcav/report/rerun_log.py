@@ -17,7 +17,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
 
-from flcav.dataset.formats.colours import COLOURS, OTHER
+from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse
 from flcav.progress import Report, silent
@@ -158,7 +158,7 @@ def _log_rectangles(recording: Any, path: str, frame: Frame, camera: str) -> Non
         _log_boxes(recording, f"{path}/image/actors", views.visible_box[shown], truth.track[shown].tolist(), colours)
     if signs is not None:
         names = [f"{kind} {state}".strip() for kind, state in zip(signs.kind, signs.state)]
-        _log_boxes(recording, f"{path}/image/signs", signs.box, names, [(1.0, 1.0, 0.3)] * len(signs))
+        _log_boxes(recording, f"{path}/image/signs", signs.box, names, [SIGN] * len(signs))
 
 
 def _log_boxes(recording: Any, path: str, boxes: Array, labels: list[str], colours: list) -> None:

@@ -1,4 +1,4 @@
-"""The colours that actors have in other people's viewers."""
+"""The colours that actors and signs have in other people's viewers."""
 
 COLOURS = {  # red, green, blue, each 0 to 1
     "car": (0.20, 0.55, 0.95),
@@ -10,3 +10,4 @@ COLOURS = {  # red, green, blue, each 0 to 1
     "pedestrian": (0.95, 0.30, 0.40),
 }
 OTHER = (0.6, 0.6, 0.6)
+SIGN = (1.0, 0.95, 0.3)

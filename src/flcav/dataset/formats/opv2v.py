@@ -36,6 +36,7 @@ CAMERAS = {  # where they look, counter-clockwise from ahead [rad]
 FIRST_CAR, FIRST_POLE, FIRST_TRACK = 1001, 2001, 10001  # OpenCOOD takes the agent whose number sorts first as the ego
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 KMH = 3.6
+FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
 
 
 def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
@@ -110,7 +111,7 @@ def _write_frame(frame: Frame, folder: Path, numbers: dict[str, int], speed_m_s:
         "true_ego_pos": list(ego),
         "vehicles": vehicles,
     }
-    (folder / f"{time}.yaml").write_text(yaml.dump(about, Dumper=yaml.CSafeDumper), encoding="utf-8")
+    (folder / f"{time}.yaml").write_text(yaml.dump(about, Dumper=FAST_DUMPER), encoding="utf-8")
     return len(vehicles)
 
 
