@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from flcav.seeds import stream
 from flcav.sensors.shading.noise import fade, hashed, noise_at, overlap
 from flcav.world.meshes.buildings import BAY_M, GABLED_BELOW_M, STOREY_M
-from flcav.world.rays.compiled import compiled
+from flcav.world.rays.compiled import inlined
 
 PLASTER, BRICK, PANEL = range(3)
 WALLS = (  # style, linear colour
@@ -59,7 +59,7 @@ def facades_of(name: str, buildings: NDArray[np.float64]) -> Facades:
     )
 
 
-@compiled
+@inlined
 def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
     """Return red, green, blue, the share of glass, and the window's number, of a wall.
 
@@ -132,7 +132,7 @@ def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
     return red, green, blue, glass, window
 
 
-@compiled
+@inlined
 def _bricks(u, z, wide, tall):
     near = fade(np.float32(0.12), wide)
     if near <= 0:

@@ -3,13 +3,13 @@
 import numpy as np
 
 from flcav.sensors.shading.noise import fade, hashed, noise_at, overlap
-from flcav.world.rays.compiled import compiled
+from flcav.world.rays.compiled import inlined
 
 SLAB_M = 0.5
 JOINT_M = 0.012
 
 
-@compiled
+@inlined
 def asphalt(x, y, footprint, table):
     """Return the brightness of asphalt over its mean: grain, stains, old and new stretches, sealed cracks."""
     broad = noise_at(table, x * 0.9, y * 0.9)
@@ -27,7 +27,7 @@ def asphalt(x, y, footprint, table):
     return tone
 
 
-@compiled
+@inlined
 def paving(x, y, footprint, table):
     """Return the brightness of a pavement of slabs over its mean."""
     i, j = int(np.floor(x / SLAB_M)), int(np.floor(y / SLAB_M))
@@ -46,7 +46,7 @@ def paving(x, y, footprint, table):
     return tone
 
 
-@compiled
+@inlined
 def grass(x, y, footprint, table):
     """Return the brightness of grass over its mean, and how dry it is, 0 to 1."""
     dry = noise_at(table, x * 0.07, y * 0.07)

@@ -18,7 +18,7 @@ from shapely.ops import substring
 from flcav.sensors.shading.noise import overlap
 from flcav.world.layers import MapLayers, Marking
 from flcav.world.paint import glyph, stripes
-from flcav.world.rays.compiled import compiled
+from flcav.world.rays.compiled import inlined
 
 CELL_M = 2.0
 REACH_M = 0.3  # how far beyond a rectangle its cells go
@@ -49,7 +49,7 @@ def markings_of(layers: MapLayers) -> Markings:
     return Markings(rectangle, colour, *_grid(rectangle))
 
 
-@compiled
+@inlined
 def paint_at(x, y, look_x, look_y, across, along, markings):
     """Return the share of a footprint about x, y that is painted, and the rectangle that paints most of it.
 

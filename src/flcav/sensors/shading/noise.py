@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.seeds import stream
-from flcav.world.rays.compiled import compiled
+from flcav.world.rays.compiled import inlined
 
 SIDE = 256  # cells of a table, a power of two
 
@@ -22,7 +22,7 @@ def clouds() -> NDArray[np.float32]:
     return (rank / rank.max()).astype(np.float32)
 
 
-@compiled
+@inlined
 def noise_at(table, x, y):
     """Return the value of a table at x, y, in cells, linearly between them."""
     i, j = int(np.floor(x)), int(np.floor(y))
@@ -33,7 +33,7 @@ def noise_at(table, x, y):
     return low + v * (high - low)
 
 
-@compiled
+@inlined
 def hashed(a, b):
     """Return a number in [0, 1) that looks random and depends on the whole numbers a and b alone."""
     word = np.uint32((a * 374761393 + b * 668265263) & 0xFFFFFFFF)
@@ -41,13 +41,13 @@ def hashed(a, b):
     return np.float32((word ^ (word >> np.uint32(16))) & np.uint32(0xFFFFFF)) / np.float32(16777216.0)
 
 
-@compiled
+@inlined
 def fade(scale, footprint):
     """Return how much of a texture of that scale [m] is left when a pixel is `footprint` [m] wide: 1 to 0."""
     return min(max(np.float32(1.5) - footprint / scale, np.float32(0)), np.float32(1))
 
 
-@compiled
+@inlined
 def overlap(distance, half, width):
     """Return the share of an interval of `width` about `distance` that lies within `half` of 0."""
     inside = min(distance + 0.5 * width, half) - max(distance - 0.5 * width, -half)

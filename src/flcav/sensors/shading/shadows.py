@@ -22,8 +22,8 @@ def shadows(
         towards = np.zeros((len(seen), 3), np.float32)
         strongest(seen, lamps, key, towards, far)
     else:
-        towards = light.to_sun[None]
-        _facing(seen, light.to_sun, light.sun.max() > DARK, far)
+        towards = np.array([light.to_sun])
+        _facing(seen, light.to_sun, max(light.sun) > DARK, far)
     return key, 1 - scene.blocked(seen.position, towards, far, hidden=hidden).astype(np.float32)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.world.meshes.furniture import SIGN_RADIUS_M
-from flcav.world.rays.compiled import compiled
+from flcav.world.rays.compiled import inlined
 
 SIGN_KINDS = ("stop", "yield", "speed_30", "speed_60", "speed_90")
 SIDE = 128  # [px] of the largest picture
@@ -30,7 +30,7 @@ def pictures() -> NDArray[np.float32]:
     return out
 
 
-@compiled
+@inlined
 def sign_at(kind, right, up, footprint, drawn):
     """Return red, green, blue of a plate `right` and `up` of its centre [m], seen by a pixel `footprint` [m] wide."""
     texel = np.float32(2 * SIGN_RADIUS_M / SIDE)
@@ -44,7 +44,7 @@ def sign_at(kind, right, up, footprint, drawn):
     return r0 + between * (r1 - r0), g0 + between * (g1 - g0), b0 + between * (b1 - b0)
 
 
-@compiled
+@inlined
 def _texel(picture, u, v, side):
     x = min(max(u * side - np.float32(0.5), np.float32(0)), np.float32(side - 1))
     y = min(max(v * side - np.float32(0.5), np.float32(0)), np.float32(side - 1))

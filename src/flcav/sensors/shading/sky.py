@@ -3,13 +3,13 @@
 import numpy as np
 
 from flcav.sensors.shading.noise import noise_at
-from flcav.world.rays.compiled import compiled
+from flcav.world.rays.compiled import inlined
 
 SKYLINE = 0.16  # sine of the elevation up to which a street's houses hide the sky
 TOP_OF_FOG_M = 500.0
 
 
-@compiled
+@inlined
 def sky_at(x, y, z, light):
     """Return the radiance of the sky without clouds in the unit direction x, y, z, world frame."""
     low = 1 - max(z, np.float32(0))
@@ -27,7 +27,7 @@ def sky_at(x, y, z, light):
     return red, green, blue
 
 
-@compiled
+@inlined
 def heaven_at(x, y, z, light, table):
     """Return the radiance where a ray meets nothing: sky, sun, clouds and the air before them."""
     red, green, blue = sky_at(x, y, z, light)
@@ -58,7 +58,7 @@ def heaven_at(x, y, z, light, table):
     return red, green, blue
 
 
-@compiled
+@inlined
 def mirrored_at(x, y, z, light):
     """Return the radiance that a mirror sees in the unit direction x, y, z: sky above dim houses above the ground."""
     red, green, blue = sky_at(x, y, abs(z), light)

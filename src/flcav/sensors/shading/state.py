@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from flcav.geometry import transform_points
 from flcav.world.materials import Material
 from flcav.world.meshes import actor_mesh
-from flcav.world.rays.compiled import compiled
+from flcav.world.rays.compiled import compiled, inlined
 from flcav.world.scene import Scene
 from flcav.world.static import town_things
 
@@ -85,7 +85,7 @@ def lamp_places(category: str, shape: int) -> tuple[NDArray[np.float64], NDArray
     return centre(Material.HEADLAMP), centre(Material.TAILLAMP)
 
 
-@compiled
+@inlined
 def lamp_light(lamp, x, y, z, nx, ny, nz, lamps):
     """Return how much light, over its intensity, a lamp throws on a surface at x, y, z that faces nx, ny, nz."""
     px, py, pz = lamps.position[lamp, 0] - x, lamps.position[lamp, 1] - y, lamps.position[lamp, 2] - z
@@ -144,7 +144,7 @@ def strongest(survey, lamps, key, direction, distance):
             distance[ray] = length - np.float32(0.6)
 
 
-@compiled
+@inlined
 def lamps_at(x, y, z, nx, ny, nz, key, lit, lamps):
     """Return red, green, blue of the light that all lamps throw on a surface; `lit` is how much of `key`'s arrives."""
     red, green, blue = np.float32(0), np.float32(0), np.float32(0)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.shading.appearance import Appearance
-from flcav.world.rays.compiled import compiled
+from flcav.world.rays.compiled import compiled, inlined
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
 
@@ -86,7 +86,7 @@ def _look_up(pose, directions, face, first, normals, bodies, appearance, out):
         out.normal[ray, 0], out.normal[ray, 1], out.normal[ray, 2] = nx, ny, nz
 
 
-@compiled
+@inlined
 def _smooth(px, py, pz, dx, dy, dz, nx, ny, nz, body, face, appearance):
     """Return the normal of the smooth surface at a point of an actor's face, whose own normal is nx, ny, nz."""
     ex, ey = px - body[0, 3], py - body[1, 3]

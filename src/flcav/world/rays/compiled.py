@@ -16,3 +16,11 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return numba.njit(nogil=True, cache=True)(function)
     except RuntimeError:  # nowhere to keep it
         return numba.njit(nogil=True)(function)
+
+
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `function` for use inside compiled ones, each of which gets a copy of its body.
+
+    A call costs two atomic operations for every array passed, records of arrays included: too much for every pixel.
+    """
+    return numba.njit(nogil=True, inline="always")(function)
