@@ -28,7 +28,7 @@ JOINING = {
 
 
 def take_apart(xodr: Path, prefix: Path) -> None:
-    """Write the nodes, edges and connections of an OpenDRIVE map beside `prefix`, e.g. `prefix.nod.xml`.
+    """Write the nodes, edges and connections of an OpenDRIVE map beside `prefix`, e.g. `prefix.nod.xml`, and a net.
 
     Heights are dropped: towns are flat. Raises `InputError` where netconvert refuses the map.
     """
@@ -38,6 +38,7 @@ def take_apart(xodr: Path, prefix: Path) -> None:
         "flatten": "true",
         "offset.disable-normalization": "true",
         "plain-output-prefix": str(prefix),
+        "output-file": f"{prefix}.net.xml",
     }
     _run(options, xodr)
 

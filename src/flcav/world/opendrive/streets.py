@@ -13,6 +13,7 @@ import numpy as np
 
 from flcav.config import InputError
 from flcav.world.opendrive.document import OPEN_ROADS, Document, Road
+from flcav.world.roads import read_net
 
 FAR_M = 5000.0  # a map farther from its origin than this is moved there
 SIDEWALK_M = 2.0  # width of an added sidewalk
@@ -50,6 +51,7 @@ def rewrite(prefix: Path, document: Document, origin: Path) -> Rewritten:
     """Rewrite the parts beside `prefix` in place; raises `InputError` naming `origin` where no car can drive."""
     nodes, edges, connections = (ElementTree.parse(f"{prefix}.{part}.xml") for part in ("nod", "edg", "con"))
     rows = edges.getroot().findall("edge")
+    _write_widths(rows, Path(f"{prefix}.net.xml"))
     add = not any(lane.get("type") in WALKED for row in rows for lane in _plain_lanes(row))
     kept: dict[str, dict[int, int]] = {}  # edge -> lane index in the map -> in the town, of lanes with traffic
     for row in rows:
@@ -75,6 +77,18 @@ def rewrite(prefix: Path, document: Document, origin: Path) -> Rewritten:
     for part, tree in (("nod", nodes), ("edg", edges), ("con", connections)):
         tree.write(f"{prefix}.{part}.xml")
     return Rewritten(offset, add)
+
+
+def _write_widths(rows: list[ElementTree.Element], net: Path) -> None:
+    """Give every lane its width from the net: among the parts, netconvert leaves out what all lanes of an edge share."""
+    width = {lane.id: lane.width for edge in read_net(net).edges.values() for lane in edge.lanes}
+    for row in rows:
+        lanes = _plain_lanes(row)
+        for child in row.findall("lane"):
+            row.remove(child)
+        for i, lane in enumerate(lanes):
+            exact = width.get(f"{row.attrib['id']}_{i}", float(lane.get("width", "3.2")))
+            ElementTree.SubElement(row, "lane", {**lane, "index": str(i), "width": f"{exact:.2f}"})
 
 
 def _road(edge: str, document: Document) -> Road:

@@ -42,7 +42,9 @@ def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
         oncoming = {(edge.end, edge.start) for edge in ahead}
         for name in stage.sumo.vehicle.getIDList():
             spot = stage.spot(name)
-            if name.startswith("cav") or not spot or spot.left < ROOM_M or len(spot.edge.lanes_of("driving")) > 1:
+            if name.startswith("cav") or not spot or spot.left < ROOM_M:
+                continue
+            if spot.lane.kind != "driving" or len(spot.edge.lanes_of("driving")) > 1:
                 continue
             follows_on_lane = spot.along > stage.sumo.vehicle.getLength(name) + BEHIND_M + 1.0
             if (spot.edge.start, spot.edge.end) not in oncoming or not follows_on_lane or stage.leader(name, FREE_M):
