@@ -50,7 +50,7 @@ def allocate(
     from flcav.config import read_config
     from flcav.optimization import allocation
     from flcav.optimization.baselines import baseline as compared
-    from flcav.optimization.graph import read_problem
+    from flcav.optimization.graph import read_graph, read_problem
     from flcav.optimization.replanning import Progress, going_on
     from flcav.optimization.vehicles import vehicle_shares
 
@@ -68,7 +68,7 @@ def allocate(
         from flcav.experiments.plan_page import plan_page
         from flcav.files import write_bytes
 
-        write_bytes(out, plan_page(asked, plan, shares).encode())
+        write_bytes(out, plan_page(asked, plan, shares, read_graph(problem)).encode())
     beside = None if baseline is None else compared(asked, baseline.value)
     if as_json:
         typer.echo(json.dumps(_as_json(plan, shares) | ({} if beside is None else {"baseline": _plain(beside)})))

@@ -176,10 +176,14 @@ def load(path: Path) -> nx.Graph:
 
 def read_problem(path: Path) -> Problem:
     """Return the problem in the file at `path`: written as tasks, or as a graph in either form."""
+    graph = read_graph(path)
+    return parse_config(Problem, read_yaml(path), str(path)) if graph is None else to_problem(graph)
+
+
+def read_graph(path: Path) -> nx.Graph | None:
+    """Return the graph in the file at `path`, None where it holds a problem written as tasks."""
     values = read_yaml(path)
-    if isinstance(values, dict) and ("networks" in values or "nodes" in values):
-        return to_problem(load(path))
-    return parse_config(Problem, values, str(path))
+    return load(path) if isinstance(values, dict) and ("networks" in values or "nodes" in values) else None
 
 
 def clusters(graph: nx.Graph) -> dict[str, dict[str, float]]:

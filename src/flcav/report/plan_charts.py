@@ -49,8 +49,8 @@ def megabytes(parts: Sequence[Row], links: Mapping[str, Row]) -> Figure:
 
 
 @style.styled
-def error_by_budget(sweep: Mapping[str, Sequence[Row]]) -> Figure:
-    """Return the best error at multiples of the budgets, scaled together and one at a time."""
+def best_by_budget(sweep: Mapping[str, Sequence[Row]], measure: str) -> Figure:
+    """Return the best objective, called `measure`, at multiples of the budgets, scaled together and one at a time."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
     axes = figure.add_subplot()
     widths = dict(zip(LINKS, (5.0, 1.6, 1.6), strict=True))  # lines that coincide are both seen
@@ -66,14 +66,14 @@ def error_by_budget(sweep: Mapping[str, Sequence[Row]]) -> Figure:
         [Line2D([], [], color=colour, linewidth=widths[name], label=name) for name, colour in LINKS.items()],
         columnspacing=1.0,
     )
-    axes.set(xlabel="budget, as a multiple of this one", ylabel="error")
+    axes.set(xlabel="budget, as a multiple of this one", ylabel=measure)
     axes.grid(axis="y")
     return figure
 
 
 @style.styled
-def marginal_values(both: Sequence[Row], links: Mapping[str, Row]) -> Figure:
-    """Return what 1,000 MB more of each link save, at multiples of both budgets."""
+def marginal_values(both: Sequence[Row], links: Mapping[str, Row], gain: str) -> Figure:
+    """Return what 1,000 MB more of each link bring, called `gain`, at multiples of both budgets."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
     axes = figure.add_subplot()
     handles = []
@@ -82,6 +82,6 @@ def marginal_values(both: Sequence[Row], links: Mapping[str, Row]) -> Figure:
         handles += axes.plot([point["factor"] for point in both], saved, color=colour, marker="o", ms=3, label=name)
     axes.axvline(1, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
     style.key(figure, handles)
-    axes.set(xlabel="both budgets, as a multiple of these", ylabel="error saved by 1,000 MB more", ylim=(0, None))
+    axes.set(xlabel="both budgets, as a multiple of these", ylabel=f"{gain} by 1,000 MB more", ylim=(0, None))
     axes.grid(axis="y")
     return figure

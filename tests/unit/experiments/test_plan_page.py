@@ -3,6 +3,7 @@ from typing import Any
 
 import pytest
 
+from flcav.experiments.fig3a import article_graph
 from flcav.experiments.plan_page import SHOWN, plan_page, plan_results
 from flcav.optimization.allocation import allocate
 from flcav.optimization.budget_sweep import budget_sweep
@@ -82,6 +83,34 @@ def test_half_a_budget_that_allows_nothing_is_said() -> None:
     sentences = results_of(ONE.model_copy(update={"budgets_mb": small}))["sentences"]
     assert "With half of both budgets the error would be nothing" not in sentences["budgets"]
     assert "half of both budgets no plan fits" in sentences["budgets"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("objective", "words"),
+    [("max-min", ("largest predicted error", "This is proven", "1,000 MB more would lower the largest error")),
+     ("area", ("area of the predicted accuracies", "not proven", "several local optima", "would raise the area"))],
+)  # fmt: skip
+def test_other_objectives_are_called_what_they_are(objective: str, words: tuple[str, ...]) -> None:
+    tasks = tuple(ONE.tasks[0].model_copy(update={"name": name, "sample_mb": mb}) for name, mb in zip("abc", (1, 2, 3)))
+    asked = ONE.model_copy(update={"tasks": tasks, "objective": objective})
+    page = plan_page(asked, allocate(asked), {})
+    for each in words:
+        assert each in page
+
+
+def test_simpler_plans_stand_beside(fleet: dict[str, Any]) -> None:
+    assert all(other["objective"] >= fleet["objective"] * (1 - 1e-9) for other in fleet["others"])
+    best = min(fleet["others"], key=lambda other: other["objective"])
+    behind = best["objective"] / fleet["objective"] - 1
+    said = f"{behind:.2%} behind this plan" if behind > 0 else "no worse than this plan"
+    assert best["name"] in fleet["sentences"]["others"]
+    assert said in fleet["sentences"]["others"]
+
+
+def test_a_graph_is_drawn_where_there_is_one() -> None:
+    plan = allocate(FLEET)
+    assert plan_page(FLEET, plan, {}, article_graph()).count("<img") == 4
 
 
 def test_the_page_needs_nothing_but_itself_and_tells_the_plan() -> None:
