@@ -17,14 +17,19 @@ def shadows(
     scene: Scene, seen: Survey, light: Light, lamps: Lamps, hidden: int | None
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Return for each ray's end the lamp that casts its shadow (-1: the sun), and the share of that light there."""
+    if light.lamps < 1:
+        return np.full(len(seen), -1, np.int32), sun_shadows(scene, seen, light, hidden)
     key, far = np.full(len(seen), -1, np.int32), np.empty(len(seen), np.float32)
-    if light.lamps == 1.0:
-        towards = np.zeros((len(seen), 3), np.float32)
-        strongest(seen, lamps, key, towards, far)
-    else:
-        towards = np.array([light.to_sun])
-        _facing(seen, light.to_sun, max(light.sun) > DARK, far)
+    towards = np.zeros((len(seen), 3), np.float32)
+    strongest(seen, lamps, key, towards, far)
     return key, 1 - scene.blocked(seen.position, towards, far, hidden=hidden).astype(np.float32)
+
+
+def sun_shadows(scene: Scene, seen: Survey, light: Light, hidden: int | None) -> NDArray[np.float32]:
+    """Return for each ray's end whether the sun reaches it: 1, or 0 behind something; 1 too where it faces away."""
+    far = np.empty(len(seen), np.float32)
+    _facing(seen, light.to_sun, max(light.sun) > DARK, far)
+    return 1 - scene.blocked(seen.position, np.array([light.to_sun]), far, hidden=hidden).astype(np.float32)
 
 
 @compiled

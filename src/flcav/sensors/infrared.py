@@ -1,0 +1,162 @@
+"""A thermal camera: the temperature each pixel seems to have in the long-wave infrared (8 to 14 um).
+
+What a pixel shows is t * (e * T + (1 - e) * T_mirrored) + (1 - t) * T_air: the surface's own temperature T, weighted by
+its emissivity e, what it mirrors for the rest, and the air between, which transmits t = exp(-extinction * distance).
+Temperatures are mixed linearly instead of by radiance: within 30 K of each other that is right to about 1 K.
+
+T = T_air + warmth: a surface in the sun is up to `sun_k` warmer (times the cosine of incidence and what clouds let
+through), one that faces a clear night sky up to `sky_k` colder, rain takes most of both away. Vehicles that move are warm where
+engine, tyres, brakes and lamps are; people are as warm as skin and clothes are. Rain and fog hide heat less than light:
+the extinction of fog in the long-wave infrared is taken as 0.6 of that of light, the clear air's as 0.2 per km.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.sensors.lens import Lens, directions
+from flcav.sensors.shading.appearance import appearance_of
+from flcav.sensors.shading.light import light_of
+from flcav.sensors.shading.shadows import sun_shadows
+from flcav.sensors.shading.survey import Survey, survey
+from flcav.world.materials import Material
+from flcav.world.scene import Scene
+from flcav.world.weather import Weather
+
+Array = NDArray[np.float64]
+
+FAR_M = 1000.0
+KELVIN_STEP = 0.01  # of a thermal image
+FOG_SHARE, CLEAR_AIR_PER_M, RAIN_PER_M = 0.6, 0.0002, 0.0012
+ENGINE_SHARE = 0.28  # of a vehicle's length, from its front
+LAMP_K = 14.0  # how much warmer a lamp is that is on
+
+
+class Warmth(NamedTuple):
+    """How a material's temperature differs from the air's."""
+
+    sun_k: float = 10.0  # face on to a clear sun at noon
+    sky_k: float = 4.0  # how far below the air it cools under a clear night sky
+    emissivity: float = 0.94
+    moving_k: float = 0.0  # when its vehicle drives
+    body_c: float | None = None  # of living things: as warm as this, whatever the weather
+
+
+WARMTH: dict[Material, Warmth] = {
+    Material.GROUND: Warmth(sun_k=9, sky_k=6),
+    Material.ROAD: Warmth(sun_k=22, sky_k=-2),  # asphalt stays warm at night
+    Material.SIDEWALK: Warmth(sun_k=15, sky_k=0),
+    Material.WALL: Warmth(sun_k=14, sky_k=-2),
+    Material.ROOF: Warmth(sun_k=24, sky_k=7),
+    Material.BARK: Warmth(sun_k=6, sky_k=1),
+    Material.LEAF: Warmth(sun_k=3, sky_k=2),
+    Material.METAL: Warmth(sun_k=16, sky_k=6, emissivity=0.75),
+    Material.SIGN: Warmth(sun_k=12, sky_k=6, emissivity=0.85),
+    Material.PAINT: Warmth(sun_k=20, sky_k=6, emissivity=0.90, moving_k=1.5),
+    Material.GLASS: Warmth(sun_k=8, sky_k=5, emissivity=0.85, moving_k=2),
+    Material.TYRE: Warmth(sun_k=12, sky_k=2, moving_k=16),
+    Material.RIM: Warmth(sun_k=10, sky_k=4, emissivity=0.60, moving_k=28),
+    Material.HEADLAMP: Warmth(sun_k=8, sky_k=4, emissivity=0.85),
+    Material.TAILLAMP: Warmth(sun_k=8, sky_k=4, emissivity=0.90),
+    Material.PLATE: Warmth(sun_k=12, sky_k=5, emissivity=0.85),
+    Material.TRIM: Warmth(sun_k=14, sky_k=3, moving_k=12),
+    Material.INTERIOR: Warmth(sun_k=4, sky_k=1, moving_k=5),
+    Material.SKIN: Warmth(sun_k=1, sky_k=0, body_c=32.0),
+    Material.CLOTH: Warmth(sun_k=5, sky_k=0, body_c=25.0),
+    Material.TROUSERS: Warmth(sun_k=5, sky_k=0, body_c=23.0),
+    Material.LAMP: Warmth(sun_k=8, sky_k=5),
+    Material.LENS_RED: Warmth(sun_k=8, sky_k=4),
+    Material.LENS_AMBER: Warmth(sun_k=8, sky_k=4),
+    Material.LENS_GREEN: Warmth(sun_k=8, sky_k=4),
+}
+_SUN, _SKY, _EMISSIVITY, _MOVING = np.array([WARMTH[material][:4] for material in Material]).T
+_BODY = np.array([np.nan if WARMTH[material].body_c is None else WARMTH[material].body_c for material in Material])
+
+
+class Infrared(Lens):
+    """What a thermal camera is built like; its pose is the rig's."""
+
+    noise_k: float = Field(default=0.06, ge=0, le=5)  # standard deviation of a pixel
+
+
+def thermal_image(
+    scene: Scene,
+    world_from_camera: Array,
+    infrared: Infrared,
+    weather: Weather,
+    rng: np.random.Generator,
+    *,
+    hidden: int | None = None,
+) -> NDArray[np.uint16]:
+    """Return (height, width) apparent temperatures [0.01 K], as if the actor `hidden` (the carrier) were not there.
+
+    `world_from_camera` (4, 4) places the optical frame, as for `camera.photograph`.
+    """
+    rays = directions(infrared)
+    appearance, light = appearance_of(scene), light_of(weather)
+    hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden)
+    seen = survey(scene, appearance, world_from_camera, rays, hits)
+    lit = sun_shadows(scene, seen, light, hidden)
+    met = seen.row >= 0
+    material = appearance.material[np.maximum(seen.row, 0)]
+    air = air_temperature(weather)
+    heat = lit * np.clip(seen.normal @ np.array(light.to_sun), 0, 1) * _sunshine(weather)
+    cold = np.clip(seen.normal[:, 2], 0, 1) * (1 - 0.9 * weather.cloud_cover)
+    night = float(np.clip((8.0 - weather.sun_elevation_deg) / 14.0, 0, 1))
+    dry = 1 - 0.8 * max(weather.wetness, min(weather.rain_mm_h / 5.0, 1.0))
+    own = air + dry * (_SUN[material] * heat - night * _SKY[material] * np.where(_SKY[material] > 0, cold, 1.0))
+    own += _living(seen, material, air) + _driving(scene, seen, material, bool(light.lamps > 0.5))
+    mirrored = np.where(seen.normal[:, 2] > 0.3, sky_temperature(weather, 1.0), air)
+    emissivity = _EMISSIVITY[material]
+    shown = emissivity * own + (1 - emissivity) * mirrored
+    shown = np.where(met, shown, sky_temperature(weather, seen.ray[:, 2]))
+    extinction = FOG_SHARE * weather.fog_per_m + CLEAR_AIR_PER_M + RAIN_PER_M * weather.rain_mm_h**0.6
+    passes = np.where(met, np.exp(-extinction * np.where(met, seen.distance, 0)), np.exp(-extinction * 500.0))
+    kelvin = passes * shown + (1 - passes) * air + infrared.noise_k * rng.standard_normal(len(rays), np.float32)
+    return np.rint(kelvin / KELVIN_STEP).clip(0, 65535).astype(np.uint16).reshape(infrared.height, infrared.width)
+
+
+def air_temperature(weather: Weather) -> float:
+    """Return the air's temperature [K]: mild, warmer the higher the sun, cooler under cloud and in rain."""
+    warm = 9.0 * np.sin(np.radians(np.clip(weather.sun_elevation_deg, -30, 90)))
+    return float(286.0 + warm - 2.5 * weather.cloud_cover * (warm > 0) - min(weather.rain_mm_h / 10.0, 1.0) * 2.0)
+
+
+def sky_temperature(weather: Weather, rise: NDArray[np.float32] | float) -> Array:
+    """Return the sky's apparent temperature [K] where a ray's sine of elevation is `rise`; clouds warm it."""
+    clear = 42.0 * np.clip(rise, 0, 1) ** 0.5 + 6.0
+    return air_temperature(weather) - clear * (1 - 0.85 * weather.cloud_cover)
+
+
+def _sunshine(weather: Weather) -> float:
+    """Return the sun's heat over that of a clear noon."""
+    height = max(np.sin(np.radians(weather.sun_elevation_deg)), 0.0)
+    return float(np.clip(height * 3, 0, 1) * (1 - 0.85 * np.clip((weather.cloud_cover - 0.3) / 0.6, 0, 1)))
+
+
+def _living(seen: Survey, material: NDArray[np.uint8], air: float) -> Array:
+    """Return how much warmer people are than the air [K]: clothes lie between the two."""
+    body = _BODY[material] + 273.15
+    clothed = np.where(material == Material.SKIN, 1.0, 0.7)
+    return np.where(np.isnan(body) | (seen.instance < 1), 0.0, clothed * (body - air))
+
+
+def _driving(scene: Scene, seen: Survey, material: NDArray[np.uint8], lamps_on: bool) -> Array:
+    """Return how much warmer the parts of vehicles under way are [K]."""
+    trace = scene.trace
+    warm = np.zeros(len(seen))
+    for actor in np.unique(seen.instance[seen.instance > 0]) - 1:
+        if trace.category[actor] in ("pedestrian", "bicycle") or str(trace.actor[actor]).startswith("parked"):
+            continue
+        rows = np.flatnonzero(seen.instance == actor + 1)
+        body = scene.world_from_actor(int(actor))
+        along = (seen.position[rows] - body[:3, 3]) @ body[:3, 0] / trace.size[actor, 0]
+        low = seen.position[rows, 2] - body[2, 3] < 0.62 * trace.size[actor, 2]
+        bonnet = np.clip((along - 0.5 + ENGINE_SHARE) / 0.08, 0, 1) * low
+        own = material[rows]
+        warm[rows] = _MOVING[own] + np.where(own == Material.PAINT, 9.0 * bonnet, 0) + 5.0 * bonnet
+        if lamps_on:
+            warm[rows] += LAMP_K * ((own == Material.HEADLAMP) | (own == Material.TAILLAMP))
+    return warm
