@@ -357,12 +357,12 @@ def test_targets_that_are_refused(dataset: Dataset, tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "source", "needed"),
     [
-        ("kitti", PaintedSource(1, cameras=False), "a level camera that looks ahead"),
+        ("kitti", PaintedSource(1, cameras=False), "a level camera that looks ahead; the dataset has none"),
         ("yolo", PaintedSource(1, cameras=False), "camera images"),
         ("coco", PaintedSource(1, cameras=False), "camera images"),
         ("kitti", PaintedSource(1, lidar=False), "a LiDAR and"),
-        ("nuscenes", PaintedSource(1, lidar=False), "a LiDAR on every agent"),
-        ("opv2v", PaintedSource(1, lidar=False), "a LiDAR on every agent"),
+        ("nuscenes", PaintedSource(1, lidar=False), "a LiDAR on every agent; cav0 has none"),
+        ("opv2v", PaintedSource(1, lidar=False), "a LiDAR on every agent; cav0 has none"),
     ],
 )
 def test_what_a_dataset_lacks_is_one_sentence(name: str, source: PaintedSource, needed: str, tmp_path: Path):

@@ -35,9 +35,9 @@ def read_frame(dataset: Dataset, i: int, options: ExportOptions) -> Frame:
     return frame if options.calibration == "true" else replace(frame, calibration=frame.assumed)
 
 
-def lacks(dataset: Dataset, name: str, needed: str) -> InputError:
-    """Return the error that says what a format misses in a dataset."""
-    return InputError(f"{dataset.folder}: cannot be exported to {name}, which needs {needed}; the dataset has none")
+def lacks(dataset: Dataset, name: str, needed: str, who: str = "the dataset") -> InputError:
+    """Return the error that says what a format misses in a dataset, or in one of its agents."""
+    return InputError(f"{dataset.folder}: cannot be exported to {name}, which needs {needed}; {who} has none")
 
 
 def check_rectified(frame: Frame, camera: str, name: str) -> None:

@@ -51,7 +51,7 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
         for i in selected:
             frame = read_frame(dataset, i, options)
             if not frame.lidar:
-                raise lacks(dataset, "OPV2V", f"a LiDAR on every agent; '{frame.agent}' has none")
+                raise lacks(dataset, "OPV2V", "a LiDAR on every agent", frame.agent)
             for track in frame.annotations.track.tolist():
                 numbers.setdefault(track, FIRST_TRACK + len(numbers))
             speed = float(np.linalg.norm(speeds[frame.agent, frame.index]))

@@ -54,7 +54,7 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
             rows.append((number, split, frame.key, frame.agent, f"{frame.time_s:.3f}", camera))
         progress(i + 1, len(dataset), "")
     if not rows:
-        raise lacks(dataset, "KITTI", "a LiDAR and a level camera that looks ahead")
+        raise lacks(dataset, "KITTI", "agents with a LiDAR and a level camera that looks ahead")
     for split in SPLITS:
         _write_lines(out / "ImageSets" / f"{split}.txt", numbers[split])
     _write_lines(out / "ImageSets" / "trainval.txt", sorted(numbers["train"] + numbers["val"]))

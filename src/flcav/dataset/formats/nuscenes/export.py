@@ -51,7 +51,7 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
             for i in selected:
                 frame = read_frame(dataset, i, options)
                 if not frame.lidar:
-                    raise lacks(dataset, "nuScenes", f"a LiDAR on every agent; '{agent}' has none")
+                    raise lacks(dataset, "nuScenes", "a LiDAR on every agent", agent)
                 drive.add(frame, velocities[agent, frame.index])
                 counts.update(samples=1, objects=len(frame.annotations))
                 progress(counts["samples"], len(dataset), "")
