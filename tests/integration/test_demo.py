@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.experiments.demo import demo_steps, run_demo
@@ -118,6 +119,14 @@ def test_the_results_name_everything(results: dict[str, Any]) -> None:
     assert placed["densest"] == densest["pole"]
     assert {"ap50_chosen", "ap50_densest"} <= placed.keys()
     assert results["allocation"].items() >= {"samples": TOY.pool.frames, "edge_rounds": 2, "cloud_rounds": 1}.items()
+
+
+def test_the_run_leaves_history_that_fit_reads(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        command(["fit", str(finished / "history.csv"), "--json", "--repeats", "20"])
+    assert not stopped.value.code
+    (curve,) = json.loads(capsys.readouterr().out)["curves"]
+    assert curve["points"] == 1 + 2 + 1  # pretrained, each edge round, each cloud round
 
 
 def test_the_ledger_is_what_crossed_the_links(finished: Path, results: dict[str, Any]) -> None:
