@@ -23,6 +23,9 @@ from flcav.optimization.weighted import least_weighted
 Array = NDArray[np.float64]
 
 MB_PER_GB = 1000.0
+EXACT = 1e-9  # gap sought for few tasks
+EXACT_TASKS = 4
+AREA_GAP = 1e-4  # of the steps towards a large area, which has no certificate anyway
 NO_CERTIFICATE = "the area is not concave in the plan: this is the best of several local optima, with no certificate"
 
 
@@ -75,13 +78,14 @@ class _Best:
 
 
 def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
-    """Return the best plan within both budgets, proven to a relative `gap` (few tasks, weighted: to 1e-9).
+    """Return the best plan within both budgets, proven to a relative `gap` (few tasks: to 1e-9).
 
     Robust plans minimise the upper bands of the curves. Raises `Infeasible`, naming the budget, the least that the
     limits allow, and by how much that is over.
     """
     asked = resolved(problem)
-    best = _METHODS[problem.objective](asked, instance(asked), gap)
+    sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
+    best = _METHODS[problem.objective](asked, instance(asked), sought)
     plans = described(problem, best.x)
     lower = None if best.lower is None else min(best.lower, best.objective)
     achieved = None
@@ -171,9 +175,7 @@ def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:
 
 def _weighted(problem: Problem, made: Instance, gap: float) -> _Best:
     found = least_weighted(made, gap)
-    return _Best(
-        found.x, weighted_error(problem, described(problem, found.x)), found.bound + made.floor, found.multipliers
-    )
+    return _Best(found.x, weighted_error(problem, described(problem, found.x)), found.bound + made.floor, found.rates)
 
 
 def _fair(problem: Problem, made: Instance, gap: float) -> _Best:
@@ -182,7 +184,7 @@ def _fair(problem: Problem, made: Instance, gap: float) -> _Best:
 
 
 def _area(problem: Problem, made: Instance, gap: float) -> _Best:
-    found = largest_area(problem, gap)
+    found = largest_area(problem, max(gap, AREA_GAP))
     return _Best(found.x, found.area, None, found.rates)
 
 

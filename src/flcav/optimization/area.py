@@ -52,7 +52,7 @@ def _climb(problem: Problem, weights: Array, gap: float) -> Polygon:
         weighed = _weighed(problem, np.maximum(weights, LEAST_WEIGHT))
         found = least_weighted(instance(weighed), gap)
         accuracy = _accuracy(problem, found.x)
-        reached = Polygon(found.x, area(accuracy), found.multipliers)
+        reached = Polygon(found.x, area(accuracy), found.rates)
         if reached.area <= best.area * (1 + gap):
             return max(best, reached, key=lambda polygon: polygon.area)
         best, corners = reached, np.maximum(accuracy, 0)

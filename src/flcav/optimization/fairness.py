@@ -19,7 +19,6 @@ from flcav.optimization.instance import Instance
 from flcav.optimization.problem import Problem
 from flcav.optimization.rounding import fill
 from flcav.optimization.separable import BUDGET_SLACK
-from flcav.optimization.weighted import EXACT, EXACT_TASKS
 
 Array = NDArray[np.float64]
 
@@ -69,7 +68,6 @@ def least_largest(problem: Problem, made: Instance, gap: float) -> Fair:
     Raises `InputError` where a task has more than a million pairs of rounds to choose from.
     """
     tasks = _choices(problem, made)
-    gap = gap if len(tasks) > EXACT_TASKS else min(gap, EXACT)
     level, bound = (max(map(_largest, tasks, x.reshape(-1, 3))) for x in (made.low, made.high))
     best, unreached = made.low, level
     while unreached - bound > 0.1 * gap * bound:

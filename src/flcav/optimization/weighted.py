@@ -21,8 +21,6 @@ from flcav.optimization.terms import terms_of
 
 Array = NDArray[np.float64]
 
-EXACT = 1e-9  # gap of small problems
-EXACT_TASKS = 4
 CORRECTIONS = 6  # of the multipliers, towards whole quantities that spend the budgets
 PLANES = 60  # of the dual
 
@@ -34,7 +32,8 @@ class Solution:
     x: Array  # (n,)
     error: float  # above the floors
     bound: float  # above the floors: no whole quantities within the budgets have less
-    multipliers: Array  # (2,) error saved per MB of each link
+    multipliers: Array  # (2,) at which the bound is proven
+    rates: Array  # (2,) error saved per MB more of each link, before rounding to whole quantities
 
     def gap(self, floor: float) -> float:
         """Return (error - bound) / bound, both with `floor`."""
@@ -50,11 +49,10 @@ def whole_plan(problem: Separable, gap: float = 1e-4) -> Solution:
 
 
 def least_weighted(instance: Instance, gap: float) -> Solution:
-    """Return whole quantities within a relative `gap` of the least error (up to `EXACT_TASKS` tasks: of `EXACT`)."""
-    gap = gap if len(instance.low) > 3 * EXACT_TASKS else min(gap, EXACT)
-    best = Solution(instance.low, instance.error(instance.low), -np.inf, np.zeros(2))
+    """Return whole quantities within a relative `gap` of the least error."""
+    best = Solution(instance.low, instance.error(instance.low), -np.inf, np.zeros(2), np.zeros(2))
     bound_at = best.multipliers
-    for multipliers, bound in _multipliers(instance, gap):
+    for number, (multipliers, bound) in enumerate(_multipliers(instance, gap)):
         x, proven = instance.cheapest(multipliers)
         if max(proven, bound) > best.bound:
             bound_at = multipliers
@@ -65,6 +63,7 @@ def least_weighted(instance: Instance, gap: float) -> Solution:
             *((x, error) if error < best.error else (best.x, best.error)),
             bound=max(best.bound, proven, bound),
             multipliers=bound_at,
+            rates=best.rates if number else multipliers,
         )
         if best.gap(instance.floor) <= gap:
             return best
@@ -72,7 +71,7 @@ def least_weighted(instance: Instance, gap: float) -> Solution:
 
 
 def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
-    """Yield multipliers near the best, and the bound that is known there."""
+    """Yield multipliers near the best, and the bound that is known there; first those of the fractional optimum."""
     if instance.effective is not None:
         yield from _planes(instance, gap)
         return
@@ -121,4 +120,5 @@ def _closed(instance: Instance, best: Solution, gap: float) -> Solution:
     points = [best.x, *(fill(instance, trim(instance, x, prices), prices) for x in visited)]
     errors = [instance.error(x) for x in points]
     first = int(np.argmin(errors))
-    return Solution(points[first], errors[first], max(best.bound, min(proven, best.error)), best.multipliers)
+    bound = max(best.bound, min(proven, best.error))
+    return Solution(points[first], errors[first], bound, best.multipliers, best.rates)
