@@ -64,9 +64,10 @@ class PaintedSource:
     split: str = "train"
     cameras: bool = True
     lidar: bool = True
+    town: str = "painted"
 
     def describe(self) -> dict[str, Any]:
-        return {"town": "painted", "seed": 0, "split": self.split}
+        return {"town": self.town, "seed": 0, "split": self.split}
 
     def scenes(self) -> list[str]:
         return [f"painted-0-{scene:03d}" for scene in range(self.scene_count)]

@@ -12,6 +12,8 @@ from painted_source import CATEGORIES, PaintedSource
 from flcav.cli.main import run
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.world.lanes import map_layers
+from flcav.world.town import load_town
 
 SPINS = 2
 WITHOUT_RERUN = importlib.util.find_spec("rerun") is None
@@ -21,7 +23,7 @@ needs_rerun = pytest.mark.skipif(WITHOUT_RERUN, reason="rerun-sdk (170 MB, the e
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("painted") / "dataset"
-    record(PaintedSource(2, spins=SPINS), folder)
+    record(PaintedSource(2, spins=SPINS, town="suburb"), folder)
     return Dataset.open(folder)
 
 
@@ -71,6 +73,16 @@ def test_a_recording_holds_points_boxes_tracks_and_pictures(dataset: Dataset, tm
     last = dataset.frame(dataset.select(scenes=[dataset.manifest["scenes"][0]])[-1]).annotations.boxes
     np.testing.assert_allclose(actors[SPINS - 1]["centers"], last.center, atol=1e-4)
     np.testing.assert_allclose(2 * np.array(actors[SPINS - 1]["half_sizes"]), last.size, atol=1e-4)
+
+
+@needs_rerun
+def test_a_recording_holds_the_map_of_its_town(dataset: Dataset, tmp_path: Path):
+    assert _view(dataset, "--save", str(tmp_path / "a.rrd")) == 0
+    found, layers = _read(tmp_path / "a.rrd"), map_layers(load_town("suburb"))
+    for name in ("roads", "sidewalks", "crossings", "markings"):
+        assert len(found[f"/world/map/{name}"][-1]["strips"]) == len(getattr(layers, name))
+    x_min, y_min, *_ = np.array(found["/world/map/roads"][-1]["strips"][0]).min(axis=0)
+    np.testing.assert_allclose((x_min, y_min), layers.roads[0].min(axis=0), rtol=1e-5)
 
 
 @needs_rerun
