@@ -1,89 +1,100 @@
-"""Every task satisfies one protocol: trained, resumed, saved and federated by the same code."""
+"""Every task satisfies one protocol: trained, resumed, evaluated, saved, used and federated by the same code."""
 
 import inspect
-from collections.abc import Callable
-from dataclasses import dataclass
+import json
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from safetensors import safe_open
+from task_drives import Drives
 
+from flcav.cli.main import run
+from flcav.cli.tasks import TASKS
 from flcav.config import InputError
+from flcav.dataset.recorder import record
+from flcav.dataset.store import Dataset
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import Trainable
-from flcav.geometry import Boxes
 from flcav.network.ledger import Budget, Ledger
+from flcav.perception.card import CARD_KEY
 from flcav.perception.client import TaskClient
-from flcav.perception.objects import Sample
-from flcav.perception.objects.task import OBJECTS
+from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task, configuration, fresh
 from flcav.perception.training import Checkpointing, Validation, train
-from flcav.perception.weather import samples as weather_samples
-from flcav.perception.weather.task import WEATHER
+from flcav.perception.training.run import Request, train_network
 from flcav.perception.weights import load_network, save_network, to_arrays
+from flcav.report import style
+from flcav.report.inference import DRAWINGS
+
+each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+CONFIGS = {"signs": replace(configuration(SIGNS, "n"), window_px=(96, 64))}
 
 
-def sweeps() -> list[Sample]:
-    random = np.random.default_rng(0)
-    clouds = [random.uniform((5, -9, -2, 0), (40, 9, 0, 1), (500, 4)).astype(np.float32) for _ in range(4)]
-    return [Sample(cloud, Boxes.from_array([[20, 0, -1, 4.4, 1.8, 1.6, 0]], "Car")) for cloud in clouds]
+def small(task: Task[Any, Any, Any]) -> Any:
+    return CONFIGS.get(task.name, configuration(task, None))
 
 
-def skies() -> list[weather_samples.Sample]:
-    random = np.random.default_rng(0)
-    return [
-        weather_samples.Sample(random.integers(0, 256, (32, 32, 3), dtype=np.uint8), label % 8) for label in range(12)
-    ]
+def folder_of(source: Drives, folder: Path) -> Path:
+    record(source, folder)
+    return folder
 
 
-@dataclass(frozen=True)
-class Case:
-    task: Task[Any, Any, Any]
-    make: Callable[[], list[Any]]
-
-    @property
-    def config(self) -> Any:
-        return configuration(self.task, None)
-
-    @property
-    def samples(self) -> list[Any]:
-        return self.make()
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Dataset:
+    return Dataset.open(folder_of(Drives(spins=2), tmp_path_factory.mktemp("drives") / "data"))
 
 
-CASES = [Case(WEATHER, skies), Case(OBJECTS, sweeps)]
-TASKS = pytest.mark.parametrize("case", CASES, ids=[case.task.name for case in CASES])
+@pytest.fixture(scope="module")
+def samples(data) -> dict[str, list[Any]]:
+    return {name: list(task.samples(data, small(task))) for name, task in TASKS.items()}
 
 
 def same(one, other) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(to_arrays(one).values(), to_arrays(other).values(), strict=True))
 
 
-@TASKS
-def test_a_seed_names_a_training(case):
-    networks = [fresh(case.task, case.config, 1) for _ in range(3)]
+def called(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        run([str(argument) for argument in arguments])
+    return int(stopped.value.code or 0)
+
+
+@each_task
+def test_samples_are_those_of_the_frames_asked_for(task, data, samples):
+    assert len(samples[task.name]) == len(data) == 6
+    assert len(task.samples(data, small(task), data.select(scenes=["fog"]))) == 2
+
+
+@each_task
+def test_a_seed_names_a_training(task, samples):
+    networks = [fresh(task, small(task), 1) for _ in range(3)]
     for network, seed in zip(networks, (3, 3, 4), strict=True):
-        history = train(case.task, network, case.samples, steps=2, seed=seed)
+        history = train(task, network, samples[task.name], steps=2, batch=2, seed=seed)
         assert np.isfinite(history.losses).all()
     assert same(networks[0], networks[1])
     assert not same(networks[0], networks[2])
-    assert not same(networks[0], fresh(case.task, case.config, 1))
+    assert not same(networks[0], fresh(task, small(task), 1))
 
 
 class Killed(Exception):
     """Stands for SIGKILL: nothing is caught, nothing is written after it."""
 
 
-@TASKS
+@each_task
 @pytest.mark.parametrize("validated", [False, True])
-def test_a_killed_training_goes_on_to_the_same_weights(case, validated, tmp_path):
+def test_a_killed_training_goes_on_to_the_same_weights(task, validated, samples, tmp_path):
     def score(network) -> float:
         return -float(sum(np.abs(array).sum() for array in to_arrays(network).values()))
 
     validation = Validation(score, every=2, patience=9) if validated else None
-    settings = {"steps": 6, "seed": 3, "validation": validation}
-    whole, cut, resumed = (fresh(case.task, case.config, 1) for _ in range(3))
-    losses = train(case.task, whole, case.samples, **settings)
+    settings = {"steps": 5, "batch": 2, "seed": 3, "validation": validation}
+    learned = samples[task.name]
+    whole, cut, resumed = (fresh(task, small(task), 1) for _ in range(3))
+    losses = train(task, whole, learned, **settings)
     checkpointing = Checkpointing(tmp_path / "checkpoint.pt", every=3)
 
     def kill(done, total, note):
@@ -91,56 +102,97 @@ def test_a_killed_training_goes_on_to_the_same_weights(case, validated, tmp_path
             raise Killed
 
     with pytest.raises(Killed):
-        train(case.task, cut, case.samples, checkpointing=checkpointing, progress=kill, **settings)
-    again = train(case.task, resumed, case.samples, checkpointing=checkpointing, **settings)
+        train(task, cut, learned, checkpointing=checkpointing, progress=kill, **settings)
+    again = train(task, resumed, learned, checkpointing=checkpointing, **settings)
     assert np.array_equal(losses.losses, again.losses)
     assert np.array_equal(losses.scores, again.scores)
-    assert len(again.scores) == (3 if validated else 0)
+    assert len(again.scores) == (2 if validated else 0)
     assert same(whole, resumed)
 
 
-@TASKS
-def test_weights_come_back_and_those_of_another_task_are_refused(case, tmp_path):
-    network = fresh(case.task, case.config, 1)
-    save_network(case.task, network, tmp_path / "weights.safetensors")
-    loaded = load_network(case.task, tmp_path / "weights.safetensors")
+@each_task
+def test_weights_come_back_and_those_of_another_task_are_refused(task, tmp_path):
+    network, path = fresh(task, small(task), 1), tmp_path / "weights.safetensors"
+    save_network(task, network, path)
+    loaded = load_network(task, path)
     assert same(network, loaded)
-    assert loaded.config == case.config
+    assert loaded.config == small(task)
     assert not loaded.training
-    for other in (other.task for other in CASES if other is not case):
-        with pytest.raises(InputError, match=f"'{case.task.family}'.*'{other.name}' takes those of '{other.family}'"):
-            load_network(other, tmp_path / "weights.safetensors")
+    for other in (other for other in TASKS.values() if other is not task):
+        with pytest.raises(InputError, match=f"'{task.family}'.*'{other.name}' takes those of '{other.family}'"):
+            load_network(other, path)
 
 
-@TASKS
-def test_a_client_is_trainable(case):
-    client: Trainable = TaskClient(case.task, case.config, case.samples)
+@each_task
+def test_a_client_is_trainable(task, samples):
+    client: Trainable = TaskClient(task, small(task), samples[task.name], batch=2)
     assert inspect.signature(client.train).parameters.keys() == {"weights", "steps", "learning_rate", "seed"}
-    weights = to_arrays(fresh(case.task, case.config, 1))
+    weights = to_arrays(fresh(task, small(task), 1))
     before = {key: array.copy() for key, array in weights.items()}
     one, other = (client.train(weights, steps=1, learning_rate=1e-3, seed=3) for _ in range(2))
     assert list(one.weights) == list(weights)
     assert all(array.dtype == weights[key].dtype for key, array in one.weights.items())
     assert all(np.array_equal(array, weights[key]) for key, array in before.items())  # its input is left alone
     assert all(np.array_equal(array, other.weights[key]) for key, array in one.weights.items())
-    assert one.samples > 0
+    assert one.samples == 2
     assert np.isfinite(one.loss)
     still = client.train(weights, steps=0, learning_rate=1e-3, seed=3)
     assert all(np.array_equal(array, weights[key]) for key, array in still.weights.items())
 
 
-@TASKS
-def test_two_clients_federate(case):
-    half = len(case.samples) // 2
-    clients = {
-        "cav0": TaskClient(case.task, case.config, case.samples[:half]),
-        "cav1": TaskClient(case.task, case.config, case.samples[half:]),
-    }
-    weights = to_arrays(fresh(case.task, case.config, 1))
+@each_task
+def test_two_clients_federate(task, samples):
+    learned = samples[task.name]
+    clients = {f"cav{i}": TaskClient(task, small(task), learned[i::2], batch=2) for i in range(2)}
+    weights = to_arrays(fresh(task, small(task), 1))
     ledger = Ledger(Budget(wireless_mb=100.0, wireline_mb=0.0))
     schedule = Schedule(rounds=1, steps=1, learning_rate=1e-3, final_learning_rate=1e-3, seed=1)
-    result = federate(clients, weights, schedule, Account(ledger, "edge", case.task.name, "wireless"))
+    result = federate(clients, weights, schedule, Account(ledger, "edge", task.name, "wireless"))
     assert list(result.weights) == list(weights)
     assert any(not np.array_equal(result.weights[name], weights[name]) for name in weights)
     assert ledger.used_mb("wireless") > 0
     assert np.isfinite(result.loss)
+
+
+@each_task
+def test_evaluations_and_findings_are_json_and_words_and_pictures(task, data):
+    network = fresh(task, small(task), 1)
+    result = task.evaluate(network, data, [0, 3])
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+    assert 0 <= task.score(result) <= 1
+    assert all(isinstance(line, str) for line in task.evaluation_lines(result))
+    finding = next(iter(task.infer(network, data.folder, 0.0)))
+    assert json.loads(json.dumps(finding.result, allow_nan=False)) == finding.result
+    assert task.finding_lines(finding.result)
+    picture = style.png(DRAWINGS[task.name](finding.seen, finding.result, "title"), dpi=40)
+    assert picture.startswith(b"\x89PNG")
+
+
+@each_task
+def test_a_whole_training_leaves_weights_with_their_card_and_curves(task, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(type(task), "configurations", {"small": small(task)})
+    card = train_network(task, Request([data, data], data, epochs=1, seed=2), tmp_path)
+    assert (card.task, card.network, card.seed, card.samples) == (task.name, "small", 2, 12)
+    assert card.metrics == task.evaluate(load_network(task, tmp_path / "weights.safetensors"), data)
+    with safe_open(tmp_path / "weights.safetensors", framework="pt") as file:
+        assert json.loads(file.metadata()[CARD_KEY]) == json.loads(card.model_dump_json())
+    assert (tmp_path / "card.md").read_text() == card.markdown()
+    assert len(list((tmp_path / "events").glob("events.out.tfevents.*"))) == 1
+
+
+@each_task
+def test_a_dataset_without_its_sensor_is_one_sentence(task, tmp_path, capsys):
+    blind = Drives(spins=1, lidar=task.name != "objects", camera=task.name == "objects")
+    folder, weights = folder_of(blind, tmp_path / "data"), tmp_path / "weights.safetensors"
+    save_network(task, fresh(task, small(task), 1), weights)
+    for command in (
+        ("train", task.name, "--data", folder, "--out", tmp_path / "out"),
+        ("evaluate", task.name, "--data", folder, "--weights", weights),
+        ("infer", task.name, folder, "--weights", weights),
+    ):
+        assert called(*command) == 2, command
+        told = capsys.readouterr()
+        assert told.out == ""
+        assert told.err.count("\n") == 1
+        assert ("no LiDAR" if task.name == "objects" else "no camera pictures") in told.err
+    assert not (tmp_path / "out").exists()

@@ -15,12 +15,12 @@ from flcav.sensors.frame import Frame
 
 Picture = NDArray[np.uint8]  # (H, W, 3) sRGB
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 SMALLEST_PX, LARGEST_PX = 32, 8192  # side of a picture
 
 
 def pictures(path: Path) -> Iterator[tuple[Path, Picture]]:
-    """Yield the pictures of a PNG or JPEG file, a folder of them, or a dataset folder, each with its own path.
+    """Yield the pictures of a PNG, JPEG or WebP file, a folder of them, or a dataset folder, each with its own path.
 
     Raises `InputError` for anything else, and for a picture that is damaged, not RGB or of a size out of bounds.
     """

@@ -18,6 +18,7 @@ from flcav.perception.card import CARD_KEY, Card
 from flcav.perception.task import ConfigT, NetworkT, Task
 
 PREFIX = "flcav."
+COUNTER = "num_batches_tracked"  # of batch normalisation with a fixed momentum, which does not use it
 
 
 def config_key(task: Task[Any, Any, Any]) -> str:
@@ -52,13 +53,13 @@ def load_weights(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path) 
 
 
 def to_arrays(network: nn.Module) -> dict[str, NDArray[Any]]:
-    """Return copies of parameters and buffers by name."""
-    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in network.state_dict().items()}
+    """Return copies of parameters and buffers by name, without the counters of batch normalisation."""
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in _learned(network).items()}
 
 
 def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Set parameters and buffers from what `to_arrays` returned; raises `InputError` where they do not fit."""
-    state = network.state_dict()
+    state = _learned(network)
     if set(arrays) != set(state):
         odd = sorted(set(arrays) ^ set(state))
         raise InputError(f"weights of another network: {len(odd)} arrays missing or unknown, the first is '{odd[0]}'")
@@ -68,6 +69,10 @@ def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
                 f"weights of another network: '{name}' has shape {array.shape}, not {tuple(state[name].shape)}"
             )
         state[name].copy_(torch.from_numpy(np.ascontiguousarray(array)))
+
+
+def _learned(network: nn.Module) -> dict[str, torch.Tensor]:
+    return {name: tensor for name, tensor in network.state_dict().items() if not name.endswith(COUNTER)}
 
 
 def _adapter(task: Task[Any, Any, Any]) -> TypeAdapter[Any]:

@@ -1,0 +1,68 @@
+"""Pictures that a user names: what is taken, and one sentence for what is not."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flcav.config import InputError
+from flcav.perception.images import checked_picture, pictures, read_picture, resized
+
+RANDOM = np.random.default_rng(0)
+RGB = RANDOM.integers(0, 256, (40, 60, 3), dtype=np.uint8)
+
+
+def saved(path, pixels, **options):
+    Image.fromarray(pixels).save(path, **options)
+    return path
+
+
+def test_files_and_folders(tmp_path):
+    for name in ("b.png", "a.webp"):
+        saved(tmp_path / name, RGB, lossless=True)
+    saved(tmp_path / "c.JPG", RGB, format="jpeg", quality=95)
+    (tmp_path / "notes.txt").write_text("no picture")
+    seen = list(pictures(tmp_path))
+    assert [path.name for path, _ in seen] == ["a.webp", "b.png", "c.JPG"]
+    assert all(np.array_equal(picture, RGB) for _, picture in seen[:2])
+    ((path, picture),) = pictures(tmp_path / "b.png")
+    assert path == tmp_path / "b.png"
+    assert np.array_equal(picture, RGB)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "said"),
+    [
+        (RGB[..., 0], r"1 channels \(L\); 3 are wanted"),
+        (np.dstack((RGB, RGB[..., :1])), r"4 channels \(RGBA\)"),
+        (RGB[:31], "60 x 31 pixels; sides of 32 to 8192"),
+        (np.zeros((32, 8193, 3), np.uint8), "8193 x 32 pixels"),
+    ],
+)
+def test_other_channels_and_sizes(pixels, said, tmp_path):
+    with pytest.raises(InputError, match=said):
+        read_picture(saved(tmp_path / "odd.png", pixels))
+
+
+def test_what_is_no_picture(tmp_path):
+    whole = io.BytesIO()
+    Image.fromarray(RGB).save(whole, "png")
+    (tmp_path / "cut.png").write_bytes(whole.getvalue()[: len(whole.getvalue()) // 2])
+    (tmp_path / "text.png").write_text("no picture")
+    for name in ("cut.png", "text.png"):
+        with pytest.raises(InputError, match=f"{name}: not a picture, or a damaged one"):
+            read_picture(tmp_path / name)
+    with pytest.raises(InputError, match="no such file"):
+        list(pictures(tmp_path / "none.png"))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="neither a dataset nor a folder"):
+        list(pictures(tmp_path / "empty"))
+    with pytest.raises(InputError, match="shape"):
+        checked_picture(RGB[..., 0], "here")
+
+
+def test_shrinking_averages():
+    board = np.indices((64, 64)).sum(0) % 2 * np.uint8(255)
+    small = resized(np.dstack([board.astype(np.uint8)] * 3), 32, 32)
+    assert np.abs(small.astype(int) - 127).max() <= 8

@@ -1,0 +1,106 @@
+"""LeNet-5 against the numbers of its paper, and how the classifier is measured."""
+
+import numpy as np
+import pytest
+import torch
+
+from flcav.perception.task import configuration, fresh
+from flcav.perception.training import train
+from flcav.perception.weather.config import LeNetConfig
+from flcav.perception.weather.evaluate import classification
+from flcav.perception.weather.model import SEEN_MAPS, LeNet, PartlyConnected, Subsampling
+from flcav.perception.weather.samples import Sample, augment, small
+from flcav.perception.weather.task import WEATHER, probabilities
+from flcav.world.weather import WEATHER_CLASSES
+
+
+def parameters(*modules: torch.nn.Module) -> int:
+    return sum(parameter.numel() for module in modules for parameter in module.parameters())
+
+
+def test_the_original_has_the_papers_parameters():
+    layers = LeNet(LeNetConfig(original=True)).layers
+    c1, s2, c3, s4, c5, f6 = (layers[i] for i in (0, 1, 3, 4, 6, 9))
+    assert [parameters(layer) for layer in (s2, c3, s4, c5, f6)] == [12, 1516, 32, 48120, 10164]
+    assert parameters(c1) - 2 * 6 * 25 == 156  # of one channel instead of three
+    assert parameters(s2, c3, s4, c5, f6) + 156 == 60_000  # "60,000 trainable free parameters"
+    assert parameters(LeNet(LeNetConfig())) == pytest.approx(62e3, rel=0.005)
+
+
+def test_maps_are_connected_as_in_table_one():
+    rows = [  # of the paper's table I: X where a map of C3 (column) sees a map of S2 (row)
+        "X   XXX  XXXX XX",
+        "XX   XXX  XXXX X",
+        "XXX   XXX  X XXX",
+        " XXX  XXXX  X XX",
+        "  XXX  XXXX XX X",
+        "   XXX  XXXX XXX",
+    ]
+    table = np.array([[sign == "X" for sign in row] for row in rows])
+    assert [tuple(np.flatnonzero(column)) for column in table.T] == list(SEEN_MAPS)
+
+
+def test_a_partly_connected_layer_sees_its_maps_alone():
+    layer = PartlyConnected()
+    start = torch.rand(1, 6, 14, 14)
+    for blind in range(6):
+        changed = start.clone()
+        changed[:, blind] += 1
+        moved = (layer(changed) - layer(start)).abs().amax((0, 2, 3)) > 1e-6
+        assert moved.tolist() == [blind in maps for maps in SEEN_MAPS]
+
+
+def test_subsampling_is_a_trained_mean():
+    layer = Subsampling(2)
+    with torch.no_grad():
+        layer.factor[1], layer.bias[1] = 3.0, -1.0
+    maps = torch.arange(8.0).reshape(1, 2, 2, 2)
+    assert layer(maps).flatten().tolist() == [1.5, 3 * 5.5 - 1]
+
+
+@pytest.mark.parametrize("name", ["tiny", "paper"])
+def test_it_learns_colours(name):
+    random = np.random.default_rng(0)
+    colours = random.integers(0, 256, (8, 3))
+    noisy = [colours[i % 8] + random.normal(0, 12, (32, 32, 3)) for i in range(48)]
+    samples = [Sample(np.clip(picture, 0, 255).astype(np.uint8), i % 8) for i, picture in enumerate(noisy)]
+    network = fresh(WEATHER, configuration(WEATHER, name), 0)
+    train(WEATHER, network, samples, steps=80, batch=16, seed=0)
+    found = probabilities(network, [sample.picture for sample in samples])
+    assert found.shape == (48, 8)
+    assert found.sum(1) == pytest.approx(1, abs=1e-5)
+    assert (found.argmax(1) == np.arange(48) % 8).mean() > 0.95
+
+
+def test_augmentation_keeps_size_label_and_light():
+    picture = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    seen = [augment(Sample(picture, 3, "s"), np.random.default_rng(seed)) for seed in range(40)]
+    assert all(one.picture.shape == (32, 32, 3) and (one.label, one.scene) == (3, "s") for one in seen)
+    assert all(abs(one.picture.mean() / picture.mean() - 1) < 0.1 for one in seen)
+    assert len({one.picture.tobytes() for one in seen}) == 40
+
+
+def test_a_picture_is_squeezed_to_its_means():
+    picture = np.zeros((64, 128, 3), np.uint8)
+    picture[:, 64:] = 200
+    seen = small(picture)
+    assert seen.shape == (32, 32, 3)
+    assert (seen[:, :14] == 0).all()
+    assert (seen[:, 18:] == 200).all()
+
+
+def test_accuracy_recall_and_confusion_by_hand():
+    truth, found = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 0, 1, 1, 1, 0])
+    result = classification(truth, found, list("aabbcc"), ["x", "y", "z", "w"])
+    assert result["accuracy"] == pytest.approx(4 / 6)
+    assert result["confusion"] == [[2, 1, 0, 0], [0, 2, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]
+    assert result["recall"] == {"x": pytest.approx(2 / 3), "y": 1, "z": 0, "w": None}
+    assert result["low"] <= result["accuracy"] <= result["high"]
+    assert (result["pictures"], result["scenes"]) == (6, 3)
+    alone = classification(truth, found, ["a"] * 6, ["x", "y", "z", "w"])
+    assert alone["low"] == alone["high"] == pytest.approx(4 / 6)
+
+
+def test_the_classes_are_those_of_the_world():
+    assert LeNetConfig().classes == tuple(WEATHER_CLASSES)
+    assert len(WEATHER_CLASSES) == 8
