@@ -24,8 +24,10 @@ Columns = Mapping[str, Any]
 
 
 def rows_of(frame: Frame) -> dict[str, Columns]:
-    """Return the columns of the rows of `frame` in each table, by the table's name."""
-    return {name: columns(frame) for name, columns in COLUMNS.items()}
+    """Return the columns of the rows of `frame` by the name of their table; tables without any are left out."""
+    truth = frame.annotations
+    parts = {"views": truth.views, "signs": truth.signs, "points": truth.points, "gnss": frame.gnss, "imu": frame.imu}
+    return {name: columns(frame) for name, columns in COLUMNS.items() if parts.get(name, True)}
 
 
 def table_of(name: str, parts: Sequence[Columns]) -> pa.Table:

@@ -5,7 +5,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import inverse, pose
 from flcav.sensors.echoes import cast_through_glass
 from flcav.sensors.lidar import Lidar, ray_pattern
 from flcav.world.rays.compiled import compiled
@@ -26,33 +25,48 @@ def occluded_rays(
 
     `distance` (N,) is where the rays ended.
     """
-    poses = scene.poses()
-    return np.array(
-        [
-            _stopped(scene, inverse(pose(*poses[a])) @ world_from_sensor, lidar, passes, distance, int(a))
-            for a in actors
-        ],
-        np.int64,
+    pattern, surfaces = ray_pattern(lidar), scene.surfaces
+    body_from_sensor = _bodies_from(scene.poses()[actors], world_from_sensor)
+    rays, counts = _stopped_rays(
+        pattern, lidar.azimuth_steps, body_from_sensor, scene.trace.size[actors], BOX_MARGIN_M, distance
     )
+    found = np.zeros(len(actors), np.int64)
+    ends = np.cumsum(counts)
+    for row in np.flatnonzero(counts).tolist():
+        chosen, actor = rays[ends[row] - counts[row] : ends[row]], int(actors[row])
+        trace = partial(scene.cast_alone, actor, body_from_sensor[row], far_m=lidar.range_m)
+        first = surfaces.first[actor + 1 : actor + 2]
+        echoes = cast_through_glass(trace, pattern[chosen], passes[chosen], first, surfaces.material)
+        found[row] = np.count_nonzero(echoes.instance >= 0)
+    return found
 
 
-def _stopped(
-    scene: Scene,
-    body_from_sensor: NDArray[np.float64],
-    lidar: Lidar,
-    passes: NDArray[np.bool_],
-    distance: NDArray[np.float32],
-    actor: int,
-) -> int:
-    directions, size = ray_pattern(lidar), scene.trace.size[actor]
-    rays = rays_into_box(directions, lidar.azimuth_steps, body_from_sensor, size, BOX_MARGIN_M, distance)
-    if not len(rays):
-        return 0
-    trace = partial(scene.cast_alone, actor, body_from_sensor, far_m=lidar.range_m)
-    surfaces = scene.surfaces
-    first = surfaces.first[actor + 1 : actor + 2]
-    echoes = cast_through_glass(trace, directions[rays], passes[rays], first, surfaces.material)
-    return int(np.count_nonzero(echoes.instance >= 0))
+def _bodies_from(poses: NDArray[np.float64], world_from_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (K, 4, 4) `body_from_sensor` of actors at `poses` (K, 4) x, y, z, yaw."""
+    cos, sin, zero, one = np.cos(poses[:, 3]), np.sin(poses[:, 3]), 0 * poses[:, 3], 0 * poses[:, 3] + 1
+    turn = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
+    found = np.tile(np.eye(4), (len(poses), 1, 1))
+    found[:, :3, :3] = turn @ world_from_sensor[:3, :3]
+    found[:, :3, 3] = np.einsum("kij,kj->ki", turn, world_from_sensor[:3, 3] - poses[:, :3])
+    return found
+
+
+@compiled
+def _stopped_rays(directions, steps, body_from_sensor, size, margin, distance):
+    """Return the rays of `rays_into_box` for each of K boxes, one after another, and (K,) how many they are."""
+    counts = np.zeros(len(size), np.int64)
+    found = np.empty(1024, np.int64)
+    total = 0
+    for box in range(len(size)):
+        rays = rays_into_box(directions, steps, body_from_sensor[box], size[box], margin, distance)
+        counts[box] = len(rays)
+        if total + len(rays) > len(found):
+            larger = np.empty(2 * (total + len(rays)), np.int64)
+            larger[:total] = found[:total]
+            found = larger
+        found[total : total + len(rays)] = rays
+        total += len(rays)
+    return found[:total], counts
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""The amodal rectangle of an actor in an image: around the projection of its mesh's convex hull, exact for pinholes."""
+"""The amodal rectangle of an actor in an image: around its projected convex hull, exact where nothing distorts."""
 
 from functools import lru_cache
 from typing import NamedTuple
