@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from flcav.cli.main import run
+from flcav.optimization.history import ARTICLE
 
 RECIPES = sorted((Path(__file__).parents[2] / "recipes" / "allocation").glob("*.yaml"))
 TASK_KEYS = {"name", "samples", "edge_rounds", "cloud_rounds", "predicted_error", "wireless_mb", "wireline_mb"}
@@ -109,3 +110,43 @@ def test_bad_history_is_one_sentence(text, named, tmp_path, capsys):
     err = capsys.readouterr().err
     assert named in err
     assert err.count("\n") == 1
+
+
+def test_fit_on_the_articles_points_prints_its_curves_bands_and_warnings(capsys):
+    assert called("fit", ARTICLE, "--json", "--at", "9000", "--repeats", "40") == 0
+    curves = {curve["task"]: curve for curve in json.loads(capsys.readouterr().out)["curves"]}
+    for task, (a, b) in {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}.items():
+        curve = curves[task]
+        assert (curve["pretrain"]["a"], curve["pretrain"]["b"]) == pytest.approx((a, b), rel=0.03)
+        assert curve["band"]["method"] == "residual bootstrap"
+        assert all(row["low"] <= row["error"] <= row["high"] for row in curve["band"]["at"])
+        assert "9000 samples (measured up to 2500)" in curve["asked"][0]["warning"]
+    assert called("fit", ARTICLE, "--model", "effective", "--repeats", "20") == 0
+    assert "signs" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["equal-stages", "equal-tasks", "max-throughput", "article"])
+def test_a_baseline_stands_beside_the_optimum(name, capsys):
+    assert called("allocate", RECIPES[0], "--baseline", name, "--json") == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["baseline"]["name"] == name
+    assert plan["baseline"]["objective"] >= plan["lower_bound"]
+    assert set(plan["baseline"]["tasks"][0]) == TASK_KEYS
+
+
+def test_a_plan_goes_on_from_progress(tmp_path, capsys):
+    progress = {"tasks": {"objects": {"samples": 700, "edge_rounds": 1, "accuracy": 0.5}}}
+    (tmp_path / "progress.yaml").write_text(yaml.safe_dump(progress))
+    assert called("allocate", RECIPES[0], "--progress", tmp_path / "progress.yaml", "--json") == 0
+    (task,) = json.loads(capsys.readouterr().out)["tasks"]
+    assert task["samples"] == 700
+    assert task["edge_rounds"] >= 1
+
+
+def test_the_area_says_that_it_has_no_certificate(tmp_path, capsys):
+    values = yaml.safe_load(RECIPES[-1].read_text()) | {"objective": "area"}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))
+    assert called("allocate", tmp_path / "problem.yaml", "--json") == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert (plan["lower_bound"], plan["gap"]) == (None, None)
+    assert "no certificate" in plan["note"]

@@ -2,27 +2,92 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from flcav.config import InputError
-from flcav.optimization.history import resources_in_order
-from flcav.optimization.learning_curve import fit_additive, fit_power
+from flcav.optimization.bands import bands, upper_curve
+from flcav.optimization.history import article_histories, histories, resources_in_order
+from flcav.optimization.learning_curve import fit_additive, fit_effective, fit_power
 
-PUBLISHED = {
-    "weather": (11.84, 1.23, {20: 0.703, 50: 0.903, 200: 0.983, 500: 0.998, 1000: 1.0, 2500: 1.0}),
-    "signs": (8.15, 0.62, {50: 0.285, 200: 0.66, 500: 0.859, 1000: 0.89, 2500: 0.943}),
-    "objects": (0.51, 0.10, {50: 0.659, 200: 0.710, 500: 0.716, 1000: 0.721, 2500: 0.793}),
-}
+PRINTED = {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}  # a and b of the article
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_published_points_give_the_published_constants(name):
-    a, b, points = PUBLISHED[name]
-    resource, accuracy = list(points), list(points.values())
-    zero = np.zeros(len(points))
-    for decay in (fit_power(resource, accuracy), fit_additive(resource, zero, zero, accuracy).curve.pretrain):
-        assert decay.a == pytest.approx(a, rel=0.03)
-        assert decay.b == pytest.approx(b, rel=0.03)
+@pytest.mark.parametrize("name", PRINTED)
+def test_the_articles_points_give_its_constants(name):
+    points = article_histories()[name]
+    samples, edge_rounds, cloud_rounds = points.resources.T
+    whole = fit_additive(samples, edge_rounds, cloud_rounds, points.accuracy).curve
+    for decay in (fit_power(samples, points.accuracy), whole.pretrain):
+        assert (decay.a, decay.b) == pytest.approx(PRINTED[name], rel=0.03)
         assert decay.x0 == 0
+    assert whole.floor == 0
+
+
+def test_effective_samples_are_recovered_up_to_what_can_be_told():
+    samples, edge, cloud, _, noise = history()
+    n = 0.1 * samples + 0.3 * 800 * (1 - 1 / (edge + 2 * cloud + 1))
+    fit = fit_effective(samples, edge, cloud, 1 - 1.5 * n**-0.4 + 1e-5 * noise, group_samples=800, k=2)
+    assert (fit.curve.alpha, fit.curve.beta) == pytest.approx((0.1, 0.3), rel=0.02)
+    assert (fit.curve.a, fit.curve.b) == pytest.approx((1.5, 0.4), rel=0.02)
+
+
+def test_beta_is_the_articles_where_rounds_never_vary():
+    points = article_histories()["signs"]
+    samples, edge_rounds, cloud_rounds = points.resources.T
+    fit = fit_effective(samples, edge_rounds, cloud_rounds, points.accuracy, group_samples=7000)
+    assert fit.curve.beta == 0.5
+    assert fit.curve.b == pytest.approx(0.62, rel=0.03)
+
+
+@pytest.mark.slow
+def test_bands_hold_the_truth_about_as_often_as_they_say():
+    rng = np.random.default_rng(1)
+    x = np.geomspace(20, 3000, 9)
+    asked = np.array([[50.0, 0, 0], [1000.0, 0, 0]])
+    inside = []
+    for _ in range(25):
+        fit = fit_additive(x, 0 * x, 0 * x, 1 - 0.9 * x**-0.3 + rng.normal(0, 0.01, len(x)))
+        found = bands(fit, level=0.8, repeats=40)
+        assert found is not None
+        low, high = found.between(asked)
+        truth = 0.9 * asked[:, 0] ** -0.3
+        inside += [(low <= truth) & (truth <= high)]
+    assert 0.55 <= np.mean(inside) <= 0.95
+
+
+def test_bands_are_seeded_and_the_upper_curve_is_above_them():
+    points = article_histories()["objects"]
+    samples, edge_rounds, cloud_rounds = points.resources.T
+    fit = fit_additive(samples, edge_rounds, cloud_rounds, points.accuracy)
+    found, again, other = (bands(fit, repeats=60, seed=seed) for seed in (3, 3, 4))
+    assert found == again != other
+    assert found is not None
+    _, high = found.between(points.resources)
+    assert np.all(upper_curve(fit, found).error(samples, 0, 0) >= high - 1e-12)
+    assert np.all(high > fit.curve.error(samples, 0, 0))
+
+
+def test_two_points_have_no_band_and_say_so():
+    fit = fit_additive([10, 100], [0, 0], [0, 0], [0.5, 0.7])
+    assert bands(fit) is None
+    assert "nothing is left to check" in fit.warnings[0]
+
+
+def test_what_lies_beyond_the_history_is_said():
+    fit = fit_additive([10, 100, 1000], [0, 0, 0], [0, 0, 0], [0.5, 0.7, 0.8])
+    assert fit.beyond(900, 0, 0) is None
+    assert "2000 samples (measured up to 1000)" in str(fit.beyond(2000, 0, 0))
+    assert "3 edge rounds (measured up to 0)" in str(fit.beyond(10, 3, 0))
+    assert fit.measured == {"samples": 1000}
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.floats(0, 1), min_size=4, max_size=9), st.integers(0, 100))
+def test_whatever_the_points_the_curve_falls(accuracy, seed):
+    x = np.sort(np.random.default_rng(seed).uniform(1, 3000, len(accuracy)))
+    curve = fit_additive(x, 0 * x, 0 * x, accuracy).curve
+    assert np.all(np.diff(curve.error(np.geomspace(1, 1e5, 60), 0, 0)) <= 0)
 
 
 def history():
@@ -69,3 +134,16 @@ def test_later_stages_stand_on_all_of_the_earlier_ones():
 def test_one_point_is_no_curve():
     with pytest.raises(InputError, match="at least 2"):
         fit_additive([10], [0], [0], [0.5])
+
+
+def test_both_forms_of_a_history_say_the_same():
+    long = {
+        "task": ["a"] * 3,
+        "stage": ["pretrain", "edge", "cloud"],
+        "resource": [80, 6, 2],
+        "accuracy": [0.5, 0.6, 0.7],
+    }
+    joint = {"samples": [80, 80, 80], "edge_rounds": [0, 6, 6], "cloud_rounds": [0, 0, 2], "accuracy": [0.5, 0.6, 0.7]}
+    one, other = histories(long, "long", "")["a"], histories(joint, "joint", "runs")["runs"]
+    np.testing.assert_array_equal(one.resources, other.resources)
+    np.testing.assert_array_equal(one.accuracy, other.accuracy)

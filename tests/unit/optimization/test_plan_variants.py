@@ -90,9 +90,10 @@ def test_max_throughput_gets_most_messages_through():
 
 
 def test_weights_from_importance_are_what_is_lost_without_a_task():
-    values = written(1, 3, "additive", LIMITS) | {"performance": 0.8}
-    for task, without in zip(values["tasks"], (0.5, 0.7, 0.9)):
-        task["performance_without"] = without
+    values: dict = written(1, 3, "additive", LIMITS)
+    values["performance"] = 0.8
+    for number, without in enumerate((0.5, 0.7, 0.9)):
+        values["tasks"][number]["performance_without"] = without
     weights = [task.weight for task in resolved(parsed(values)).tasks]
     assert weights == pytest.approx([0.75, 0.25, 0.0])
     plan = allocate(parsed(values))
