@@ -85,7 +85,7 @@ def test_who_stops_or_gives_way_has_a_line_before_the_junction(mapped: tuple[Tow
         for lane in driving:
             way = LineString(lane.shape)
             crossed = [way.intersection(line) for line in lines[kind or "stop_line"] if way.intersects(line)]
-            before = [float(way.length - shapely.line_locate_point(way, at)) for at in crossed]
+            before = [float(way.length - way.project(at.centroid)) for at in crossed]
             last = [distance for distance in before if distance < 3.0]
             assert len(last) == (kind is not None), (edge.id, kind)
 
@@ -130,10 +130,10 @@ def test_a_raster_says_what_shapely_says(mapped: tuple[Town, RoadNet, MapLayers]
     town, net, layers = mapped
     centre = next(junction.centre for junction in net.junctions.values() if len(junction.shape) > 8)
     world_from_patch = pose(float(centre[0]), float(centre[1]), 0.0, 0.4)
-    raster = rasterise(layers, world_from_patch, (40.0, 24.0), 0.2)
-    assert raster.shape == (len(RASTER_LAYERS), 200, 120)
-    rows, columns = np.mgrid[0:200, 0:120]
-    x, y = 20.0 - (rows + 0.5) * 0.2, 12.0 - (columns + 0.5) * 0.2
+    raster = rasterise(layers, world_from_patch, (40.0, 24.0), 0.4)
+    assert raster.shape == (len(RASTER_LAYERS), 100, 60)
+    rows, columns = np.mgrid[0:100, 0:60]
+    x, y = 20.0 - (rows + 0.5) * 0.4, 12.0 - (columns + 0.5) * 0.4
     points = np.stack((x, y, 0 * x, 1 + 0 * x)).reshape(4, -1)
     world = (world_from_patch @ points)[:2]
     shapes = painted(layers)
@@ -146,8 +146,8 @@ def test_a_raster_says_what_shapely_says(mapped: tuple[Town, RoadNet, MapLayers]
     }
     for name, outlines in expected.items():
         polygons = shapely.union_all([Polygon(outline) for outline in outlines])
-        inside = shapely.contains_xy(polygons, *world).reshape(200, 120)
-        edge = shapely.dwithin(polygons.boundary, shapely.points(*world), 1e-6).reshape(200, 120)
+        inside = shapely.contains_xy(polygons, *world).reshape(100, 60)
+        edge = shapely.dwithin(polygons.boundary, shapely.points(*world), 1e-6).reshape(100, 60)
         np.testing.assert_array_equal(raster[RASTER_LAYERS.index(name)][~edge], inside[~edge], err_msg=name)
     lines = raster[RASTER_LAYERS.index("marking")]
     assert lines.any()

@@ -49,7 +49,7 @@ def in_frame(trace: Trace, instant: int, actor: int, point: np.ndarray) -> tuple
     return dx * np.cos(yaw) + dy * np.sin(yaw), -dx * np.sin(yaw) + dy * np.cos(yaw)
 
 
-@pytest.mark.parametrize(("town", "seed"), [("ring", 1), ("grid", 0)])
+@pytest.mark.parametrize(("town", "seed"), [("ring", 1), pytest.param("grid", 0, marks=pytest.mark.slow)])
 def test_somebody_pushes_in_close_ahead(town: str, seed: int) -> None:
     trace, event, begins = run(load_town(town), "cut_in", seed)
     ego, other = (index(trace, name) for name in event.actors)
@@ -66,7 +66,7 @@ def test_somebody_pushes_in_close_ahead(town: str, seed: int) -> None:
     assert speed(trace, ego)[begins : begins + 40].min() < speed(trace, ego)[begins] - 1.0  # it had to brake
 
 
-@pytest.mark.parametrize(("town", "seed"), [("suburb", 2), ("ring", 2)])
+@pytest.mark.parametrize(("town", "seed"), [("suburb", 2), pytest.param("ring", 6, marks=pytest.mark.slow)])
 def test_an_oncoming_car_overtakes_in_the_lane_of_those_it_meets(town: str, seed: int) -> None:
     loaded = load_town(town)
     trace, event, begins = run(loaded, "overtaking", seed)
@@ -95,7 +95,7 @@ def test_an_oncoming_car_overtakes_in_the_lane_of_those_it_meets(town: str, seed
     assert wrong_way * STEP_S > 1.0
 
 
-@pytest.mark.parametrize(("town", "seed"), [("suburb", 0), ("grid", 1)])
+@pytest.mark.parametrize(("town", "seed"), [("suburb", 0), pytest.param("grid", 1, marks=pytest.mark.slow)])
 def test_a_pedestrian_hidden_by_the_van_runs_before_the_vehicle(town: str, seed: int) -> None:
     loaded = load_town(town)
     trace, event, begins = run(loaded, "pedestrian_behind_van", seed, actors={"pedestrian": "pedestrian.child"})
@@ -121,7 +121,7 @@ def test_a_pedestrian_hidden_by_the_van_runs_before_the_vehicle(town: str, seed:
         assert not box(trace, i, ego).intersects(box(trace, i, child))
 
 
-@pytest.mark.parametrize(("town", "seed"), [("grid", 1), ("ring", 2)])
+@pytest.mark.parametrize(("town", "seed"), [("grid", 1), pytest.param("ring", 2, marks=pytest.mark.slow)])
 def test_somebody_crosses_the_stop_line_on_red(town: str, seed: int) -> None:
     loaded = load_town(town)
     trace, event, begins = run(loaded, "red_light_runner", seed)
@@ -163,7 +163,7 @@ def test_a_vehicle_breaks_down_and_drives_on_when_it_may() -> None:
     assert victim[begins + 80 :].max() > 2.0
 
 
-@pytest.mark.parametrize(("town", "seed"), [("suburb", 1), ("ring", 0)])
+@pytest.mark.parametrize(("town", "seed"), [("suburb", 1), pytest.param("ring", 0, marks=pytest.mark.slow)])
 def test_two_vehicles_crash_and_stay(town: str, seed: int) -> None:
     trace, event, begins = run(load_town(town), "crash", seed)
     behind, ahead = (index(trace, name) for name in event.actors)
@@ -182,6 +182,7 @@ def test_two_vehicles_crash_and_stay(town: str, seed: int) -> None:
         assert speed(trace, ahead)[i] < 0.05
 
 
+@pytest.mark.slow
 def test_near_a_position_only() -> None:
     town = load_town("suburb")
     trace, event, begins = run(town, "pedestrian_behind_van", 2, position=(0.0, 5.0), until_s=110.0)

@@ -80,7 +80,7 @@ def rewrite(prefix: Path, document: Document, origin: Path) -> Rewritten:
 
 
 def _write_widths(rows: list[ElementTree.Element], net: Path) -> None:
-    """Give every lane its width from the net: among the parts, netconvert leaves out what all lanes of an edge share."""
+    """Give every lane its width from the net: among the parts netconvert leaves out what the lanes of an edge share."""
     width = {lane.id: lane.width for edge in read_net(net).edges.values() for lane in edge.lanes}
     for row in rows:
         lanes = _plain_lanes(row)

@@ -19,6 +19,7 @@ class Director:
         """Stand at the start of a run; `sumo` is the libsumo module."""
         self.stage = Stage(sumo, read_net(net))
         self.events: list[dict[str, Any]] = []  # as `Event`, of those that happened, in order of time
+        self._busy: set[str] = set()  # who plays in one scenario plays in no other
         self._scenarios = scenarios
         self._scripts: list[Generator[None, None, None] | None] = [self._play(scenario) for scenario in scenarios]
 
@@ -34,14 +35,15 @@ class Director:
 
     def _play(self, scenario: Scenario) -> Generator[None, None, None]:
         cast, act = SCRIPTS[scenario.kind]
-        while (roles := cast(self.stage, scenario)) is None:
+        while (roles := cast(self.stage, scenario)) is None or self._busy & set(named(roles)):
             for _ in range(LOOKS_AGAIN):
                 yield
         there, known = set(self.stage.sumo.vehicle.getIDList()), set(self.stage.props)
         playing = act(self.stage, scenario, roles)
         next(playing)
-        found = [roles] if isinstance(roles, str) else [role for role in roles if isinstance(role, str)]
-        actors = [name for name in found if name in there] + [name for name in self.stage.props if name not in known]
+        actors = [name for name in named(roles) if name in there]
+        actors += [name for name in self.stage.props if name not in known]
+        self._busy |= {name for name in actors if not name.startswith("cav")}
         begins_s = round(self.stage.step * STEP_S, 1)
         self.events.append({"kind": scenario.kind, "begins_s": begins_s, "actors": actors})
         yield
@@ -50,3 +52,8 @@ class Director:
     def props(self, step: int) -> list[tuple[str, str, State]]:
         """Return name, vehicle type and state of every prop at a step."""
         return [(name, kind, states[step]) for name, (kind, states) in self.stage.props.items() if step in states]
+
+
+def named(roles: Any) -> list[str]:
+    """Return the names among the roles of a scenario."""
+    return [roles] if isinstance(roles, str) else [role for role in roles if isinstance(role, str)]

@@ -49,7 +49,7 @@ def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
             follows_on_lane = spot.along > stage.sumo.vehicle.getLength(name) + BEHIND_M + 1.0
             if (spot.edge.start, spot.edge.end) not in oncoming or not follows_on_lane or stage.leader(name, FREE_M):
                 continue
-            if _meets(stage.state(name), stage.state(ego)) and _alone(stage, name):
+            if _meets(stage.state(name), stage.state(ego)) and _way_is_free(stage, name) and _alone(stage, name):
                 return Overtaking(name, spot)
     return None
 
@@ -62,6 +62,19 @@ def _meets(one: State, other: State) -> bool:
     )
     facing = dx * x + dy * y > 0.0 > dx * other_x + dy * other_y
     return facing and MEETS_M[0] <= math.hypot(dx, dy) <= MEETS_M[1] and one[3] > SLOW / 2
+
+
+def _way_is_free(stage: Stage, name: str) -> bool:
+    """Say whether nobody comes towards a vehicle on the other lane, nearer than the vehicle under test may be."""
+    x, y, angle, _ = stage.state(name)
+    heading = math.radians(90.0 - angle)
+    for other in stage.sumo.vehicle.getIDList():
+        dx, dy = stage.state(other)[0] - x, stage.state(other)[1] - y
+        ahead = dx * math.cos(heading) + dy * math.sin(heading)
+        left = -dx * math.sin(heading) + dy * math.cos(heading)
+        if -10.0 < ahead < MEETS_M[0] and 1.0 < left < 12.0:
+            return False
+    return True
 
 
 def _alone(stage: Stage, name: str) -> bool:
