@@ -65,4 +65,4 @@ def _draw(error: CalibrationError, seed: int, agent: str, name: str) -> tuple[Ar
 
 
 def _lenses(rig: Rig) -> Mapping[str, Lens]:
-    return {name: camera.settings for name, camera in rig.cameras.items()}
+    return {name: camera.settings for name, camera in (*rig.cameras.items(), *rig.infrareds.items())}

@@ -14,7 +14,9 @@ from flcav.sensors.camera import photograph
 from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
 from flcav.sensors.gnss import fix
 from flcav.sensors.imu import reading
+from flcav.sensors.infrared import thermal_image
 from flcav.sensors.labels.annotate import Sight, Sweep, annotate
+from flcav.sensors.lens import Lens, directions
 from flcav.sensors.lidar import Lidar, cast, draw_passes, measure
 from flcav.sensors.radar import radar_sweep
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
@@ -50,13 +52,17 @@ def observe(
     def bias_rng(sensor: str) -> np.random.Generator:
         return stream(seed, scene_name, agent, sensor)
 
-    lidar, sweeps, exposures, sights, radar, echoes, gnss, imu = {}, {}, {}, {}, {}, {}, {}, {}
+    lidar, sweeps, exposures, sights, infrared, radar, echoes, gnss, imu = ({} for _ in range(9))
     for name, mounted in rig.lidars.items():
         lidar[name], sweeps[name] = _sweep(carrier, name, mounted.settings, weather, rng(name))
     for name, mounted in rig.cameras.items():
         at = carrier.go_to(name)
         exposures[name] = photograph(scene, at, mounted.settings, weather, rng(name), hidden=carrier.own)
         sights[name] = Sight(mounted.settings, at, scene.offset_s, exposures[name].instance)
+    for name, mounted in rig.infrareds.items():
+        at = carrier.go_to(name)
+        infrared[name] = thermal_image(scene, at, mounted.settings, weather, rng(name), hidden=carrier.own)
+        sights[name] = Sight(mounted.settings, at, scene.offset_s, _actors_seen(carrier, at, mounted.settings))
     for name, mounted in rig.radars.items():
         at = carrier.go_to(name)
         radar[name], actor = radar_sweep(
@@ -88,6 +94,7 @@ def observe(
             name: CameraImage(seen.rgb, seen.depth_m, seen.semantic, row[np.maximum(seen.instance, 0)])
             for name, seen in exposures.items()
         },
+        infrared=infrared,
         radar=radar,
         gnss=gnss,
         imu=imu,
@@ -172,6 +179,12 @@ def _sweep(
     return points, Sweep(lidar, world_from_sensor, passes, echoes.distance, returns, visible)
 
 
+def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> NDArray[np.int32]:
+    """Return (H, W) what the ray through each pixel's centre meets: a + 1 at the trace's actor a, else 0."""
+    hits = carrier.scene.cast(world_from_camera, directions(lens), hidden=carrier.own)
+    return np.maximum(hits.instance, 0).reshape(lens.height, lens.width)
+
+
 def _within_range(carrier: _Carrier, rig: Rig) -> NDArray[np.bool_]:
     """Return (A,) which actors are present with their box centre within a LiDAR's range, or a lone camera's."""
     scene, world_from_agent = carrier.scene, carrier.pose()
@@ -179,7 +192,7 @@ def _within_range(carrier: _Carrier, rig: Rig) -> NDArray[np.bool_]:
     center = trace.position[scene.index] + trace.size * (0, 0, 0.5)
     ranges = {name: mounted.settings.range_m for name, mounted in rig.lidars.items()}
     within = np.zeros(len(trace.actor), bool)
-    for name, range_m in (ranges or dict.fromkeys(rig.cameras, CAMERA_RANGE_M)).items():
+    for name, range_m in (ranges or dict.fromkeys((*rig.cameras, *rig.infrareds), CAMERA_RANGE_M)).items():
         sensor = (world_from_agent @ carrier.calibration.agent_from_sensor[name])[:3, 3]
         within |= trace.present[scene.index] & (np.linalg.norm(center - sensor, axis=1) <= range_m)
     return within

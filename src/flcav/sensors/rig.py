@@ -13,6 +13,7 @@ from flcav.geometry import pose
 from flcav.sensors.camera import Camera
 from flcav.sensors.gnss import Gnss
 from flcav.sensors.imu import Imu
+from flcav.sensors.infrared import Infrared
 from flcav.sensors.lidar import Lidar
 from flcav.sensors.radar import Radar
 
@@ -60,6 +61,12 @@ class MountedCamera(Mounted):
     settings: Camera = Camera()
 
 
+class MountedInfrared(Mounted):
+    """A thermal camera and where it is."""
+
+    settings: Infrared = Infrared()
+
+
 class MountedRadar(Mounted):
     """A radar and where it is."""
 
@@ -83,6 +90,7 @@ class Rig(Config):
 
     lidars: dict[str, MountedLidar] = Field(default_factory=dict)
     cameras: dict[str, MountedCamera] = Field(default_factory=dict)
+    infrareds: dict[str, MountedInfrared] = Field(default_factory=dict)
     radars: dict[str, MountedRadar] = Field(default_factory=dict)
     gnss: dict[str, MountedGnss] = Field(default_factory=dict)
     imus: dict[str, MountedImu] = Field(default_factory=dict)
@@ -90,7 +98,7 @@ class Rig(Config):
     @model_validator(mode="after")
     def _check_names(self) -> "Rig":
         kinds = [getattr(self, kind) for kind in type(self).model_fields]
-        if not (self.lidars or self.cameras):
+        if not (self.lidars or self.cameras or self.infrareds):
             raise ValueError("a rig needs at least one LiDAR or camera")
         times = Counter(name for kind in kinds for name in kind)
         for name, count in times.items():

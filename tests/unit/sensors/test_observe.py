@@ -177,6 +177,7 @@ def test_passes_are_drawn_as_often_as_asked():
 EVERYTHING = {
     "lidars": {"lidar": {"mount": {"z": 1.8}, "settings": {"channels": 8, "azimuth_steps": 180}}},
     "cameras": {"front": {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 96, "height": 64}, "trigger_ms": 40.0}},
+    "infrareds": {"warm": {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 64, "height": 48}}},
     "radars": {"radar": {"mount": {"x": 2.0, "z": 0.5}}},
     "gnss": {"gnss": {"mount": {"z": 1.6}}},
     "imus": {"imu": {"mount": {"z": 0.5}, "trigger_ms": -20.0}},
@@ -201,7 +202,7 @@ def test_every_sensor_looks_at_its_own_time(driving: Scene):
     np.testing.assert_allclose(
         frame.world_from_sensor("front"), frame.agent_at_trigger["front"] @ frame.agent_from_sensor["front"]
     )
-    assert frame.calibration.offset_ms == {"lidar": 0.0, "front": 40.0, "radar": 0.0, "gnss": 0.0, "imu": -20.0}
+    assert frame.calibration.offset_ms == dict.fromkeys(frame.agent_from_sensor, 0.0) | {"front": 40.0, "imu": -20.0}
     assert driving.offset_s == 0.0
 
 
@@ -214,6 +215,8 @@ def test_what_the_camera_shows_is_what_is_annotated(driving: Scene):
     assert set(truth.points) == {"lidar", "radar"}
     np.testing.assert_array_equal(truth.points["lidar"], truth.returns)
     assert truth.points["radar"].sum() <= len(frame.radar["radar"])
+    assert frame.infrared["warm"].shape == (48, 64)
+    assert truth.views["warm"].pixels[list(truth.track).index("veh1")] > 20
     assert frame.gnss["gnss"].shape == (3,)
     assert frame.imu["imu"].shape == (6,)
     assert not list(check_images(frame))
