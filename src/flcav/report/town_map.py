@@ -35,10 +35,10 @@ SHADOW = 5.0
 def town_map(town: Town) -> bytes:
     """Return the map of a town as a PNG file; equal towns give equal bytes."""
     x_low, y_low, x_high, y_high = town.bounds
-    figure = style.canvas(WIDE_IN, WIDE_IN * (y_high - y_low) / (x_high - x_low) + 0.5)
+    figure = style.canvas(WIDE_IN, WIDE_IN * (y_high - y_low) / (x_high - x_low) + 0.8)
     axes = figure.add_subplot()
     draw_map(axes, town)
-    axes.set_title(f"{town.name}: {town.parameters.description}", fontsize=style.TEXT + 2, color=style.INK)
+    figure.suptitle(f"{town.name}: {town.parameters.description}", fontsize=style.TEXT + 1, color=style.INK)
     style.key(figure, _legend(town), fontsize=style.TEXT)
     return style.png(figure, dpi=160)
 

@@ -50,7 +50,7 @@ def surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Surfaces:
     inside = [Polygon(junction.shape).buffer(0) for junction in net.junctions.values() if len(junction.shape) > 2]
     driven_area, walked_area = shapely.union_all(driven), shapely.union_all(walked)
     roads = driven_area.union(shapely.union_all(inside).difference(walked_area))
-    roads = _clean(roads)
+    roads = MultiPolygon([part for part in _clean(roads).geoms if part.intersects(driven_area)])
     sidewalks = shapely.union_all(paved).difference(roads)
     islands = MultiPolygon(
         [
