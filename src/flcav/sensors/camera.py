@@ -4,24 +4,21 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from flcav.sensors.lens import Lens, directions
-from flcav.sensors.shading.appearance import SEMANTICS, Appearance, appearance_of
-from flcav.sensors.shading.light import light_of
-from flcav.sensors.shading.shadows import shadows
-from flcav.sensors.shading.state import lamps_of, state_of
-from flcav.sensors.shading.surface import shade
-from flcav.sensors.shading.survey import Survey, survey
-from flcav.sensors.shading.tone import develop
+from flcav.sensors.shading.appearance import SEMANTICS
+from flcav.sensors.shading.render import Picture, render
+from flcav.sensors.shading.tone import GRAINS, develop, grain
 from flcav.world.rays.compiled import compiled
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
-FAR_M = 1000.0
-
 
 class Camera(Lens):
     """What a camera is built like; its pose is the rig's."""
+
+    noise: float = Field(default=0.8, ge=0, le=20)  # standard deviation of a byte
 
 
 class Exposure(NamedTuple):
@@ -47,40 +44,21 @@ def photograph(
     `world_from_camera` (4, 4) places the optical frame (x right, y down, z forward): for a sensor mounted by body axes
     it is `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments, and the same state of `rng`, give the same bytes.
     """
-    rays = directions(camera)
-    appearance, light = appearance_of(scene), light_of(weather)
-    state = state_of(scene, light.lamps, low_sight=light.extinction > 0.002)
-    lamps = lamps_of(scene, state)
-    hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden)
-    seen = survey(scene, appearance, world_from_camera, rays, hits)
-    key, lit = shadows(scene, seen, light, lamps, hidden)
-    open_sky = np.ones(len(rays), np.float32)
-    radiance, painted = np.empty((len(rays), 3), np.float32), np.empty(len(rays), np.bool_)
-    pixel_angle = np.float32(1 / camera.intrinsics()[0, 0])
-    shade(seen, light, appearance, state, lamps, key, lit, open_sky, pixel_angle, radiance, painted)
-    rgb = np.empty((len(rays), 3), np.uint8)
-    develop(radiance, np.float32(light.exposure), rgb)
-    return _exposure(camera, rays, rgb, seen, appearance, painted)
-
-
-def _exposure(
-    camera: Camera,
-    rays: NDArray[np.float32],
-    rgb: NDArray[np.uint8],
-    seen: Survey,
-    appearance: Appearance,
-    painted: NDArray[np.bool_],
-) -> Exposure:
+    picture = render(scene, world_from_camera, camera, weather, rng, hidden=hidden)
     shape = (camera.height, camera.width)
-    semantic = np.empty(len(rays), np.uint8)
-    instance = np.empty(len(rays), np.int32)
-    _label(seen, appearance, painted, SEMANTICS["sky"], SEMANTICS["road_line"], semantic, instance)
-    return Exposure(
-        rgb.reshape(*shape, 3),
-        (seen.distance * rays[:, 2]).reshape(shape),
-        semantic.reshape(shape),
-        instance.reshape(shape),
-    )
+    rgb = np.empty((*shape, 3), np.uint8)
+    shift = int(rng.integers(GRAINS))
+    develop(picture.radiance, picture.exposure, grain(), shift, np.float32(camera.noise), rgb.reshape(-1, 3))
+    semantic, instance = _labels(picture)
+    depth = picture.seen.distance * directions(camera)[:, 2]
+    return Exposure(rgb, depth.reshape(shape), semantic.reshape(shape), instance.reshape(shape))
+
+
+def _labels(picture: Picture) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    semantic, instance = np.empty(len(picture.seen), np.uint8), np.empty(len(picture.seen), np.int32)
+    sky, line = SEMANTICS["sky"], SEMANTICS["road_line"]
+    _label(picture.seen, picture.appearance, picture.painted, sky, line, semantic, instance)
+    return semantic, instance
 
 
 @compiled

@@ -118,4 +118,4 @@ def _at(elevation_deg: float, table: tuple[tuple[float, float, float], ...]) -> 
 
 def _exposure(ambient: float) -> float:
     """Return how much longer a camera exposes in less light: not enough to make night day."""
-    return float(1.25 * (1.0 / max(ambient, 1e-4)) ** 0.55 if ambient < 1.0 else 1.25)
+    return float(1.25 * max(ambient, 2e-3) ** -0.5 if ambient < 1.0 else 1.25)

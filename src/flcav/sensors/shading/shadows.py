@@ -1,10 +1,10 @@
-"""Which light is kept away: one ray from every surface seen to the light that matters most there."""
+"""Which light arrives: one ray from every surface seen to the sun, or to the lamp that matters most there."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.shading.light import Light
-from flcav.sensors.shading.state import Lamps, strongest
+from flcav.sensors.shading.state import Lamps, light_up
 from flcav.sensors.shading.survey import Survey
 from flcav.world.rays.compiled import compiled
 from flcav.world.scene import Scene
@@ -13,16 +13,13 @@ SUN_REACH_M = 300.0
 DARK = 1e-3  # a sun dimmer than this casts no shadow
 
 
-def shadows(
-    scene: Scene, seen: Survey, light: Light, lamps: Lamps, hidden: int | None
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Return for each ray's end the lamp that casts its shadow (-1: the sun), and the share of that light there."""
-    if light.lamps < 1:
-        return np.full(len(seen), -1, np.int32), sun_shadows(scene, seen, light, hidden)
-    key, far = np.full(len(seen), -1, np.int32), np.empty(len(seen), np.float32)
-    towards = np.zeros((len(seen), 3), np.float32)
-    strongest(seen, lamps, key, towards, far)
-    return key, 1 - scene.blocked(seen.position, towards, far, hidden=hidden).astype(np.float32)
+def lamp_light_on(scene: Scene, seen: Survey, lamps: Lamps, hidden: int | None) -> NDArray[np.float32]:
+    """Return (N, 3) what lamps throw on each ray's end; the strongest one there casts shadows, the others none."""
+    light, most, towards = (np.zeros((len(seen), 3), np.float32) for _ in range(3))
+    far = np.empty(len(seen), np.float32)
+    light_up(seen, lamps, light, most, towards, far)
+    _add_where_free(light, most, scene.blocked(seen.position, towards, far, hidden=hidden))
+    return light
 
 
 def sun_shadows(scene: Scene, seen: Survey, light: Light, hidden: int | None) -> NDArray[np.float32]:
@@ -38,3 +35,11 @@ def _facing(seen, to_sun, shines, far):
         normal = seen.normal[ray]
         turned = normal[0] * to_sun[0] + normal[1] * to_sun[1] + normal[2] * to_sun[2]
         far[ray] = SUN_REACH_M if shines and seen.row[ray] >= 0 and turned > 0 else -1.0
+
+
+@compiled
+def _add_where_free(light, most, blocked):
+    for ray in range(len(blocked)):
+        if not blocked[ray]:
+            for band in range(3):
+                light[ray, band] += most[ray, band]

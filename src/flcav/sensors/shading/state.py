@@ -18,8 +18,8 @@ LENSES = {"r": RED, "R": RED, "y": AMBER, "Y": AMBER, "u": RED | AMBER, "g": GRE
 BRAKING_MS2 = -0.6  # harder than this, brake lamps are on
 
 STREET_LAMP = (4.6, 3.3, 1.75)  # intensity straight down
-HEADLAMP = (34.0, 32.5, 29.0)  # intensity on the axis of a low beam
-STREET_REACH_M, BEAM_REACH_M = 30.0, 60.0
+HEADLAMP = (17.0, 16.2, 14.5)  # intensity on the axis of a low beam
+STREET_REACH_M, BEAM_REACH_M = 24.0, 55.0
 CELL_M = 8.0
 
 
@@ -36,6 +36,7 @@ class Lamps(NamedTuple):
 
     position: NDArray[np.float32]  # (K, 3) world [m]
     ahead: NDArray[np.float32]  # (K, 3) unit direction of a beam; zero for a street lamp
+    colour: NDArray[np.float32]  # (K, 3) intensity straight down, or on the beam's axis
     corner: NDArray[np.float64]  # (2,) lowest x, y of the grid
     first: NDArray[np.int32]  # (cells along x, cells along y + 1)
     listed: NDArray[np.int32]
@@ -67,8 +68,10 @@ def lamps_of(scene: Scene, state: State) -> Lamps:
             places.append(transform_points(body, heads))
             beams.append(np.tile(body[:3, 0] - (0, 0, 0.012), (len(heads), 1)))
     position, ahead = np.concatenate(places), np.concatenate(beams)
-    reach = np.where(ahead.any(axis=1), BEAM_REACH_M, STREET_REACH_M)
-    return Lamps(position.astype(np.float32), ahead.astype(np.float32), *_grid(position, ahead, reach))
+    reach = np.where(np.abs(ahead).sum(axis=1) > 0, BEAM_REACH_M, STREET_REACH_M)
+    beam = np.abs(ahead).sum(axis=1, keepdims=True) > 0
+    colour = np.where(beam, HEADLAMP, STREET_LAMP).astype(np.float32)
+    return Lamps(position.astype(np.float32), ahead.astype(np.float32), colour, *_grid(position, ahead, reach))
 
 
 @lru_cache(maxsize=64)
@@ -90,10 +93,11 @@ def lamp_light(lamp, x, y, z, nx, ny, nz, lamps):
     """Return how much light, over its intensity, a lamp throws on a surface at x, y, z that faces nx, ny, nz."""
     px, py, pz = lamps.position[lamp, 0] - x, lamps.position[lamp, 1] - y, lamps.position[lamp, 2] - z
     square = px * px + py * py + pz * pz
-    distance = np.sqrt(square)
-    incidence = (px * nx + py * ny + pz * nz) / distance
-    if incidence <= 0:
+    faced = px * nx + py * ny + pz * nz
+    if faced <= 0 or square > np.float32(BEAM_REACH_M * BEAM_REACH_M):
         return np.float32(0)
+    distance = np.sqrt(square)
+    incidence = faced / distance
     ax, ay, az = lamps.ahead[lamp, 0], lamps.ahead[lamp, 1], lamps.ahead[lamp, 2]
     if ax == 0 and ay == 0:
         down = pz / distance
@@ -110,17 +114,20 @@ def lamp_light(lamp, x, y, z, nx, ny, nz, lamps):
     if above > 0:
         spread = max(np.float32(0.02), 1 - above * 60)
     else:
-        spread = np.float32(0.75) / (1 + level * level) + np.float32(0.10)
+        spread = np.float32(0.85) / (1 + level * level * level * level) + np.float32(0.04)
     beam = max(np.float32(0), 1 - aside * aside * np.float32(2.6))
     end = 1 - square / np.float32(BEAM_REACH_M * BEAM_REACH_M)
-    return incidence * spread * beam * beam * end / max(square, np.float32(1))
+    return incidence * spread * beam * beam * end / max(square, np.float32(9))
 
 
 @compiled
-def strongest(survey, lamps, key, direction, distance):
-    """Write for each ray's end the lamp that lights it most, -1 for none, and the way to that lamp."""
-    for ray in range(len(key)):
-        key[ray], distance[ray] = -1, -1
+def light_up(survey, lamps, light, most, towards, distance):
+    """Write what lamps throw on each ray's end: `light` (N, 3) of all but the strongest one, `most` (N, 3) of that.
+
+    `towards` (N, 3) and `distance` (N,) lead to the strongest; the distance is -1 where there is none.
+    """
+    for ray in range(len(distance)):
+        distance[ray] = -1
         if survey.row[ray] < 0:
             continue
         x, y, z = survey.position[ray, 0], survey.position[ray, 1], survey.position[ray, 2]
@@ -128,45 +135,28 @@ def strongest(survey, lamps, key, direction, distance):
         if i < 0 or j < 0 or i >= lamps.first.shape[0] or j >= lamps.first.shape[1] - 1:
             continue
         nx, ny, nz = survey.normal[ray, 0], survey.normal[ray, 1], survey.normal[ray, 2]
-        most = np.float32(1e-5)
+        best, which = np.float32(1e-5), -1
         for place in range(lamps.first[i, j], lamps.first[i, j + 1]):
             lamp = lamps.listed[place]
             own = lamp_light(lamp, x, y, z, nx, ny, nz, lamps)
-            if lamps.ahead[lamp, 0] != 0 or lamps.ahead[lamp, 1] != 0:
-                own *= np.float32(10)
-            if own > most:
-                most, key[ray] = own, lamp
-        if key[ray] >= 0:
-            lamp = key[ray]
-            px, py, pz = lamps.position[lamp, 0] - x, lamps.position[lamp, 1] - y, lamps.position[lamp, 2] - z
+            if own <= 0:
+                continue
+            red, green, blue = lamps.colour[lamp, 0] * own, lamps.colour[lamp, 1] * own, lamps.colour[lamp, 2] * own
+            if red > best:
+                light[ray, 0] += most[ray, 0]
+                light[ray, 1] += most[ray, 1]
+                light[ray, 2] += most[ray, 2]
+                most[ray, 0], most[ray, 1], most[ray, 2] = red, green, blue
+                best, which = red, lamp
+            else:
+                light[ray, 0] += red
+                light[ray, 1] += green
+                light[ray, 2] += blue
+        if which >= 0:
+            px, py, pz = lamps.position[which, 0] - x, lamps.position[which, 1] - y, lamps.position[which, 2] - z
             length = np.sqrt(px * px + py * py + pz * pz)
-            direction[ray, 0], direction[ray, 1], direction[ray, 2] = px / length, py / length, pz / length
+            towards[ray, 0], towards[ray, 1], towards[ray, 2] = px / length, py / length, pz / length
             distance[ray] = length - np.float32(0.6)
-
-
-@inlined
-def lamps_at(x, y, z, nx, ny, nz, key, lit, lamps):
-    """Return red, green, blue of the light that all lamps throw on a surface; `lit` is how much of `key`'s arrives."""
-    red, green, blue = np.float32(0), np.float32(0), np.float32(0)
-    i, j = int((x - lamps.corner[0]) / CELL_M), int((y - lamps.corner[1]) / CELL_M)
-    if i < 0 or j < 0 or i >= lamps.first.shape[0] or j >= lamps.first.shape[1] - 1:
-        return red, green, blue
-    for place in range(lamps.first[i, j], lamps.first[i, j + 1]):
-        lamp = lamps.listed[place]
-        own = lamp_light(lamp, x, y, z, nx, ny, nz, lamps)
-        if own <= 0:
-            continue
-        if lamp == key:
-            own *= lit
-        if lamps.ahead[lamp, 0] == 0 and lamps.ahead[lamp, 1] == 0:
-            red += own * np.float32(STREET_LAMP[0])
-            green += own * np.float32(STREET_LAMP[1])
-            blue += own * np.float32(STREET_LAMP[2])
-        else:
-            red += own * np.float32(HEADLAMP[0])
-            green += own * np.float32(HEADLAMP[1])
-            blue += own * np.float32(HEADLAMP[2])
-    return red, green, blue
 
 
 def _grid(

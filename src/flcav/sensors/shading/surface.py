@@ -8,7 +8,7 @@ from flcav.sensors.shading.markings import paint_at
 from flcav.sensors.shading.noise import fade, hashed, noise_at
 from flcav.sensors.shading.signs import sign_at
 from flcav.sensors.shading.sky import heaven_at, mirrored_at
-from flcav.sensors.shading.state import AMBER, GREEN, RED, lamps_at
+from flcav.sensors.shading.state import AMBER, GREEN, RED
 from flcav.world.materials import Material
 from flcav.world.rays.compiled import compiled
 from flcav.world.static import Part
@@ -25,12 +25,13 @@ ROAD_LINE = 0.5  # share of a pixel from which on paint is what it shows
 
 
 @compiled
-def shade(survey, light, appearance, state, lamps, key, lit, open_sky, pixel_angle, radiance, painted):
+def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angle, radiance, painted):
     """Write the `radiance` (N, 3) of what N rays met, and whether it is `painted` (N,) road.
 
-    `lit` (N,) is the share that arrives of the sun's light, or where `key` (N,) names a lamp, of that lamp's;
-    `open_sky` (N,) is how much of the sky is free; a pixel sees `pixel_angle` [rad].
+    `lit` (N,) is the share of the sun's light that arrives, `lamplight` (N, 3) what lamps throw there (or (0, 3): none
+    is on), `open_sky` (N,) how much of the sky is free; a pixel sees `pixel_angle` [rad].
     """
+    lamps_on = len(lamplight) > 0
     table = appearance.noise
     for ray in range(len(lit)):
         dx, dy, dz = survey.ray[ray, 0], survey.ray[ray, 1], survey.ray[ray, 2]
@@ -147,9 +148,7 @@ def shade(survey, light, appearance, state, lamps, key, lit, open_sky, pixel_ang
                 red, green, blue = red * dark, green * dark, blue * dark
 
         sun = nx * light.to_sun[0] + ny * light.to_sun[1] + nz * light.to_sun[2]
-        if key[ray] >= 0:
-            sun = np.float32(0)
-        elif through > 0:
+        if through > 0:
             sun = (np.float32(0.25) + np.float32(0.75) * max(sun, -sun * through)) * lit[ray]
         else:
             sun = max(sun, np.float32(0)) * lit[ray]
@@ -158,11 +157,10 @@ def shade(survey, light, appearance, state, lamps, key, lit, open_sky, pixel_ang
         arrive_r = sun * light.sun[0] + up * light.ambient[0] + down * light.bounce[0]
         arrive_g = sun * light.sun[1] + up * light.ambient[1] + down * light.bounce[1]
         arrive_b = sun * light.sun[2] + up * light.ambient[2] + down * light.bounce[2]
-        if light.lamps > 0:
-            lamp_r, lamp_g, lamp_b = lamps_at(x, y, z, nx, ny, nz, key[ray], lit[ray], lamps)
-            arrive_r += lamp_r * np.float32(light.lamps)
-            arrive_g += lamp_g * np.float32(light.lamps)
-            arrive_b += lamp_b * np.float32(light.lamps)
+        if lamps_on:
+            arrive_r += lamplight[ray, 0] * light.lamps
+            arrive_g += lamplight[ray, 1] * light.lamps
+            arrive_b += lamplight[ray, 2] * light.lamps
             if material in (SIGN, PLATE):  # sends head lamps' light back
                 arrive_r, arrive_g, arrive_b = arrive_r * 2, arrive_g * 2, arrive_b * 2
         red, green, blue = red * arrive_r, green * arrive_g, blue * arrive_b
@@ -174,7 +172,7 @@ def shade(survey, light, appearance, state, lamps, key, lit, open_sky, pixel_ang
             turned = 2 * facing
             rx, ry, rz = dx + turned * nx, dy + turned * ny, dz + turned * nz
             env_r, env_g, env_b = mirrored_at(rx, ry, rz, light)
-            if gloss > 0 and lit[ray] > 0 and key[ray] < 0:
+            if gloss > 0 and lit[ray] > 0:
                 beside = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
                 if beside > np.float32(0.6):
                     flash = np.exp(gloss * (beside - 1)) * lit[ray] * gloss * np.float32(0.02)

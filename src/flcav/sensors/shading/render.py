@@ -1,0 +1,125 @@
+"""One image, from its first rays to the light that falls on every pixel."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.sensors.lens import Lens, directions
+from flcav.sensors.shading import antialias, rain
+from flcav.sensors.shading.appearance import Appearance, appearance_of
+from flcav.sensors.shading.glare import add_glare
+from flcav.sensors.shading.light import Light, light_of
+from flcav.sensors.shading.openness import openness
+from flcav.sensors.shading.shadows import lamp_light_on, sun_shadows
+from flcav.sensors.shading.state import Lamps, State, lamps_of, state_of
+from flcav.sensors.shading.surface import shade
+from flcav.sensors.shading.survey import Survey, survey
+from flcav.world.scene import Scene
+from flcav.world.weather import Weather
+
+FAR_M = 1000.0
+LOW_SIGHT = 0.002  # [1/m] of extinction from which on vehicles have their lamps on by day
+MIRRORS = 0.2  # wetness from which on a road mirrors
+NO_LAMPS = np.zeros((0, 3), np.float32)
+
+
+class Picture(NamedTuple):
+    """An image before it is developed, and what its first rays met."""
+
+    radiance: NDArray[np.float32]  # (N, 3) of each pixel
+    exposure: np.float32
+    seen: Survey
+    painted: NDArray[np.bool_]  # (N,) whether a pixel shows paint on a road
+    appearance: Appearance
+
+
+class _World(NamedTuple):
+    scene: Scene
+    appearance: Appearance
+    light: Light
+    state: State
+    lamps: Lamps
+    pixel_angle: np.float32
+    hidden: int | None
+
+
+def render(
+    scene: Scene,
+    world_from_camera: NDArray[np.float64],
+    lens: Lens,
+    weather: Weather,
+    rng: np.random.Generator,
+    *,
+    hidden: int | None,
+) -> Picture:
+    """Return the light that falls on every pixel of `lens`, row after row: see `camera.photograph`."""
+    rays, light, appearance = directions(lens), light_of(weather), appearance_of(scene)
+    state = state_of(scene, float(light.lamps), low_sight=bool(light.extinction > LOW_SIGHT))
+    angle = np.float32(1 / lens.intrinsics()[0, 0])
+    world = _World(scene, appearance, light, state, lamps_of(scene, state), angle, hidden)
+    seen = _meet(world, world_from_camera, rays)
+    open_sky = openness(scene, seen, lens, hidden)
+    radiance, painted = _radiance(world, seen, open_sky)
+    if light.wetness > MIRRORS:
+        _mirror(world, world_from_camera, lens, rays, seen, radiance)
+    kind = antialias.rough_pixels(seen, appearance, lens)
+    antialias.mark_thin(kind, scene.town, world_from_camera, lens, seen)
+    further, pixel = antialias.further_rays(rays, kind, lens)
+    if len(pixel):
+        more, _ = _radiance(world, _meet(world, world_from_camera, further), open_sky[pixel])
+        antialias.average(radiance, more, pixel, np.float32(antialias.BRIGHTEST / light.exposure))
+    image = radiance.reshape(lens.height, lens.width, 3)
+    if weather.rain_mm_h > 0:
+        rain.add_streaks(image, weather.rain_mm_h, 0.75 * np.array(light.horizon) + 0.05 * np.array(light.sun), rng)
+    add_glare(image, scene, state, light, world_from_camera, lens, hidden)
+    return Picture(radiance, light.exposure, seen, painted, appearance)
+
+
+def _meet(
+    world: _World,
+    world_from_camera: NDArray[np.float64],
+    rays: NDArray[np.float32],
+    near_m: NDArray[np.float32] | None = None,
+) -> Survey:
+    hits = world.scene.cast(world_from_camera, rays, near_m=near_m, far_m=FAR_M, hidden=world.hidden)
+    return survey(world.scene, world.appearance, world_from_camera, rays, hits)
+
+
+def _radiance(
+    world: _World, seen: Survey, open_sky: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    lit = sun_shadows(world.scene, seen, world.light, world.hidden)
+    lamplight = lamp_light_on(world.scene, seen, world.lamps, world.hidden) if world.light.lamps > 0 else NO_LAMPS
+    radiance, painted = np.empty((len(seen), 3), np.float32), np.empty(len(seen), np.bool_)
+    shade(
+        seen, world.light, world.appearance, world.state, lit, lamplight, open_sky, world.pixel_angle, radiance, painted
+    )
+    return radiance, painted
+
+
+def _mirror(
+    world: _World,
+    world_from_camera: NDArray[np.float64],
+    lens: Lens,
+    rays: NDArray[np.float32],
+    seen: Survey,
+    radiance: NDArray[np.float32],
+) -> None:
+    """Add to wet roads what they mirror: what the same rays meet from below the road, with the world upside down."""
+    wet = rain.wet_pixels(seen, world.appearance, lens.width, lens.height)
+    if not len(wet):
+        return
+    below = np.diag((1.0, 1.0, -1.0, 1.0)) @ world_from_camera
+    met = _meet(world, below, np.ascontiguousarray(rays[wet]), near_m=seen.distance[wet] + np.float32(0.05))
+    found, _ = _radiance(world, met, np.ones(len(wet), np.float32))
+    width, height = lens.width // 2, lens.height // 2
+    image, weight = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
+    j, i = wet // lens.width // 2, wet % lens.width // 2
+    image[j, i], weight[j, i] = found, 1
+    smeared = np.zeros_like(image)
+    rain.smear(image, weight, width, height, smeared)
+    light = world.light
+    rain.add_mirrored(
+        radiance, seen, world.appearance, smeared, light.wetness, light.extinction, lens.width, lens.height
+    )
