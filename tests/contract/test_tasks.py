@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from safetensors import safe_open
 from task_drives import Drives
 
@@ -26,6 +27,7 @@ from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task, configuration, fresh
 from flcav.perception.training import Checkpointing, Validation, train
 from flcav.perception.training.run import Request, train_network
+from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import load_network, save_network, to_arrays
 from flcav.report import style
 from flcav.report.inference import DRAWINGS
@@ -196,3 +198,28 @@ def test_a_dataset_without_its_sensor_is_one_sentence(task, tmp_path, capsys):
         assert told.err.count("\n") == 1
         assert ("no LiDAR" if task.name == "objects" else "no camera pictures") in told.err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("task", [WEATHER, SIGNS], ids=lambda task: task.name)
+def test_a_bad_picture_is_one_sentence(task, tmp_path, capsys):
+    weights = tmp_path / "weights.safetensors"
+    save_network(task, fresh(task, small(task), 1), weights)
+    grey, small_one = np.zeros((40, 60), np.uint8), np.zeros((20, 60, 3), np.uint8)
+    for number, (pixels, said) in enumerate(((grey, "1 channels (L); 3 are wanted"), (small_one, "60 x 20 pixels"))):
+        path = tmp_path / f"{number}.png"
+        Image.fromarray(pixels).save(path)
+        assert called("infer", task.name, path, "--weights", weights, "--json") == 2
+        told = capsys.readouterr()
+        assert told.out == ""
+        assert told.err.count("\n") == 1
+        assert f"{path}: a picture of {said}" in told.err
+
+
+@each_task
+def test_infer_writes_a_picture_of_each_input(task, data, tmp_path, capsys):
+    weights, out = tmp_path / "weights.safetensors", tmp_path / "pictures"
+    save_network(task, fresh(task, small(task), 1), weights)
+    source = sorted(data.folder.glob("front/*.webp" if task.name != "objects" else "top/*.bin"))[0]
+    assert called("infer", task.name, source, "--weights", weights, "--pictures", out) == 0
+    assert capsys.readouterr().out.startswith(f"{source}:")
+    assert [path.name for path in out.iterdir()] == [f"00000_{source.stem}.png"]

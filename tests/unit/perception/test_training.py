@@ -12,7 +12,7 @@ from flcav.perception.objects.batch import batch_loss
 from flcav.perception.objects.evaluate import Truth, score_detections
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import configuration, fresh
-from flcav.perception.training import Checkpointing, batches, train, train_steps
+from flcav.perception.training import Checkpointing, Validation, batches, train, train_steps
 from flcav.perception.training.schedules import one_cycle
 from flcav.perception.weights import to_arrays
 
@@ -85,6 +85,27 @@ def test_no_samples_and_unknown_schedules_are_refused(samples):
         train(OBJECTS, tiny(), samples, steps=1, seed=0, schedule="spiral")
     with pytest.raises(InputError, match="0 samples"):
         TaskClient(OBJECTS, tiny().config, [])
+
+
+def test_validation_ends_a_training_and_leaves_its_best_weights(samples):
+    scores, kept = iter((0.1, 0.5, 0.5, 0.4, 0.9)), []
+
+    def score(network):
+        kept.append(to_arrays(network))
+        return next(scores)
+
+    network = tiny()
+    history = train(OBJECTS, network, samples, steps=9, seed=0, validation=Validation(score, every=1, patience=2))
+    assert history.scores.tolist() == [0.1, 0.5, 0.5, 0.4]
+    assert len(history.losses) == 4
+    assert all(np.array_equal(array, kept[1][name]) for name, array in to_arrays(network).items())
+
+
+@pytest.mark.parametrize(
+    ("scores", "over"), [([], False), ([0.3, 0.2], False), ([0.3, 0.2, 0.3], True), ([0.3, 0.2, 0.31], False)]
+)
+def test_patience_is_validations_without_a_new_best(scores, over):
+    assert Validation(len, every=1, patience=2).over(scores) is over
 
 
 def test_batches_are_shuffled_passes():
