@@ -6,9 +6,11 @@ import numpy as np
 
 from flcav.geometry import is_rigid, points_in_boxes, transform_points, wrap_angle
 from flcav.sensors.frame import Frame
+from flcav.sensors.rain import rain_range_noise
 from flcav.world.trace import CATEGORIES, Trace
 
 MARGIN_M = 0.15  # a return may lie so far outside its actor's box: range noise, mirrors
+SIGMAS = 4.0  # and further where rain blurs its range
 INSIDE = 0.95  # share of an actor's returns that must lie in its box, grown by the margin
 GAP_DEG = 30.0  # a whole spin has returns in every sector so wide
 FORCE = 200.0  # [m/s^2] no vehicle survives
@@ -80,9 +82,11 @@ def check_points(frame: Frame, spin_s: float = 0.0) -> Iterator[str]:
     ]
     seen = np.flatnonzero(returns > 0)
     everything = np.concatenate(clouds)
-    own_speed = np.linalg.norm(frame.annotations.velocity, axis=1)
+    speed = np.linalg.norm(frame.annotations.velocity, axis=1)
+    away = np.linalg.norm(boxes.center - frame.world_from_agent[:3, 3], axis=1)
+    rain = rain_range_noise(frame.weather.rain_mm_h) if frame.weather else 0.0
     for i in seen:
-        margin_m = MARGIN_M + spin_s * own_speed[i]
+        margin_m = MARGIN_M + spin_s * speed[i] + SIGMAS * rain * away[i]
         count = int(points_in_boxes(everything, boxes[[i]], margin_m).sum())
         if count < INSIDE * returns[i]:
             track, label = frame.annotations.track[i], boxes.label[i]

@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from flcav.config import parse_config
 from flcav.dataset.tables import (
     ACCELERATION_COLUMNS,
     AMODAL_COLUMNS,
@@ -44,8 +45,11 @@ def vectors_of(rows: pa.Table, columns: Sequence[str]) -> dict[str, NDArray[np.f
 
 
 def weather_of(rows: pa.Table) -> Weather | None:
-    """Return the weather of a frame, None where it is not known."""
-    return Weather(**{name: rows[name][0].as_py() for name in WEATHER_COLUMNS}) if len(rows) else None
+    """Return the weather of a frame, None where it is not known; raises `InputError` where it is none."""
+    if not len(rows):
+        return None
+    row = rows.slice(0, 1).to_pylist()[0]
+    return parse_config(Weather, {name: row[name] for name in WEATHER_COLUMNS}, f"the weather of {row['frame']}")
 
 
 def _points(rows: pa.Table, count: int) -> NDArray[np.int64]:

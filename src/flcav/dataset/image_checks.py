@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from flcav.config import parse_config
 from flcav.geometry import Boxes, points_in_boxes, transform_points
 from flcav.sensors.frame import Array, CameraImage, Frame, SignViews, Views
 from flcav.sensors.labels.regions import actor_regions
@@ -103,10 +104,12 @@ def check_signs(key: str, name: str, signs: SignViews, lens: Lens) -> Iterator[s
 
 
 def _lens(frame: Frame, name: str, image: CameraImage) -> Lens:
-    (fx, _, cx), (_, fy, cy), _ = frame.calibration.intrinsics[name]
-    k1, k2, p1, p2, k3 = frame.calibration.distortion[name]
+    """Return the lens of a camera; raises `InputError` where its calibration is that of none."""
+    fx, fy, cx, cy = frame.calibration.intrinsics[name][[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    coefficients = zip(("k1", "k2", "p1", "p2", "k3"), frame.calibration.distortion[name].tolist())
     height, width = image.rgb.shape[:2]
-    return Lens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
+    values = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **dict(coefficients)}
+    return parse_config(Lens, values, f"{frame.key}: the calibration of '{name}'")
 
 
 def _boxes_then(frame: Frame, offset_s: float) -> Boxes:

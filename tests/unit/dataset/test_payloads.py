@@ -1,0 +1,65 @@
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from flcav.config import InputError
+from flcav.dataset.payloads import encode_depth, encode_plane, encode_rows, read_image, read_plane, read_rows
+
+PLANES = {
+    "rgb": lambda rng: rng.integers(0, 256, (24, 32, 3), dtype=np.uint8),
+    "semantic": lambda rng: rng.integers(0, 30, (24, 32), dtype=np.uint8),
+    "instance": lambda rng: rng.integers(0, 65_536, (24, 32), dtype=np.uint16),
+}
+
+
+@pytest.mark.parametrize("plane", PLANES)
+def test_planes_come_back_as_they_were_and_other_programs_read_them(tmp_path: Path, plane: str):
+    pixels = PLANES[plane](np.random.default_rng(0))
+    data = encode_plane(plane, pixels)
+    (tmp_path / plane).write_bytes(data)
+    found = read_plane(tmp_path / plane, plane)
+    assert found.dtype == pixels.dtype
+    np.testing.assert_array_equal(found, pixels)
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), pixels)
+    assert encode_plane(plane, pixels) == data
+
+
+@given(st.lists(st.floats(0.0625, 9e5, width=32), min_size=1, max_size=64))
+@settings(max_examples=50, deadline=None)
+def test_depth_is_kept_to_a_32768th_of_itself(tmp_path_factory: pytest.TempPathFactory, values: list[float]):
+    path = tmp_path_factory.mktemp("depth") / "d"
+    depth = np.array([[*values, np.inf]], np.float32)
+    path.write_bytes(encode_depth(depth))
+    found = read_plane(path, "depth_m")
+    assert found.shape == depth.shape
+    assert found.dtype == np.float32
+    assert found[0, -1] == np.inf
+    np.testing.assert_allclose(found[0, :-1], depth[0, :-1], rtol=2.0**-15)
+
+
+def test_what_is_no_payload_is_named(tmp_path: Path):
+    path = tmp_path / "x"
+    for plane in ("rgb", "depth_m", "semantic", "instance"):
+        with pytest.raises(InputError, match="missing from the dataset"):
+            read_plane(path, plane)
+    path.write_bytes(b"not an image")
+    for plane in ("rgb", "depth_m", "semantic", "instance"):
+        with pytest.raises(InputError, match=r"x: not a readable (depth )?image"):
+            read_plane(path, plane)
+    whole = encode_plane("semantic", np.zeros((20, 20), np.uint8))
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="not a readable image"):
+        read_image(path, np.uint8)
+
+
+def test_rows_are_counted(tmp_path: Path):
+    path, rows = tmp_path / "r.radar.bin", np.arange(15, dtype=np.float32).reshape(3, 5)
+    path.write_bytes(encode_rows(rows))
+    np.testing.assert_array_equal(read_rows(path, "radar.bin", 3), rows)
+    with pytest.raises(InputError, match="60 bytes where 4 points take 80"):
+        read_rows(path, "radar.bin", 4)
