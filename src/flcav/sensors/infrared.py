@@ -5,9 +5,10 @@ its emissivity e, what it mirrors for the rest, and the air between, which trans
 Temperatures are mixed linearly instead of by radiance: within 30 K of each other that is right to about 1 K.
 
 T = T_air + warmth: a surface in the sun is up to `sun_k` warmer (times the cosine of incidence and what clouds let
-through), one that faces a clear night sky up to `sky_k` colder, rain takes most of both away. Vehicles that
-move are warm where engine, tyres, brakes and lamps are; people are as warm as skin and clothes are. Rain and fog hide heat less than light:
-the extinction of fog in the long-wave infrared is taken as 0.6 of that of light, the clear air's as 0.2 per km.
+through), one that faces a clear night sky up to `sky_k` colder, rain takes most of both away. Vehicles that move are
+warm where engine, tyres, brakes and lamps are; people are as warm as skin and clothes are. Rain and fog hide heat
+less than light: the extinction of fog in the long-wave infrared is taken as 0.6 of that of light, the clear air's as
+0.2 per km.
 """
 
 from typing import NamedTuple

@@ -18,6 +18,7 @@ ARM_HEAD_M = 5.6  # and above it
 ARM_LANES = 2  # approaches from so many driving lanes on have a head above them
 BEFORE_END_M = 0.6  # a mast stands so far before its lane's end
 FROM_KERB_M = 0.45
+SENSOR_CLEAR_M = 8.0
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,12 @@ class Signals:
         return cls(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)), ())
 
 
-def place_signals(net: RoadNet) -> Signals:
-    """Return the heads of all approaches of `net` that a light rules, in the net's order."""
-    heads = [head for edge in net.streets for head in _approach(edge, net.connections)]
+def place_signals(net: RoadNet, sensors: Array) -> Signals:
+    """Return the heads of all approaches of `net` that a light rules, in the net's order.
+
+    No arm reaches over the road where one of the `sensors` (P, 3) at the roadside stands close by: it hides the view.
+    """
+    heads = [head for edge in net.streets for head in _approach(edge, net.connections, sensors)]
     if not heads:
         return Signals.none()
     position, yaw, foot, link = zip(*heads)
@@ -47,7 +51,7 @@ def place_signals(net: RoadNet) -> Signals:
 Head = tuple[tuple[float, float, float], float, tuple[float, float], str]
 
 
-def _approach(edge: Edge, connections: tuple[Connection, ...]) -> Iterator[Head]:
+def _approach(edge: Edge, connections: tuple[Connection, ...], sensors: Array) -> Iterator[Head]:
     driven = edge.lanes_of("driving")
     names = {lane.id for lane in driven}
     ruled = [way for way in connections if way.light and way.start in names]
@@ -60,7 +64,8 @@ def _approach(edge: Edge, connections: tuple[Connection, ...]) -> Iterator[Head]
     x, y, heading = verge.at(verge.line.length - BEFORE_END_M, inwards)
     yaw = heading + np.pi
     yield (x, y, KERB_HEAD_M), yaw, (x, y), link
-    if len(driven) >= ARM_LANES:
+    clear = all(np.hypot(*(sensor[:2] - (x, y))) > SENSOR_CLEAR_M for sensor in sensors)
+    if len(driven) >= ARM_LANES and clear:
         middle = np.mean([np.asarray(lane.shape)[-1] for lane in driven], axis=0)
         left = np.array((-np.sin(heading), np.cos(heading)))
         reach = float(left @ (middle - (x, y)))

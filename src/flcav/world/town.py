@@ -125,5 +125,5 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
             kind=tuple(row[2] for row in signs),
         ),
         lamps=placement.place_lamps(rows, stream(parameters.seed, "lamps")),
-        signals=place_signals(net),
+        signals=place_signals(net, np.array([row[1] for row in poles], np.float64).reshape(-1, 3)),
     )

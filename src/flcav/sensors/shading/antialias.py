@@ -1,7 +1,8 @@
 """Where one ray per pixel is not enough, and the further rays that make up for it.
 
-Pixels at edges get four more rays, which with the first stand as five rooks; pixels that a thin thing far away may
-cross get eight more. So a pole covers as much of its pixels as it is wide, whether or not a pixel's centre meets it.
+Pixels at edges get two more rays, which with the first stand as three rooks; pixels that a thin thing far away may
+cross get eight more, as nine. So a pole covers as much of its pixels as it is wide, whether or not a pixel's centre
+meets it.
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ STEP = 0.02  # out of the neighbour's plane, over the distance
 THIN_PX = 4.0  # things narrower than this are thin
 FARTHEST_M = 220.0
 POST_M, SIGN_M, SIGNAL_M = 0.1, 0.42, 0.6  # half widths
-_ROOKS = np.array([(-2, -1), (-1, 2), (1, -2), (2, 1)], np.float32) / 5
+_THREE = np.array([(-1, 1), (1, -1)], np.float32) / 3
 _NINE = np.array([(-4, -1), (-3, 2), (-2, -3), (-1, 4), (1, -4), (2, 3), (3, -2), (4, 1)], np.float32) / 9
 BRIGHTEST = 3.0  # what outshines this after exposure counts no more: edges of lamps would stay jagged
 
@@ -77,10 +78,10 @@ def further_rays(
     rays: NDArray[np.float32], kind: NDArray[np.uint8], lens: Lens
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return the further unit rays (S, 3) of the pixels that need some, and the pixel (S,) each belongs to."""
-    count = np.array([0, len(_ROOKS), len(_NINE), len(_NINE)], np.int64)[kind]
+    count = np.array([0, len(_THREE), len(_NINE), len(_NINE)], np.int64)[kind]
     total = int(count.sum())
     directions, pixel = np.empty((total, 3), np.float32), np.empty(total, np.int32)
-    _spread(rays, kind, lens.width, lens.height, _ROOKS, _NINE, directions, pixel)
+    _spread(rays, kind, lens.width, lens.height, _THREE, _NINE, directions, pixel)
     return directions, pixel
 
 
@@ -143,12 +144,12 @@ def _draw_bars(start, end, half, near, distance, width, height, kind):
 
 
 @compiled
-def _spread(rays, kind, width, height, rooks, nine, directions, pixel):
+def _spread(rays, kind, width, height, three, nine, directions, pixel):
     sample = 0
     for own in range(len(kind)):
         if kind[own] == 0:
             continue
-        offsets = nine if kind[own] & THIN else rooks
+        offsets = nine if kind[own] & THIN else three
         right = own + 1 if own % width + 1 < width else own - 1
         below = own + width if own + width < len(kind) else own - width
         sign_x, sign_y = np.float32(right - own), np.float32(1 if below > own else -1)

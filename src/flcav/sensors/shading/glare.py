@@ -5,12 +5,12 @@ from numpy.typing import NDArray
 
 from flcav.geometry import inverse, transform_points
 from flcav.sensors.lens import Lens, project
+from flcav.sensors.shading.appearance import things_of
 from flcav.sensors.shading.light import Light
 from flcav.sensors.shading.state import AMBER, GREEN, RED, State, lamp_places
 from flcav.world.meshes.signals import LENS_PITCH_M
 from flcav.world.rays.compiled import compiled
 from flcav.world.scene import Scene
-from flcav.world.static import town_things
 
 HEAD, TAIL, STREET, SIGNAL = 9.0, 0.55, 1.6, 0.35  # how strong the halos are
 HEAD_COLOUR, TAIL_COLOUR, STREET_COLOUR = (1.0, 0.95, 0.86), (1.0, 0.05, 0.03), (1.0, 0.74, 0.40)
@@ -72,7 +72,7 @@ def _glowing(scene: Scene, state: State, light: Light, eye: NDArray[np.float64],
     if light.lamps > 0:
         street = STREET * float(light.lamps)
         out.extend((np.array((x, y, z - 0.2)), STREET_COLOUR, street) for x, y, z in scene.town.lamps)
-        things = town_things(scene.town)
+        things = things_of(scene)
         for number, (place, yaw, kind) in enumerate(zip(things.position, things.yaw, things.kind)):
             ahead = (eye - place) @ (np.cos(yaw), np.sin(yaw), 0.0)
             if kind == "signal" and ahead > 0:

@@ -88,7 +88,8 @@ def light_of(weather: Weather) -> Light:
     haze = 0.00012
     rain = RAIN_EXTINCTION * weather.rain_mm_h**0.63 * 3.0
     lamps = float(np.clip((2.0 - weather.sun_elevation_deg) / 6.0, 0, 1))
-    sky = 0.62 * zenith + 0.38 * horizon
+    sky = 0.45 * zenith + 0.55 * horizon
+    sky = 0.55 * sky + 0.45 * sky.mean()  # light from many sides: houses and ground take the blue out of it
     bounce = 0.16 * (sun * max(to_sun[2], 0.0) + sky)
     ambient = float((0.5 * sun * max(to_sun[2], 0.15) + 0.6 * zenith + 0.4 * horizon).mean())
     return Light(
@@ -118,4 +119,4 @@ def _at(elevation_deg: float, table: tuple[tuple[float, float, float], ...]) -> 
 
 def _exposure(ambient: float) -> float:
     """Return how much longer a camera exposes in less light: not enough to make night day."""
-    return float(1.25 * max(ambient, 2e-3) ** -0.5 if ambient < 1.0 else 1.25)
+    return float(0.92 * max(ambient, 2e-3) ** -0.55 if ambient < 1.0 else 0.92)

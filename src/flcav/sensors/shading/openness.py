@@ -9,6 +9,7 @@ from flcav.world.rays.compiled import compiled
 from flcav.world.scene import Scene
 
 REACH_M = 2.2
+FARTHEST_M = 40.0  # beyond, corners are taken as open
 DARKEST = 0.15
 TURNS = 16
 
@@ -31,7 +32,7 @@ def _hemisphere(seen, width, columns, origin, towards, far):
     for cell in range(len(far)):
         i, j = cell % columns, cell // columns
         pixel = 2 * j * width + 2 * i
-        if seen.row[pixel] < 0:
+        if seen.row[pixel] < 0 or seen.distance[pixel] > FARTHEST_M:
             far[cell] = -1
             continue
         turn = ((i & 3) * 5 + (j & 3) * 11) % TURNS

@@ -12,7 +12,7 @@ from flcav.sensors.shading.glare import add_glare
 from flcav.sensors.shading.light import Light, light_of
 from flcav.sensors.shading.openness import openness
 from flcav.sensors.shading.shadows import lamp_light_on, sun_shadows
-from flcav.sensors.shading.state import Lamps, State, lamps_of, state_of
+from flcav.sensors.shading.state import Lamps, State, lamps_of, no_lamps, state_of
 from flcav.sensors.shading.surface import shade
 from flcav.sensors.shading.survey import Survey, survey
 from flcav.world.scene import Scene
@@ -57,7 +57,9 @@ def render(
     rays, light, appearance = directions(lens), light_of(weather), appearance_of(scene)
     state = state_of(scene, float(light.lamps), low_sight=bool(light.extinction > LOW_SIGHT))
     angle = np.float32(1 / lens.intrinsics()[0, 0])
-    world = _World(scene, appearance, light, state, lamps_of(scene, state), angle, hidden)
+    world = _World(
+        scene, appearance, light, state, lamps_of(scene, state) if light.lamps > 0 else no_lamps(), angle, hidden
+    )
     seen = _meet(world, world_from_camera, rays)
     open_sky = openness(scene, seen, lens, hidden)
     radiance, painted = _radiance(world, seen, open_sky)
@@ -72,7 +74,8 @@ def render(
     image = radiance.reshape(lens.height, lens.width, 3)
     if weather.rain_mm_h > 0:
         rain.add_streaks(image, weather.rain_mm_h, 0.75 * np.array(light.horizon) + 0.05 * np.array(light.sun), rng)
-    add_glare(image, scene, state, light, world_from_camera, lens, hidden)
+    if state.head.any() or light.lamps > 0:
+        add_glare(image, scene, state, light, world_from_camera, lens, hidden)
     return Picture(radiance, light.exposure, seen, painted, appearance)
 
 

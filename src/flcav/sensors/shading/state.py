@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import transform_points
+from flcav.sensors.shading.appearance import things_of
 from flcav.world.materials import Material
 from flcav.world.meshes import actor_mesh
 from flcav.world.rays.compiled import compiled, inlined
 from flcav.world.scene import Scene
-from flcav.world.static import town_things
 
 RED, AMBER, GREEN = 1, 2, 4
 LENSES = {"r": RED, "R": RED, "y": AMBER, "Y": AMBER, "u": RED | AMBER, "g": GREEN, "G": GREEN, "o": AMBER}
@@ -19,7 +19,7 @@ BRAKING_MS2 = -0.6  # harder than this, brake lamps are on
 
 STREET_LAMP = (4.6, 3.3, 1.75)  # intensity straight down
 HEADLAMP = (17.0, 16.2, 14.5)  # intensity on the axis of a low beam
-STREET_REACH_M, BEAM_REACH_M = 24.0, 55.0
+STREET_REACH_M, BEAM_REACH_M = 20.0, 45.0
 CELL_M = 8.0
 
 
@@ -46,7 +46,7 @@ def state_of(scene: Scene, lamps_on: float, low_sight: bool) -> State:
     """Return what is lit; `low_sight`: rain or fog that vehicles have their lamps on in by day."""
     trace, index = scene.trace, scene.index
     letters = dict(zip(trace.light.tolist(), trace.light_state[index].tolist()))
-    lens = [LENSES.get(letters.get(link, ""), 0) for link in town_things(scene.town).link]
+    lens = [LENSES.get(letters.get(link, ""), 0) for link in things_of(scene).link]
     parked = np.char.startswith(trace.actor, "parked")
     on = np.where(parked | ~trace.present[index], 0.0, max(lamps_on, 0.8 if low_sight else 0.0))
     forward = np.stack((np.cos(trace.yaw[index]), np.sin(trace.yaw[index])), axis=1)
@@ -72,6 +72,12 @@ def lamps_of(scene: Scene, state: State) -> Lamps:
     beam = np.abs(ahead).sum(axis=1, keepdims=True) > 0
     colour = np.where(beam, HEADLAMP, STREET_LAMP).astype(np.float32)
     return Lamps(position.astype(np.float32), ahead.astype(np.float32), colour, *_grid(position, ahead, reach))
+
+
+def no_lamps() -> Lamps:
+    """Return no lamps at all: those of a day."""
+    none = np.zeros((0, 3))
+    return Lamps(*(none.astype(np.float32) for _ in range(3)), *_grid(none, none, np.zeros(0)))
 
 
 @lru_cache(maxsize=64)

@@ -35,10 +35,9 @@ def survey(
     hits: Hits,
 ) -> Survey:
     """Return what the rays `directions` (N, 3), optical frame, met: their `hits`, looked up."""
-    count, present = len(directions), scene.trace.present[scene.index]
-    bodies = np.tile(np.eye(4), (len(present) + 1, 1, 1))
-    for actor in np.flatnonzero(present):
-        bodies[actor + 1] = scene.world_from_actor(int(actor))
+    count, bodies = len(directions), np.tile(np.eye(4, dtype=np.float32), (len(scene.surfaces.first), 1, 1))
+    bodies[:, :3, :3] = scene.world_from_instance()
+    bodies[1:, :3, 3] = scene.poses()[:, :3]
     out = Survey(
         np.empty((count, 3), np.float32),
         hits.distance,
@@ -49,7 +48,7 @@ def survey(
     )
     pose = world_from_camera.astype(np.float32)
     first, normals = scene.surfaces.first, scene.surfaces.normal
-    _look_up(pose, directions, hits.face, first, normals, bodies.astype(np.float32), appearance, out)
+    _look_up(pose, directions, hits.face, first, normals, bodies, appearance, out)
     return out
 
 

@@ -37,6 +37,6 @@ def develop(radiance, exposure, grain, shift, noise, out):
         for band in range(3):
             light = max(radiance[pixel, band] * exposure, np.float32(0))
             value = TABLE[int(light / (np.float32(1) + light) * np.float32(STEPS - 0.01))]
-            number = (number + 1) % GRAINS
+            number = number + 1 if number + 1 < GRAINS else 0
             value += noise * grain[number] + np.float32(0.5)
             out[pixel, band] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))
