@@ -21,10 +21,11 @@ def record(
     """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
     from flcav import progress
     from flcav.config import parse_config, read_config
-    from flcav.dataset.layout import read_manifest
+    from flcav.dataset.layout import read_manifest, trace_path
     from flcav.dataset.recorder import record as write
     from flcav.sources.embedded import EmbeddedSource
     from flcav.sources.recipe import Recipe
+    from flcav.world.trace import Trace
 
     changes = {name: value for name, value in (("frames", frames), ("seed", seed)) if value is not None}
     asked = read_config(Recipe, recipe)
@@ -39,3 +40,8 @@ def record(
         f"{out}: {done} {counts['frames']} frames of {counts['scenes']} scenes, "
         f"{counts['annotations']} annotations, {counts['points']} points, {counts['images']} images, {size_mb:.1f} MB"
     )
+    if source.recipe.scenarios:
+        happened = [event.kind for scene in manifest["scenes"] for event in Trace.load(out / trace_path(scene)).events]
+        asked_for = counts["scenes"] * len(source.recipe.scenarios)
+        each = ", ".join(f"{happened.count(kind)} {kind}" for kind in sorted(set(happened)))
+        typer.echo(f"corner cases: {len(happened)} of {asked_for} found their moment ({each or 'none'})")
