@@ -76,10 +76,11 @@ def actors() -> Picture:
     """Every shape of every category, on an empty square."""
     town, trace = load_town("suburb"), scene_of("suburb").trace
     shapes = [(category, shape) for category, rows in SHAPES.items() for shape in range(len(rows))]
+    shapes.sort(key=lambda row: SHAPES[row[0]][row[1]].length)  # the long ones behind
     picked = np.arange(len(shapes)) % len(trace.actor)
     size = np.array([SHAPES[category][shape][1:4] for category, shape in shapes])
     row, column = np.divmod(np.arange(len(shapes)), 6)
-    place = np.stack((6.0 * column - 415.0, 13.0 * row - 400.0, 0.0 * row - 0.03), axis=1)
+    place = np.stack((6.0 * column - 265.0, 11.0 * row - 290.0, 0.0 * row - 0.03), axis=1)
     still = replace(
         trace,
         time_s=trace.time_s[:1],
@@ -95,8 +96,8 @@ def actors() -> Picture:
         yaw_rate=np.zeros((1, len(picked))),
         light_state=trace.light_state[:1],
     )
-    at = pose(-400.0, -418.0, 13.0, np.pi / 2, np.radians(25))
-    return shoot(Scene(town, still), at, "clear", Camera(width=1280, height=640, fov_deg=62, noise=0))
+    at = pose(-250.0, -309.0, 13.0, np.pi / 2, np.radians(24))
+    return shoot(Scene(town, still), at, "clear", Camera(width=1280, height=560, fov_deg=72, noise=0))
 
 
 def infrared() -> Picture:
