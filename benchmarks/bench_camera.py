@@ -3,6 +3,7 @@
 import argparse
 import json
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -22,7 +23,8 @@ def measure(scene: Scene, agent: str, names: list[str], repeats: int) -> dict[st
     """Return the median CPU-ms of the bare trace ("bare") and of an image in each weather, taken in turns."""
     own, camera = int(np.flatnonzero(scene.trace.actor == agent)[0]), Camera()
     at = scene.world_from_actor(own) @ pose(0.8, 0.0, 1.5) @ BODY_FROM_OPTICAL
-    works = {"bare": lambda: scene.cast(at, directions(camera), far_m=FAR_M, hidden=own)}
+    works: dict[str, Callable[[], object]] = {}
+    works["bare"] = lambda: scene.cast(at, directions(camera), far_m=FAR_M, hidden=own)
     for name in names:
         works[name] = lambda weather=WEATHERS[name]: photograph(
             scene, at, camera, weather, np.random.default_rng(0), hidden=own

@@ -58,7 +58,7 @@ class Town:
     poles: Poles
     signs: Signs
     lamps: Array  # (L, 3) street lamp foot x, y and height
-    geo: GeoReference = GeoReference()  # of the world frame's origin
+    geo: GeoReference = field(default_factory=GeoReference)  # of the world frame's origin
     signals: Signals = field(default_factory=Signals.none)
 
 

@@ -27,6 +27,7 @@ def test_equals_batch_norm_then_relu(shape):
         assert all(torch.allclose(a, b, atol=1e-9) for a, b in zip(got, wanted, strict=True))
     assert theirs.running_var is not None
     assert torch.allclose(ours.running_variance, theirs.running_var)
-    ours.eval(), theirs.eval()
+    ours.eval()
+    theirs.eval()
     x = torch.randn(shape, dtype=torch.float64)
     assert torch.allclose(ours(x), F.relu(theirs(x)), atol=1e-10)

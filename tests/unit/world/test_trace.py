@@ -61,7 +61,7 @@ def test_files_that_are_no_trace_are_named(tmp_path: Path) -> None:
     make_trace().save(tmp_path / "whole.parquet")
     older = pq.read_table(tmp_path / "whole.parquet").drop_columns(["yaw_rate"])
     pq.write_table(older, tmp_path / "older.parquet")
-    with pytest.raises(InputError, match="another version.*'yaw_rate'"):
+    with pytest.raises(InputError, match=r"another version.*'yaw_rate'"):
         Trace.load(tmp_path / "older.parquet")
     cut = (tmp_path / "whole.parquet").read_bytes()[:-100]
     (tmp_path / "cut.parquet").write_bytes(cut)

@@ -77,7 +77,8 @@ def lamps_of(scene: Scene, state: State) -> Lamps:
 def no_lamps() -> Lamps:
     """Return no lamps at all: those of a day."""
     none = np.zeros((0, 3))
-    return Lamps(*(none.astype(np.float32) for _ in range(3)), *_grid(none, none, np.zeros(0)))
+    position, ahead, colour = (none.astype(np.float32) for _ in range(3))
+    return Lamps(position, ahead, colour, *_grid(none, none, np.zeros(0)))
 
 
 @lru_cache(maxsize=64)
