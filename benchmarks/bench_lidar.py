@@ -7,10 +7,9 @@ and over a spin that takes time.
 
 import argparse
 import json
-import time
-from collections.abc import Callable, Sequence
 
 import numpy as np
+from cpu_time import cpu_ms
 
 from flcav.sensors.echoes import AFTER_PANE_M, PANES
 from flcav.sensors.lidar import cast, draw_passes, ray_pattern, scan
@@ -21,17 +20,6 @@ from flcav.world.scene import Scene
 from flcav.world.town import load_town
 from flcav.world.traffic import simulate
 from flcav.world.weather import WEATHERS
-
-
-def cpu_ms(works: Sequence[Callable[[], object]], repeats: int) -> list[float]:
-    """Return the median CPU-ms of each of `works`, run in turns so that a busy machine slows them alike."""
-    taken = np.empty((repeats, len(works)))
-    for repeat in range(-1, repeats):
-        for number, work in enumerate(works):
-            start = time.process_time()
-            work()
-            taken[repeat, number] = time.process_time() - start
-    return [1e3 * float(value) for value in np.median(taken, axis=0)]
 
 
 def measure(scene: Scene, rig_name: str, agent: str, repeats: int) -> dict[str, float]:

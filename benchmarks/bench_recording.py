@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from cpu_time import cpu_ms
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -56,17 +57,6 @@ def recipe(cameras: bool = False, spins: int = SPINS, scenes: int = 1) -> Recipe
             "pole_rig": {"lidars": {"lidar": {"settings": {**LIDAR, "down_deg": -45.0}}}},
         }
     )
-
-
-def cpu_ms(works: Sequence[Callable[[], object]], repeats: int) -> list[float]:
-    """Return the median CPU-ms of each of `works`, run in turns so that a busy machine slows them alike."""
-    taken = np.empty((repeats, len(works)))
-    for repeat in range(-1, repeats):
-        for number, work in enumerate(works):
-            start = time.process_time()
-            work()
-            taken[repeat, number] = time.process_time() - start
-    return [1e3 * float(value) for value in np.median(taken, axis=0)]
 
 
 def whole_recording(repeats: int) -> dict[str, float]:

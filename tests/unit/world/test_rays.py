@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from flcav.geometry import inverse, pose, transform_points
 from flcav.world.rays.compiled import compiled
 from flcav.world.rays.embree import Assembly, Embree, Solid
-from flcav.world.rays.library import embree_library
+from flcav.world.rays.loader import embree_library
 from flcav.world.rays.packets import trace_packets
 from flcav.world.rays.raycaster import MISS, Raycaster
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import pose
-from flcav.world.rays import library as c
+from flcav.world.rays import loader as c
 from flcav.world.rays.packets import LANES, block_packets, trace_packets
 from flcav.world.rays.raycaster import Hits
 
