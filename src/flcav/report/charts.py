@@ -59,6 +59,9 @@ def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
             axes.axvline(start, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
     ends = {known[number]: number for known in places.values() for number in (min(known), max(known))}
     axes.set_xticks(list(ends), [str(number) for number in ends.values()])
+    lasts = {max(known.values()) for known in places.values() if len(known) > 1}
+    for place, label in zip(ends, axes.get_xticklabels(), strict=True):
+        label.set_horizontalalignment("right" if place in lasts else "left")  # neighbours of two stages stay apart
     axes.set_xlim(0, len(places) + 0.12)
 
 
