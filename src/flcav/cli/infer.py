@@ -20,7 +20,9 @@ def infer(
     inputs: list[Path] = typer.Argument(
         help="KITTI .bin files (objects) or PNG and JPEG files, folders of them, or dataset folders."
     ),
-    weights: Path | None = typer.Option(None, "--weights", help="Weights (safetensors) that flcav train wrote."),
+    weights: Path | None = typer.Option(
+        None, "--weights", help="Weights that flcav train wrote; by default those of the package."
+    ),
     threshold: float = typer.Option(0.3, "--threshold", min=0.0, max=1.0, help="Lowest score shown."),
     pictures: Path | None = typer.Option(None, "--pictures", help="Folder for a picture of each input with findings."),
     as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
@@ -30,11 +32,10 @@ def infer(
     Boxes of objects are in the LiDAR frame: x forward, y left, z up, metres and radians. Boxes of signs are in pixels
     from the upper left corner of the picture.
     """
-    from flcav.cli.tasks import task_named, weights_given
-    from flcav.perception.weights import load_network
+    from flcav.cli.tasks import network_of, task_named
 
     learned = task_named(task)
-    network = load_network(learned, weights_given(weights, task))
+    network = network_of(learned, weights)
     results = []
     for number, finding in enumerate(found for path in inputs for found in learned.infer(network, path, threshold)):
         results.append({"path": str(finding.path), **finding.result})

@@ -8,6 +8,7 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
+from flcav.perception.weights import load_network, shipped
 
 TASKS: dict[str, Task[Any, Any, Any]] = {task.name: task for task in (WEATHER, SIGNS, OBJECTS)}
 
@@ -19,8 +20,6 @@ def task_named(name: str) -> Task[Any, Any, Any]:
     return TASKS[name]
 
 
-def weights_given(path: Path | None, task: str) -> Path:
-    """Return the path; raises `InputError` where there is none, because no weights come with the package."""
-    if path is None:
-        raise InputError(f"--weights is missing: no weights for '{task}' come with the package, train some first")
-    return path
+def network_of(task: Task[Any, Any, Any], weights: Path | None) -> Any:
+    """Return the network in the file `weights`, by default in the one that comes with the package."""
+    return load_network(task, weights or shipped(task))

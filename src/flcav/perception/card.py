@@ -11,6 +11,7 @@ from flcav.files import sha256, write_bytes
 
 CARD_KEY = "flcav.card"  # metadata entry of a file of weights
 LICENCE = "Apache-2.0"
+RECIPE_FIELDS = ("town", "seed", "split", "scenes", "spins_per_scene", "every_s", "cavs", "poles", "weather")
 
 
 class Card(Config):
@@ -38,8 +39,17 @@ class Card(Config):
 
 
 def data_entry(data: Dataset) -> dict[str, Any]:
-    """Return what identifies a dataset: its name, its number of frames, its manifest's fingerprint."""
-    return {"name": data.folder.resolve().name, "frames": len(data), "manifest": sha256(data.folder / MANIFEST)}
+    """Return what a dataset is: its name, its number of frames, its manifest's fingerprint, and its recipe.
+
+    Of the recipe, what makes two datasets differ most: town, seed and weather; the manifest has the whole.
+    """
+    recipe = data.manifest.get("recipe", {})
+    return {
+        "name": data.folder.resolve().name,
+        "frames": len(data),
+        "manifest": sha256(data.folder / MANIFEST),
+        "recipe": {name: recipe[name] for name in RECIPE_FIELDS if name in recipe},
+    }
 
 
 def write_card(card: Card, path: Path) -> None:

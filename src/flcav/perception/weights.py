@@ -18,7 +18,16 @@ from flcav.perception.card import CARD_KEY, Card
 from flcav.perception.task import ConfigT, NetworkT, Task
 
 PREFIX = "flcav."
+SHIPPED = "shipped/weights.safetensors"  # in a task's folder; its card lies beside it
 COUNTER = "num_batches_tracked"  # of batch normalisation with a fixed momentum, which does not use it
+
+
+def shipped(task: Task[Any, Any, Any]) -> Path:
+    """Return the file of weights that comes with the package; raises `InputError` where `task` has none."""
+    path = Path(__file__).parent / task.name / SHIPPED
+    if not path.is_file():
+        raise InputError(f"--weights is missing: no weights for '{task.name}' come with the package, train some first")
+    return path
 
 
 def config_key(task: Task[Any, Any, Any]) -> str:
@@ -42,6 +51,14 @@ def load_network(task: Task[ConfigT, NetworkT, Any], path: Path) -> NetworkT:
         network = task.build(config)
     _fill(network, tensors, path)
     return network.eval()
+
+
+def read_card(path: Path) -> Card:
+    """Return the card in a file of weights; raises `InputError` where there is none."""
+    metadata, _ = _opened(path)
+    if CARD_KEY not in metadata:
+        raise InputError(f"{path}: weights without a card")
+    return Card.model_validate_json(metadata[CARD_KEY])
 
 
 def load_weights(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path) -> None:
@@ -79,15 +96,19 @@ def _adapter(task: Task[Any, Any, Any]) -> TypeAdapter[Any]:
     return TypeAdapter(type(next(iter(task.configurations.values()))))
 
 
-def _read(task: Task[ConfigT, Any, Any], path: Path) -> tuple[ConfigT, dict[str, torch.Tensor]]:
+def _opened(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+            return file.metadata() or {}, tensors
     except (SafetensorError, OSError):
         raise InputError(f"{path}: not a safetensors file, or a damaged one") from None
+
+
+def _read(task: Task[ConfigT, Any, Any], path: Path) -> tuple[ConfigT, dict[str, torch.Tensor]]:
+    metadata, tensors = _opened(path)
     key = config_key(task)
     if key not in metadata:
         found = [name.removeprefix(PREFIX) for name in metadata if name.startswith(PREFIX) and name != CARD_KEY]

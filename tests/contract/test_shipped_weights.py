@@ -1,0 +1,50 @@
+"""Weights that come with the package: small, loadable, and their cards say how they came about."""
+
+from pathlib import Path
+
+import pytest
+
+from flcav import perception
+from flcav.cli.main import run
+from flcav.cli.tasks import TASKS, network_of
+from flcav.config import InputError
+from flcav.perception.card import LICENCE
+from flcav.perception.weights import SHIPPED, read_card, shipped
+
+EACH_MB, ALL_MB = 3.0, 12.0
+FOLDER = Path(next(iter(perception.__path__)))
+SENT = {task.name: task for task in TASKS.values() if (FOLDER / task.name / SHIPPED).is_file()}
+NOT_SENT = {name: task for name, task in TASKS.items() if name not in SENT}
+
+
+def test_they_are_small():
+    sizes = {path: path.stat().st_size / 1e6 for path in FOLDER.glob("*/shipped/*")}
+    assert sum(sizes.values()) <= ALL_MB
+    assert max(sizes.values(), default=0.0) <= EACH_MB
+    assert {path.parent.parent.name for path in sizes} <= set(TASKS)
+
+
+@pytest.mark.parametrize("task", SENT.values(), ids=SENT)
+def test_they_load_and_their_card_says_how_they_came_about(task):
+    path = shipped(task)
+    network, card = network_of(task, None), read_card(path)
+    assert card.task == task.name
+    assert network.config == task.configurations[card.network]
+    assert card.parameters == sum(parameter.numel() for parameter in network.parameters())
+    assert card.licence == LICENCE
+    assert card.seed >= 0
+    assert card.samples > 0
+    assert card.training["epochs"] > 0
+    assert all(entry["recipe"]["town"] and entry["frames"] > 0 for entry in card.data)
+    assert card.data
+    assert 0 < task.score(card.metrics) <= 1
+    assert path.with_name("card.md").read_text(encoding="utf-8") == card.markdown()
+
+
+@pytest.mark.parametrize("task", NOT_SENT.values(), ids=NOT_SENT)
+def test_where_there_are_none_one_sentence_says_so(task, tmp_path, capsys):
+    with pytest.raises(InputError, match=f"no weights for '{task.name}' come with the package"):
+        shipped(task)
+    with pytest.raises(SystemExit, match="2"):
+        run(["infer", task.name, str(tmp_path)])
+    assert capsys.readouterr().err.count("\n") == 1
