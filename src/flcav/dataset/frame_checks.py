@@ -3,15 +3,19 @@
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flcav.geometry import is_rigid, points_in_boxes, transform_points, wrap_angle
-from flcav.sensors.frame import Frame
+from flcav.sensors.frame import Array, Frame
 from flcav.sensors.rain import rain_range_noise
+from flcav.sensors.rolling import Motion
+from flcav.world.scene import OFFSET_S
 from flcav.world.trace import CATEGORIES, Trace
 
 MARGIN_M = 0.15  # a return may lie so far outside its actor's box: range noise, mirrors
 SIGMAS = 4.0  # and further where rain blurs its range
 INSIDE = 0.95  # share of an actor's returns that must lie in its box, grown by the margin
+LONGEST_SPIN_S = 2 * OFFSET_S
 GAP_DEG = 30.0  # a whole spin has returns in every sector so wide
 FORCE = 200.0  # [m/s^2] no vehicle survives
 RATE = 20.0  # [rad/s]
@@ -26,6 +30,9 @@ def check_values(frame: Frame) -> Iterator[str]:
             yield f"{frame.key}: '{name}' has a point that is not finite"
         elif ((points[:, 3] < 0) | (points[:, 3] > 1)).any():
             yield f"{frame.key}: '{name}' has an intensity outside 0 to 1"
+    for name, times_s in frame.point_times.items():
+        if not (np.abs(times_s) <= LONGEST_SPIN_S / 2).all():
+            yield f"{frame.key}: '{name}' has a point that was measured in no spin around the frame's time"
     if not is_rigid(frame.world_from_agent):
         yield f"{frame.key}: the pose of {frame.agent} is not a rigid transform"
     for category in sorted(set(truth.boxes.label.tolist()) - set(CATEGORIES)):
@@ -68,29 +75,44 @@ def check_measurements(frame: Frame) -> Iterator[str]:
             yield f"{frame.key}: '{name}' reports a motion that nothing survives"
 
 
-def check_points(frame: Frame, spin_s: float = 0.0) -> Iterator[str]:
+def check_points(frame: Frame, trace: Trace | None = None) -> Iterator[str]:
     """Check that each box, grown by the margin, holds as many points as its actor is said to have returned.
 
-    A LiDAR that takes `spin_s` for a spin sees moving actors up to half of it before and after their boxes' time.
+    Points of a spin that takes time are judged by where carrier and actor were when each was measured, and not at all
+    where the frame's traffic is not known.
     """
-    if not frame.lidar:
+    if not frame.lidar or (frame.point_times and trace is None):
         return
+    motions = _motions(frame, trace) if trace is not None and frame.point_times else {}
+    everything, times_s = _in_world(frame, motions.get(frame.agent))
     boxes, returns = frame.annotations.boxes, frame.annotations.returns
-    clouds = [
-        transform_points(frame.world_from_sensor(name), points[:, :3].astype(np.float64))
-        for name, points in frame.lidar.items()
-    ]
-    seen = np.flatnonzero(returns > 0)
-    everything = np.concatenate(clouds)
-    speed = np.linalg.norm(frame.annotations.velocity, axis=1)
     away = np.linalg.norm(boxes.center - frame.world_from_agent[:3, 3], axis=1)
     rain = rain_range_noise(frame.weather.rain_mm_h) if frame.weather else 0.0
-    for i in seen:
-        margin_m = MARGIN_M + spin_s * speed[i] + SIGMAS * rain * away[i]
-        count = int(points_in_boxes(everything, boxes[[i]], margin_m).sum())
+    for i in np.flatnonzero(returns > 0):
+        track, label = str(frame.annotations.track[i]), boxes.label[i]
+        points = motions[track].bring_back(everything, times_s) if track in motions else everything
+        count = int(points_in_boxes(points, boxes[[i]], MARGIN_M + SIGMAS * rain * away[i]).sum())
         if count < INSIDE * returns[i]:
-            track, label = frame.annotations.track[i], boxes.label[i]
             yield f"{frame.key}: points lie outside the box of {label} '{track}': {count} of {returns[i]} within"
+
+
+def _in_world(frame: Frame, carrier: Motion | None) -> tuple[Array, NDArray[np.float32]]:
+    """Return all LiDARs' points (N, 3) where they were measured, and (N,) when [s] after the spin."""
+    clouds, times = [], []
+    for name, points in frame.lidar.items():
+        cloud = transform_points(frame.world_from_sensor(name), points[:, :3].astype(np.float64))
+        times.append(frame.point_times.get(name, np.zeros(len(points), np.float32)))
+        clouds.append(cloud if carrier is None else carrier.carry(cloud, times[-1]))
+    return np.concatenate(clouds), np.concatenate(times)
+
+
+def _motions(frame: Frame, trace: Trace) -> dict[str, Motion]:
+    """Return how everybody in town moves at the spin, by name."""
+    motions = {}
+    for instant in np.flatnonzero(np.abs(trace.time_s - frame.time_s) < EXACT)[:1].tolist():
+        for actor in np.flatnonzero(trace.present[instant]).tolist():
+            motions[str(trace.actor[actor])] = Motion.of(trace, instant, actor)
+    return motions
 
 
 def check_traffic(frame: Frame, trace: Trace) -> Iterator[str]:

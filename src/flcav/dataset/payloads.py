@@ -20,8 +20,8 @@ from flcav.sensors.frame import Frame
 DEPTH_BITS = 14  # of a depth's mantissa that are kept: 3 mm at 100 m
 _DROPPED = 23 - DEPTH_BITS
 PLANES = {"rgb": "webp", "depth_m": "depth.zst", "semantic": "semantic.png", "instance": "instance.png"}
-POINTS, RADAR, INFRARED = "bin", "radar.bin", "infrared.png"
-COLUMNS = {POINTS: 4, RADAR: 5}  # little-endian float32, row after row
+POINTS, TIMES, RADAR, INFRARED = "bin", "times.bin", "radar.bin", "infrared.png"
+COLUMNS = {POINTS: 4, TIMES: 1, RADAR: 5}  # little-endian float32, row after row
 
 
 class Payload(NamedTuple):
@@ -35,6 +35,8 @@ def payloads(frame: Frame) -> Iterator[Payload]:
     """Yield the files of what the frame's sensors measured."""
     for name, points in frame.lidar.items():
         yield Payload(payload_path(name, frame.key, POINTS), encode_rows(points))
+    for name, times in frame.point_times.items():
+        yield Payload(payload_path(name, frame.key, TIMES), encode_rows(times))
     for name, image in frame.images.items():
         for plane, suffix in PLANES.items():
             yield Payload(payload_path(name, frame.key, suffix), encode_plane(plane, getattr(image, plane)))

@@ -14,7 +14,7 @@ from flcav.config import InputError
 from flcav.dataset.calibration import Calibrations, read_calibrations
 from flcav.dataset.frames import annotations_of, vectors_of, weather_of
 from flcav.dataset.layout import CALIBRATION, FrameKey, payload_path, read_manifest, table_path, trace_path
-from flcav.dataset.payloads import INFRARED, PLANES, POINTS, RADAR, read_image, read_plane, read_rows
+from flcav.dataset.payloads import INFRARED, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, read_table
 from flcav.sensors.frame import CameraImage, Frame
 from flcav.world.trace import Trace
@@ -95,6 +95,7 @@ class Dataset:
                 ranging=(*self._lidar[i], *self._radar[i]),
                 cameras=(*self._cameras[i], *self._infrared[i]),
             ),
+            point_times=self._point_times(i),
             images=ReadWhenAsked(self._cameras[i], lambda camera: self._image(i, camera)),
             infrared=ReadWhenAsked(self._infrared[i], lambda camera: self._thermal(i, camera)),
             radar=self._rows_of(i, self._radar[i], RADAR),
@@ -165,6 +166,12 @@ class Dataset:
             sensor: read_rows(self.folder / payload_path(sensor, self._name[i], suffix), suffix, count)
             for sensor, count in counts.items()
         }
+
+    def _point_times(self, i: int) -> dict[str, NDArray[np.float32]]:
+        """Return the times of the points of the LiDARs that have them; `validate` finds a file that is missing."""
+        paths = {sensor: self.folder / payload_path(sensor, self._name[i], TIMES) for sensor in self._lidar[i]}
+        timed = {sensor: count for sensor, count in self._lidar[i].items() if paths[sensor].is_file()}
+        return {sensor: times[:, 0] for sensor, times in self._rows_of(i, timed, TIMES).items()}
 
     def _image(self, i: int, camera: str) -> CameraImage:
         return CameraImage(**{plane: self.plane(i, camera, plane) for plane in PLANES})

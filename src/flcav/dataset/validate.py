@@ -2,7 +2,7 @@
 
 import contextlib
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +37,13 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
     problems += check_order(dataset.keys)
     problems += _other_counts(dataset)
     problems += check_calibrations(dataset.calibrations, manifest["recipe"])
-    spin_s = _longest_spin_s(manifest["recipe"])
 
     traces: dict[str, Trace | None] = {}
     for i, key in enumerate(dataset.keys):
         if key.scene not in traces:
             traces = {key.scene: _trace(dataset, key.scene, damaged)}
         try:
-            problems += _frame_problems(dataset.frame(i), traces[key.scene], spin_s)
+            problems += _frame_problems(dataset.frame(i), traces[key.scene])
         except InputError as error:  # a file that cannot be read
             if not any(str(error).startswith(str(folder / name)) for name in damaged):
                 problems.append(str(error))
@@ -52,21 +51,14 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
     return problems
 
 
-def _frame_problems(frame: Frame, trace: Trace | None, spin_s: float) -> Iterator[str]:
+def _frame_problems(frame: Frame, trace: Trace | None) -> Iterator[str]:
     yield from check_values(frame)
     yield from check_sweeps(frame)
-    yield from check_points(frame, spin_s)
+    yield from check_points(frame, trace)
     yield from check_measurements(frame)
     yield from check_images(frame)
     if trace is not None:
         yield from check_traffic(frame, trace)
-
-
-def _longest_spin_s(recipe: Mapping[str, Any]) -> float:
-    """Return how long a spin of the recipe's rolling LiDARs takes at most, 0 where none rolls."""
-    rigs = (recipe.get("vehicle_rig") or {}, recipe.get("pole_rig") or {})
-    settings = [lidar["settings"] for rig in rigs for lidar in rig.get("lidars", {}).values()]
-    return max((1 / lidar["rate_hz"] for lidar in settings if lidar.get("rolling")), default=0.0)
 
 
 def check_order(keys: Sequence[FrameKey]) -> list[str]:

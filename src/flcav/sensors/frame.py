@@ -93,6 +93,9 @@ class Frame:
     assumed: Calibration  # as the agent believes it to be
     lidar: Mapping[str, NDArray[np.float32]]  # LiDAR name -> (N, 4) x, y, z [m], intensity [0, 1]; sensor frame
     annotations: Annotations
+    point_times: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    # LiDAR whose spin takes time -> (N,) when each of its points was measured [s] after `time_s`, each in the sensor's
+    # frame of its own time: see `flcav.sensors.rolling`
     images: Mapping[str, CameraImage] = field(default_factory=dict)
     infrared: Mapping[str, NDArray[np.uint16]] = field(default_factory=dict)  # (H, W) apparent temperature [0.01 K]
     radar: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)

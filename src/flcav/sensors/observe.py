@@ -17,7 +17,7 @@ from flcav.sensors.imu import reading
 from flcav.sensors.infrared import thermal_image
 from flcav.sensors.labels.annotate import Sight, Sweep, annotate
 from flcav.sensors.lens import Lens, directions
-from flcav.sensors.lidar import Lidar, cast, draw_passes, measure
+from flcav.sensors.lidar import Lidar, cast, draw_passes, measure, point_times_s
 from flcav.sensors.radar import radar_sweep
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
 from flcav.world.scene import Scene
@@ -90,6 +90,11 @@ def observe(
         assumed=assume(carrier.calibration, error, seed=seed, agent=agent),
         lidar=lidar,
         annotations=annotations,
+        point_times={
+            name: point_times_s(mounted.settings, lidar[name])
+            for name, mounted in rig.lidars.items()
+            if mounted.settings.rolling
+        },
         images={
             name: CameraImage(seen.rgb, seen.depth_m, seen.semantic, row[np.maximum(seen.instance, 0)])
             for name, seen in exposures.items()
@@ -176,7 +181,7 @@ def _sweep(
     count = len(scene.trace.actor)
     returns = np.bincount(actor + 1, minlength=count + 1)[1:]
     visible = np.bincount(echoes.instance + 1, minlength=count + 2)[2:]  # without what is missed, and the town
-    return points, Sweep(lidar, world_from_sensor, passes, echoes.distance, returns, visible)
+    return points, Sweep(lidar, world_from_sensor, passes, echoes.distance, echoes.instance, returns, visible)
 
 
 def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> NDArray[np.int32]:

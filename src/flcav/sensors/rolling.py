@@ -6,12 +6,16 @@ the beams pass its middle. Points are left where the sensor measured them, each 
 """
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import inverse
 from flcav.world.scene import Scene
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
 
 SECTORS = 36
 ROUNDING = 1e-6  # of a turn: what looks straight back belongs to the beginning of the spin, not to its end
@@ -45,3 +49,40 @@ def time_in_spin_s(points: NDArray[np.float32], spin_s: float) -> NDArray[np.flo
     """Return when each point (N, >=2) of a spin, in the sensor's frame, was measured: (N,) [s] after its middle."""
     turned = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
     return (((turned + ROUNDING) % 1.0 - 0.5) * spin_s).astype(np.float32)
+
+
+class Motion(NamedTuple):
+    """How a body moves about an instant of the traffic, as in `Scene.move_to`: world frame, about the vertical."""
+
+    origin: Array  # (3,) at the instant [m]
+    velocity: Array  # (3,) [m/s]
+    acceleration: Array  # (3,) [m/s^2]
+    yaw_rate: float  # [rad/s]
+
+    @classmethod
+    def of(cls, trace: Trace, index: int, actor: int) -> "Motion":
+        """Return the motion of a trace's actor, present at instant `index`."""
+        at = index, actor
+        return cls(trace.position[at], trace.velocity[at], trace.acceleration[at], float(trace.yaw_rate[at]))
+
+    def carry(self, points: Array, times_s: NDArray[np.floating]) -> Array:
+        """Return (N, 3) where points that the body carries are `times_s` (N,) after the instant.
+
+        `points` are where they are at the instant, such as those of a sweep, put into the world by its pose then: so
+        they come to lie where they were measured.
+        """
+        return _turn(points - self.origin, self.yaw_rate * times_s) + self.origin + self._way(times_s)
+
+    def bring_back(self, points: Array, times_s: NDArray[np.floating]) -> Array:
+        """Return (N, 3) where points on the body, seen at `times_s` (N,) after the instant, are at the instant."""
+        return _turn(points - self.origin - self._way(times_s), -self.yaw_rate * times_s) + self.origin
+
+    def _way(self, times_s: NDArray[np.floating]) -> Array:
+        seconds = times_s.astype(np.float64)[:, None]
+        return seconds * self.velocity + seconds**2 / 2 * self.acceleration
+
+
+def _turn(points: Array, angles: NDArray[np.floating]) -> Array:
+    x, y, z = points.T
+    cos, sin = np.cos(angles), np.sin(angles)
+    return np.column_stack((cos * x - sin * y, sin * x + cos * y, z))

@@ -19,11 +19,12 @@ def occluded_rays(
     lidar: Lidar,
     passes: NDArray[np.bool_],
     distance: NDArray[np.float32],
+    instance: NDArray[np.int32],
     actors: NDArray[np.int64],
 ) -> NDArray[np.int64]:
     """Return, for each of `actors` (K,), how many more rays of the sweep would come back from it in an empty world.
 
-    `distance` (N,) is where the rays ended.
+    `distance` (N,) is where the rays ended, `instance` (N,) at what: a + 1 at actor a.
     """
     pattern, surfaces = ray_pattern(lidar), scene.surfaces
     body_from_sensor = _bodies_from(scene.poses()[actors], world_from_sensor)
@@ -34,6 +35,8 @@ def occluded_rays(
     ends = np.cumsum(counts)
     for row in np.flatnonzero(counts).tolist():
         chosen, actor = rays[ends[row] - counts[row] : ends[row]], int(actors[row])
+        if lidar.rolling:  # it may have been met before, or on its way to, where it is at the scene's instant
+            chosen = chosen[instance[chosen] != actor + 1]
         trace = partial(scene.cast_alone, actor, body_from_sensor[row], far_m=lidar.range_m)
         first = surfaces.first[actor + 1 : actor + 2]
         echoes = cast_through_glass(trace, pattern[chosen], passes[chosen], first, surfaces.material)

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError, parse_config
-from flcav.geometry import pose
+from flcav.geometry import pose, transform_points
 from flcav.sensors.beams import BEAMS
 from flcav.sensors.carla import CarlaReturns
 from flcav.sensors.lidar import Lidar, point_times_s, ray_pattern, scan
+from flcav.sensors.observe import observe
+from flcav.sensors.rig import Rig
+from flcav.sensors.rolling import Motion
 from flcav.world.materials import REFLECTIVITY, Material
 from flcav.world.scene import Scene
 from flcav.world.town import Town
@@ -180,6 +183,35 @@ def test_a_moving_actor_is_where_it_is_when_the_beams_pass(driving: Scene):
         truck = points[actor == 1]
         back = truck[:, 0] * np.cos(facing) - 30.0 * point_times_s(lidar, truck)
         assert back.min() == pytest.approx(10 - 3.9, abs=0.25)
+
+
+def test_points_find_back_to_their_body(driving: Scene):
+    """Poses of the scene at other times are the oracle."""
+    driving.trace.acceleration[0, 1] = (-4.0, 1.0, 0.0)
+    driving.trace.yaw_rate[0, 1] = 0.7
+    at_spin, motion = driving.world_from_actor(1), Motion.of(driving.trace, 0, 1)
+    body = np.array([[3.9, 1.2, 0.5], [-3.9, -1.2, 3.0], [0.0, 0.0, 0.0]])
+    here = transform_points(at_spin, body)
+    for time_s in (-0.05, 0.0, 0.08):
+        driving.move_to(0, time_s)
+        there = transform_points(driving.world_from_actor(1), body)
+        times = np.full(len(body), time_s, np.float32)
+        np.testing.assert_allclose(motion.carry(here, times), there, atol=1e-6)
+        np.testing.assert_allclose(motion.bring_back(there, times), here, atol=1e-6)
+
+
+def test_what_comes_towards_a_rolling_lidar_does_not_hide_itself(driving: Scene):
+    driving.trace.velocity[0] = [(0.0, 0.0, 0.0), (-30.0, 0.0, 0.0)]
+    driving.trace.position[0, 1] = (
+        -20.0,
+        0.0,
+        0.0,
+    )  # seen at both ends of the spin, 1.5 m from its place in the middle
+    rig = {"lidars": {"lidar": {"mount": {"z": 1.8}, "settings": {"rolling": True, "channels": 64}}}}
+    frame = observe(driving, Rig.model_validate(rig), "cav0", 0, scene_name="s", seed=0)
+    assert frame.annotations.track.tolist() == ["veh1"]
+    assert frame.annotations.returns[0] > 100
+    assert frame.annotations.occlusion[0] < 0.1
 
 
 def test_a_spin_of_few_columns_has_fewer_sectors(walled: Scene):

@@ -24,6 +24,7 @@ class Sweep(NamedTuple):
     world_from_sensor: Array  # (4, 4)
     passes: NDArray[np.bool_]  # see `draw_passes`
     distance: NDArray[np.float32]  # (N,) where the rays ended [m]
+    instance: NDArray[np.int32]  # (N,) and at what: a + 1 at the scene's actor a
     returns: NDArray[np.int64]  # (A,) points of each of the scene's actors
     visible: NDArray[np.int64]  # (A,) rays that come back from it, detected or not
 
@@ -90,6 +91,6 @@ def _occlusion(scene: Scene, sweeps: list[Sweep], actors: NDArray[np.int64]) -> 
     seen = np.flatnonzero(visible)  # of the others nothing is visible, whatever they would show
     for sweep in sweeps:
         occluded[seen] += occluded_rays(
-            scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, sweep.distance, actors[seen]
+            scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, sweep.distance, sweep.instance, actors[seen]
         )
     return 1 - visible / np.maximum(visible + occluded, 1)

@@ -25,6 +25,7 @@ from flcav.dataset.payloads import encode_png
 from flcav.sensors.frame import Frame
 
 LIDAR_FIELDS = ("x", "y", "z", "intensity")
+TIME_FIELD = "time"  # of a point [s] after the cloud's time stamp, as ROS drivers of spinning LiDARs have it
 RADAR_FIELDS = ("x", "y", "z", "range_m", "azimuth_rad", "elevation_rad", "doppler_m_s", "rcs_dbsm")
 IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^2], [rad/s], body frame
 
@@ -60,7 +61,10 @@ def messages(frame: Frame) -> Iterator[Logged]:
         moved = _transforms([("world", frame.agent, world_from_agent)], looks_s(name))
         yield Logged("tf", moved, looks_s(name))
     for name, points in frame.lidar.items():
-        yield Logged(f"{name}/points", _cloud(points, LIDAR_FIELDS, **place(name)), looks_s(name))
+        cloud, fields = points, LIDAR_FIELDS
+        if name in frame.point_times:
+            cloud, fields = np.column_stack((points, frame.point_times[name])), (*LIDAR_FIELDS, TIME_FIELD)
+        yield Logged(f"{name}/points", _cloud(cloud, fields, **place(name)), looks_s(name))
     for name, picture in frame.images.items():
         image = CompressedImage(**place(name), data=encode_png(picture.rgb), format="png")
         yield Logged(f"{name}/calibration", _calibration(frame, name, picture.rgb, **place(name)), looks_s(name))
