@@ -49,6 +49,8 @@ WEATHERS: dict[str, Weather] = {
     "wet_sun": Weather(cloud_cover=0.3, wetness=0.8),
 }
 
+ANY = "any"  # no class: a weather from the whole space
+
 Region = Mapping[str, tuple[float, float]]  # parameter -> lowest and highest value; what is not named is free
 
 _DAY = {"sun_elevation_deg": (20.0, 75.0)}
@@ -73,6 +75,9 @@ MARGINS: dict[str, float] = {
     "rain_mm_h": 1.0,
     "visibility_m": 5000.0,
 }
+# The same, as a distance is measured: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H) and visibility.
+SEPARATION: dict[str, float] = {"sun_elevation_deg": 10.0, "cloud_cover": 0.2, "rain_mm_h": 0.59, "visibility_m": 0.85}
+DRIZZLE_MM_H = 0.1  # less rain than that is no rain
 
 
 def weather_class(weather: Weather) -> str | None:
@@ -83,12 +88,22 @@ def weather_class(weather: Weather) -> str | None:
     return None
 
 
-def draw_weather(name: str | None, rng: np.random.Generator) -> Weather:
-    """Return a weather drawn from the region of the class `name`, or from the whole space where it is None.
+def nearest_class(weather: Weather) -> str:
+    """Return the class whose region is nearest: the class itself within a region, a stated rule between and beyond.
+
+    Distances are Euclidean over what is in the air: each parameter's gap to the region in units of the gap that at the
+    least separates two classes, those of rain and visibility on logarithmic scales. Wetness is left out, since roads
+    stay wet after rain.
+    """
+    return min(WEATHER_CLASSES, key=lambda name: _distance(weather, WEATHER_CLASSES[name]))
+
+
+def draw_weather(name: str, rng: np.random.Generator) -> Weather:
+    """Return a weather drawn from the region of the class `name`, from the whole space for "any".
 
     Rain and visibility are drawn evenly over their logarithm, everything else evenly; the sun's azimuth is free.
     """
-    region = _anywhere(rng) if name is None else WEATHER_CLASSES[name]
+    region = _anywhere(rng) if name == ANY else WEATHER_CLASSES[name]
     drawn = {parameter: _draw(parameter, *limits, rng) for parameter, limits in region.items()}
     return Weather(**{**drawn, "sun_azimuth_deg": float(rng.uniform(0.0, 360.0))})
 
@@ -126,11 +141,14 @@ class Keyframe(Config):
 class WeatherSchedule(Config):
     """The weather over a scene: keyframes, or classes one of which is drawn for each scene.
 
-    In a recipe it may also be written as the name of a preset, as one weather, or as the list of keyframes alone.
+    With `turn_s`, a scene goes through all its classes in an order drawn for it, from one to the next in that time; a
+    class may be named several times. In a recipe it may also be written as the name of a preset, as one weather, or as
+    the list of keyframes alone.
     """
 
     keyframes: tuple[Keyframe, ...] = ()
-    classes: tuple[str, ...] = ()
+    classes: tuple[str, ...] = ()  # of WEATHER_CLASSES; "any": of the whole space
+    turn_s: float | None = Field(default=None, gt=0, exclude_if=lambda value: value is None)
 
     @model_validator(mode="before")
     @classmethod
@@ -145,25 +163,33 @@ class WeatherSchedule(Config):
     @field_validator("classes")
     @classmethod
     def _known_classes(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        if unknown := [name for name in value if name not in WEATHER_CLASSES]:
-            raise ValueError(f"no weather class '{unknown[0]}'; the classes are {', '.join(WEATHER_CLASSES)}")
+        if unknown := [name for name in value if name not in (*WEATHER_CLASSES, ANY)]:
+            raise ValueError(f"no weather class '{unknown[0]}'; the classes are {', '.join(WEATHER_CLASSES)}, {ANY}")
         return value
 
     @model_validator(mode="after")
     def _one_of_both_in_order(self) -> "WeatherSchedule":
         if bool(self.keyframes) == bool(self.classes):
             raise ValueError("give a weather, a list of keyframes, or classes to draw from")
+        if self.turn_s and not self.classes:
+            raise ValueError("turn_s is how long classes take turns; give classes with it")
         times = [keyframe.at_s for keyframe in self.keyframes]
         if any(later <= earlier for earlier, later in pairwise(times)):
             raise ValueError(f"the keyframes' at_s must ascend, not {times}")
         return self
 
     def draw(self, rng: np.random.Generator) -> "WeatherSchedule":
-        """Return the schedule of one scene: itself, or a weather of one of its classes."""
+        """Return the schedule of one scene: itself, a weather of one of its classes, or one of each in turn."""
         if not self.classes:
             return self
-        weather = draw_weather(self.classes[int(rng.integers(len(self.classes)))], rng)
-        return WeatherSchedule(keyframes=(Keyframe(at_s=0.0, weather=weather),))
+        if self.turn_s is None:
+            weather = draw_weather(self.classes[int(rng.integers(len(self.classes)))], rng)
+            return WeatherSchedule(keyframes=(Keyframe(at_s=0.0, weather=weather),))
+        order = rng.permutation(len(self.classes))
+        turns = (
+            Keyframe(at_s=i * self.turn_s, weather=draw_weather(self.classes[k], rng)) for i, k in enumerate(order)
+        )
+        return WeatherSchedule(keyframes=tuple(turns))
 
     def at(self, time_s: float) -> Weather:
         """Return the weather `time_s` after the scene's first spin; before and after all keyframes it stands still.
@@ -183,6 +209,21 @@ def _draw(parameter: str, low: float, high: float, rng: np.random.Generator) -> 
     if parameter in ("rain_mm_h", "visibility_m") and low > 0:
         return float(np.clip(np.exp(rng.uniform(np.log(low), np.log(high))), low, high))
     return float(rng.uniform(low, high))
+
+
+def _distance(weather: Weather, region: Region) -> float:
+    gaps = []
+    for parameter, unit in SEPARATION.items():
+        low, high = (_scaled(parameter, limit) for limit in region.get(parameter, (-np.inf, np.inf)))
+        value = _scaled(parameter, getattr(weather, parameter))
+        gaps.append(max(low - value, value - high, 0.0) / unit)
+    return float(np.hypot.reduce(gaps))
+
+
+def _scaled(parameter: str, value: float) -> float:
+    if not np.isfinite(value) or parameter not in ("rain_mm_h", "visibility_m"):
+        return value
+    return float(np.log10(value + DRIZZLE_MM_H if parameter == "rain_mm_h" else value))
 
 
 def _anywhere(rng: np.random.Generator) -> Region:

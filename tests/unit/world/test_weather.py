@@ -8,13 +8,17 @@ from hypothesis import strategies as st
 
 from flcav.config import Config, InputError, parse_config
 from flcav.world.weather import (
+    ANY,
+    DRIZZLE_MM_H,
     MARGINS,
+    SEPARATION,
     WEATHER_CLASSES,
     WEATHERS,
     Weather,
     WeatherSchedule,
     draw_weather,
     interpolate,
+    nearest_class,
     weather_class,
 )
 
@@ -55,8 +59,8 @@ def test_regions_themselves_are_a_margin_apart():
 @given(seed=st.integers(0, 2**32))
 @settings(max_examples=50, deadline=None)
 def test_the_whole_space_holds_what_occurs(seed: int):
-    weather = draw_weather(None, np.random.default_rng(seed))
-    assert draw_weather(None, np.random.default_rng(seed)) == weather
+    weather = draw_weather(ANY, np.random.default_rng(seed))
+    assert draw_weather(ANY, np.random.default_rng(seed)) == weather
     if weather.rain_mm_h:
         assert weather.cloud_cover >= 0.6
         assert weather.wetness >= 0.3
@@ -64,8 +68,43 @@ def test_the_whole_space_holds_what_occurs(seed: int):
 
 def test_the_whole_space_reaches_every_class_and_beyond():
     rng = np.random.default_rng(0)
-    found = {weather_class(draw_weather(None, rng)) for _ in range(4000)}
+    found = {weather_class(draw_weather(ANY, rng)) for _ in range(4000)}
     assert found == {*CLASSES, None}
+
+
+@given(name=st.sampled_from(CLASSES), seed=st.integers(0, 2**32))
+@settings(max_examples=100, deadline=None)
+def test_within_a_region_the_nearest_class_is_its_own(name: str, seed: int):
+    assert nearest_class(draw_weather(name, np.random.default_rng(seed))) == name
+
+
+@pytest.mark.parametrize(
+    ("weather", "name"),
+    [
+        (Weather(cloud_cover=0.29), "clear"),
+        (Weather(cloud_cover=0.31), "cloudy"),
+        (Weather(wetness=0.9), "clear"),  # the rain is over
+        (Weather(sun_elevation_deg=-25.0, cloud_cover=1.0, rain_mm_h=2.0, wetness=0.9), "night"),
+        (Weather(cloud_cover=0.95, rain_mm_h=9.9, wetness=0.9), "light_rain"),
+        (Weather(cloud_cover=0.95, rain_mm_h=10.2, wetness=0.9), "heavy_rain"),
+        (Weather(cloud_cover=0.9, visibility_m=1000.0), "fog"),
+        (Weather(cloud_cover=0.9, visibility_m=3000.0), "overcast"),
+    ],
+)
+def test_between_the_regions_the_nearest_class_is_that_of_the_smaller_gap(weather: Weather, name: str):
+    assert weather_class(weather) is None
+    assert nearest_class(weather) == name
+
+
+def test_regions_are_a_unit_of_the_distance_apart():
+    def scaled(parameter: str, value: float) -> float:
+        logarithms = {"rain_mm_h": np.log10(max(value, 0) + DRIZZLE_MM_H), "visibility_m": np.log10(max(value, 1))}
+        return logarithms.get(parameter, value) / SEPARATION[parameter]
+
+    for one, other in combinations(WEATHER_CLASSES.values(), 2):
+        shared = [p for p in SEPARATION if p in one and p in other]
+        low, high = ([[scaled(p, region[p][end]) for p in shared] for region in (one, other)] for end in (0, 1))
+        assert np.maximum(np.subtract(low[0], high[1]), np.subtract(low[1], high[0])).max() >= 1
 
 
 def test_night_and_fog_follow_from_the_parameters():
@@ -108,11 +147,30 @@ def test_a_schedule_in_its_four_forms():
     drawn = schedule({"classes": ["sunset", "night"]})
     seen = {weather_class(drawn.draw(np.random.default_rng(seed)).at(1.0)) for seed in range(20)}
     assert seen == {"sunset", "night"}
+    assert schedule({"classes": ["any"]}).draw(np.random.default_rng(1)).at(0.0) != Weather()
     with pytest.raises(ValueError, match="no weather was drawn"):
         drawn.at(0.0)
 
 
-@pytest.mark.parametrize("value", ["clear", {"wetness": 0.5}, [{"at_s": 1.0, "weather": "fog"}], {"classes": ["fog"]}])
+def test_classes_take_turns_in_an_order_of_the_scene():
+    turns = schedule({"classes": [*CLASSES, "any"], "turn_s": 4.0})
+    scenes = [turns.draw(np.random.default_rng(seed)) for seed in range(3)]
+    orders = [[weather_class(scene.at(4.0 * i)) for i in range(9)] for scene in scenes]
+    assert all({*CLASSES} <= {*order} for order in orders)
+    assert orders[0] != orders[1]
+    assert scenes[0].at(2.0) == interpolate(scenes[0].at(0.0), scenes[0].at(4.0), 0.5)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "clear",
+        {"wetness": 0.5},
+        [{"at_s": 1.0, "weather": "fog"}],
+        {"classes": ["fog"]},
+        {"classes": ["any"], "turn_s": 2},
+    ],
+)
 def test_a_schedule_survives_its_own_dump(value: Any):
     once = schedule(value)
     assert schedule(once.model_dump(mode="json")) == once
@@ -126,6 +184,8 @@ def test_a_schedule_survives_its_own_dump(value: Any):
         ({"colour": 1}, "unknown field"),
         ({"classes": ["snow"]}, "no weather class 'snow'"),
         ({"classes": []}, "give a weather"),
+        ({"classes": ["fog"], "turn_s": 0}, r"turn_s' = 0"),
+        ({"keyframes": [{"at_s": 0, "weather": "fog"}], "turn_s": 4}, "give classes with it"),
         ([], "give a weather"),
         ([{"at_s": 3, "weather": "fog"}, {"at_s": 3, "weather": "clear"}], "must ascend"),
         ([{"at_s": -3, "weather": "fog"}], r"at_s' = -3"),
