@@ -18,6 +18,12 @@ ROAD, SIDEWALK = int(Material.ROAD), int(Material.SIDEWALK)
 WATER_INDEX = 1.33
 TURNED_BACK = 1 - (1 - 0.066) / WATER_INDEX**2  # share of diffuse light that water reflects back to what it covers
 AFTER_PANE_M = 0.002
+ROUGH = np.array(
+    [
+        name in ("GROUND", "ROAD", "SIDEWALK", "WALL", "ROOF", "BARK", "LEAF", "CLOTH", "TROUSERS")
+        for name in Material.__members__
+    ]
+)
 LEVELS = 4096
 QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of the normal distribution
 
@@ -82,10 +88,11 @@ def _look_up(instance, face, first, material, passes, glass):
 
 
 @compiled
-def brightness(echoes, directions, surfaces, sensor_from_instance, wetness):
+def brightness(echoes, directions, surfaces, sensor_from_instance, wetness, roughness=0.0):
     """Return how bright each ray's surface is seen: 1 for a white one face on, 0 where there is none. (N,) float32.
 
-    `sensor_from_instance` (I, 3, 3) turns normals. On roads a film of water dims it as `wetness` (0..1) grows.
+    `sensor_from_instance` (I, 3, 3) turns normals. On roads a film of water dims it as `wetness` (0..1) grows. Ground,
+    masonry, plants and cloth are rough by `roughness` [rad], see `rough_cosine`.
     """
     _, instance, face, materials, panes = echoes
     turn = sensor_from_instance.reshape(-1, 9)
@@ -108,12 +115,26 @@ def brightness(echoes, directions, surfaces, sensor_from_instance, wetness):
             seen *= np.float32(1 - wetness * (1 - under_water(cosine, seen)))
         if surfaces.retro[material]:
             seen *= np.float32(RETRO_GAIN)
+        elif roughness > 0 and ROUGH[material]:
+            seen *= rough_cosine(cosine, roughness)
         else:
             seen *= cosine
         for _ in range(panes[ray]):
             seen *= np.float32(PANE_TRANSMISSION)
         out[ray] = seen
     return out
+
+
+@compiled
+def rough_cosine(cosine, roughness):
+    """Return what takes the place of the cosine of incidence on a surface of facets, seen from where it is lit.
+
+    `roughness` is the standard deviation of the facets' slopes [rad]: Oren and Nayar, "Generalization of Lambert's
+    reflectance model", SIGGRAPH 1994, eq. 30, for equal directions in and out. A street is hardly darker far off.
+    """
+    square = roughness * roughness
+    flat = 1 - 0.5 * square / (square + 0.33)
+    return np.float32(flat * cosine + 0.45 * square / (square + 0.09) * (1 - cosine * cosine))
 
 
 @compiled

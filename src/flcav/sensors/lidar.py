@@ -40,6 +40,9 @@ class Lidar(Config):
     dropout: float = Field(default=0.005, ge=0, lt=1)  # share of echoes lost whatever their power
     glass_pass: float = Field(default=0.9, ge=0, le=1)  # share of rays that pass panes of glass
     divergence_rad: float = Field(default=0.003, gt=0, le=0.05)  # width of a beam over its range
+    roughness_rad: float = Field(default=0.0, ge=0, le=1.5)  # of ground, masonry, plants and cloth: see `rough_cosine`
+    intensity_gamma: float = Field(default=1.0, gt=0, le=2)  # brightness to this power is the intensity reported
+    intensity_floor: float = Field(default=0.0, ge=0, lt=1)  # intensities below are reported as 0
     rolling: bool = False  # the world and the sensor move on while it spins
     carla: CarlaReturns | None = None  # report as CARLA's LiDAR does, in place of the power equation
 
@@ -163,7 +166,9 @@ def measure(
 
     weather = weather or CLEAR
     sensor_from_instance = (world_from_sensor[:3, :3].T @ scene.world_from_instance()).astype(np.float32)
-    bright = brightness(echoes, ray_pattern(lidar), scene.surfaces, sensor_from_instance, weather.wetness)
+    bright = brightness(
+        echoes, ray_pattern(lidar), scene.surfaces, sensor_from_instance, weather.wetness, lidar.roughness_rad
+    )
     distance, least_power = echoes.distance, 0.9 / lidar.sensitivity_m**2
     air = air_in(weather, lidar.divergence_rad, 0.7 * least_power)
     if air is not None:
@@ -185,7 +190,15 @@ def measure(
         points,
         actor,
     )
+    _report_intensity(points[:kept], lidar)
     return points[:kept], actor[:kept]
+
+
+def _report_intensity(points: NDArray[np.float32], lidar: Lidar) -> None:
+    if lidar.intensity_gamma != 1:
+        points[:, 3] **= np.float32(lidar.intensity_gamma)
+    if lidar.intensity_floor > 0:
+        points[points[:, 3] < lidar.intensity_floor, 3] = 0
 
 
 def scan(

@@ -21,7 +21,7 @@ CAMERA_RANGE_M = (
     100.0  # of labels, where an agent has cameras alone; what shows in an image is labelled at any distance
 )
 TRIGGER_MS = 100.0
-RESERVED = ("traces",)  # folders of a dataset
+RESERVED = ("traces", "town")  # folders of a dataset
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
@@ -158,6 +158,16 @@ def roadside() -> Rig:
     return Rig(lidars=lidar_pole().lidars, cameras=cameras)
 
 
+# Velodyne's data sheet: pavement (reflectivity .1) is seen up to 50 m, cars and foliage (.8) up to 120 m: white to 134.
+# Its intensities are compressed, and many returns of dark or glossy bodies come with none.
+HDL64E = Lidar(beams="hdl64e", sensitivity_m=134.0, roughness_rad=0.6, intensity_gamma=0.5, intensity_floor=0.15)
+
+
+def kitti_lidar() -> Rig:
+    """Return the LiDAR of `kitti` alone."""
+    return Rig(lidars={"velodyne": MountedLidar(mount=Mount(z=1.73), settings=HDL64E)})
+
+
 def kitti() -> Rig:
     """Return KITTI's set-up: HDL-64E, left colour camera, GNSS and IMU (Geiger et al., IJRR 32(11), 2013, fig. 3).
 
@@ -166,7 +176,7 @@ def kitti() -> Rig:
     camera = Camera(width=1242, height=375, fx=721.5377, fy=721.5377, cx=609.5593, cy=172.854)
     unit = Mount(x=-0.81, y=0.32, z=0.93)
     return Rig(
-        lidars={"velodyne": MountedLidar(mount=Mount(z=1.73), settings=Lidar(beams="hdl64e"))},
+        lidars=kitti_lidar().lidars,
         cameras={"image_2": MountedCamera(mount=Mount(x=0.27, y=0.06, z=1.65), settings=camera)},
         gnss={"gnss": MountedGnss(mount=unit)},
         imus={"imu": MountedImu(mount=unit)},
@@ -178,6 +188,7 @@ RIGS: dict[str, Rig] = {
     "car_surround": car_surround(),
     "roadside": roadside(),
     "kitti": kitti(),
+    "kitti_lidar": kitti_lidar(),
     "lidar32": lidar32(),
     "lidar_pole": lidar_pole(),
 }
