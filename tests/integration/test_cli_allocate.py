@@ -57,13 +57,19 @@ def test_out_is_a_page_that_tells_the_plan(tmp_path, capsys):
     assert f"<td>{plan['tasks'][0]['samples']:,}</td>" in page
 
 
-def test_links_too_slow_for_the_plan_are_infeasible(tmp_path, capsys):
+def test_links_too_slow_limit_the_plan_until_nothing_can_be_carried(tmp_path, capsys):
     values = yaml.safe_load((RECIPES[0].parents[1] / "graphs" / "three_layers.yaml").read_text())
-    (tmp_path / "graph.yaml").write_text(yaml.safe_dump(values | {"horizon_s": 60}))
+    errors = []
+    for horizon_s in (600, 60):
+        (tmp_path / "graph.yaml").write_text(yaml.safe_dump(values | {"horizon_s": horizon_s}))
+        assert called("allocate", tmp_path / "graph.yaml", "--json") == 0
+        errors.append(json.loads(capsys.readouterr().out)["objective"])
+    assert errors[0] < errors[1]
+    (tmp_path / "graph.yaml").write_text(yaml.safe_dump(values | {"horizon_s": 20}))
     assert called("allocate", tmp_path / "graph.yaml", "--json") == 2
     answer = json.loads(capsys.readouterr().out)
     assert answer["status"] == "infeasible"
-    assert "more than horizon_s = 60" in answer["message"]
+    assert "more than horizon_s = 20" in answer["message"]
 
 
 def test_infeasible_is_exit_2_a_sentence_and_json(tmp_path, capsys):

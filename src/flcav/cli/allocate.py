@@ -48,19 +48,18 @@ def allocate(
 ) -> None:
     """Split both uplink budgets over tasks and training stages so that they err least, by the problem's objective."""
     from flcav.config import read_config
-    from flcav.optimization import allocation
+    from flcav.optimization.allocation import Infeasible
     from flcav.optimization.baselines import baseline as compared
+    from flcav.optimization.fleet import allocate_fleet
     from flcav.optimization.graph import read_graph, read_problem
     from flcav.optimization.replanning import Progress, going_on
-    from flcav.optimization.vehicles import vehicle_shares
 
     asked = read_problem(problem)
     if progress is not None:
         asked = going_on(asked, read_config(Progress, progress))
     try:
-        plan = allocation.allocate(asked)
-        shares = vehicle_shares(asked, plan.tasks)
-    except allocation.Infeasible as error:
+        plan, shares = allocate_fleet(asked)
+    except Infeasible as error:
         if as_json:
             typer.echo(json.dumps({"status": "infeasible", "message": str(error)}))
         raise

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from flcav.experiments.findings import HELD, NOT_HELD, UNDECIDED, verdict
+from flcav.experiments.intervals import mean_over_seeds
 
 EQUAL, JOINT = "equal-stages", "joint"
 TOWN = "grid"  # whose accuracies the planner's history holds
@@ -19,7 +20,7 @@ _VERDICTS = {
 
 def allocation_findings(results: Mapping[str, Any]) -> list[dict[str, str]]:
     """Return findings about `results`: question, verdict and a sentence with the numbers behind it."""
-    return [_better(results), _ranking(results), _accuracy(results), _budgets(results)]
+    return [_better(results), _ranking(results), _every_stage(results), _accuracy(results), _budgets(results)]
 
 
 def _better(results: Mapping[str, Any]) -> dict[str, str]:
@@ -80,6 +81,44 @@ def _why(results: Mapping[str, Any]) -> str:
         if not low <= plans[name][count] <= high
     ]
     return sentence + (f" The curve is extrapolated for {'; '.join(beyond)}." if beyond else "")
+
+
+def _every_stage(results: Mapping[str, Any]) -> dict[str, str]:
+    """Return what each stage of federation added in each plan: the curves fall always and cannot foresee a loss."""
+    gains = {(name, stage): _gain(results, TOWN, name, stage) for name in (EQUAL, JOINT) for stage in ("edge", "cloud")}
+    plans = results["seeds"][0]["plans"]
+    rounds = {(name, stage): plans[name][f"{stage}_rounds"] for name, stage in gains}
+    told = [
+        f"{STAGE_NAMES[stage]} of the {name} plan ({rounds[name, stage]} round{'s' * (rounds[name, stage] != 1)}) "
+        f"{_interval(gain)}"
+        for (name, stage), gain in gains.items()
+    ]
+    sentences = [f"On {TOWN}, over the stage before it: {'; '.join(told)}."]
+    verdicts = {key: verdict(gain["low"], gain["high"]) for key, gain in gains.items()}
+    lost = [key for key, each in verdicts.items() if each == NOT_HELD]
+    if lost:
+        sentences.append("The curves fall with every round, so no plan made from them foresees a loss.")
+    for name, stage in (key for key in lost if key[1] == "cloud"):
+        beside = "; ".join(
+            f"on {town} the same stage brought {_interval(_gain(results, town, name, stage))}"
+            for town in results["summary"]["realised"]
+            if town != TOWN
+        )
+        sentences.append(f"The cloud's average of all regions' networks serves them all: {beside}.")
+    decided = NOT_HELD if lost else HELD if set(verdicts.values()) == {HELD} else UNDECIDED
+    return _finding("Did every stage raise the accuracy?", decided, " ".join(sentences))
+
+
+def _gain(results: Mapping[str, Any], town: str, name: str, stage: str) -> dict[str, float]:
+    """Return what a stage added to what was there before it, over seeds; a single seed decides nothing."""
+    before = {"edge": "pretrain", "cloud": "edge"}[stage]
+    rows = [seed["realised"][town][name] for seed in results["seeds"]]
+    gain = mean_over_seeds([row[stage]["ap50"] - row[before]["ap50"] for row in rows])
+    return gain if len(rows) > 1 else gain | {"low": -1.0, "high": 1.0}
+
+
+def _interval(gain: Mapping[str, float]) -> str:
+    return f"{_signed(gain['mean'])} ({_signed(gain['low'])} to {_signed(gain['high'])})"
 
 
 def _gains(after: Mapping[str, float]) -> dict[str, float]:

@@ -29,6 +29,10 @@ END_GAP = 1e-4  # relative, of times
 NODES = 100
 
 
+class TooSlow(Infeasible):
+    """The vehicles' own links need longer than the horizon."""
+
+
 @dataclass(frozen=True)
 class VehicleShare:
     """What one vehicle does for one task."""
@@ -37,6 +41,9 @@ class VehicleShare:
     samples: int  # uploads in stage I
     rounds: tuple[int, ...]  # joins, of 1 ... edge_rounds + k * cloud_rounds, in the order of the run
     wireless_mb: float
+
+
+Shares = dict[str, tuple[VehicleShare, ...]]  # by task
 
 
 @dataclass(frozen=True)
@@ -52,10 +59,11 @@ class _Part:
     quality: float
 
 
-def vehicle_shares(problem: Problem, plans: Sequence[TaskPlan]) -> dict[str, tuple[VehicleShare, ...]]:
+def vehicle_shares(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
     """Return the shares of every task that names its vehicles, by task, for `plans` in the order of the tasks.
 
-    Raises `Infeasible` where the vehicles hold too few samples, or their links need longer than `horizon_s`.
+    Raises `Infeasible` where the vehicles hold too few samples, `TooSlow` where their links need longer than
+    `horizon_s`.
     """
     planned = [(task, plan) for task, plan in zip(problem.tasks, plans, strict=True) if task.uplink_mbps]
     if not planned:
@@ -69,7 +77,7 @@ def vehicle_shares(problem: Problem, plans: Sequence[TaskPlan]) -> dict[str, tup
             )
     parts = [part for task, plan in planned for part in _parts(problem, task, plan)]
     counts = _split(parts, [plan for _, plan in planned], problem.horizon_s)
-    shares: dict[str, tuple[VehicleShare, ...]] = {}
+    shares: Shares = {}
     for task, _ in planned:
         own = [(part, row) for part, row in zip(parts, counts) if part.task is task]
         joined = _rounds([part.group for part, _ in own], [int(row[1]) for _, row in own], own[0][0].rounds)
@@ -168,10 +176,10 @@ def _least(aim: Array, constraints: Sequence[LinearConstraint], high: Array, gap
     return result.x
 
 
-def _too_slow(soonest: Array | None, horizon_s: float | None) -> Infeasible:
+def _too_slow(soonest: Array | None, horizon_s: float | None) -> TooSlow:
     assert soonest is not None
     assert horizon_s is not None
-    return Infeasible(
+    return TooSlow(
         f"the vehicles' own links need {soonest[-1]:.6g} s for the plan even if stragglers leave out rounds, "
         f"{soonest[-1] - horizon_s:.6g} s more than horizon_s = {horizon_s:g}"
     )

@@ -77,10 +77,11 @@ def test_differences_are_paired_by_seed() -> None:
 
 
 def test_a_prediction_that_came_true_is_said_to_have_held() -> None:
-    assert verdicts(RIGHT) == ["held", "held", "held", "held"]
-    better, ranking, accuracy, budgets = (finding["sentence"] for finding in RIGHT["findings"])
+    assert verdicts(RIGHT) == ["held", "held", "undecided", "held", "held"]
+    better, ranking, stages, accuracy, budgets = (finding["sentence"] for finding in RIGHT["findings"])
     assert "0.613 with equal stages and 0.667 with the joint plan: +0.053" in better
     assert "predicts +0.040 for the joint plan; 3 of 3 seeds agree in sign, and so does their mean" in ranking
+    assert "edge FL of the joint plan (12 rounds) +0.107 (+0.092 to +0.121)" in stages
     assert "off its prediction by 0.013 on average" in accuracy
     assert "within its budgets, at 63% to 98%" in budgets
     assert "−0.50 to +1.00 MB" in budgets
@@ -92,6 +93,16 @@ def test_a_wrong_ranking_is_said_and_why() -> None:
     assert "0 of 3 seeds agree in sign, and their mean does not. They part most in edge FL" in ranking["sentence"]
     assert "was to have −0.010 more than equal stages, and had −0.067" in ranking["sentence"]
     assert "extrapolated for edge rounds 12 of the joint plan (history: 0 to 6)" in ranking["sentence"]
+
+
+def test_a_stage_that_costs_accuracy_is_said_beside_what_it_brought_elsewhere() -> None:
+    rows = [((0.48, 0.58, 0.60), (0.52, 0.62, ap)) for ap in (0.58, 0.585, 0.59)]
+    stages = results_of(*rows)["findings"][2]
+    assert stages["verdict"] == "did not hold"
+    assert "cloud FL of the joint plan (1 round) −0.035 (−0.047 to −0.023)" in stages["sentence"]
+    assert "foresees a loss" in stages["sentence"]
+    assert "on ring the same stage brought −0.035" in stages["sentence"]
+    assert results_of(rows[0])["findings"][2]["verdict"] == "undecided"
 
 
 def test_seeds_that_disagree_decide_nothing() -> None:
@@ -125,7 +136,7 @@ def test_tables_hold_a_row_per_run() -> None:
     assert "| cloud FL | joint | 0.660 | 0.667 (" in found["accuracy"]
     assert "| grid | cloud FL | +0.040 | +0.053 (" in found["differences"]
     assert "| 2 | joint | wireline | 110.0 | 70.0 | 69.5 | -0.50 |" in found["megabytes"]
-    assert found["findings"].count("\n- ") == 3
+    assert found["findings"].count("\n- ") == 4
 
 
 def test_the_picture_is_a_png() -> None:

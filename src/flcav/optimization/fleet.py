@@ -1,0 +1,136 @@
+"""A plan that the vehicles can carry: within both budgets, what each vehicle holds, and each vehicle's own link.
+
+The budgets know the fleet as a whole, and the optimum within them may ask more of slow links than `horizon_s` allows.
+Then two relaxations are solved, each with one number made smaller until the plan can be split over the vehicles:
+
+- *all join*: every vehicle joins every round, as the budgets are priced, and the wireless budget shrinks;
+- *one joins*: one vehicle per edge group joins a round, the least that a split needs, and what all links together can
+  carry within the horizon, which takes the wireless budget's place, shrinks.
+
+Unshrunk, each errs no more than any plan that can be carried, so the larger of their bounds is proven; the better of
+the two plans is taken, and its gap says how far that may be from the best.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flcav.network.plan import Price
+from flcav.optimization.allocation import Allocation, Infeasible, allocate, described, resolved, score, used
+from flcav.optimization.problem import Problem, Task
+from flcav.optimization.vehicles import BITS_PER_BYTE, Shares, TooSlow, vehicle_shares
+
+HALVINGS = 9  # of the interval in which what is made smaller is sought
+ROUNDING = 1e-9  # relative
+OPTIMAL = 1e-4  # gap
+CARRIED = "the vehicles' own links, within horizon_s, limit this plan, not the wireless budget"
+
+Carried = tuple[Allocation, Shares]
+Relaxed = Callable[[float], Problem]  # by the share that is left of what is made smaller
+
+
+def allocate_fleet(problem: Problem) -> Carried:
+    """Return the plan and what each vehicle does for it.
+
+    Raises `Infeasible` where the limits ask for more than the budgets, the held samples or the links carry.
+    """
+    asked = problem.model_copy(update={"tasks": tuple(_within_held(task) for task in problem.tasks)})
+    plan = allocate(asked)
+    try:
+        return plan, vehicle_shares(asked, plan.tasks)
+    except TooSlow as error:
+        relaxations = [_all_join(asked, plan)]
+        if all(task.uplink_mbps for task in asked.tasks):
+            relaxations.append(_one_joins(asked))
+        found = [carried for relaxed in relaxations if (carried := _largest(asked, relaxed))]
+        if not found:
+            raise error
+        bounds = [plan.lower_bound, *(_bound(relaxed) for relaxed in relaxations[1:])]
+        return _certified(asked, found, bounds)
+
+
+def _within_held(task: Task) -> Task:
+    """Return the task with no more samples than its vehicles hold; raises `Infeasible` if its limits ask for more."""
+    vehicles = task.uplink_mbps or {}
+    if not vehicles or any(vehicle not in task.samples_held for vehicle in vehicles):
+        return task
+    held = sum(task.samples_held[vehicle] for vehicle in vehicles)
+    least, most = task.limits.samples
+    if held < least:
+        raise Infeasible(
+            f"task {task.name!r}: its vehicles hold {held} samples (samples_held), and limits.samples starts at {least}"
+        )
+    limits = task.limits.model_copy(update={"samples": (least, min(most, held))})
+    return task.model_copy(update={"limits": limits})
+
+
+def _all_join(asked: Problem, plan: Allocation) -> Relaxed:
+    return lambda share: _with_wireless(asked, share * plan.used_mb.wireless_mb, asked.tasks)
+
+
+def _one_joins(asked: Problem) -> Relaxed:
+    assert asked.horizon_s is not None
+    links = {name: link.wireless for task in asked.tasks for name, link in (task.uplink_mbps or {}).items()}
+    carried_mb = min(sum(links.values()) * asked.horizon_s / BITS_PER_BYTE, asked.budgets_mb.wireless)
+    tasks = tuple(task.model_copy(update={"edge_groups": (1,) * len(task.edge_groups)}) for task in asked.tasks)
+    return lambda share: _with_wireless(asked, share * carried_mb, tasks)
+
+
+def _with_wireless(asked: Problem, wireless_mb: float, tasks: tuple[Task, ...]) -> Problem:
+    budgets = asked.budgets_mb.model_copy(update={"wireless": wireless_mb})
+    return asked.model_copy(update={"budgets_mb": budgets, "tasks": tasks})
+
+
+def _largest(asked: Problem, relaxed: Relaxed) -> Carried | None:
+    """Return the plan of the largest share that can be carried, as far as halving finds it."""
+    low, high, share, found = 0.0, 1.0, 1.0, None
+    for _ in range(HALVINGS + 1):
+        try:
+            found, low = _carried(asked, allocate(relaxed(share))), share
+        except TooSlow:
+            high = share
+        except Infeasible:
+            low = share  # too little for the limits
+        if low >= high:
+            break
+        share = (low + high) / 2
+    return found
+
+
+def _carried(asked: Problem, plan: Allocation) -> Carried:
+    """Return the plan at its price in `asked`, split; raises `TooSlow` if the links or the budgets do not carry it."""
+    counts = [count for row in plan.tasks for count in (row.samples, row.edge_rounds, row.cloud_rounds)]
+    tasks = described(asked, np.array(counts, dtype=np.float64))
+    spent = used(tasks)
+    if spent.wireless_mb > asked.budgets_mb.wireless * (1 + ROUNDING):
+        raise TooSlow("the wireless budget does not carry the rounds of every vehicle")
+    shares = vehicle_shares(asked, tasks)
+    return replace(plan, tasks=tasks, used_mb=spent, objective=score(resolved(asked), tasks)), shares
+
+
+def _bound(relaxed: Relaxed) -> float | None:
+    try:
+        return allocate(relaxed(1.0)).lower_bound
+    except Infeasible:
+        return None
+
+
+def _certified(asked: Problem, found: Sequence[Carried], bounds: Sequence[float | None]) -> Carried:
+    """Return the best plan with what is proven of it; more of the wireless budget would bring it nothing."""
+    larger = asked.objective == "area"
+    plan, shares = (max if larger else min)(found, key=lambda carried: carried[0].objective)
+    known = [bound for bound in bounds if bound is not None]
+    lower = None if larger else min(max(known), plan.objective)
+    gap = None if lower is None else (plan.objective - lower) / lower if lower > 0 else float(plan.objective > 0)
+    rates = Price(0.0, plan.marginal_error_per_gb.wireline_mb)
+    notes = (plan.note, CARRIED)
+    certified = replace(
+        plan,
+        status="optimal" if gap is not None and gap <= OPTIMAL else "feasible",
+        lower_bound=lower,
+        gap=gap,
+        marginal_error_per_gb=rates,
+        note="; ".join(note for note in notes if note),
+    )
+    return certified, shares
