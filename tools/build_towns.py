@@ -263,6 +263,48 @@ def ring() -> Sketch:
     return town
 
 
+def arterial() -> Sketch:
+    """A village street between two lights, crossed by roads of 60 km/h, in a fast road that leads around it."""
+    town = Sketch(
+        {
+            "fast": Profile(1, 3.6, 0, 0, 1.8, 25.0, 5),
+            "through": Profile(1, 3.3, 2.2, 0, 2.0, 16.67, 3),
+            "lane": Profile(1, 3.0, 0, 0, 1.8, 8.33, 1),
+        }
+    )
+    junctions: dict[str, tuple[Point, str]] = {
+        "w": ((-172, 0), "traffic_light"),
+        "n1": ((-86, 125), "priority_stop"),
+        "n2": ((0, 125), "priority"),
+        "n3": ((86, 125), "traffic_light"),
+        "e": ((172, 0), "traffic_light"),
+        "s3": ((86, -125), "priority"),
+        "s2": ((0, -125), "priority_stop"),
+        "s1": ((-86, -125), "traffic_light"),
+        "c1": ((-86, 0), "traffic_light"),
+        "c2": ((0, 0), "priority_stop"),
+        "c3": ((86, 0), "traffic_light"),
+    }
+    for name, (at, kind) in junctions.items():
+        town.node(name, at, kind)
+    corner = 60.0
+    bends = {"w": (-172, 125), "n3": (172, 125), "e": (172, -125), "s1": (-172, -125)}
+    rim = ("w", "n1", "n2", "n3", "e", "s3", "s2", "s1")
+    for start, end in zip(rim, (*rim[1:], rim[0])):
+        via: tuple[Point, ...] = ()
+        if start in bends:
+            x, y = bends[start]
+            centre = (x - math.copysign(corner, x), y - math.copysign(corner, y))
+            first = {"w": 180, "n3": 90, "e": 0, "s1": 270}[start]
+            via = tuple(on_circle(centre, corner, math.radians(first - 10 * k)) for k in range(10))
+        town.street(start, end, "fast", via)
+    for start, end in ("w", "c1"), ("c3", "e"), ("n1", "c1"), ("c1", "s1"), ("n3", "c3"), ("c3", "s3"):
+        town.street(start, end, "through")
+    for start, end in ("c1", "c2"), ("c2", "c3"), ("n2", "c2"), ("c2", "s2"):
+        town.street(start, end, "lane")
+    return town
+
+
 if __name__ == "__main__":
-    for name, sketch in {"suburb": suburb(), "grid": grid(), "ring": ring()}.items():
+    for name, sketch in {"suburb": suburb(), "grid": grid(), "ring": ring(), "arterial": arterial()}.items():
         sketch.build(TOWNS / name / "town.net.xml")

@@ -1,6 +1,8 @@
 """The built-in simulator as a source: SUMO traffic in one of our towns, seen by our sensors."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError
@@ -11,9 +13,11 @@ from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.recipe import Recipe
 from flcav.world.scene import Scene
-from flcav.world.town import load_town
+from flcav.world.town import TOWNS, load_town
 from flcav.world.trace import Trace
 from flcav.world.traffic import simulate
+
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")  # it begins the names of scenes
 
 
 class EmbeddedSource:
@@ -23,6 +27,8 @@ class EmbeddedSource:
         """Load the town; raises `InputError` where it, a pole or an observer is missing, or a mount below ground."""
         self.recipe = recipe
         self.town = load_town(recipe.town)
+        if not _SAFE_NAME.fullmatch(self.town.name):
+            raise InputError(f"field 'town' = {recipe.town!r}: the folder's name must be letters, digits, - and _")
         known = self.town.poles.id.tolist()
         self.poles = known if recipe.poles == "all" else list(recipe.poles)
         if unknown := [pole for pole in self.poles if pole not in known]:
@@ -41,15 +47,18 @@ class EmbeddedSource:
 
     def describe(self) -> dict[str, Any]:
         """Return the recipe with every name resolved: the poles, the rigs, what the town was built from."""
-        folder = self.town.net.parent
         return {
             **self.recipe.model_dump(mode="json"),
             "town": self.town.name,
-            "town_files": {path.name: sha256(path) for path in (self.town.net, folder / "town.yaml")},
+            "town_files": {path.name: sha256(path) for path in self._town_paths()},
             "scenes": len(self.scenes()),
             "frames": self._frames,
             "poles": self.poles,
         }
+
+    def town_files(self) -> Mapping[str, bytes]:
+        """Return the files of the town's folder by name; none of a town that comes with flcav."""
+        return {} if self.recipe.town in TOWNS else {path.name: path.read_bytes() for path in self._town_paths()}
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes: town, seed and number, so that no two runs share a name."""
@@ -87,10 +96,14 @@ class EmbeddedSource:
         """Return the scene's traffic at the times of its spins."""
         if self._last_trace is None or self._last_trace[0] != scene:
             seed = child_seed(self.recipe.seed, "traffic", self.scenes().index(scene))
-            times_s, scenarios = self.recipe.times_s(), self.recipe.scenarios
+            warmup = stream(self.recipe.seed, scene, "warmup").integers(*self.recipe.warmup_steps, endpoint=True)
+            times_s, scenarios = self.recipe.times_s(int(warmup)), self.recipe.scenarios
             trace = simulate(self.town, seed=seed, cavs=self.recipe.cavs, times_s=times_s, scenarios=scenarios)
             self._last_trace = scene, trace
         return self._last_trace[1]
+
+    def _town_paths(self) -> tuple[Path, Path]:
+        return self.town.net, self.town.net.parent / "town.yaml"
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_last_trace": None, "_last_scene": None}

@@ -13,11 +13,22 @@ from flcav.world.scenarios.scenario import Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
 STEP_S = 0.1  # of the traffic
+LONGEST_S = 36_000.0
 
 
 def _multiple_of_step(value: float) -> float:
     if not np.isclose(value / STEP_S, round(value / STEP_S), atol=1e-6):
         raise ValueError(f"must be a multiple of {STEP_S} s")
+    return value
+
+
+def _warmup(value: Any) -> Any:
+    ends = value if isinstance(value, list | tuple) else (value, value)
+    numbers = len(ends) == 2 and all(isinstance(end, int | float) and not isinstance(end, bool) for end in ends)
+    if not numbers or not 0 < ends[0] <= ends[1] <= LONGEST_S:
+        raise ValueError(f"must be seconds above 0 and up to {LONGEST_S:g}, or two such numbers, the lower first")
+    for end in ends:
+        _multiple_of_step(end)
     return value
 
 
@@ -36,7 +47,8 @@ def _rig(value: Any) -> Any:
     return RIGS[value]
 
 
-Duration = Annotated[float, Field(gt=0, le=36_000), AfterValidator(_multiple_of_step)]
+Duration = Annotated[float, Field(gt=0, le=LONGEST_S), AfterValidator(_multiple_of_step)]
+Warmup = Annotated[float | tuple[float, float], BeforeValidator(_warmup)]
 NamedRig = Annotated[Rig, BeforeValidator(_rig)]
 
 
@@ -52,7 +64,7 @@ class Recipe(Config):
     split: str = Field(default="train", pattern=r"^[A-Za-z0-9_-]+$")
     scenes: int = Field(default=1, ge=1)
     frames: int | None = Field(default=None, ge=1)  # exactly the first so many, by as many scenes as they take
-    warmup_s: Duration = 60.0
+    warmup_s: Warmup = 60.0  # or from, to: each scene draws its own, so that scenes differ in what lights show
     spins_per_scene: int = Field(default=10, ge=1)
     every_s: Duration = 1.0
     cavs: int = Field(default=1, ge=0)
@@ -68,11 +80,17 @@ class Recipe(Config):
         for scenario in self.scenarios:
             if scenario.near and int(scenario.near.removeprefix("cav")) >= self.cavs:
                 raise ValueError(f"scenarios: '{scenario.kind}' is near {scenario.near}, but cavs = {self.cavs}")
-            if scenario.at_s >= self.times_s()[-1]:
+            if scenario.at_s >= self.times_s(self.warmup_steps[0])[-1]:
                 raise ValueError(f"scenarios: '{scenario.kind}' is at {scenario.at_s:g} s, after the last spin")
         return self
 
-    def times_s(self) -> NDArray[np.float64]:
-        """Return the (spins_per_scene,) times of the spins in each run [s]."""
-        steps = round(self.warmup_s / STEP_S) + np.arange(self.spins_per_scene) * round(self.every_s / STEP_S)
+    @property
+    def warmup_steps(self) -> tuple[int, int]:
+        """Return the shortest and the longest warm-up of a scene, in steps of the traffic."""
+        ends = self.warmup_s if isinstance(self.warmup_s, tuple) else (self.warmup_s, self.warmup_s)
+        return round(ends[0] / STEP_S), round(ends[1] / STEP_S)
+
+    def times_s(self, warmup_steps: int) -> NDArray[np.float64]:
+        """Return the (spins_per_scene,) times of the spins in a run after a warm-up of so many steps [s]."""
+        steps = warmup_steps + np.arange(self.spins_per_scene) * round(self.every_s / STEP_S)
         return np.round(steps * np.float64(STEP_S), 1)

@@ -1,6 +1,6 @@
 """Whatever observes traffic: the built-in simulator, another simulator, a log."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from flcav.sensors.frame import Frame
@@ -44,4 +44,13 @@ class Replayable(Source, Protocol):
 
     def replay(self, scene: str, trace: Trace, numbers: range) -> Iterator[Frame]:
         """Yield frames `numbers`, counted as `frames(scene)` yields them, of the scene whose traffic is `trace`."""
+        ...
+
+
+@runtime_checkable
+class Located(Source, Protocol):
+    """A source whose town has a folder that may not be there where its dataset is read: the dataset keeps it."""
+
+    def town_files(self) -> Mapping[str, bytes]:
+        """Return the files of the town's folder by name; none of a town that comes with flcav."""
         ...

@@ -17,7 +17,7 @@ from flcav.world.surfaces import kerb_lines, simple_polygons, surfaces
 
 Array = NDArray[np.float64]
 
-TOWNS: tuple[str, ...] = ("suburb", "grid", "ring")
+TOWNS: tuple[str, ...] = ("suburb", "grid", "ring", "arterial")
 KERB_M = 0.12  # how far a sidewalk is above the road
 MARGIN_M = 5.0  # of open land around the outermost thing
 

@@ -56,6 +56,15 @@ def test_scenes_differ_in_traffic_and_in_parked_cars():
         assert places[0] != places[1], kind
 
 
+def test_each_scene_draws_its_own_warm_up_from_a_range():
+    source = small(warmup_s=[35.0, 95.0], scenes=4)
+    starts = [float(source.trace(scene).time_s[0]) for scene in source.scenes()]
+    assert len(set(starts)) == 4
+    assert 35.0 <= min(starts) < max(starts) <= 95.0
+    again = source.scenes()[0]
+    assert small(warmup_s=[35.0, 95.0], scenes=4).trace(again).time_s[0] == starts[0]
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

@@ -23,10 +23,18 @@ def test_rigs_by_name_and_written_out():
 
 
 def test_times_are_exact_tenths_of_a_second():
-    times = parsed(warmup_s=59.9, every_s=0.1, spins_per_scene=300).times_s()
+    recipe = parsed(warmup_s=59.9, every_s=0.1, spins_per_scene=300)
+    assert recipe.warmup_steps == (599, 599)
+    times = recipe.times_s(599)
     assert len(times) == 300
     assert times.tolist() == [(599 + spin) / 10 for spin in range(300)]
     assert times.dtype == np.float64
+
+
+def test_a_range_of_warm_ups_is_one_of_the_recipes_settings():
+    recipe = parsed(warmup_s=[60, 90.5])
+    assert recipe.warmup_steps == (600, 905)
+    assert parse_config(Recipe, recipe.model_dump(mode="json"), "resolved") == recipe
 
 
 @pytest.mark.parametrize(
@@ -39,7 +47,11 @@ def test_times_are_exact_tenths_of_a_second():
         ({"frames": 0}, "field 'frames' = 0"),
         ({"every_s": 0}, "field 'every_s' = 0: .*greater than 0"),
         ({"every_s": 0.25}, "field 'every_s' = 0.25: must be a multiple of 0.1 s"),
-        ({"warmup_s": float("inf")}, "field 'warmup_s'"),
+        ({"warmup_s": float("inf")}, "field 'warmup_s' = inf: must be seconds"),
+        ({"warmup_s": 0}, "field 'warmup_s' = 0: must be seconds above 0"),
+        ({"warmup_s": [90.0, 60.0]}, "field 'warmup_s' = .*the lower first"),
+        ({"warmup_s": [60.0, 90.05]}, "field 'warmup_s' = .*must be a multiple of 0.1 s"),
+        ({"warmup_s": "a minute"}, "field 'warmup_s' = 'a minute': must be seconds"),
         ({"split": "../test"}, "field 'split'"),
         ({"poles": "some"}, "field 'poles' = 'some': must be a list of different pole numbers, or 'all'"),
         ({"poles": [1, 1]}, "field 'poles'"),

@@ -1,4 +1,4 @@
-"""The three towns, against what shapely says of their polygons."""
+"""The towns, against what shapely says of their polygons."""
 
 import pickle
 import shutil

@@ -17,7 +17,12 @@ from flcav.world.trace import CATEGORIES, Trace
 from flcav.world.traffic import simulate
 
 TIMES_S = 60.0 + 0.1 * np.arange(300)
-ROUGHLY = {"suburb": (20, 35, 45), "grid": (40, 70, 15), "ring": (30, 50, 15)}  # moving vehicles from, to; parked from
+ROUGHLY = {
+    "suburb": (20, 35, 45),
+    "grid": (40, 70, 15),
+    "ring": (30, 50, 15),
+    "arterial": (28, 40, 10),
+}  # moving vehicles from, to; parked from
 
 
 @pytest.fixture(scope="module", params=TOWNS)
