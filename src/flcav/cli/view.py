@@ -22,7 +22,6 @@ def view(
     from flcav.dataset.store import Dataset
     from flcav.files import atomic_path
     from flcav.world.lanes import map_layers
-    from flcav.world.town import load_town
 
     if find_spec("rerun") is None:
         raise InputError("flcav view needs Rerun, which is not installed: pip install 'flcav[view]'")
@@ -38,10 +37,8 @@ def view(
         raise InputError(f"{folder}: no scene '{scene}'; it has {', '.join(scenes)}")
     shown = scene or scenes[0]
     selected = dataset.select(scenes=[shown])
-    try:
-        layers = map_layers(load_town(dataset.manifest["recipe"].get("town", "")))
-    except InputError:  # a source that has no town of ours
-        layers = None
+    town = dataset.town()
+    layers = None if town is None else map_layers(town)
     first = [i for i in selected if dataset.keys[i].index == dataset.keys[selected[0]].index]
     layout = blueprint([dataset.frame(i) for i in first])
     recording = rerun.RecordingStream("flcav", recording_id=shown)

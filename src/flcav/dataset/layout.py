@@ -13,6 +13,7 @@ MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
 CALIBRATION = "calibration.json"  # see `flcav.dataset.calibration`
 FILES = "files"  # table of the payload files: all that is neither a table, the calibration nor the manifest
 TRACES = "traces"
+TOWN = "town"  # holds the folder of a town that does not come with flcav
 WORK = ".recording"  # what a recording under way keeps; gone when it is done
 PACKAGES = ("flcav", "embreex", "libsumo", "numba", "numpy", "pillow", "pyarrow")  # those that decide the bytes
 
@@ -45,6 +46,11 @@ def trace_path(scene: str) -> str:
 def package_versions() -> dict[str, str]:
     """Return the versions of the packages that decide what is recorded."""
     return {name: version(name) for name in PACKAGES}
+
+
+def town_path(town: str) -> str:
+    """Return the folder of a town that the dataset brings with it."""
+    return f"{TOWN}/{town}"
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

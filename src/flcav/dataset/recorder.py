@@ -8,6 +8,7 @@ point costs the parts that were under way.
 import json
 import shutil
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from flcav.dataset.layout import (
     package_versions,
     read_manifest,
     table_path,
+    town_path,
     trace_path,
 )
 from flcav.dataset.ray_engine import ray_cluster
@@ -31,9 +33,9 @@ from flcav.dataset.schedule import pending, record_scenes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, join_tables, write_table
 from flcav.dataset.tasks import PAYLOADS, TRAFFIC, parts
 from flcav.dataset.workers import processes
-from flcav.files import sha256, write_json
+from flcav.files import sha256, write_bytes, write_json
 from flcav.progress import Report, silent
-from flcav.sources.source import Source
+from flcav.sources.source import Located, Source
 
 ENGINES = {"processes": processes, "ray": ray_cluster}
 HEADER = "recipe.json"
@@ -112,7 +114,8 @@ def _assemble(source: Source, out: Path, header: dict[str, Any]) -> None:
     joined = work / JOINED
     joined.mkdir(exist_ok=True)
     folders = [part.folder(work) for scene in scenes for part in parts(source, scene)]
-    listings = [listing for scene in scenes if (listing := _move_traffic(work / scene, scene, out))]
+    listings = [work / table_path(FILES)] if _write_town(source, work, out) else []
+    listings += [listing for scene in scenes if (listing := _move_traffic(work / scene, scene, out))]
     for folder in folders:
         listings.append(folder / table_path(FILES))
         for name in pq.ParquetFile(listings[-1]).read()["path"].to_pylist():
@@ -147,12 +150,29 @@ def _assemble(source: Source, out: Path, header: dict[str, Any]) -> None:
     shutil.rmtree(work)
 
 
+def _write_town(source: Source, work: Path, out: Path) -> bool:
+    """Write the files of a town that the dataset brings with it, and their listing; return whether there are any."""
+    files = source.town_files() if isinstance(source, Located) else {}
+    if not files:
+        return False
+    folder = town_path(str(source.describe()["town"]))
+    for name, data in files.items():
+        write_bytes(out / folder / name, data)
+    _list({f"{folder}/{name}": out / folder / name for name in files}, work)
+    return True
+
+
+def _list(files: Mapping[str, Path], folder: Path) -> None:
+    """Write the listing of `files` by what they are called in the dataset into `folder`."""
+    rows = [(name, path.stat().st_size, sha256(path)) for name, path in files.items()]
+    write_table(pa.table(dict(zip(FILES_SCHEMA.names, zip(*rows))), schema=FILES_SCHEMA), folder / table_path(FILES))
+
+
 def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
     """Move the traffic of a scene into the dataset and return its listing; None of a scene that has none."""
     traffic, listing = folder / TRAFFIC, folder / table_path(FILES)
     if traffic.exists():
-        values = [trace_path(scene)], [traffic.stat().st_size], [sha256(traffic)]
-        write_table(pa.table(dict(zip(FILES_SCHEMA.names, values)), schema=FILES_SCHEMA), listing)
+        _list({trace_path(scene): traffic}, folder)
         _move(traffic, out / trace_path(scene))
     return listing if listing.exists() else None
 

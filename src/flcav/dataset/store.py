@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.calibration import Calibrations, read_calibrations
 from flcav.dataset.frames import annotations_of, vectors_of, weather_of
-from flcav.dataset.layout import CALIBRATION, FrameKey, payload_path, read_manifest, table_path, trace_path
+from flcav.dataset.layout import CALIBRATION, FrameKey, payload_path, read_manifest, table_path, town_path, trace_path
 from flcav.dataset.payloads import INFRARED, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, read_table
 from flcav.sensors.frame import CameraImage, Frame
+from flcav.world.town import Town, load_town
 from flcav.world.trace import Trace
 
 POINT_BYTES = 16  # four float32
@@ -117,6 +118,15 @@ class Dataset:
         """Return the traffic of a scene, None where it was not known; raises `InputError` where it cannot be read."""
         path = self.folder / trace_path(scene)
         return Trace.load(path) if path.is_file() else None
+
+    def town(self) -> Town | None:
+        """Return the town of the dataset, None where it is not known."""
+        name = str(self.manifest["recipe"].get("town", ""))
+        kept = self.folder / town_path(name)
+        try:
+            return load_town(kept if name and kept.is_dir() else name)
+        except InputError:
+            return None
 
     def payload_bytes(self, i: int) -> int:
         """Return the bytes of frame `i` as a labelled sample: its point clouds and its annotation rows."""

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
 from flcav.dataset.formats.exporter import ExportOptions, lacks, read_frame
 from flcav.dataset.formats.motion import agent_velocities
 from flcav.dataset.formats.nuscenes.drive import Drive
@@ -23,7 +22,6 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import pose
 from flcav.progress import Report
 from flcav.sensors.lidar import Lidar, ray_pattern
-from flcav.world.town import load_town
 
 Array = NDArray[np.float64]
 
@@ -88,10 +86,8 @@ def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:
 def _write_map(dataset: Dataset, path: Path) -> Array:
     """Write the mask of roads and sidewalks, empty where the dataset's town is not known; return global_from_world."""
     path.parent.mkdir(parents=True)
-    name = dataset.manifest["recipe"].get("town", "")
-    try:
-        town = load_town(name)
-    except InputError:
+    town = dataset.town()
+    if town is None:
         positions = np.array([dataset.frame(i).world_from_agent[:2, 3] for i in range(len(dataset))])
         low, high = positions.min(axis=0) - UNKNOWN_MARGIN_M, positions.max(axis=0) + UNKNOWN_MARGIN_M
         height, width = np.ceil((high - low)[::-1] / RESOLUTION_M).astype(int)

@@ -1,0 +1,88 @@
+"""A town made from an OpenDRIVE map, recorded as a user would, and its dataset without the town's folder."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from PIL import Image
+
+from flcav.cli.main import run
+from flcav.dataset.store import Dataset
+
+pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
+
+CROSS = Path(__file__).parents[1] / "data" / "cross.xodr"
+REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "carla_maps"
+SMALL = {"channels": 16, "azimuth_steps": 360}
+RECIPE: dict[str, Any] = {
+    "seed": 1,
+    "cavs": 2,
+    "poles": "all",
+    "warmup_s": 40.0,
+    "spins_per_scene": 2,
+    "vehicle_rig": {
+        "lidars": {"lidar": {"mount": {"z": 1.85}, "settings": SMALL}},
+        "cameras": {"front": {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 320, "height": 192}}},
+    },
+    "pole_rig": {
+        "lidars": {"lidar": {"settings": {**SMALL, "down_deg": -45}}},
+        "cameras": {"watch": {"mount": {"pitch_deg": 20}, "settings": {"width": 320, "height": 192}}},
+    },
+}
+
+
+def flcav(*arguments: object) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run([str(argument) for argument in arguments])
+    assert not ended.value.code, arguments
+
+
+def recorded(xodr: Path, folder: Path, **changes: object) -> Path:
+    """Import a map, name its folder in a recipe, record and validate that."""
+    flcav("towns", "import", xodr, "--out", folder / "mine")
+    (folder / "recipe.yaml").write_text(yaml.safe_dump({**RECIPE, "town": str(folder / "mine"), **changes}))
+    flcav("record", folder / "recipe.yaml", "--out", folder / "data")
+    flcav("validate", folder / "data")
+    return folder / "data"
+
+
+def test_a_dataset_brings_its_town_along(tmp_path: Path):
+    data = recorded(CROSS, tmp_path)
+    kept = data / "town" / "mine"
+    for name in ("town.net.xml", "town.yaml"):
+        assert (kept / name).read_bytes() == (tmp_path / "mine" / name).read_bytes()
+    shutil.rmtree(tmp_path / "mine")
+    town = Dataset.open(data).town()
+    assert town is not None
+    assert town.name == "mine"
+    flcav("export", "nuscenes", data, "--out", tmp_path / "nuscenes")
+    assert np.asarray(Image.open(tmp_path / "nuscenes" / "maps" / "map.png")).any()
+
+
+def test_a_folder_whose_name_no_file_can_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    flcav("towns", "import", CROSS, "--out", tmp_path / "my town")
+    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump({**RECIPE, "town": str(tmp_path / "my town")}))
+    with pytest.raises(SystemExit) as ended:
+        run(["record", str(tmp_path / "recipe.yaml"), "--out", str(tmp_path / "data")])
+    assert ended.value.code == 2
+    assert "the folder's name must be letters, digits, - and _" in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Town02", "Town10HD"])
+def test_carlas_towns_show_lights_and_signs(name: str, tmp_path: Path):
+    if not (REAL / f"{name}.xodr").exists():
+        pytest.skip("CARLA's maps are not part of the project")
+    data = recorded(REAL / f"{name}.xodr", tmp_path)
+    signs = pq.read_table(data / "signs.parquet").to_pydict()
+    states = {state for kind, state in zip(signs["kind"], signs["state"]) if kind == "signal"}
+    assert {"red", "green"} <= states
+    assert any(kind.startswith("speed") for kind in signs["kind"])
+    categories = set(pq.read_table(data / "annotations.parquet")["category"].to_pylist())
+    assert {"car", "pedestrian"} <= categories
