@@ -12,6 +12,7 @@ class Target(StrEnum):
     demo_arms = "demo-arms"
     fig3a = "fig3a"
     fig6a_allocation = "fig6a-allocation"
+    task_weather = "task-weather"
 
 
 class Scale(StrEnum):
@@ -19,27 +20,38 @@ class Scale(StrEnum):
 
     quick = "quick"
     paper = "paper"
+    full = "full"
 
 
-SEEDS = {Target.demo_arms: 5, Target.fig6a_allocation: 3}
+SEEDS = {Target.demo_arms: 5}
+COMMON_SEEDS = 3
+TASK = "task-"  # before a task's name: its study
 
 
 def reproduce(
     target: Target = typer.Argument(..., help="What to reproduce."),
     out: Path = typer.Option(..., "--out", help="Folder of the runs; the same command goes on after a stop."),
     seeds: int | None = typer.Option(
-        None, "--seeds", min=1, help="Number of seeds, from 1: 5 of demo-arms, 3 of fig6a-allocation if not given."
+        None, "--seeds", min=1, help="Number of seeds, from 1: 5 of demo-arms, 3 of the others if not given."
     ),
-    scale: Scale = typer.Option(Scale.paper, "--scale", help="paper: as committed; quick: the demo's size."),
+    scale: Scale | None = typer.Option(
+        None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
+    ),
     jobs: int = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each."),
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
     if target == Target.fig3a:
         _fig3a(out)
         return
-    run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
-    run(out, range(1, (seeds or SEEDS[target]) + 1), scale.value, jobs)
-    typer.echo(f"{out / 'result.json'}: the numbers of {seeds or SEEDS[target]} seeds")
+    count = seeds or SEEDS.get(target, COMMON_SEEDS)
+    numbers = range(1, count + 1)
+    quick = scale == Scale.quick
+    if target.value.startswith(TASK):
+        _task(target.value, out, numbers, "quick" if quick else "full", jobs)
+    else:
+        run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
+        run(out, numbers, "quick" if quick else "paper", jobs)
+    typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
 
 
 def _fig3a(out: Path) -> None:
@@ -77,6 +89,22 @@ def _fig6a_allocation(out: Path, seeds: range, scale: str, jobs: int) -> None:
     write_bytes(out / "plans.png", draw_allocation(results))
     for finding in results["findings"]:
         typer.echo(f"{finding['question']} {finding['verdict']}. {finding['sentence']}")
+
+
+def _task(target: str, out: Path, seeds: range, scale: str, jobs: int) -> None:
+    from flcav.cli.steps import live_steps
+    from flcav.experiments.studies import STUDIES
+    from flcav.experiments.task_study import run_study
+    from flcav.files import write_bytes, write_json
+
+    study = STUDIES[target.removeprefix(TASK)]
+    with live_steps(target) as notify:
+        results = run_study(study, out, seeds=seeds, scale=scale, jobs=jobs, notify=notify)
+    write_json(out / "result.json", results)
+    write_bytes(out / f"{study.task.name}.png", study.draw(results))
+    for test, numbers in results["summary"].items():
+        for name, value in numbers.items():
+            typer.echo(f"{test}, {name}: {value['mean']:.3f} ({value['low']:.3f} to {value['high']:.3f})")
 
 
 def register(app: typer.Typer) -> None:

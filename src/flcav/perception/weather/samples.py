@@ -1,12 +1,16 @@
 """What the classifier learns from: small pictures and their weather."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.perception.images import Picture, resized
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.perception.images import Picture, recorded, resized
 from flcav.perception.weather.model import SIDE
+from flcav.world.weather import Weather, weather_class
 
 SHIFT_PX, GAIN = 3, 0.05  # the most that augmentation moves a picture, and brightens or darkens it
 
@@ -18,6 +22,31 @@ class Sample:
     picture: Picture  # (32, 32, 3)
     label: int  # index of the class
     scene: str = ""
+
+
+def labelled(
+    data: Dataset,
+    classes: Sequence[str],
+    frames: Sequence[int] | None = None,
+    *,
+    named: Callable[[Weather], str | None] = weather_class,
+) -> list[Sample]:
+    """Return every camera's pictures, small enough to be kept, with the class that `named` finds in their weather.
+
+    Those of no class are left out. Raises `InputError` where there are no pictures, no record of the weather, or none
+    of `classes`.
+    """
+    found, weather_known = [], False
+    for frame, _, rgb in recorded(data, frames):
+        weather_known |= frame.weather is not None
+        name = named(frame.weather) if frame.weather else None
+        if name in classes:
+            found.append(Sample(small(rgb), classes.index(name), frame.scene))
+    if not weather_known:
+        raise InputError(f"{data.folder}: the weather was not recorded, which 'weather' needs")
+    if not found:
+        raise InputError(f"{data.folder}: no picture in any of the weathers {', '.join(classes)}")
+    return found
 
 
 def small(picture: Picture) -> Picture:

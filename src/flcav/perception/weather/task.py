@@ -9,16 +9,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.perception.images import Picture, pictures, recorded
+from flcav.perception.images import Picture, pictures
 from flcav.perception.task import Finding, Practice
 from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
 from flcav.perception.weather.evaluate import classification
 from flcav.perception.weather.model import LeNet
-from flcav.perception.weather.samples import Sample, augment, batched, small
+from flcav.perception.weather.samples import Sample, augment, batched, labelled, small
 from flcav.progress import Report, silent
-from flcav.world.weather import weather_class
+from flcav.world.weather import nearest_class
 
 BATCH = 256  # pictures at once where nothing is learned
 
@@ -36,21 +35,8 @@ class WeatherTask:
         return LeNet(config)
 
     def samples(self, data: Dataset, config: LeNetConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
-        """Return every camera's pictures with their weather, small enough to be kept; those of no class are left out.
-
-        Raises `InputError` where there are no pictures, no record of the weather, or none of `config`'s classes.
-        """
-        found, recorded_weather = [], False
-        for frame, _, rgb in recorded(data, frames):
-            recorded_weather |= frame.weather is not None
-            name = weather_class(frame.weather) if frame.weather else None
-            if name in config.classes:
-                found.append(Sample(small(rgb), config.classes.index(name), frame.scene))
-        if not recorded_weather:
-            raise InputError(f"{data.folder}: the weather was not recorded, which '{self.name}' needs")
-        if not found:
-            raise InputError(f"{data.folder}: no picture in any of the weathers {', '.join(config.classes)}")
-        return found
+        """Return the pictures whose weather lies in one of the classes' regions, see `labelled`."""
+        return labelled(data, config.classes, frames)
 
     def draw(self, samples: Sequence[Sample], index: int, config: LeNetConfig, rng: np.random.Generator) -> Sample:
         """Return the sample mirrored, moved and lit at random."""
@@ -65,10 +51,7 @@ class WeatherTask:
         self, network: LeNet, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
     ) -> dict[str, Any]:
         """Return accuracy, recall per class and the confusion matrix, see `classification`."""
-        samples = self.samples(data, network.config, frames)
-        found = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
-        truth = np.array([sample.label for sample in samples])
-        return classification(truth, found, [sample.scene for sample in samples], network.config.classes)
+        return classified(network, self.samples(data, network.config, frames), progress)
 
     def score(self, result: Mapping[str, Any]) -> float:
         """Return the accuracy."""
@@ -100,6 +83,19 @@ class WeatherTask:
 
 
 WEATHER = WeatherTask()
+
+
+def classified(network: LeNet, samples: Sequence[Sample], progress: Report = silent) -> dict[str, Any]:
+    """Return how the network does on labelled pictures, see `classification`."""
+    found = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
+    truth = np.array([sample.label for sample in samples])
+    return classification(truth, found, [sample.scene for sample in samples], network.config.classes)
+
+
+def over_the_whole_space(network: LeNet, data: Dataset) -> dict[str, Any]:
+    """Return {"nearest": as `classified`} where pictures between and beyond the regions count as of the nearest."""
+    samples = labelled(data, network.config.classes, named=nearest_class)
+    return {"nearest": classified(network, samples)}
 
 
 def probabilities(network: LeNet, small_pictures: Sequence[Picture], progress: Report = silent) -> np.ndarray:

@@ -1,0 +1,6 @@
+"""The studies of the tasks, by name."""
+
+from flcav.experiments.studies import weather
+from flcav.experiments.task_study import Study
+
+STUDIES: dict[str, Study] = {study.task.name: study for study in (weather.STUDY,)}

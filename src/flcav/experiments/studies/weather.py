@@ -1,0 +1,68 @@
+"""The study of the weather task: two towns to learn from; held-out scenes, a held-out town and the whole space to test.
+
+The recipe is that of recipes/weather.yaml: each scene goes once through all eight classes, so that they are balanced.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from flcav.experiments.task_study import RecipeFields, Result, Study
+from flcav.perception.weather.task import WEATHER, over_the_whole_space
+from flcav.report import style
+from flcav.report.confusion import confusions
+from flcav.world.weather import ANY, WEATHER_CLASSES
+
+RECIPE: RecipeFields = {
+    "warmup_s": 40.0,
+    "spins_per_scene": 8,
+    "every_s": 4.0,
+    "cavs": 3,
+    "vehicle_rig": {
+        "cameras": {
+            "camera": {
+                "mount": {"x": 0.5, "z": 1.5},
+                "settings": {"width": 320, "height": 192, "fov_deg": 90.0},
+            }
+        }
+    },
+    "weather": {"classes": list(WEATHER_CLASSES), "turn_s": 4.0},
+}
+WHOLE_SPACE = "whole space"
+ANY_WEATHER = {"classes": [ANY] * 8, "turn_s": 4.0}
+
+
+def _numbers(result: Result) -> Mapping[str, float]:
+    """Return the accuracy on pictures within the classes' regions, and on all where the whole space was asked for."""
+    nearest = {"nearest class": result["nearest"]["accuracy"]} if "nearest" in result else {}
+    return {"accuracy": result["accuracy"], **nearest}
+
+
+def _draw(results: Mapping[str, Any]) -> bytes:
+    """Return the confusion matrix of each test, the seeds' together."""
+    tests = [seed["tests"] for seed in results["seeds"]]
+    shown = {name: [test[name].get("nearest", test[name]) for test in tests] for name in results["summary"]}
+    counts = {name: np.sum([result["confusion"] for result in found], axis=0) for name, found in shown.items()}
+    return style.png(confusions(counts, next(iter(shown.values()))[0]["classes"]))
+
+
+STUDY = Study(
+    task=WEATHER,
+    network="tiny",
+    train=(
+        {**RECIPE, "town": "ring", "seed": 13, "scenes": 50},
+        {**RECIPE, "town": "suburb", "seed": 113, "scenes": 50},
+    ),
+    validation={**RECIPE, "town": "ring", "seed": 213, "split": "validation", "scenes": 20},
+    tests={
+        "held-out scenes": {**RECIPE, "town": "ring", "seed": 313, "split": "test", "scenes": 24},
+        "held-out town": {**RECIPE, "town": "grid", "seed": 413, "split": "test", "scenes": 24},
+        WHOLE_SPACE: {**RECIPE, "town": "ring", "seed": 513, "split": "test", "scenes": 24, "weather": ANY_WEATHER},
+    },
+    epochs=60,
+    patience=15,
+    numbers=_numbers,
+    draw=_draw,
+    extra={WHOLE_SPACE: over_the_whole_space},
+)

@@ -1,0 +1,93 @@
+"""A task's study at toy scale, its steps, and that the studies are of the recipes users have."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from flcav.config import InputError, parse_config
+from flcav.experiments.studies import STUDIES, weather
+from flcav.experiments.task_study import at_scale, run_study, steps_of
+from flcav.perception.training.run import CARD, EVENTS, WEIGHTS
+from flcav.sources.recipe import Recipe
+
+RECIPES = Path(__file__).parents[3] / "recipes"
+each_study = pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+
+
+@each_study
+def test_no_two_splits_share_a_scene(study):
+    recipes = [*study.train, study.validation, *study.tests.values()]
+    parsed = [parse_config(Recipe, dict(recipe), study.task.name) for recipe in recipes]
+    assert len({(recipe.town, recipe.seed) for recipe in parsed}) == len(recipes)
+    assert study.network in study.task.configurations
+
+
+@each_study
+def test_a_quick_study_is_the_same_with_fewer_scenes_and_epochs(study):
+    quick = at_scale(study, "quick")
+    assert at_scale(study, "full") == study
+    assert quick.epochs <= study.epochs
+    assert all(recipe["scenes"] <= study.quick_scenes for recipe in (*quick.train, quick.validation))
+    assert {step.name for step in steps_of(quick, [1])} == {step.name for step in steps_of(study, [1])}
+    with pytest.raises(InputError, match="scale 'paper'"):
+        at_scale(study, "paper")
+
+
+def test_the_weather_recipe_is_the_users():
+    recipe = yaml.safe_load((RECIPES / "weather.yaml").read_text())
+    told = {"town": recipe.pop("town"), "seed": recipe.pop("seed"), "scenes": recipe.pop("scenes")}
+    recipe.pop("split")
+    assert recipe == weather.RECIPE
+    assert any(told.items() <= train.items() for train in weather.STUDY.train)
+
+
+def test_a_training_waits_for_its_frames_and_a_test_for_its_training():
+    steps = {step.name: step for step in steps_of(weather.STUDY, [1, 2])}
+    assert set(steps["seed-2"].needs) == {"train-0", "train-1", "validation"}
+    assert set(steps["seed-2-tested"].needs) == {"seed-2", *(f"test-{name}" for name in weather.STUDY.tests)}
+
+
+@pytest.mark.slow
+def test_a_toy_study_gives_numbers_of_each_seed_and_goes_on(tmp_path: Path):
+    small: dict[str, Any] = {"cavs": 1, "spins_per_scene": 4, "scenes": 1, "warmup_s": 20.0}
+
+    def toy(recipe):
+        return {**recipe, **small, "weather": {"classes": ["clear", "night", "clear", "fog"], "turn_s": 4.0}}
+
+    study = replace(
+        weather.STUDY,
+        train=(toy(weather.STUDY.train[0]),),
+        validation=toy(weather.STUDY.validation),
+        tests={name: toy(weather.STUDY.tests[name]) for name in ("held-out town", weather.WHOLE_SPACE)},
+        epochs=1,
+    )
+    said: list[str] = []
+
+    def notify(step: str, done: int, total: int, note: str) -> None:
+        said.append(f"{step} {note}")
+
+    results = run_study(study, tmp_path, seeds=[1, 2], jobs=1, notify=notify)
+    assert [seed["seed"] for seed in results["seeds"]] == [1, 2]
+    for seed in results["seeds"]:
+        folder = tmp_path / f"seed-{seed['seed']}"
+        assert (folder / WEIGHTS).is_file()
+        assert (folder / CARD).is_file()
+        assert list((folder / EVENTS).iterdir())
+        assert seed["card"]["seed"] == seed["seed"]
+        assert seed["tests"]["held-out town"]["pictures"] == 4
+    accuracies = [seed["tests"]["held-out town"]["accuracy"] for seed in results["seeds"]]
+    mean = results["summary"]["held-out town"]["accuracy"]
+    assert mean["mean"] == pytest.approx(np.mean(accuracies))
+    assert mean["low"] <= mean["mean"] <= mean["high"]
+    assert "nearest class" in results["summary"][weather.WHOLE_SPACE]
+    assert study.draw(results).startswith(b"\x89PNG")
+
+    said.clear()
+    assert run_study(study, tmp_path, seeds=[1, 2], jobs=1, notify=notify) == results
+    assert all(line.endswith("done before") for line in said)
+    with pytest.raises(InputError, match="another configuration"):
+        run_study(replace(study, epochs=2), tmp_path, seeds=[1, 2], jobs=1, notify=notify)
