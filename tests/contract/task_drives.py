@@ -1,4 +1,7 @@
-"""Drives that every task can learn from: a car among LiDAR points, painted squares for signs, skies for the weather."""
+"""Drives that every task can learn from: a car among LiDAR points, painted squares for signs, skies for the weather.
+
+The car also drives for longer than it is watched, for those who ask where it goes.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,12 +10,14 @@ import numpy as np
 
 from flcav.geometry import Boxes, pose, transform_points
 from flcav.sensors.frame import Annotations, Calibration, CameraImage, Frame, SignViews
+from flcav.world.trace import Trace
 from flcav.world.weather import WEATHERS
 
 WIDTH, HEIGHT = 96, 64
 COLOURS = {"stop": (220, 20, 30), "yield": (240, 220, 30), "speed_30": (30, 60, 220)}
 SKIES = {"clear": (60, 120, 240), "fog": (200, 200, 200), "night": (8, 8, 20)}
 LIDAR_HEIGHT_M = 1.8
+SPEED = 20.0  # of the car [m/s]
 
 
 @dataclass(frozen=True)
@@ -22,9 +27,10 @@ class Drives:
     spins: int = 4
     lidar: bool = True
     camera: bool = True
+    traffic: bool = True
 
     def describe(self) -> dict[str, Any]:
-        return {"town": "none", "split": "train", "seed": 0, "spins": self.spins}
+        return {"town": "suburb", "split": "train", "seed": 0, "spins": self.spins}
 
     def scenes(self) -> list[str]:
         return list(SKIES)
@@ -35,8 +41,28 @@ class Drives:
     def frames(self, scene: str):
         return (self.frame(scene, index) for index in range(self.spins))
 
-    def trace(self, scene: str) -> None:
-        return None
+    def trace(self, scene: str) -> Trace | None:
+        if not self.traffic:
+            return None
+        time_s = np.arange(-2.5, 3.6, 0.5)
+        count = len(time_s)
+        position = np.stack((12 + SPEED * time_s, np.full(count, 3.0), np.zeros(count)), axis=1)
+        return Trace(
+            town="suburb",
+            time_s=time_s,
+            actor=np.array(["veh0"]),
+            category=np.array(["car"]),
+            shape=np.zeros(1, np.int64),
+            size=np.array([(4.4, 1.8, 1.6)]),
+            present=np.ones((count, 1), np.bool_),
+            position=position[:, None],
+            yaw=np.zeros((count, 1)),
+            velocity=np.broadcast_to(np.array((SPEED, 0.0, 0.0)), (count, 1, 3)),
+            acceleration=np.zeros((count, 1, 3)),
+            yaw_rate=np.zeros((count, 1)),
+            light=np.zeros(0, np.str_),
+            light_state=np.zeros((count, 0), "<U1"),
+        )
 
     def frame(self, scene: str, index: int) -> Frame:
         """Return spin `index` of the scene that is named after its sky."""

@@ -34,10 +34,16 @@ from flcav.report.inference import DRAWINGS
 
 each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 CONFIGS = {"signs": replace(configuration(SIGNS, "n"), window_px=(96, 64))}
+LACKING = {"objects": ({"lidar": False}, "no LiDAR"), "trajectory": ({"traffic": False}, "no traffic")}
+FILES = {"weather": "front/*.webp", "signs": "front/*.webp", "objects": "top/*.bin", "trajectory": "none"}
 
 
 def small(task: Task[Any, Any, Any]) -> Any:
     return CONFIGS.get(task.name, configuration(task, None))
+
+
+def shown(data: Dataset) -> list[str]:
+    return [data.name(i) for i in range(len(data))]
 
 
 def folder_of(source: Drives, folder: Path) -> Path:
@@ -184,7 +190,8 @@ def test_a_whole_training_leaves_weights_with_their_card_and_curves(task, data, 
 
 @each_task
 def test_a_dataset_without_its_sensor_is_one_sentence(task, tmp_path, capsys):
-    blind = Drives(spins=1, lidar=task.name != "objects", camera=task.name == "objects")
+    lacking, said = LACKING.get(task.name, ({"camera": False}, "no camera pictures"))
+    blind = Drives(spins=1, **lacking)
     folder, weights = folder_of(blind, tmp_path / "data"), tmp_path / "weights.safetensors"
     save_network(task, fresh(task, small(task), 1), weights)
     for command in (
@@ -196,7 +203,7 @@ def test_a_dataset_without_its_sensor_is_one_sentence(task, tmp_path, capsys):
         told = capsys.readouterr()
         assert told.out == ""
         assert told.err.count("\n") == 1
-        assert ("no LiDAR" if task.name == "objects" else "no camera pictures") in told.err
+        assert said in told.err
     assert not (tmp_path / "out").exists()
 
 
@@ -219,7 +226,8 @@ def test_a_bad_picture_is_one_sentence(task, tmp_path, capsys):
 def test_infer_writes_a_picture_of_each_input(task, data, tmp_path, capsys):
     weights, out = tmp_path / "weights.safetensors", tmp_path / "pictures"
     save_network(task, fresh(task, small(task), 1), weights)
-    source = sorted(data.folder.glob("front/*.webp" if task.name != "objects" else "top/*.bin"))[0]
+    source = next(iter(sorted(data.folder.glob(FILES[task.name]))), data.folder)
     assert called("infer", task.name, source, "--weights", weights, "--pictures", out) == 0
-    assert capsys.readouterr().out.startswith(f"{source}:")
-    assert [path.name for path in out.iterdir()] == [f"00000_{source.stem}.png"]
+    assert capsys.readouterr().out.startswith(str(source))
+    names = [path.stem for path in sorted(out.iterdir())]
+    assert names == [f"{i:05d}_{name}" for i, name in enumerate([source.stem] if source.is_file() else shown(data))]

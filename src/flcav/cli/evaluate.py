@@ -12,14 +12,17 @@ def register(app: typer.Typer) -> None:
 
 
 def evaluate(
-    task: str = typer.Argument(help="What was learned: weather, signs or objects."),
+    task: str = typer.Argument(help="What was learned: weather, signs, objects or trajectory."),
     data: Path = typer.Option(..., "--data", help="Dataset folder."),
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
     as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
 ) -> None:
-    """Evaluate a network on recorded frames: accuracy of weather, mAP of signs, average precision of objects."""
+    """Evaluate a network on recorded frames.
+
+    Accuracy of weather, mAP of signs, average precision of objects, errors of predicted paths.
+    """
     from flcav import progress
     from flcav.cli.tasks import network_of, task_named
     from flcav.dataset.store import Dataset

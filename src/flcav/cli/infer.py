@@ -16,9 +16,9 @@ def register(app: typer.Typer) -> None:
 
 
 def infer(
-    task: str = typer.Argument(help="What to find: weather, signs or objects."),
+    task: str = typer.Argument(help="What to find: weather, signs, objects or trajectory."),
     inputs: list[Path] = typer.Argument(
-        help="KITTI .bin files (objects) or PNG and JPEG files, folders of them, or dataset folders."
+        help="KITTI .bin files (objects) or PNG and JPEG files, folders of them, or dataset folders (trajectory)."
     ),
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
@@ -30,7 +30,8 @@ def infer(
     """Run a network on files or datasets.
 
     Boxes of objects are in the LiDAR frame: x forward, y left, z up, metres and radians. Boxes of signs are in pixels
-    from the upper left corner of the picture.
+    from the upper left corner of the picture. Paths are in the world's frame, all modes with their probabilities,
+    with "constant_velocity" beside them and "truth" where the recording goes on for long enough.
     """
     from flcav.cli.tasks import network_of, task_named
 

@@ -7,10 +7,11 @@ from flcav.config import InputError
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task
+from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import load_network, shipped
 
-TASKS: dict[str, Task[Any, Any, Any]] = {task.name: task for task in (WEATHER, SIGNS, OBJECTS)}
+TASKS: dict[str, Task[Any, Any, Any]] = {task.name: task for task in (WEATHER, SIGNS, OBJECTS, TRAJECTORY)}
 
 
 def task_named(name: str) -> Task[Any, Any, Any]:

@@ -11,14 +11,14 @@ def register(app: typer.Typer) -> None:
 
 
 def train(
-    task: str = typer.Argument(help="What to learn: weather, signs or objects."),
+    task: str = typer.Argument(help="What to learn: weather, signs, objects or trajectory."),
     data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
     out: Path = typer.Option(..., "--out", help="Folder of the weights; an interrupted training goes on."),
     validation: Path | None = typer.Option(
         None, "--validation", help="Dataset of other scenes: keeps the epoch that is best on it, and may stop early."
     ),
     network: str | None = typer.Option(
-        None, "--network", help="weather and objects: tiny (default) or paper; signs: n (default) or s."
+        None, "--network", help="tiny (default) or paper; signs: n (default) or s; trajectory also tiny-cameras."
     ),
     epochs: int = typer.Option(10, "--epochs", min=1, help="Passes through the data."),
     patience: int = typer.Option(5, "--patience", min=1, help="Epochs without a better validation before it stops."),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes
 from flcav.report import style
+from flcav.report.predicted_paths import draw_paths
 from flcav.report.sweeps import draw_boxes
 
 WIDTH_IN = 8.0
@@ -79,6 +80,7 @@ DRAWINGS: dict[str, Callable[[NDArray[Any], Mapping[str, Any], str], Figure]] = 
     "weather": draw_weather,
     "signs": draw_signs,
     "objects": draw_objects,
+    "trajectory": draw_paths,
 }
 
 

@@ -1,0 +1,66 @@
+"""Which network predicts trajectories."""
+
+from typing import Annotated
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+STEP_S = 0.25  # between two points of a track
+PAST, FUTURE = 8, 12  # steps before and after the present: 2 s and 3 s
+HORIZON_S = FUTURE * STEP_S
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Patch:
+    """The square of ground that is looked at, in the frame of the predicted road user: x ahead, y to the left."""
+
+    cells: Annotated[int, Field(ge=16, multiple_of=8)] = 64  # along each side
+    cell_m: Annotated[float, Field(gt=0)] = 1.0
+    ahead: Annotated[float, Field(gt=0, lt=1)] = 0.75  # share of it that lies ahead
+
+    @property
+    def side_m(self) -> float:
+        """Return the length of a side [m]."""
+        return self.cells * self.cell_m
+
+    @property
+    def middle_x_m(self) -> float:
+        """Return how far ahead of the road user the patch's middle is [m]."""
+        return (self.ahead - 0.5) * self.side_m
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class CrossView:
+    """A cross-view transformer: pictures of several cameras to features on the ground."""
+
+    width_px: Annotated[int, Field(ge=32, multiple_of=16)] = 128  # pictures are resized to this
+    height_px: Annotated[int, Field(ge=32, multiple_of=16)] = 64
+    features: Annotated[int, Field(ge=8, multiple_of=8)] = 32
+    heads: Annotated[int, Field(ge=1)] = 4
+    layers: Annotated[int, Field(ge=1)] = 1  # of attention, one after another
+    queries: Annotated[int, Field(ge=4)] = 16  # along each side of the patch
+    map_weight: Annotated[float, Field(ge=0)] = 2.0  # of the map's segmentation in the loss
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class TrajectoryConfig:
+    """An LSTM encoder-decoder that sees the surroundings as rasters of map and tracks, or through cameras."""
+
+    modes: Annotated[int, Field(ge=1)] = 6
+    hidden: Annotated[int, Field(ge=8)] = 64  # of both LSTMs
+    maps: Annotated[tuple[int, int, int], Field()] = (16, 32, 32)  # of the convolutions over the raster
+    patch: Patch = Patch()
+    cameras: CrossView | None = None  # None: rasters
+
+
+CONFIGURATIONS = {
+    "tiny": TrajectoryConfig(),
+    "tiny-cameras": TrajectoryConfig(cameras=CrossView()),
+    "paper": TrajectoryConfig(hidden=256, maps=(32, 64, 128), patch=Patch(cells=128, cell_m=0.5)),
+    "paper-cameras": TrajectoryConfig(
+        hidden=256,
+        maps=(32, 64, 128),
+        patch=Patch(cells=200, cell_m=0.5),
+        cameras=CrossView(width_px=480, height_px=224, features=128, heads=4, layers=2, queries=25),
+    ),
+}

@@ -1,0 +1,107 @@
+"""Predictions for the frames of a dataset, as JSON knows them, on the map around who observes."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.dataset.layout import read_manifest
+from flcav.dataset.store import Dataset
+from flcav.geometry import yaw_of
+from flcav.perception.task import Finding
+from flcav.perception.trajectory.config import FUTURE, STEP_S, Patch
+from flcav.perception.trajectory.model import TrajectoryNetwork
+from flcav.perception.trajectory.predict import predict
+from flcav.perception.trajectory.rasters import OPEN, centres
+from flcav.perception.trajectory.roads import RoadMap, roads_of
+from flcav.perception.trajectory.samples import Samples, present_at, traffic
+from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+
+AROUND_M = 50.0  # of the observing agent, ahead, behind and to both sides: shown, and predicted with rasters
+AROUND = Patch(cells=400, cell_m=2 * AROUND_M / 400, ahead=0.5)  # the map that is shown
+TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())
+
+
+def findings(network: TrajectoryNetwork, path: Path) -> Iterator[Finding]:
+    """Yield what is predicted in each frame of the dataset `path`; raises `InputError` for anything else.
+
+    The result is in the world's frame: {"time_s": [...], "observer": {"x", "y", "yaw"}, "lights": [{"x", "y",
+    "open"}], "agents": [{"track", "class", "x", "y", "yaw", "speed", "length", "width", "modes": [{"probability",
+    "path": [[x, y], ...]}], "constant_velocity": [...], "truth": [...] or None}]}. It is shown on the map around the
+    observer, (layers, H, W) as `RoadMap.static` has them, row 0 ahead of him and column 0 to his left. Frames whose
+    vehicles have no past of 2 s yet have no agents.
+    """
+    read_manifest(path)
+    data = Dataset.open(path)
+    traces: dict[str, Trace] = {}
+    for number, key in enumerate(data.keys):
+        if key.scene not in traces:
+            traces = {key.scene: traffic(data, key.scene)}
+        trace = traces[key.scene]
+        world_from_agent = data.frame(number).world_from_agent
+        observer = np.array([*world_from_agent[:2, 3], yaw_of(world_from_agent)])
+        result = _predicted(network, data, number, trace, observer)
+        yield Finding(path / data.name(number), map_around(roads_of(data), observer), result)
+
+
+def map_around(roads: RoadMap, observer: Array) -> NDArray[np.bool_]:
+    """Return (layers, H, W) the map within `AROUND_M` of x, y, yaw."""
+    return roads.static(out_of_frame(centres(AROUND)[None], observer[None])[0]).T.reshape(
+        -1, AROUND.cells, AROUND.cells
+    )
+
+
+def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Trace, observer: Array) -> dict[str, Any]:
+    key, config = data.keys[number], network.config
+    instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
+    if config.cameras:
+        wanted = trace.actor == key.agent
+    else:
+        apart = into_frame(trace.position[None, instant, :, :2], observer[None])[0]
+        wanted = (np.abs(apart) <= AROUND_M).all(axis=1)
+    columns = present_at(trace, key.time_s, roads_of(data), config.patch, wanted, complete=False)
+    count = len(columns["past"])
+    columns |= {"scene": np.full(count, key.scene), "frame": np.full(count, number)}
+    agents = []
+    if count:
+        paths, probabilities = predict(network, Samples(data, columns, config.cameras))
+        pose, plain = columns["pose"], constant_velocity(columns["past"])
+        for i, actor in enumerate(columns["actor"]):
+            modes = [
+                {"probability": float(share), "path": _in_world(way, pose[i])}
+                for share, way in zip(probabilities[i], paths[i])
+            ]
+            truth = columns["future"][i].astype(np.float64)
+            agents.append(
+                {
+                    "track": str(trace.actor[actor]),
+                    "class": str(trace.category[actor]),
+                    **dict(zip(("x", "y", "yaw"), pose[i].tolist())),
+                    "speed": float(columns["past"][i, -1, 3]),
+                    **dict(zip(("length", "width"), trace.size[actor, :2].tolist())),
+                    "modes": sorted(modes, key=lambda mode: -mode["probability"]),
+                    "constant_velocity": _in_world(plain[i], pose[i]),
+                    "truth": _in_world(truth, pose[i]) if np.isfinite(truth).all() else None,
+                }
+            )
+    return {
+        "time_s": list(TIMES_S),
+        "observer": dict(zip(("x", "y", "yaw"), observer.tolist())),
+        "lights": _lights(trace, instant, roads_of(data)),
+        "agents": agents,
+    }
+
+
+def _lights(trace: Trace, instant: int, roads: RoadMap) -> list[dict[str, Any]]:
+    letters = dict(zip(trace.light.tolist(), trace.light_state[instant].tolist()))
+    middles = {name: bar.mean(axis=0).tolist() for name, bar in roads.lights.items() if name in letters}
+    return [{"x": x, "y": y, "open": letters[name] in OPEN} for name, (x, y) in middles.items()]
+
+
+def _in_world(path: Array, pose: Array) -> list[list[float]]:
+    return out_of_frame(path[None], pose[None])[0].tolist()

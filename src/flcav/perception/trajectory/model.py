@@ -1,0 +1,91 @@
+"""An LSTM encoder-decoder over tracks that looks at its surroundings: where it is, and again wherever it goes.
+
+Encoder: an LSTM over the past, and a bird's-eye view (`flcav.perception.trajectory.views`). Decoder: one LSTM per mode,
+all with the same weights, begun differently; at each step it sees the features of the ground at the position that it
+has reached, and changes its last displacement. Without any change a path keeps heading and speed.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from flcav.perception.trajectory.config import FUTURE, STEP_S, TrajectoryConfig
+from flcav.perception.trajectory.cross_view import CrossViewEncoder
+from flcav.perception.trajectory.views import RasterEncoder, Seen
+
+SCALE_M = 10.0  # positions and speeds are divided by this
+TRACK = 6  # features of a point of the past
+
+
+class Inputs(NamedTuple):
+    """A batch as the network takes it."""
+
+    past: Tensor  # (B, PAST + 1, 4) x, y, yaw, speed
+    raster: Tensor | None = None  # (B, LAYERS, cells, cells) of zeros and ones
+    pictures: Tensor | None = None  # (B, n, 3, height, width) in [-1, 1]
+    intrinsics: Tensor | None = None  # (B, n, 3, 3)
+    camera_from_frame: Tensor | None = None  # (B, n, 4, 4)
+
+
+class Forecast(NamedTuple):
+    """What the network says."""
+
+    paths: Tensor  # (B, K, FUTURE, 2) x, y [m] in the frame of the present
+    logits: Tensor  # (B, K) of the modes' probabilities
+    map_logits: Tensor | None  # (B, LAYERS seen, h, w) of the map learned through cameras
+
+
+class TrajectoryNetwork(nn.Module):
+    """K ways a road user may go, each with its probability."""
+
+    def __init__(self, config: TrajectoryConfig) -> None:
+        super().__init__()
+        self.config = config
+        hidden, ground = config.hidden, config.maps[1]
+        self.view = CrossViewEncoder(config) if config.cameras else RasterEncoder(config)
+        self.track = nn.LSTM(TRACK, hidden, batch_first=True)
+        self.context = nn.Sequential(nn.Linear(hidden + self.view.summary, 2 * hidden), nn.ReLU())
+        self.begin = nn.Linear(2 * hidden, config.modes * hidden)
+        self.likely = nn.Linear(2 * hidden, config.modes)
+        self.decoder = nn.LSTMCell(4 + ground, hidden)
+        self.change = nn.Linear(hidden, 2)
+        nn.init.normal_(self.change.weight, std=0.01)
+        nn.init.zeros_(self.change.bias)
+
+    def forward(self, inputs: Inputs) -> Forecast:
+        """Return the forecast of a batch."""
+        seen = self.view(inputs)
+        _, (encoded, _) = self.track(_features(inputs.past))
+        context = self.context(torch.cat((encoded[-1], seen.summary), dim=1))
+        paths = self._decoded(context, inputs.past[:, -1, 3] * STEP_S, seen)
+        return Forecast(paths, self.likely(context), seen.map_logits)
+
+    def _decoded(self, context: Tensor, step_m: Tensor, seen: Seen) -> Tensor:
+        batch, modes, hidden = len(context), self.config.modes, self.config.hidden
+        state = torch.tanh(self.begin(context)).reshape(batch * modes, hidden)
+        cell = torch.zeros_like(state)
+        last = functional.pad(step_m[:, None, None], (0, 1)).expand(batch, modes, 2)
+        position, path = torch.zeros_like(last), []
+        for _ in range(FUTURE):
+            here = self._ground_at(seen.ground, position)
+            known = torch.cat((position / SCALE_M, last, here), dim=2)
+            state, cell = self.decoder(known.reshape(batch * modes, -1), (state, cell))
+            last = last + self.change(state).reshape(batch, modes, 2)
+            position = position + last
+            path.append(position)
+        return torch.stack(path, dim=2)
+
+    def _ground_at(self, ground: Tensor, position: Tensor) -> Tensor:
+        """Return (B, K, features) of the maps (B, features, h, w) of the patch at positions (B, K, 2); 0 beyond it."""
+        patch = self.config.patch
+        half = patch.side_m / 2
+        right_down = torch.stack((-position[..., 1] / half, (patch.middle_x_m - position[..., 0]) / half), dim=-1)
+        found = functional.grid_sample(ground, right_down[:, None], align_corners=False)
+        return found[:, :, 0].transpose(1, 2)
+
+
+def _features(past: Tensor) -> Tensor:
+    x, y, yaw, speed = past.unbind(2)
+    return torch.stack((x / SCALE_M, y / SCALE_M, yaw.cos(), yaw.sin(), speed / SCALE_M, speed.gt(0.1).float()), dim=2)

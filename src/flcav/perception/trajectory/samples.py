@@ -1,0 +1,147 @@
+"""What the predictor learns from: road users' past and future in the frame of their present, and their surroundings."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.perception.task import of_frames
+from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
+from flcav.perception.trajectory.rasters import rasters
+from flcav.perception.trajectory.roads import BEFORE_M, RoadMap, roads_of
+from flcav.perception.trajectory.surround import Surround, surround
+from flcav.perception.trajectory.tracks import OFFSETS_S, check_instants, into_frame, tracks_at
+from flcav.world.trace import Trace
+
+LOOKED_AT_AGAIN = 4  # so many sets of samples are kept, so that validation does not extract its own anew
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One road user at one instant, its present the origin and x its heading; metres, radians, seconds.
+
+    The fields before `surround` are also those of `Tables`, with a row for each of N samples.
+    """
+
+    past: NDArray[np.float32]  # (PAST + 1, 4) x, y, yaw, speed; the last is the present
+    future: NDArray[np.float32]  # (FUTURE, 2) x, y; NaN where it is not known
+    raster: NDArray[np.uint8]  # (LAYERS, cells, cells / 8) bits of `flcav.perception.trajectory.rasters`
+    pose: NDArray[np.float64]  # (3,) x, y, yaw of the present in the world
+    actor: NDArray[np.int64]  # () index in its trace
+    at_junction: NDArray[np.bool_]  # () inside one, or its lane leads into one within BEFORE_M
+    scene: NDArray[np.str_]  # ()
+    frame: NDArray[np.int64]  # () number of the dataset's frame
+    surround: Surround | None = None  # what the cameras see, where they are looked through
+
+
+COLUMNS = tuple(field.name for field in fields(Sample) if field.name != "surround")
+
+
+class Samples(Sequence[Sample]):
+    """Samples as arrays, a row each; pictures are read when a sample is asked for."""
+
+    def __init__(self, data: Dataset, columns: dict[str, NDArray], cameras: CrossView | None) -> None:
+        self.columns = columns
+        self._data, self._cameras = data, cameras
+
+    def __len__(self) -> int:
+        return len(self.columns["past"])
+
+    @overload
+    def __getitem__(self, index: int) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Sample]: ...
+    def __getitem__(self, index: int | slice) -> Sample | list[Sample]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        row = {name: column[index] for name, column in self.columns.items()}
+        seen = surround(self._data, int(row["frame"]), row["pose"], self._cameras) if self._cameras else None
+        return Sample(**row, surround=seen)
+
+
+def samples_of(data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | None = None) -> Samples:
+    """Return the samples of frames of a dataset whose past and future are known.
+
+    With rasters those are all vehicles on the road at the frames' instants, whoever observes; with cameras each frame's
+    own vehicle. Raises `InputError` where the dataset lacks traffic, or pictures, or holds no such sample.
+    """
+    return _samples(data, config.patch, config.cameras, tuple(of_frames(data, frames)))
+
+
+@lru_cache(maxsize=LOOKED_AT_AGAIN)
+def _samples(data: Dataset, patch: Patch, cameras: CrossView | None, frames: tuple[int, ...]) -> Samples:
+    parts = list(_parts(data, patch, cameras, frames))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in COLUMNS}
+    if not len(columns["past"]):
+        who = "observing vehicle" if cameras else "vehicle"
+        raise InputError(f"{data.folder}: no {who} is there from 2 s before to 3 s after any of the frames")
+    return Samples(data, columns, cameras)
+
+
+def _parts(
+    data: Dataset, patch: Patch, cameras: CrossView | None, frames: Sequence[int]
+) -> Iterator[dict[str, NDArray]]:
+    seen = set()
+    traces: dict[str, Trace] = {}
+    for number in frames:
+        key = data.keys[number]
+        if key.scene not in traces:
+            traces = {key.scene: traffic(data, key.scene)}
+        trace = traces[key.scene]
+        if cameras:
+            if not data.cameras(number):
+                raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
+            wanted = trace.actor == key.agent
+        elif (key.scene, key.index) in seen:
+            continue
+        else:
+            wanted = np.ones(len(trace.actor), np.bool_)
+        seen.add((key.scene, key.index))
+        rows = present_at(trace, key.time_s, roads_of(data), patch, wanted)
+        count = len(rows["past"])
+        yield rows | {"scene": np.full(count, key.scene), "frame": np.full(count, number)}
+
+
+def traffic(data: Dataset, scene: str) -> Trace:
+    """Return a scene's traffic; raises `InputError` where it is not there, or too coarse."""
+    trace = data.trace(scene)
+    if trace is None:
+        raise InputError(f"{data.folder}: no traffic of scene '{scene}' was recorded, which 'trajectory' needs")
+    check_instants(trace, f"{data.folder}, scene '{scene}'")
+    return trace
+
+
+def present_at(
+    trace: Trace, time_s: float, roads: RoadMap, patch: Patch, wanted: NDArray[np.bool_], complete: bool = True
+) -> dict[str, NDArray]:
+    """Return the columns of `Sample` that a trace tells, of the vehicles on the road at `time_s` and `wanted` (A,).
+
+    Theirs is a past in full, and where `complete` a future.
+    """
+    tracks = tracks_at(trace, time_s + OFFSETS_S)
+    known = np.isfinite(tracks.yaw)
+    on_road = (trace.category != "pedestrian") & ~np.char.startswith(trace.actor, "parked") & wanted
+    on_road &= known.all(axis=0) if complete else known[: PAST + 1].all(axis=0)
+    actor = np.flatnonzero(on_road)
+    pose = np.concatenate((tracks.position[PAST, actor], tracks.yaw[PAST, actor, None]), axis=1)
+    path = into_frame(tracks.position[:, actor].transpose(1, 0, 2), pose)
+    turn = np.unwrap(tracks.yaw[: PAST + 1, actor], axis=0).T - tracks.yaw[PAST, actor, None]
+    turn -= np.round(turn[:, -1:] / (2 * np.pi)) * 2 * np.pi
+    speed = tracks.speed[: PAST + 1, actor].T
+    past = np.concatenate((path[:, : PAST + 1], turn[..., None], speed[..., None]), axis=2)
+    lit = trace.light_state[max(0, int(np.searchsorted(trace.time_s, time_s + 1e-6, side="right")) - 1)]
+    seen = rasters(trace, tracks, lit, actor, roads, patch)
+    _, to_junction_m = roads.lanes_at(pose[:, :2], pose[:, 2])
+    return {
+        "past": past.astype(np.float32),
+        "future": path[:, PAST + 1 :].astype(np.float32),
+        "raster": np.packbits(seen, axis=-1),
+        "pose": pose,
+        "actor": actor,
+        "at_junction": to_junction_m <= BEFORE_M,
+    }

@@ -1,0 +1,113 @@
+"""Trajectory prediction as a `Task`."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from flcav.dataset.store import Dataset
+from flcav.perception.task import Finding, Practice
+from flcav.perception.trajectory.batch import futures_of, inputs_of, rasters_of
+from flcav.perception.trajectory.config import CONFIGURATIONS, TrajectoryConfig
+from flcav.perception.trajectory.evaluate import metrics
+from flcav.perception.trajectory.infer import findings
+from flcav.perception.trajectory.loss import forecast_loss, map_loss
+from flcav.perception.trajectory.model import TrajectoryNetwork
+from flcav.perception.trajectory.predict import predict
+from flcav.perception.trajectory.samples import Sample, samples_of
+from flcav.progress import Report, silent
+
+Array = NDArray[np.float64]
+
+
+class TrajectoryTask:
+    """Where road users will be in the next three seconds."""
+
+    name = "trajectory"
+    family = "trajectory-lstm"
+    configurations = CONFIGURATIONS
+    practice = Practice(batch=64, learning_rate=2e-3)
+
+    def build(self, config: TrajectoryConfig) -> TrajectoryNetwork:
+        """Return a fresh network."""
+        return TrajectoryNetwork(config)
+
+    def samples(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
+        """Return the road users of the frames with a past and a future, see `samples_of`."""
+        return samples_of(data, config, frames)
+
+    def draw(self, samples: Sequence[Sample], index: int, config: TrajectoryConfig, rng: np.random.Generator) -> Sample:
+        """Return the sample as it is: the frame of the present leaves nothing to turn or to move."""
+        return samples[index]
+
+    def loss(self, network: TrajectoryNetwork, samples: Sequence[Sample]) -> Tensor:
+        """Return the loss of the modes, with cameras also that of the map."""
+        inputs = inputs_of(samples, network)
+        forecast = network(inputs)
+        loss = forecast_loss(forecast, futures_of(samples, inputs.past.device))
+        if forecast.map_logits is None or network.config.cameras is None:
+            return loss
+        taught = map_loss(forecast.map_logits, rasters_of(samples, inputs.past.device))
+        return loss + network.config.cameras.map_weight * taught
+
+    def evaluate(
+        self,
+        network: TrajectoryNetwork,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        *,
+        progress: Report = silent,
+    ) -> dict[str, Any]:
+        """Return errors of one and of K modes and of constant velocity by slice, see `metrics`."""
+        samples = samples_of(data, network.config, frames)
+        paths, probabilities = predict(network, samples, progress)
+        return metrics(paths, probabilities, samples.columns)
+
+    def score(self, result: Mapping[str, Any]) -> float:
+        """Return 1 / (1 + the mean of both final errors, of one and of K modes, in metres)."""
+        every = result["slices"]["all"]
+        return 1 / (1 + (every["minFDE_1"] + every["minFDE_K"]) / 2)
+
+    def infer(self, network: TrajectoryNetwork, path: Path, threshold: float = 0.0) -> Iterator[Finding]:
+        """Yield the predicted paths of each frame of a dataset, see `findings`; all modes, however unlikely."""
+        yield from findings(network, path)
+
+    def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
+        """Return a line per slice."""
+        lines = [f"{result['modes']} modes, {result['scenes']} scenes; errors in m: average / final / missed"]
+        for name, numbers in result["slices"].items():
+            if numbers is None:
+                lines.append(f"{name}: none")
+                continue
+            lines.append(f"{name}: {numbers['samples']} samples")
+            for label, ade, fde, missed in (
+                ("one mode", "minADE_1", "minFDE_1", "miss_rate_1"),
+                (f"best of {result['modes']}", "minADE_K", "minFDE_K", "miss_rate_K"),
+                (
+                    "constant velocity",
+                    "constant_velocity_ADE",
+                    "constant_velocity_FDE",
+                    "miss_rate_constant_velocity",
+                ),
+            ):
+                ratio = numbers[fde] / numbers["constant_velocity_FDE"] if numbers["constant_velocity_FDE"] else 1.0
+                lines.append(
+                    f"  {label:<18}{numbers[ade]:.2f} / {numbers[fde]:.2f} / {numbers[missed]:.1%}  ({ratio:.2f}x)"
+                )
+        return lines
+
+    def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
+        """Return each road user's likeliest way."""
+        lines = []
+        for agent in result["agents"]:
+            best = max(agent["modes"], key=lambda mode: mode["probability"])
+            x, y = best["path"][-1]
+            said = f"at ({agent['x']:.1f}, {agent['y']:.1f}), in {result['time_s'][-1]:g} s at ({x:.1f}, {y:.1f})"
+            lines.append(f"{agent['track']} {said}, {best['probability']:.2f}")
+        return lines or ["nobody to predict"]
+
+
+TRAJECTORY = TrajectoryTask()

@@ -1,0 +1,93 @@
+"""Tracks at the task's own instants, from traffic that was recorded at others, and in the frame of their end."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.geometry import wrap_angle
+from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+
+GAP_S = 0.5  # between two instants of a trace, at most: half a metre is the worst that a curve in between costs
+OFFSETS_S: Array = np.arange(-PAST, FUTURE + 1, dtype=np.float64) * STEP_S
+
+
+class Tracks(NamedTuple):
+    """All A road users of a trace at S instants; NaN where they are not there."""
+
+    position: Array  # (S, A, 2) world [m]
+    yaw: Array  # (S, A) [rad]
+    speed: Array  # (S, A) [m/s]
+
+
+def check_instants(trace: Trace, origin: str) -> None:
+    """Raise `InputError` where tracks cannot be told from the instants of `trace`."""
+    gaps = np.diff(trace.time_s)
+    if len(gaps) == 0 or gaps.max() > GAP_S + 1e-6:
+        said = f"spins up to {gaps.max():g} s apart" if len(gaps) else "a single spin"
+        raise InputError(f"{origin}: {said}; the trajectory task wants them every {GAP_S:g} s or more often")
+
+
+def tracks_at(trace: Trace, times_s: Array) -> Tracks:
+    """Return the tracks at `times_s` (S,): cubic Hermite curves through the trace's positions (Catmull-Rom's tangents).
+
+    Somebody is there at an instant where the trace has him at both instants around it.
+    """
+    knots, position = trace.time_s, trace.position[..., :2]
+    times_s = np.round(times_s, 6)
+    last = np.clip(np.searchsorted(knots, times_s, side="right") - 1, 0, len(knots) - 1)
+    after = np.where(times_s <= knots[last] + 1e-6, last, np.minimum(last + 1, len(knots) - 1))
+    gap = np.where(after > last, knots[after] - knots[last], 1.0)[:, None]
+    share = np.where(after > last, (times_s - knots[last]) / gap[:, 0], 0.0)[:, None]
+    known = (times_s >= knots[0] - 1e-6) & (times_s <= knots[-1] + 1e-6)
+    there = trace.present[last] & trace.present[after] & known[:, None]
+    tangent = _tangents(knots, position)
+    u, h = share[..., None], gap[..., None]
+    curve = (
+        (1 + 2 * u) * (1 - u) ** 2 * position[last]
+        + u * (1 - u) ** 2 * h * tangent[last]
+        + u**2 * (3 - 2 * u) * position[after]
+        + u**2 * (u - 1) * h * tangent[after]
+    )
+    speed = np.linalg.norm(trace.velocity[..., :2], axis=2)
+    yaw = trace.yaw[last] + share * wrap_angle(trace.yaw[after] - trace.yaw[last])
+    return Tracks(
+        position=np.where(there[..., None], curve, np.nan),
+        yaw=np.where(there, wrap_angle(yaw), np.nan),
+        speed=np.where(there, speed[last] + share * (speed[after] - speed[last]), np.nan),
+    )
+
+
+def _tangents(knots: Array, position: Array) -> Array:
+    """Return (T, A, 2) velocities from the positions an instant before and after, one-sided where one is missing."""
+    slope = np.diff(position, axis=0) / np.diff(knots)[:, None, None]
+    none = np.full_like(position[:1], np.nan)
+    sides = np.stack((np.concatenate((none, slope)), np.concatenate((slope, none))))
+    count = np.isfinite(sides).sum(axis=0)
+    return np.where(np.isfinite(sides), sides, 0.0).sum(axis=0) / np.maximum(count, 1)
+
+
+def into_frame(points: Array, pose: Array) -> Array:
+    """Return points (N, ..., 2) of the world in the frames of `pose` (N, 3) x, y, yaw: x ahead, y to the left."""
+    spread = (slice(None), *(None,) * (points.ndim - 2))
+    cos, sin = np.cos(pose[:, 2])[spread], np.sin(pose[:, 2])[spread]
+    x, y = points[..., 0] - pose[:, 0][spread], points[..., 1] - pose[:, 1][spread]
+    return np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)
+
+
+def out_of_frame(points: Array, pose: Array) -> Array:
+    """Return the points (N, ..., 2) that `into_frame` was given."""
+    spread = (slice(None), *(None,) * (points.ndim - 2))
+    cos, sin = np.cos(pose[:, 2])[spread], np.sin(pose[:, 2])[spread]
+    x, y = points[..., 0], points[..., 1]
+    return np.stack((cos * x - sin * y + pose[:, 0][spread], sin * x + cos * y + pose[:, 1][spread]), axis=-1)
+
+
+def constant_velocity(past: NDArray[np.floating]) -> Array:
+    """Return (N, FUTURE, 2) where the road users go if they keep heading and speed; `past` as of `Samples`."""
+    ahead = past[:, -1, 3, None] * STEP_S * np.arange(1, FUTURE + 1)
+    return np.stack((ahead, np.zeros_like(ahead)), axis=-1).astype(np.float64)
