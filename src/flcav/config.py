@@ -1,7 +1,7 @@
 """User-facing configuration: YAML in, a frozen and checked record out, one sentence where it is wrong."""
 
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -18,6 +18,7 @@ class Config(BaseModel):
 
 
 ConfigT = TypeVar("ConfigT", bound=Config)
+Place = tuple[int | str, ...]  # of a field within fields
 
 
 def parse_config(model: type[ConfigT], values: object, origin: str) -> ConfigT:
@@ -47,13 +48,35 @@ def read_yaml(path: Path) -> object:
 
 
 def _sentence(error: ValidationError, model: type[BaseModel]) -> str:
-    first = error.errors()[0]
+    errors = error.errors()
+    deepest = [each for each in errors if not any(_inside(other["loc"], each["loc"]) for other in errors)]
+    first = deepest[0]
     field = ".".join(str(part) for part in first["loc"]) or "(whole)"
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    more = f" (and {len(deepest) - 1} more)" if len(deepest) > 1 else ""
     if first["type"] == "extra_forbidden":
-        known = ", ".join(sorted(model.model_fields)) if len(first["loc"]) == 1 else "see the documentation"
-        return f"unknown field '{field}'; known fields: {known}{more}"
+        known = sorted({name for owner in _models_at(model, first["loc"][:-1]) for name in owner.model_fields})
+        return f"unknown field '{field}'; known fields: {', '.join(known)}{more}"
     if first["type"] == "missing":
         return f"field '{field}' is missing{more}"
     message = first["msg"].removeprefix("Value error, ")
     return f"field '{field}' = {first['input']!r}: {message}{more}"
+
+
+def _inside(place: Place, outer: Place) -> bool:
+    """Return whether `place` lies within `outer`: a fault there makes the whole faulty too."""
+    return len(place) > len(outer) and place[: len(outer)] == outer
+
+
+def _models_at(model: type[BaseModel], place: Place) -> list[type[BaseModel]]:
+    """Return the models that may stand at `place`; numbers, keys and tags of unions lead from none to another."""
+    found = [model]
+    for part in place:
+        within = [owner.model_fields[part].annotation for owner in found if part in owner.model_fields]
+        found = [each for annotation in within for each in _models_in(annotation)] or found
+    return found
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models_in(part)]
