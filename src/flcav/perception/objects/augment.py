@@ -1,20 +1,38 @@
-"""Random mirrorings, turns and scales of a whole sample: the global augmentations of SECOND, sec. 3.2.1."""
+"""Random changes of a whole sample: SECOND's global mirroring, turning and scaling (sec. 3.2.1), and more.
+
+The others vary what differs between LiDARs, cars and countries: the sizes of objects (Yang et al., "ST3D", CVPR 2021,
+random object scaling), how the sensor stands, what is lost, how much of the surroundings is seen.
+"""
 
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, concatenate, points_in_boxes
 from flcav.perception.objects.config import Augmentation
-from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.samples import MIN_RETURNS, Sample
+
+VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's view to either side, down and up: KITTI's left colour camera
 
 
 def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Sample:
-    """Return the sample flipped, turned and scaled about the sensor by random amounts drawn from `rng`."""
+    """Return the sample changed by random amounts drawn from `rng`, as far as `how` allows."""
     mirror = -1.0 if how.flip and rng.random() < 0.5 else 1.0
     turn = rng.uniform(-how.turn_rad, how.turn_rad)
     scale = rng.uniform(1 - how.scale, 1 + how.scale)
-    return transformed(sample, mirror, turn, scale)
+    if how.resize != (1.0, 1.0):
+        sample = resized(sample, rng.uniform(*how.resize, size=(len(sample.boxes), 3)))
+    sample = transformed(sample, mirror, turn, scale)
+    if how.tilt_rad or how.lift_m:
+        slope = np.tan(rng.uniform(0, how.tilt_rad)) * _unit(rng.uniform(0, 2 * np.pi))
+        sample = sheared(sample, slope, rng.uniform(-how.lift_m, how.lift_m))
+    kept = np.ones(len(sample.points), dtype=bool)
+    if how.drop:
+        kept &= rng.random(len(kept)) >= rng.uniform(0, how.drop)
+    if how.view and rng.random() < how.view:
+        kept &= in_view(sample.points)
+    return sample if kept.all() else thinned(sample, kept)
 
 
 def transformed(sample: Sample, mirror: float, turn_rad: float, scale: float) -> Sample:
@@ -31,3 +49,56 @@ def transformed(sample: Sample, mirror: float, turn_rad: float, scale: float) ->
 
     free = None if sample.free is None else (sample.free @ plane).astype(np.float32)
     return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact)
+
+
+def resized(sample: Sample, factor: NDArray[np.float64]) -> Sample:
+    """Return the sample with the length, width and height of box n, and the returns in it, times factor[n] (N, 3).
+
+    An object keeps the middle of its foot.
+    """
+    boxes, points = sample.boxes, sample.points.copy()
+    foot = boxes.center - boxes.size * (0, 0, 0.5)
+    for row, inside in enumerate(points_in_boxes(sample.points, boxes)):
+        along = _unit(boxes.yaw[row])
+        frame = np.array([[*along, 0], [-along[1], along[0], 0], [0, 0, 1]])  # rows: the box's axes
+        stretch = frame.T @ np.diag(factor[row]) @ frame
+        points[inside, :3] = (sample.points[inside, :3] - foot[row]) @ stretch + foot[row]
+    size = boxes.size * factor
+    return replace(sample, points=points, boxes=replace(boxes, center=foot + size * (0, 0, 0.5), size=size))
+
+
+def sheared(sample: Sample, slope: NDArray[np.float64], lift_m: float) -> Sample:
+    """Return the sample lifted by `lift_m` plus `slope` (2,) times x, y: a tilt as small as those of cars and hills."""
+    points = sample.points.copy()
+    points[:, 2] += (points[:, :2] @ slope + lift_m).astype(np.float32)
+
+    def moved(boxes: Boxes) -> Boxes:
+        rise = boxes.center[:, :2] @ slope + lift_m
+        return replace(boxes, center=boxes.center + rise[:, None] * (0, 0, 1))
+
+    return replace(sample, points=points, boxes=moved(sample.boxes), ignore=moved(sample.ignore))
+
+
+def in_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which points (N, >=3) a camera at the sensor, looking ahead, would show."""
+    side, down, up = VIEW
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    return (x > 0) & (np.abs(y) < side * x) & (z > -down * x) & (z < up * x)
+
+
+def thinned(sample: Sample, kept: NDArray[np.bool_]) -> Sample:
+    """Return the sample with the returns `kept` (N,): objects that have too few left are ignored, or gone with none."""
+    points = sample.points[kept]
+    returns = _counted(points, sample.boxes)
+    enough = returns >= MIN_RETURNS
+    exact = None if sample.exact is None else sample.exact[enough]
+    ignore = concatenate([sample.boxes[(returns > 0) & ~enough], sample.ignore[_counted(points, sample.ignore) > 0]])
+    return replace(sample, points=points, boxes=sample.boxes[enough], ignore=ignore, exact=exact)
+
+
+def _counted(points: NDArray[np.float32], boxes: Boxes) -> NDArray[np.int64]:
+    return points_in_boxes(points, boxes).sum(1)
+
+
+def _unit(angle: float) -> NDArray[np.float64]:
+    return np.array((np.cos(angle), np.sin(angle)))

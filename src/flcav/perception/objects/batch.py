@@ -7,13 +7,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.loss import second_loss
 from flcav.perception.objects.model import HeadOutput, Second
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.targets import assign
-
-GLOBAL = Augmentation()  # of every sample, at every step
 
 
 def batch_loss(network: Second, samples: Sequence[Sample]) -> Tensor:

@@ -10,6 +10,7 @@ STRICT = ConfigDict(extra="forbid")
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 Count = Annotated[int, Field(gt=0)]
+Portion = Annotated[float, Field(ge=0, lt=1)]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -25,6 +26,21 @@ class Anchor:
 
 
 @dataclass(frozen=True, config=STRICT)
+class Augmentation:
+    """What training changes about its samples at random; amounts are uniform up to the one given."""
+
+    flip: bool = True  # left-right, in one of two samples
+    turn_rad: Annotated[float, Field(ge=0, lt=math.pi / 2)] = 0.3  # about the sensor, to either side
+    scale: Portion = 0.03  # of the whole scene, 1 -/+ scale
+    resize: tuple[Positive, Positive] = (1.0, 1.0)  # factor of each object's length, width and height, each by itself
+    tilt_rad: Portion = 0.0  # of the sensor, about any level axis
+    lift_m: Portion = 0.0  # of the sensor, up or down
+    drop: Portion = 0.0  # share of the returns that are lost
+    paste: Annotated[int, Field(ge=0)] = 0  # objects of each class from other samples, at most
+    view: Annotated[float, Field(ge=0, le=1)] = 0.0  # share of the samples cut to what a camera ahead sees
+
+
+@dataclass(frozen=True, config=STRICT)
 class SecondConfig:
     """A SECOND network in the LiDAR frame: x forward, y left, z up, metres, origin at the sensor."""
 
@@ -37,12 +53,20 @@ class SecondConfig:
     bev_channels: tuple[Count, Count]
     bev_up_channels: tuple[Count, Count]
     ground_z_m: float = -1.8  # height of the ground the anchors stand on: the sensor's height, negated
+    intensity: bool = True  # whether the network sees it
+    uncertainty: bool = False  # whether it predicts the variance of each residual beside it
+    calibration: tuple[tuple[float, float], ...] | None = None  # of each class: factor and summand of its logits
+    augmentation: Augmentation = Augmentation()
 
     @model_validator(mode="after")
     def _positive_extent(self) -> "SecondConfig":
         low, high = self.range_m[:3], self.range_m[3:]
         if any(b <= a for a, b in zip(low, high, strict=True)):
             raise ValueError("every axis of range_m needs a maximum above its minimum")
+        if self.calibration is not None and len(self.calibration) != len(self.anchors):
+            raise ValueError(
+                f"{len(self.anchors)} classes need as many pairs in calibration, not {len(self.calibration)}"
+            )
         return self
 
     @property
@@ -64,12 +88,3 @@ ANCHORS = {
     ),
     "Cyclist": Anchor(name="Cyclist", length_m=1.76, width_m=0.6, height_m=1.73, matched_iou=0.5, unmatched_iou=0.35),
 }
-
-
-@dataclass(frozen=True, config=STRICT)
-class Augmentation:
-    """How far training mirrors, turns and scales its samples."""
-
-    flip: bool = True  # left-right, in one of two samples
-    turn_rad: float = 0.3  # uniform to either side
-    scale: float = 0.03  # uniform in 1 -/+ scale

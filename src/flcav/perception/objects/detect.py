@@ -1,23 +1,30 @@
 """Boxes from point clouds."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from flcav.geometry import Boxes, concatenate
 from flcav.perception.objects.anchors import anchor_boxes, anchor_classes
 from flcav.perception.objects.batch import predict
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.loss import LOG_VARIANCES
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.targets import decode
+from flcav.perception.objects.targets import decode, decoded_variance
 from flcav.perception.ops.rotated import nms
 
 CANDIDATES = 256  # best-scoring anchors per class that suppression looks at
 
 
 def detect(network: Second, points: NDArray[np.float32], *, score_threshold: float = 0.1) -> Boxes:
-    """Return the boxes found in a point cloud (N, 4), LiDAR frame, best score first within a class."""
+    """Return the boxes found in a point cloud (N, 4), LiDAR frame, best score first within a class.
+
+    They have variances where the network predicts them.
+    """
     return detect_all(network, [points], score_threshold=score_threshold)[0]
 
 
@@ -31,15 +38,29 @@ def detect_all(
     with torch.inference_mode():
         for first in range(0, len(clouds), batch):
             output = predict(network, clouds[first : first + batch])
-            score = output.score.sigmoid().cpu().numpy()
+            score = calibrated(output.score, network.config).sigmoid().cpu().numpy()
             box = output.box.double().cpu().numpy()
             direction = output.direction.argmax(2).cpu().numpy()
-            found += [_boxes(network, *one, score_threshold) for one in zip(score, box, direction, strict=True)]
+            spread = [None] * len(score)
+            if output.log_variance is not None:
+                spread = output.log_variance.double().clamp(*LOG_VARIANCES).exp().cpu().numpy()
+            parts = zip(score, box, direction, spread, strict=True)
+            found += [_boxes(network, *one, score_threshold) for one in parts]
     network.train(training)
     return found
 
 
-def _boxes(network: Second, score: NDArray, box: NDArray, direction: NDArray, threshold: float) -> Boxes:
+def calibrated(logits: Tensor, config: SecondConfig) -> Tensor:
+    """Return the logits (..., classes) whose sigmoid is the score: the network's own, or put right by calibration."""
+    if config.calibration is None:
+        return logits
+    factor, summand = logits.new_tensor(config.calibration).T
+    return logits * factor + summand
+
+
+def _boxes(
+    network: Second, score: NDArray, box: NDArray, direction: NDArray, spread: NDArray | None, threshold: float
+) -> Boxes:
     config = network.config
     parts = []
     for index, name in enumerate(config.classes):
@@ -48,7 +69,11 @@ def _boxes(network: Second, score: NDArray, box: NDArray, direction: NDArray, th
         likely = np.argsort(-scores, kind="stable")[:CANDIDATES]
         likely = likely[scores[likely] >= threshold]
         own, scores = own[likely], scores[likely]
-        rows = decode(box[own], direction[own], anchor_boxes(config)[own])
+        anchors = anchor_boxes(config)[own]
+        rows = decode(box[own], direction[own], anchors)
         kept = nms(torch.from_numpy(rows), torch.from_numpy(scores)).numpy()
-        parts.append(Boxes.from_array(rows[kept], name, scores[kept]))
+        found = Boxes.from_array(rows[kept], name, scores[kept])
+        if spread is not None:
+            found = replace(found, variance=decoded_variance(spread[own][kept], rows[kept], anchors[kept]))
+        parts.append(found)
     return concatenate(parts)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse
-from flcav.perception.objects.config import Augmentation, SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.sensors.frame import Frame
 
 DETECTION_CLASS = {
@@ -89,16 +89,17 @@ def only_lidar(frame: Frame, name: str | None = None) -> str:
 
 
 def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:
-    """Return the points that mirroring, turning and scaling as `Augmentation` does may bring into the range."""
+    """Return the points that mirroring, turning, scaling and tilting in training may bring into the range."""
     x0, _, z0, _, _, z1 = config.range_m
-    most = Augmentation()
+    most = config.augmentation
     x, side, z = points[:, 0], np.abs(points[:, 1]), points[:, 2]
     distance = np.hypot(x, side)
     toward = x * np.cos(most.turn_rad) + side * np.sin(most.turn_rad)
     ahead = np.where(side < x * np.tan(most.turn_rad), distance, toward)  # furthest ahead that a turn brings it
     grow = 1 / (1 - most.scale)
     kept = (distance <= config.reach_m * grow) & (ahead >= min(x0 * grow, x0 / grow))
-    kept &= (z >= min(z0 * grow, z0 / grow)) & (z <= max(z1 * grow, z1 / grow))
+    slack = most.lift_m + distance * np.sin(most.tilt_rad)
+    kept &= (z >= min(z0 * grow, z0 / grow) - slack) & (z <= max(z1 * grow, z1 / grow) + slack)
     return points[kept]
 
 

@@ -54,6 +54,16 @@ def decode(residual: Array, direction: NDArray[np.int64], anchors: Array) -> Arr
     return np.concatenate((plane, height[:, None], size, yaw[:, None]), 1)
 
 
+def decoded_variance(variance: Array, boxes: Array, anchors: Array) -> Array:
+    """Return (P, 7) variances of boxes [m^2, rad^2] from those of the residuals they were decoded from.
+
+    To first order: a size is the exponential of its residual, the others are linear in theirs.
+    """
+    diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
+    slope = np.column_stack((diagonal, diagonal, anchors[:, 5], boxes[:, 3:6], np.ones(len(boxes))))
+    return variance * slope**2
+
+
 def direction_of(yaw: Array) -> NDArray[np.int64]:
     """Return 0 where the heading lies in [pi/4, 5/4 pi), else 1: what a box's axis alone leaves open."""
     return (np.mod(yaw - np.pi / 4, 2 * np.pi) >= np.pi).astype(np.int64)

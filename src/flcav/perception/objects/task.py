@@ -9,15 +9,18 @@ from torch import Tensor
 
 from flcav.dataset.store import Dataset
 from flcav.perception.objects.augment import augment
-from flcav.perception.objects.batch import GLOBAL, batch_loss
+from flcav.perception.objects.batch import batch_loss
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import evaluate
 from flcav.perception.objects.infer import box_rows, point_clouds
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
+from flcav.perception.objects.paste import pasted
 from flcav.perception.objects.samples import RecordedSweeps, Sample
 from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
+
+DONORS = 2  # other samples that objects are pasted from
 
 
 class ObjectsTask:
@@ -37,8 +40,13 @@ class ObjectsTask:
         return RecordedSweeps(data, config, of_frames(data, frames))
 
     def draw(self, samples: Sequence[Sample], index: int, config: SecondConfig, rng: np.random.Generator) -> Sample:
-        """Return the sample mirrored, turned and scaled at random."""
-        return augment(samples[index], GLOBAL, rng)
+        """Return the sample with objects of others pasted into it, then changed as `config.augmentation` says."""
+        how = config.augmentation
+        sample = samples[index]
+        if how.paste:
+            donors = [samples[int(i)] for i in rng.integers(len(samples), size=DONORS)]
+            sample = pasted(sample, donors, how.paste, rng)
+        return augment(sample, how, rng)
 
     def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
         """Return SECOND's loss of a batch."""

@@ -1,0 +1,122 @@
+"""Augmentation: returns stay on their objects, labels stay true, pasted objects meet nothing."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import Polygon
+
+from flcav.geometry import Boxes, points_in_boxes
+from flcav.perception.objects.augment import augment, in_view, resized, sheared, thinned
+from flcav.perception.objects.config import Augmentation
+from flcav.perception.objects.paste import fitting, pasted
+from flcav.perception.objects.samples import MIN_RETURNS, Sample
+
+
+def scene(seed: int, objects: int = 12, per_object: int = 20) -> Sample:
+    """Return cars of random pose that do not stand in one another, with `per_object` returns each, and clutter."""
+    rng = np.random.default_rng(seed)
+    spots = rng.permutation(36)[:objects]
+    center = np.column_stack((8 + 8 * (spots % 6), 8 * (spots // 6) - 20, rng.uniform(-1.2, -0.8, objects)))
+    size = rng.uniform((3, 1.5, 1.4), (5, 2, 1.8), (objects, 3))
+    boxes = Boxes(center, size, rng.uniform(-np.pi, np.pi, objects), np.full(objects, "Car"))
+    local = rng.uniform(-0.49, 0.49, (objects, per_object, 3)) * size[:, None]
+    cos, sin = np.cos(boxes.yaw)[:, None], np.sin(boxes.yaw)[:, None]
+    x, y, z = np.moveaxis(local, 2, 0)
+    on_objects = np.stack((x * cos - y * sin, x * sin + y * cos, z), 2) + center[:, None]
+    points = np.concatenate((on_objects.reshape(-1, 3), rng.uniform((0, -30, 2), (60, 30, 3), (200, 3))))
+    return Sample(np.column_stack((points, rng.random(len(points)))).astype(np.float32), boxes)
+
+
+EVERYTHING = Augmentation(
+    turn_rad=0.7, scale=0.05, resize=(0.8, 1.1), tilt_rad=0.02, lift_m=0.2, drop=0.3, paste=3, view=0.5
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_every_object_that_is_to_be_found_keeps_returns_in_its_box(seed):
+    changed = augment(scene(seed), EVERYTHING, np.random.default_rng(seed))
+    assert (points_in_boxes(changed.points, changed.boxes).sum(1) >= MIN_RETURNS).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_resized_objects_keep_their_returns_and_their_foot(seed):
+    before = scene(seed)
+    factor = np.random.default_rng(seed).uniform(0.8, 1.1, (len(before.boxes), 3))
+    after = resized(before, factor)
+    np.testing.assert_allclose(after.boxes.size, before.boxes.size * factor)
+    foot = [b.center[:, 2] - b.size[:, 2] / 2 for b in (before.boxes, after.boxes)]
+    np.testing.assert_allclose(*foot)
+    own = np.repeat(np.arange(len(before.boxes)), 20)
+    inside = points_in_boxes(after.points[: len(own)], after.boxes, margin_m=1e-4)
+    assert inside[own, np.arange(len(own))].all()
+
+
+def test_resizing_by_one_changes_nothing():
+    before = scene(3)
+    after = resized(before, np.ones((len(before.boxes), 3)))
+    np.testing.assert_allclose(after.points, before.points, atol=1e-5)
+    np.testing.assert_allclose(after.boxes.array(), before.boxes.array(), atol=1e-12)
+
+
+def test_a_tilt_raises_what_lies_up_the_slope():
+    before = scene(4)
+    after = sheared(before, np.array((0.02, 0.0)), 0.1)
+    np.testing.assert_allclose(
+        after.boxes.center[:, 2] - before.boxes.center[:, 2], 0.1 + 0.02 * before.boxes.center[:, 0]
+    )
+    np.testing.assert_allclose(after.points[:, 2] - before.points[:, 2], 0.1 + 0.02 * before.points[:, 0], atol=1e-5)
+
+
+def test_thinning_leaves_out_objects_without_returns_and_ignores_those_with_few():
+    sample = scene(5)
+    kept = np.ones(len(sample.points), dtype=bool)
+    kept[:20] = False  # all of the first
+    kept[20:37] = False  # all but three of the second
+    thin = thinned(sample, kept)
+    np.testing.assert_array_equal(thin.boxes.array(), sample.boxes[2:].array())
+    np.testing.assert_array_equal(thin.ignore.array(), sample.boxes[1:2].array())
+
+
+def test_a_view_ahead_ends_where_the_camera_does():
+    directions = np.array([[1, 0.84, 0], [1, -0.84, 0], [1, 0.86, 0], [1, 0, 0.25], [1, 0, -0.27], [-1, 0, 0]])
+    np.testing.assert_array_equal(in_view(directions.astype(np.float32)), [True, True, False, False, True, False])
+
+
+def footprint(box: Boxes) -> Polygon:
+    return Polygon(box.corners()[0, :4, :2])
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_pasted_objects_meet_no_other_from_above(seed):
+    both = pasted(scene(seed), [scene(seed + 1), scene(seed + 2)], 5, np.random.default_rng(seed))
+    shapes = [footprint(both.boxes[i : i + 1]) for i in range(len(both.boxes))]
+    new = range(12, len(shapes))
+    assert len(new) <= 5
+    for i in new:
+        assert all(shapes[i].intersection(shapes[j]).area < 1e-9 for j in range(len(shapes)) if j != i)
+    assert (points_in_boxes(both.points, both.boxes).sum(1) >= MIN_RETURNS).all()
+
+
+def test_pasted_objects_bring_their_returns_and_push_the_scenes_out():
+    donor = scene(7, objects=1)
+    clutter = np.column_stack((donor.points[:5, :3], np.full(5, 9.0))).astype(np.float32)
+    both = pasted(Sample(clutter, Boxes.empty()), [donor], 1, np.random.default_rng(0))
+    assert len(both.boxes) == 1
+    assert not (both.points[:, 3] == 9).any()
+    np.testing.assert_array_equal(np.sort(both.points[:, 0]), np.sort(donor.points[:20, 0]))
+
+
+def test_nothing_is_pasted_where_there_is_no_room():
+    sample = scene(8)
+    assert not len(fitting(sample.boxes, sample.boxes, 5))
+    assert len(pasted(sample, [Sample(sample.points, Boxes.empty())], 5, np.random.default_rng(0)).boxes) == 12
+
+
+def test_the_same_stream_changes_a_sample_the_same_way():
+    one, two = (augment(scene(9), EVERYTHING, np.random.default_rng(1)) for _ in range(2))
+    np.testing.assert_array_equal(one.points, two.points)
+    assert one.boxes.array() == pytest.approx(two.boxes.array())
