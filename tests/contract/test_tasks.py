@@ -207,6 +207,16 @@ def test_a_dataset_without_its_sensor_is_one_sentence(task, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@each_task
+def test_where_nothing_can_be_written_no_training_starts(task, data, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(type(task), "samples", None)  # not even called
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file" / "out", tmp_path / "file"):
+        assert called("train", task.name, "--data", data.folder, "--out", out) == 2
+        told = capsys.readouterr()
+        assert told.err == f"flcav: {out}: cannot be written (Not a directory)\n"
+
+
 @pytest.mark.parametrize("task", [WEATHER, SIGNS], ids=lambda task: task.name)
 def test_a_bad_picture_is_one_sentence(task, tmp_path, capsys):
     weights = tmp_path / "weights.safetensors"

@@ -1,5 +1,6 @@
 """A whole training of any task, from datasets to a file of weights with its card."""
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 from torch import nn
 from torch.utils.data import ConcatDataset
 
+from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.perception.card import Card, data_entry, write_card
 from flcav.perception.task import Task, configuration, fresh
@@ -35,8 +37,10 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     """Train, going on from where an interrupted run left off in `out`; write weights, card and curves there.
 
     One learning-rate cycle over all epochs. With validation data, the network of the best epoch is kept and its
-    evaluation is in the card. Raises `InputError` for an unknown network and for data that the task cannot use.
+    evaluation is in the card. Raises `InputError` for an unknown network, for data that the task cannot use, and where
+    `out` cannot be written.
     """
+    _check_writable(out)
     config = configuration(task, request.network)
     network = fresh(task, config, request.seed)
     parts = [task.samples(data, config) for data in request.data]
@@ -68,6 +72,15 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     save_network(task, network, out / WEIGHTS, card)
     write_card(card, out / CARD)
     return card
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise `InputError` where nothing can be written below `folder`; leaves nothing behind."""
+    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    try:
+        tempfile.TemporaryFile(dir=nearest).close()
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
 
 
 def _validation(task: Task[Any, Any, Any], request: Request, per_epoch: int) -> Validation | None:
