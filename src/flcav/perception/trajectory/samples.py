@@ -15,7 +15,7 @@ from flcav.perception.trajectory.config import PAST, CrossView, Patch, Trajector
 from flcav.perception.trajectory.rasters import rasters
 from flcav.perception.trajectory.roads import BEFORE_M, RoadMap, roads_of
 from flcav.perception.trajectory.surround import Surround, surround
-from flcav.perception.trajectory.tracks import OFFSETS_S, check_instants, into_frame, tracks_at
+from flcav.perception.trajectory.tracks import check_instants, into_frame, tracks_around
 from flcav.world.trace import Trace
 
 LOOKED_AT_AGAIN = 4  # so many sets of samples are kept, so that validation does not extract its own anew
@@ -123,7 +123,7 @@ def present_at(
 
     Theirs is a past in full, and where `complete` a future.
     """
-    tracks = tracks_at(trace, time_s + OFFSETS_S)
+    tracks = tracks_around(trace, time_s)
     known = np.isfinite(tracks.yaw)
     on_road = (trace.category != "pedestrian") & ~np.char.startswith(trace.actor, "parked") & wanted
     on_road &= known.all(axis=0) if complete else known[: PAST + 1].all(axis=0)

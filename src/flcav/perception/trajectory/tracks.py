@@ -12,7 +12,7 @@ from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
 
-GAP_S = 0.5  # between two instants of a trace, at most: half a metre is the worst that a curve in between costs
+GAP_S = 0.5  # between two instants of a trace, at most
 OFFSETS_S: Array = np.arange(-PAST, FUTURE + 1, dtype=np.float64) * STEP_S
 
 
@@ -32,19 +32,31 @@ def check_instants(trace: Trace, origin: str) -> None:
         raise InputError(f"{origin}: {said}; the trajectory task wants them every {GAP_S:g} s or more often")
 
 
-def tracks_at(trace: Trace, times_s: Array) -> Tracks:
-    """Return the tracks at `times_s` (S,): cubic Hermite curves through the trace's positions (Catmull-Rom's tangents).
+def tracks_around(trace: Trace, time_s: float) -> Tracks:
+    """Return the tracks at `time_s + OFFSETS_S`; nothing up to `time_s` depends on what the trace says of later."""
+    times_s = time_s + OFFSETS_S
+    known = int(np.searchsorted(trace.time_s, time_s + 1e-6, side="right"))
+    past, future = tracks_at(trace, times_s[: PAST + 1], known), tracks_at(trace, times_s[PAST + 1 :])
+    return Tracks(*(np.concatenate(parts) for parts in zip(past, future)))
 
-    Somebody is there at an instant where the trace has him at both instants around it.
+
+def tracks_at(trace: Trace, times_s: Array, known: int | None = None) -> Tracks:
+    """Return the tracks at `times_s` (S,), from the trace's first `known` instants or from all of it.
+
+    They are cubic Hermite curves through its positions, with Catmull-Rom's tangents. Somebody is there at an instant
+    where the trace has him at both instants around it.
     """
-    knots, position = trace.time_s, trace.position[..., :2]
+    knots, position = trace.time_s[:known], trace.position[:known, :, :2]
+    if not len(knots):
+        shape = (len(times_s), len(trace.actor))
+        return Tracks(np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.full(shape, np.nan))
     times_s = np.round(times_s, 6)
     last = np.clip(np.searchsorted(knots, times_s, side="right") - 1, 0, len(knots) - 1)
     after = np.where(times_s <= knots[last] + 1e-6, last, np.minimum(last + 1, len(knots) - 1))
     gap = np.where(after > last, knots[after] - knots[last], 1.0)[:, None]
     share = np.where(after > last, (times_s - knots[last]) / gap[:, 0], 0.0)[:, None]
-    known = (times_s >= knots[0] - 1e-6) & (times_s <= knots[-1] + 1e-6)
-    there = trace.present[last] & trace.present[after] & known[:, None]
+    within = (times_s >= knots[0] - 1e-6) & (times_s <= knots[-1] + 1e-6)
+    there = trace.present[last] & trace.present[after] & within[:, None]
     tangent = _tangents(knots, position)
     u, h = share[..., None], gap[..., None]
     curve = (
