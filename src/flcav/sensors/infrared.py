@@ -99,11 +99,11 @@ def thermal_image(
     appearance, light = appearance_of(scene), light_of(weather)
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden)
     seen = survey(scene, appearance, world_from_camera, rays, hits)
-    lit = sun_shadows(scene, seen, light, hidden)
+    shaded = sun_shadows(scene, seen, light, hidden)
     met = seen.row >= 0
     material = appearance.material[np.maximum(seen.row, 0)]
     air = air_temperature(weather)
-    heat = lit * np.clip(seen.normal @ np.array(light.to_sun), 0, 1) * _sunshine(weather)
+    heat = ~shaded * np.clip(seen.normal @ np.array(light.to_sun), 0, 1) * _sunshine(weather)
     cold = np.clip(seen.normal[:, 2], 0, 1) * (1 - 0.9 * weather.cloud_cover)
     night = float(np.clip((8.0 - weather.sun_elevation_deg) / 14.0, 0, 1))
     dry = 1 - 0.8 * max(weather.wetness, min(weather.rain_mm_h / 5.0, 1.0))

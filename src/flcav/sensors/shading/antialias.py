@@ -1,4 +1,4 @@
-"""Where one ray per pixel is not enough, and the further rays that make up for it.
+"""Further rays for the pixels that one does not do justice, and the mean over them.
 
 Pixels at edges get two more rays, which with the first stand as three rooks; pixels that a thin thing far away may
 cross get eight more, as nine. So a pole covers as much of its pixels as it is wide, whether or not a pixel's centre
@@ -8,70 +8,15 @@ meets it.
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import inverse, transform_points
-from flcav.sensors.lens import Lens, project
-from flcav.sensors.shading.appearance import Appearance
-from flcav.sensors.shading.survey import Survey
+from flcav.sensors.lens import Lens
+from flcav.sensors.shading.edges import THIN
 from flcav.world.materials import Material
 from flcav.world.rays.compiled import compiled
-from flcav.world.town import Town
 
-LEAF = int(Material.LEAF)
-EDGE, THIN = 1, 2  # what a pixel is
-BEND = 0.93  # cosine between normals from which on a surface has no edge
-STEP = 0.02  # out of the neighbour's plane, over the distance
-THIN_PX = 4.0  # things narrower than this are thin
-FARTHEST_M = 220.0
-POST_M, SIGN_M, SIGNAL_M = 0.1, 0.42, 0.6  # half widths
+SIGN = int(Material.SIGN)
 _THREE = np.array([(-1, 1), (1, -1)], np.float32) / 3
 _NINE = np.array([(-4, -1), (-3, 2), (-2, -3), (-1, 4), (1, -4), (2, 3), (3, -2), (4, 1)], np.float32) / 9
 BRIGHTEST = 3.0  # what outshines this after exposure counts no more: edges of lamps would stay jagged
-
-
-def rough_pixels(seen: Survey, appearance: Appearance, lens: Lens) -> NDArray[np.uint8]:
-    """Return (N,) which pixels are an EDGE."""
-    out = np.zeros(len(seen), np.uint8)
-    arrays = (seen.row, seen.instance, seen.distance, seen.normal, seen.position, appearance.material)
-    _edges(*arrays, lens.width, out)
-    return out
-
-
-def mark_thin(
-    kind: NDArray[np.uint8], town: Town, world_from_camera: NDArray[np.float64], lens: Lens, seen: Survey
-) -> None:
-    """Mark the pixels that the town's lamps, masts, signs and signal heads may cross and that show nothing nearer."""
-    bars = thin_bars(town)
-    camera_from_world = inverse(world_from_camera)
-    ends = [transform_points(camera_from_world, bars[:, part]) for part in (slice(0, 3), slice(3, 6))]
-    near = np.minimum(ends[0][:, 2], ends[1][:, 2])
-    kept = (near > 2.0) & (near < FARTHEST_M)
-    pixels = [project(lens, end[kept]) for end in ends]
-    focal = lens.intrinsics()[0, 0]
-    half_px = bars[kept, 6] * focal / near[kept]
-    small = (half_px * 2 < THIN_PX) | (bars[kept, 6] > POST_M) & (half_px * 2 < 6 * THIN_PX)
-    small &= np.isfinite(pixels[0]).all(axis=1) & np.isfinite(pixels[1]).all(axis=1)
-    _draw_bars(
-        pixels[0][small],
-        pixels[1][small],
-        half_px[small],
-        near[kept][small],
-        seen.distance,
-        lens.width,
-        lens.height,
-        kind,
-    )
-
-
-def thin_bars(town: Town) -> NDArray[np.float64]:
-    """Return (K, 7) both ends of everything thin in a town, world [m], and its half width."""
-    rows = [(x, y, 0, x, y, height, POST_M) for x, y, height in town.lamps]
-    rows += [(x, y, 0, x, y, z, POST_M) for x, y, z in town.poles.position]
-    for x, y, z in town.signs.position:
-        rows += [(x, y, 0, x, y, z, POST_M), (x, y, z - 0.36, x, y, z + 0.36, SIGN_M)]
-    for (x, y, z), foot in zip(town.signals.position, town.signals.foot):
-        rows += [(*foot, 0, *foot, z + 0.25, POST_M), (*foot, z, x, y, z, POST_M)]
-        rows.append((x, y, z - 0.6, x, y, z + 0.6, SIGNAL_M))
-    return np.array(rows, np.float64).reshape(-1, 7)
 
 
 def further_rays(
@@ -83,6 +28,27 @@ def further_rays(
     directions, pixel = np.empty((total, 3), np.float32), np.empty(total, np.int32)
     _spread(rays, kind, lens.width, lens.height, _THREE, _NINE, directions, pixel)
     return directions, pixel
+
+
+@compiled
+def donors(hits, pixel, seen, first, material, width, out):
+    """Write for each further ray the pixel `out` (S,) that shows the same face: its own or one beside it; else -1.
+
+    What is drawn on faces is smooth over pixels, so that such a ray would see the same. Signs have none: their
+    letters are finer. `first` and `material` are those of `Scene.surfaces`.
+    """
+    for sample in range(len(pixel)):
+        out[sample] = -1
+        own, instance, row = pixel[sample], hits.instance[sample], -1
+        if instance >= 0:
+            row = first[instance] + hits.face[sample]
+            if material[row] == SIGN:
+                continue
+        for step in (0, -1, 1, -width, width, -width - 1, -width + 1, width - 1, width + 1):
+            other = own + step
+            if other >= 0 and other < len(seen.row) and seen.row[other] == row and seen.instance[other] == instance:
+                out[sample] = other
+                break
 
 
 @compiled
@@ -99,48 +65,6 @@ def average(radiance, further, pixel, ceiling):
                 total += min(further[sample, band], ceiling)
             radiance[own, band] = total / (end - start + 1)
         start = end
-
-
-@compiled
-def _edges(row, instance, distance, normal, position, material, width, out):
-    for pixel in range(len(out)):
-        for side in range(2):
-            if side == 0 and pixel % width + 1 == width:
-                continue
-            other = pixel + (width if side else 1)
-            if other >= len(out) or row[pixel] == row[other]:
-                continue
-            edge = row[pixel] < 0 or row[other] < 0 or instance[pixel] != instance[other]
-            if not edge and not (material[row[pixel]] == LEAF and material[row[other]] == LEAF):
-                bend, off = np.float32(0), np.float32(0)
-                for axis in range(3):
-                    bend += normal[pixel, axis] * normal[other, axis]
-                    off += normal[pixel, axis] * (position[other, axis] - position[pixel, axis])
-                edge = bend < BEND or abs(off) > STEP * min(distance[pixel], distance[other])
-            if edge:
-                out[pixel], out[other] = EDGE, EDGE
-
-
-@compiled
-def _draw_bars(start, end, half, near, distance, width, height, kind):
-    for bar in range(len(half)):
-        along_x, along_y = end[bar, 0] - start[bar, 0], end[bar, 1] - start[bar, 1]
-        steps = int(max(abs(along_x), abs(along_y))) + 1
-        if steps > 4 * (width + height):
-            continue
-        reach = half[bar] + 1.0
-        for step in range(steps + 1):
-            x = start[bar, 0] + along_x * step / steps
-            y = start[bar, 1] + along_y * step / steps
-            flat = abs(along_y) < abs(along_x)
-            middle = y if flat else x
-            for aside in range(int(np.floor(middle - reach)), int(np.ceil(middle + reach)) + 1):
-                column, row = (round(x), aside) if flat else (aside, round(y))
-                if column < 0 or row < 0 or column >= width or row >= height:
-                    continue
-                pixel = row * width + column
-                if distance[pixel] > near[bar] - 1.0:
-                    kind[pixel] |= THIN
 
 
 @compiled

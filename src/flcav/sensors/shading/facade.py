@@ -65,14 +65,14 @@ def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
 
     `across` is the pixel's width on a plane face on [m], `slant` the same over the cosine of the incidence.
     """
-    place, size = facades.place[building], facades.size[building]
-    dx, dy = x - place[0], y - place[1]
-    u, v = dx * place[2] + dy * place[3], dy * place[2] - dx * place[3]
-    side = nx * place[2] + ny * place[3]  # of the normal along the building
+    place, cos, sin = facades.place, facades.place[building, 2], facades.place[building, 3]
+    dx, dy = x - place[building, 0], y - place[building, 1]
+    u, v = dx * cos + dy * sin, dy * cos - dx * sin
+    side = nx * cos + ny * sin  # of the normal along the building
     if abs(side) > np.float32(0.7):
-        u, v, length, number = v, u, size[1], 1
+        u, v, length, number = v, u, facades.size[building, 1], 1
     else:
-        length, number = size[0], 0
+        length, number = facades.size[building, 0], 0
     if v < 0:
         number += 2
     tone = np.float32(0.90) + np.float32(0.20) * noise_at(table, u * 0.7 + building * 13.0, z * 0.5)
@@ -89,11 +89,11 @@ def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
         fine = fade(np.float32(0.05), slant)
         if fine > 0:
             tone += fine * np.float32(0.08) * (noise_at(table, u * 24.0, z * 24.0) - np.float32(0.5))
-    wall = facades.wall[building]
-    red, green, blue = wall[0] * tone, wall[1] * tone, wall[2] * tone
+    wall = facades.wall
+    red, green, blue = wall[building, 0] * tone, wall[building, 1] * tone, wall[building, 2] * tone
     storey = int(z // STOREY_M)
     bays = int(length // BAY_M)
-    if bays < 1 or (storey + 1) * STOREY_M > size[2] + np.float32(0.3) or z < 0:
+    if bays < 1 or (storey + 1) * STOREY_M > facades.size[building, 2] + np.float32(0.3) or z < 0:
         return red, green, blue, np.float32(0), 0
     pitch = length / bays
     bay = int(np.floor((u + length / 2) / pitch))

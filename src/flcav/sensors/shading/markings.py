@@ -61,13 +61,13 @@ def paint_at(x, y, look_x, look_y, across, along, markings):
     total, most, which = np.float32(0), np.float32(0), 0
     for place in range(markings.first[i, j], markings.first[i, j + 1]):
         piece = markings.listed[place]
-        row = markings.rectangle[piece]
-        dx, dy = np.float32(x - row[0]), np.float32(y - row[1])
-        parallel = abs(look_x * row[2] + look_y * row[3])
-        crossed = abs(look_x * row[3] - look_y * row[2])
-        share = overlap(dx * row[2] + dy * row[3], row[4], parallel * along + crossed * across)
+        box = markings.rectangle
+        dx, dy, tx, ty = np.float32(x - box[piece, 0]), np.float32(y - box[piece, 1]), box[piece, 2], box[piece, 3]
+        parallel = abs(look_x * tx + look_y * ty)
+        crossed = abs(look_x * ty - look_y * tx)
+        share = overlap(dx * tx + dy * ty, box[piece, 4], parallel * along + crossed * across)
         if share > 0:
-            share *= overlap(dy * row[2] - dx * row[3], row[5], crossed * along + parallel * across)
+            share *= overlap(dy * tx - dx * ty, box[piece, 5], crossed * along + parallel * across)
             total += share
             if share > most:
                 most, which = share, piece

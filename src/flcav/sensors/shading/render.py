@@ -6,15 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.lens import Lens, directions
-from flcav.sensors.shading import antialias, rain
+from flcav.sensors.shading import antialias, edges, rain
 from flcav.sensors.shading.appearance import Appearance, appearance_of
 from flcav.sensors.shading.glare import add_glare
 from flcav.sensors.shading.light import Light, light_of
+from flcav.sensors.shading.memory import keep_freed_memory
 from flcav.sensors.shading.openness import openness
 from flcav.sensors.shading.shadows import lamp_light_on, sun_shadows
 from flcav.sensors.shading.state import Lamps, State, lamps_of, no_lamps, state_of
 from flcav.sensors.shading.surface import shade
 from flcav.sensors.shading.survey import Survey, survey
+from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
@@ -54,6 +56,7 @@ def render(
     hidden: int | None,
 ) -> Picture:
     """Return the light that falls on every pixel of `lens`, row after row: see `camera.photograph`."""
+    keep_freed_memory()
     rays, light, appearance = directions(lens), light_of(weather), appearance_of(scene)
     state = state_of(scene, float(light.lamps), low_sight=bool(light.extinction > LOW_SIGHT))
     angle = np.float32(1 / lens.intrinsics()[0, 0])
@@ -65,11 +68,11 @@ def render(
     radiance, painted = _radiance(world, seen, open_sky)
     if light.wetness > MIRRORS:
         _mirror(world, world_from_camera, lens, rays, seen, radiance)
-    kind = antialias.rough_pixels(seen, appearance, lens)
-    antialias.mark_thin(kind, scene.town, world_from_camera, lens, seen)
+    kind = edges.rough_pixels(seen, radiance, light.exposure, appearance, lens)
+    edges.mark_thin(kind, scene.town, world_from_camera, lens, seen)
     further, pixel = antialias.further_rays(rays, kind, lens)
     if len(pixel):
-        more, _ = _radiance(world, _meet(world, world_from_camera, further), open_sky[pixel])
+        more = _further(world, world_from_camera, further, pixel, lens.width, seen, open_sky, radiance)
         antialias.average(radiance, more, pixel, np.float32(antialias.BRIGHTEST / light.exposure))
     image = radiance.reshape(lens.height, lens.width, 3)
     if weather.rain_mm_h > 0:
@@ -92,13 +95,35 @@ def _meet(
 def _radiance(
     world: _World, seen: Survey, open_sky: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    lit = sun_shadows(world.scene, seen, world.light, world.hidden)
-    lamplight = lamp_light_on(world.scene, seen, world.lamps, world.hidden) if world.light.lamps > 0 else NO_LAMPS
+    scene, light, hidden = world.scene, world.light, world.hidden
+    shaded = sun_shadows(scene, seen, light, hidden)
+    lamplight = lamp_light_on(scene, seen, world.lamps, hidden) if light.lamps > 0 else NO_LAMPS
     radiance, painted = np.empty((len(seen), 3), np.float32), np.empty(len(seen), np.bool_)
-    shade(
-        seen, world.light, world.appearance, world.state, lit, lamplight, open_sky, world.pixel_angle, radiance, painted
-    )
+    tables = (light, world.appearance, world.state)
+    shade(seen, *tables, shaded, lamplight, open_sky, world.pixel_angle, radiance, painted)
     return radiance, painted
+
+
+def _further(
+    world: _World,
+    world_from_camera: NDArray[np.float64],
+    rays: NDArray[np.float32],
+    pixel: NDArray[np.int32],
+    width: int,
+    seen: Survey,
+    open_sky: NDArray[np.float32],
+    radiance: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Return the light (S, 3) of further rays, each within a `pixel` (S,): what a pixel close by shows, or shaded."""
+    scene, appearance = world.scene, world.appearance
+    hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=world.hidden)
+    donor = np.empty(len(rays), np.int32)
+    antialias.donors(hits, pixel, seen, scene.surfaces.first, appearance.material, width, donor)
+    out, rest = radiance[donor], np.flatnonzero(donor < 0)
+    unknown = Hits(hits.distance[rest], hits.instance[rest], hits.face[rest])
+    found = survey(scene, appearance, world_from_camera, rays[rest], unknown)
+    out[rest], _ = _radiance(world, found, open_sky[pixel[rest]])
+    return out
 
 
 def _mirror(

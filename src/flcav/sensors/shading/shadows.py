@@ -22,11 +22,11 @@ def lamp_light_on(scene: Scene, seen: Survey, lamps: Lamps, hidden: int | None) 
     return light
 
 
-def sun_shadows(scene: Scene, seen: Survey, light: Light, hidden: int | None) -> NDArray[np.float32]:
-    """Return for each ray's end whether the sun reaches it: 1, or 0 behind something; 1 too where it faces away."""
+def sun_shadows(scene: Scene, seen: Survey, light: Light, hidden: int | None) -> NDArray[np.bool_]:
+    """Return for each ray's end whether something hides the sun there; false too where it faces away."""
     far = np.empty(len(seen), np.float32)
     _facing(seen, light.to_sun, max(light.sun) > DARK, far)
-    return 1 - scene.blocked(seen.position, np.array([light.to_sun]), far, hidden=hidden).astype(np.float32)
+    return scene.blocked(seen.position, np.array([light.to_sun]), far, hidden=hidden)
 
 
 @compiled

@@ -25,15 +25,15 @@ ROAD_LINE = 0.5  # share of a pixel from which on paint is what it shows
 
 
 @compiled
-def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angle, radiance, painted):
+def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_angle, radiance, painted):
     """Write the `radiance` (N, 3) of what N rays met, and whether it is `painted` (N,) road.
 
-    `lit` (N,) is the share of the sun's light that arrives, `lamplight` (N, 3) what lamps throw there (or (0, 3): none
-    is on), `open_sky` (N,) how much of the sky is free; a pixel sees `pixel_angle` [rad].
+    `shaded` (N,) says where the sun is hidden, `lamplight` (N, 3) is what lamps throw there (or (0, 3): none is on),
+    `open_sky` (N,) how much of the sky is free; a pixel sees `pixel_angle` [rad].
     """
     lamps_on = len(lamplight) > 0
     table = appearance.noise
-    for ray in range(len(lit)):
+    for ray in range(len(shaded)):
         dx, dy, dz = survey.ray[ray, 0], survey.ray[ray, 1], survey.ray[ray, 2]
         row = survey.row[ray]
         painted[ray] = False
@@ -47,8 +47,8 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
         facing = max(-(dx * nx + dy * ny + dz * nz), np.float32(0.02))
         across = np.float32(survey.distance[ray] * pixel_angle)
         slant = across / facing
-        own = appearance.colour[instance, material]
-        red, green, blue = own[0], own[1], own[2]
+        own = appearance.colour
+        red, green, blue = own[instance, material, 0], own[instance, material, 1], own[instance, material, 2]
         mirror, gloss = appearance.mirror[material], appearance.gloss[material]
         shine_r, shine_g, shine_b = np.float32(0), np.float32(0), np.float32(0)
         through = np.float32(0)  # share of the sun that shines through from behind
@@ -61,10 +61,10 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
                 painted[ray] = share > ROAD_LINE
                 worn = np.float32(0.72) + np.float32(0.28) * noise_at(table, x * 1.7, y * 1.7)
                 share *= min(worn + np.float32(0.25) * tone, np.float32(1))
-                colour = appearance.markings.colour[piece]
-                red += share * (colour[0] * tone - red)
-                green += share * (colour[1] * tone - green)
-                blue += share * (colour[2] * tone - blue)
+                colour = appearance.markings.colour
+                red += share * (colour[piece, 0] * tone - red)
+                green += share * (colour[piece, 1] * tone - green)
+                blue += share * (colour[piece, 2] * tone - blue)
         elif material == SIDEWALK:
             if nz > np.float32(0.5):
                 tone = paving(x, y, slant, table)
@@ -103,12 +103,16 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             tone = np.float32(0.85) + np.float32(0.3) * noise_at(table, (x + y) * 1.9, z * 1.9)
             red, green, blue = red * tone, green * tone, blue * tone
         elif material == ROOF and appearance.part[row] == BUILDING:
-            colour = appearance.facades.roof[appearance.part_row[row]]
+            colour, building = appearance.facades.roof, appearance.part_row[row]
             tone = np.float32(0.85) + np.float32(0.3) * noise_at(table, x * 2.3, y * 2.3 + z)
             near = fade(np.float32(0.25), slant)
             if near > 0 and nz > np.float32(0.2) and nz < np.float32(0.97):
                 tone *= 1 - near * np.float32(0.28) * np.float32(abs((z * 4.5) % 1.0 - 0.5) * 2)
-            red, green, blue = colour[0] * tone, colour[1] * tone, colour[2] * tone
+            red, green, blue = (
+                colour[building, 0] * tone,
+                colour[building, 1] * tone,
+                colour[building, 2] * tone,
+            )
         elif material == LEAF:
             near = fade(np.float32(0.10), across)
             tone = np.float32(0.62) + np.float32(0.75) * hashed(row, 5)
@@ -122,10 +126,10 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             red, green, blue = red * tone * (np.float32(0.75) + autumn * np.float32(0.7)), green * tone, blue * tone
             through = np.float32(0.55)
         elif material == SIGN:
-            place = appearance.plates.place[appearance.part_row[row]]
-            right = (x - place[0]) * place[3] + (y - place[1]) * place[4]
+            place, plate = appearance.plates.place, appearance.part_row[row]
+            right = (x - place[plate, 0]) * place[plate, 3] + (y - place[plate, 1]) * place[plate, 4]
             red, green, blue = sign_at(
-                appearance.plates.kind[appearance.part_row[row]], right, z - place[2], across, appearance.plates.drawn
+                appearance.plates.kind[plate], right, z - place[plate, 2], across, appearance.plates.drawn
             )
         elif material >= LENS_RED and material <= LENS_GREEN:
             lens = state.lens[-appearance.thing[row] - 1]
@@ -147,11 +151,12 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             if instance == 0:
                 red, green, blue = red * dark, green * dark, blue * dark
 
+        lit = np.float32(0) if shaded[ray] else np.float32(1)
         sun = nx * light.to_sun[0] + ny * light.to_sun[1] + nz * light.to_sun[2]
         if through > 0:
-            sun = (np.float32(0.25) + np.float32(0.75) * max(sun, -sun * through)) * lit[ray]
+            sun = (np.float32(0.25) + np.float32(0.75) * max(sun, -sun * through)) * lit
         else:
-            sun = max(sun, np.float32(0)) * lit[ray]
+            sun = max(sun, np.float32(0)) * lit
         up = (np.float32(0.5) + np.float32(0.5) * nz) * open_sky[ray]
         down = (np.float32(0.5) - np.float32(0.5) * nz) * (np.float32(0.4) + np.float32(0.6) * open_sky[ray])
         arrive_r = sun * light.sun[0] + up * light.ambient[0] + down * light.bounce[0]
@@ -172,10 +177,10 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             turned = 2 * facing
             rx, ry, rz = dx + turned * nx, dy + turned * ny, dz + turned * nz
             env_r, env_g, env_b = mirrored_at(rx, ry, rz, light)
-            if gloss > 0 and lit[ray] > 0:
+            if gloss > 0 and lit > 0:
                 beside = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
                 if beside > np.float32(0.6):
-                    flash = np.exp(gloss * (beside - 1)) * lit[ray] * gloss * np.float32(0.02)
+                    flash = np.exp(gloss * (beside - 1)) * lit * gloss * np.float32(0.02)
                     env_r += flash * light.sun[0]
                     env_g += flash * light.sun[1]
                     env_b += flash * light.sun[2]

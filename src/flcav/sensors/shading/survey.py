@@ -35,9 +35,9 @@ def survey(
     hits: Hits,
 ) -> Survey:
     """Return what the rays `directions` (N, 3), optical frame, met: their `hits`, looked up."""
-    count, bodies = len(directions), np.tile(np.eye(4, dtype=np.float32), (len(scene.surfaces.first), 1, 1))
-    bodies[:, :3, :3] = scene.world_from_instance()
-    bodies[1:, :3, 3] = scene.poses()[:, :3]
+    count, poses = len(directions), scene.poses()
+    bodies = np.zeros((len(poses) + 1, 5), np.float32)  # x, y, z, cosine and sine of the yaw
+    bodies[1:] = np.c_[poses[:, :3], np.cos(poses[:, 3]), np.sin(poses[:, 3])]
     out = Survey(
         np.empty((count, 3), np.float32),
         hits.distance,
@@ -70,9 +70,9 @@ def _look_up(pose, directions, face, first, normals, bodies, appearance, out):
         distance = out.distance[ray]
         px, py, pz = pose[0, 3] + dx * distance, pose[1, 3] + dy * distance, pose[2, 3] + dz * distance
         nx, ny, nz = normals[row, 0], normals[row, 1], normals[row, 2]
-        body = bodies[instance]
+        cos, sin = bodies[instance, 3], bodies[instance, 4]
         if instance > 0:
-            nx, ny = body[0, 0] * nx + body[0, 1] * ny, body[1, 0] * nx + body[1, 1] * ny
+            nx, ny = cos * nx - sin * ny, sin * nx + cos * ny
         if nx * dx + ny * dy + nz * dz > 0:
             nx, ny, nz = -nx, -ny, -nz
         out.position[ray, 0], out.position[ray, 1], out.position[ray, 2] = (
@@ -81,37 +81,40 @@ def _look_up(pose, directions, face, first, normals, bodies, appearance, out):
             pz + nz * lift,
         )
         if instance > 0:
-            nx, ny, nz = _smooth(px, py, pz, dx, dy, dz, nx, ny, nz, body, row - appearance.first_actor, appearance)
+            ex, ey, ez = px - bodies[instance, 0], py - bodies[instance, 1], pz - bodies[instance, 2]
+            bx, by = cos * ex + sin * ey, cos * ey - sin * ex
+            number = row - appearance.first_actor
+            sx, sy, sz = _smooth(bx, by, ez, appearance.corner, appearance.corner_normal, number)
+            sx, sy = cos * sx - sin * sy, sin * sx + cos * sy
+            if sx * nx + sy * ny + sz * nz < 0:
+                sx, sy, sz = -sx, -sy, -sz
+            if sx * dx + sy * dy + sz * dz < np.float32(-0.02):  # it may not face away from who sees the face
+                nx, ny, nz = sx, sy, sz
         out.normal[ray, 0], out.normal[ray, 1], out.normal[ray, 2] = nx, ny, nz
 
 
 @inlined
-def _smooth(px, py, pz, dx, dy, dz, nx, ny, nz, body, face, appearance):
-    """Return the normal of the smooth surface at a point of an actor's face, whose own normal is nx, ny, nz."""
-    ex, ey = px - body[0, 3], py - body[1, 3]
-    x, y, z = body[0, 0] * ex + body[1, 0] * ey, body[0, 1] * ex + body[1, 1] * ey, pz - body[2, 3]
-    corner, normal = appearance.corner[face], appearance.corner_normal[face]
-    ax, ay, az = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
-    bx, by, bz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
-    cx, cy, cz = x - corner[0, 0], y - corner[0, 1], z - corner[0, 2]
+def _smooth(x, y, z, corner, normal, face):
+    """Return the unit normal (body frame) of the smooth surface at a point of an actor's face, or zero."""
+    ax, ay, az = (
+        corner[face, 1, 0] - corner[face, 0, 0],
+        corner[face, 1, 1] - corner[face, 0, 1],
+        corner[face, 1, 2] - corner[face, 0, 2],
+    )
+    bx, by, bz = (
+        corner[face, 2, 0] - corner[face, 0, 0],
+        corner[face, 2, 1] - corner[face, 0, 1],
+        corner[face, 2, 2] - corner[face, 0, 2],
+    )
+    cx, cy, cz = x - corner[face, 0, 0], y - corner[face, 0, 1], z - corner[face, 0, 2]
     aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
     ca, cb = cx * ax + cy * ay + cz * az, cx * bx + cy * by + cz * bz
-    area = aa * bb - ab * ab
-    if area < 1e-14:
-        return nx, ny, nz
+    area = max(aa * bb - ab * ab, np.float32(1e-14))
     v = min(max((bb * ca - ab * cb) / area, np.float32(0)), np.float32(1))
     w = min(max((aa * cb - ab * ca) / area, np.float32(0)), np.float32(1))
     u = 1 - v - w
-    sx = u * normal[0, 0] + v * normal[1, 0] + w * normal[2, 0]
-    sy = u * normal[0, 1] + v * normal[1, 1] + w * normal[2, 1]
-    sz = u * normal[0, 2] + v * normal[1, 2] + w * normal[2, 2]
-    sx, sy = body[0, 0] * sx + body[0, 1] * sy, body[1, 0] * sx + body[1, 1] * sy
-    length = np.sqrt(sx * sx + sy * sy + sz * sz)
-    if length < 1e-6:
-        return nx, ny, nz
-    if sx * nx + sy * ny + sz * nz < 0:
-        length = -length
-    sx, sy, sz = sx / length, sy / length, sz / length
-    if sx * dx + sy * dy + sz * dz > np.float32(-0.02):  # a smooth normal may not face away from who sees the face
-        return nx, ny, nz
-    return sx, sy, sz
+    sx = u * normal[face, 0, 0] + v * normal[face, 1, 0] + w * normal[face, 2, 0]
+    sy = u * normal[face, 0, 1] + v * normal[face, 1, 1] + w * normal[face, 2, 1]
+    sz = u * normal[face, 0, 2] + v * normal[face, 1, 2] + w * normal[face, 2, 2]
+    length = max(np.sqrt(sx * sx + sy * sy + sz * sz), np.float32(1e-6))
+    return sx / length, sy / length, sz / length
