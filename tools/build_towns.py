@@ -277,12 +277,12 @@ def arterial() -> Sketch:
         "n1": ((-86, 125), "priority_stop"),
         "n2": ((0, 125), "priority"),
         "n3": ((86, 125), "traffic_light"),
-        "e": ((172, 0), "traffic_light"),
-        "s3": ((86, -125), "priority"),
+        "e": ((172, 0), "priority"),
+        "s3": ((86, -125), "priority_stop"),
         "s2": ((0, -125), "priority_stop"),
         "s1": ((-86, -125), "traffic_light"),
         "c1": ((-86, 0), "traffic_light"),
-        "c2": ((0, 0), "priority_stop"),
+        "c2": ((0, 0), "priority"),
         "c3": ((86, 0), "traffic_light"),
     }
     for name, (at, kind) in junctions.items():

@@ -13,6 +13,7 @@ class Target(StrEnum):
     fig3a = "fig3a"
     fig6a_allocation = "fig6a-allocation"
     task_weather = "task-weather"
+    task_signs = "task-signs"
     task_trajectory = "task-trajectory"
     task_trajectory_cameras = "task-trajectory-cameras"
 

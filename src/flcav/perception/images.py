@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageEnhance, UnidentifiedImageError
 
 from flcav.config import InputError
 from flcav.dataset.layout import MANIFEST
@@ -42,9 +42,10 @@ def recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterator[tup
     seen = False
     for number in of_frames(data, frames):
         frame = data.frame(number)
-        for camera, image in frame.images.items():
+        for camera in data.cameras(number):
             seen = True
-            yield frame, camera, checked_picture(image.rgb, f"{data.folder} {frame.key}/{camera}")
+            rgb = data.plane(number, camera, "rgb")  # the image's other planes are not read
+            yield frame, camera, checked_picture(rgb, f"{data.folder} {frame.key}/{camera}")
     if not seen:
         raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
 
@@ -78,3 +79,9 @@ def checked_picture(pixels: NDArray[np.uint8], origin: str | Path) -> Picture:
 def resized(picture: Picture, width: int, height: int) -> Picture:
     """Return the picture at another size; when it shrinks, each pixel is the weighted mean of those it covers."""
     return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR))
+
+
+def recoloured(picture: Picture, gain: float, saturation: float) -> Picture:
+    """Return the picture `gain` times as bright and its colours `saturation` times as far from grey."""
+    coloured = ImageEnhance.Color(Image.fromarray(picture)).enhance(saturation)
+    return np.asarray(ImageEnhance.Brightness(coloured).enhance(gain))

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.perception.images import checked_picture, pictures, read_picture, resized
+from flcav.perception.images import checked_picture, pictures, read_picture, recoloured, resized
 
 RANDOM = np.random.default_rng(0)
 RGB = RANDOM.integers(0, 256, (40, 60, 3), dtype=np.uint8)
@@ -66,3 +66,13 @@ def test_shrinking_averages():
     board = np.indices((64, 64)).sum(0) % 2 * np.uint8(255)
     small = resized(np.dstack([board.astype(np.uint8)] * 3), 32, 32)
     assert np.abs(small.astype(int) - 127).max() <= 8
+
+
+def test_colours_go_away_from_grey_and_get_brighter():
+    grey = np.full((4, 4, 3), 100, np.uint8)
+    assert (recoloured(grey, 1.5, 0.2) == 150).all()
+    assert (recoloured(grey, 3.0, 1.0) == 255).all()
+    red = np.full((4, 4, 3), (200, 50, 50), np.uint8)
+    assert np.array_equal(recoloured(red, 1.0, 1.0), red)
+    spread = [float(np.ptp(recoloured(red, 1.0, by)[0, 0])) for by in (0.5, 1.0, 1.3)]
+    assert spread == pytest.approx([75, 150, 195], abs=1)

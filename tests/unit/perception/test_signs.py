@@ -10,7 +10,7 @@ import torch
 from flcav.perception.ops.rectangles import complete_iou
 from flcav.perception.signs.augment import GREY, cut, draw, joined, window
 from flcav.perception.signs.config import CONFIGURATIONS, STRIDES, SignsConfig
-from flcav.perception.signs.detect import Detections, detect
+from flcav.perception.signs.detect import Detections, detect, tensor_of
 from flcav.perception.signs.evaluate import Truth, mean_average_precision
 from flcav.perception.signs.loss import BOX, CLASS, LEVELS, OBJECT, detection_loss
 from flcav.perception.signs.model import SignDetector, boxes_of, decode
@@ -139,6 +139,17 @@ def test_the_loss_is_the_sum_of_its_parts():
     assert float(detection_loss(raw, targets, TINY)) == pytest.approx(expected, rel=1e-4)
 
 
+def test_half_precision_hardly_changes_the_loss():
+    samples = [painted(seed) for seed in range(4)]
+    network = fresh(SIGNS, TINY, 0)
+    whole = detection_loss(
+        network(tensor_of([sample.picture for sample in samples], network)), assign(samples, TINY), TINY
+    )
+    loss = SIGNS.loss(network, samples)
+    assert loss.dtype == torch.float32
+    assert loss.item() == pytest.approx(whole.item(), rel=0.02)
+
+
 def test_pictures_without_signs_have_a_loss():
     network = fresh(SIGNS, TINY, 0)
     empty = Sample(painted(0).picture, NO_BOXES, np.zeros(0, np.int64), NO_BOXES)
@@ -164,7 +175,7 @@ def test_boxes_go_with_their_pixels_into_windows_and_mosaics():
             assert (sample.boxes <= [96, 64, 96, 64]).all()
 
 
-def test_a_cut_ignores_what_it_leaves_less_than_half_of():
+def test_a_cut_ignores_what_it_leaves_too_little_of():
     sample = Sample(
         np.zeros((40, 40, 3), np.uint8), np.array([[0.0, 0, 10, 10], [20, 20, 30, 30]]), np.array([0, 1]), NO_BOXES
     )
@@ -180,6 +191,14 @@ def test_training_sees_windows_of_one_size_the_same_for_a_seed():
     one, other = ([draw(samples, i, TINY, np.random.default_rng(i)) for i in range(5)] for _ in range(2))
     assert all(sample.picture.shape == (64, 96, 3) for sample in one)
     assert all(np.array_equal(a.picture, b.picture) for a, b in zip(one, other, strict=True))
+
+
+def test_mosaics_look_for_rare_classes():
+    common, rare = painted(0, 140, 100), painted(1, 140, 100)
+    samples = [replace(common, label=np.zeros_like(common.label))] * 9 + [replace(rare, label=np.full(2, 2))]
+    random = np.random.default_rng(0)
+    seen = np.concatenate([draw(samples, 0, TINY, random).label for _ in range(200)])
+    assert (seen == 2).sum() > 0.15 * (seen == 0).sum()  # though it is in a tenth of the pictures
 
 
 def found(*rows) -> Detections:

@@ -1,23 +1,26 @@
 """Windows of pictures at random places and scales, four of them as a mosaic, in random colours. Never mirrored.
 
 The mosaic is that of Bochkovskiy et al., "YOLOv4", 2020, sec. 3.3, of windows at their own scale: signs are few and
-small, so that windows are drawn around them, and pictures are not made smaller.
+small, so that windows are drawn around them, and pictures are not made smaller. The other windows of a mosaic look for
+a sign of a class drawn at random, so that rare ones (amber lasts seconds of a minute) are seen as often as any.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.perception.images import resized
+from flcav.perception.images import recoloured, resized
 from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.samples import Sample, size_px
 
 GREY = 114  # what lies beyond a picture
-MOSAIC = 0.5  # share of the samples that are mosaics
+MOSAIC = 0.7  # share of the samples that are mosaics
 AROUND_A_SIGN = 0.8  # share of the windows drawn so that they hold one, where the picture has any
 SCALE = (0.7, 1.5)
-WHOLE = 0.5  # share of a box that must lie in the window for it to be found
+WHOLE = 0.8  # share of a box that must lie in the window for it to be found: a lamp may be in what is cut off
+LOOKS = 12  # pictures that are looked through for a sign of a class
 GAIN, SATURATION = (0.7, 1.3), (0.6, 1.4)
 
 
@@ -25,17 +28,29 @@ def draw(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.ran
     """Return sample `index` as a training step sees it: a window of it, or a mosaic with windows of three others."""
     width, height = config.window_px
     if rng.random() >= MOSAIC:
-        return recoloured(window(samples[index], width, height, config, rng), rng)
+        return _in_other_colours(window(samples[index], width, height, config, rng), rng)
     across = int(rng.uniform(0.3, 0.7) * width)
     down = int(rng.uniform(0.3, 0.7) * height)
-    others = rng.integers(0, len(samples), 3)
     parts = []
-    for place, number in enumerate((index, *others)):
+    for place in range(4):
         left, top = place % 2, place // 2
         size = (width - across if left else across, height - down if top else down)
-        part = window(samples[int(number)], *size, config, rng)
+        if place:
+            wanted = int(rng.integers(len(config.classes)))
+            part = window(_one_with(wanted, samples, rng), *size, config, rng, wanted)
+        else:
+            part = window(samples[index], *size, config, rng)
         parts.append((part, across if left else 0, down if top else 0))
-    return recoloured(joined(parts, width, height), rng)
+    return _in_other_colours(joined(parts, width, height), rng)
+
+
+def _one_with(label: int, samples: Sequence[Sample], rng: np.random.Generator) -> Sample:
+    """Return a sample drawn at random, if possible one in which there is a sign of class `label`."""
+    looked = (samples[int(number)] for number in rng.integers(0, len(samples), LOOKS))
+    sample = next(looked)
+    while label not in sample.label and (other := next(looked, None)):
+        sample = other
+    return sample
 
 
 def joined(parts: Sequence[tuple[Sample, int, int]], width: int, height: int) -> Sample:
@@ -49,13 +64,24 @@ def joined(parts: Sequence[tuple[Sample, int, int]], width: int, height: int) ->
     return Sample(picture, boxes, np.concatenate([part.label for part, *_ in parts]), ignore)
 
 
-def window(sample: Sample, width: int, height: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
-    """Return a window of `width` x `height` of the sample, scaled and placed at random, often around a sign."""
+def window(
+    sample: Sample,
+    width: int,
+    height: int,
+    config: SignsConfig,
+    rng: np.random.Generator,
+    wanted: int | None = None,
+) -> Sample:
+    """Return a window of `width` x `height` of the sample, scaled and placed at random, often around a sign.
+
+    Which sign is random too; one of class `wanted`, if there is any.
+    """
     scale = rng.uniform(*SCALE)
     size = np.array([width, height]) / scale
     full = np.array(sample.picture.shape[1::-1], dtype=float)
     if len(sample.boxes) and rng.random() < AROUND_A_SIGN:
-        box = sample.boxes[rng.integers(len(sample.boxes))]
+        of_class = np.flatnonzero(sample.label == wanted)
+        box = sample.boxes[rng.choice(of_class if len(of_class) else len(sample.boxes))]
         corner = (box[:2] + box[2:]) / 2 - rng.uniform(0.15, 0.85, 2) * size
     else:
         corner = rng.uniform(0, 1, 2) * (full - size)
@@ -68,7 +94,7 @@ def window(sample: Sample, width: int, height: int, config: SignsConfig, rng: np
 def cut(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], config: SignsConfig) -> Sample:
     """Return the part x, y, width, height [px] of a sample at another size; what lies outside is grey.
 
-    Boxes of which less than half remains, or that become too small, are ignored.
+    Boxes of which less than `WHOLE` remains, or that become too small, are ignored.
     """
     x, y, across, down = part
     canvas = np.full((down, across, 3), GREY, np.uint8)
@@ -89,10 +115,7 @@ def cut(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], 
     return Sample(resized(canvas, *size), boxes[found], sample.label[found], ignore)
 
 
-def recoloured(sample: Sample, rng: np.random.Generator) -> Sample:
+def _in_other_colours(sample: Sample, rng: np.random.Generator) -> Sample:
     """Return the sample brighter or darker, and more or less colourful; hues stay, since they tell lights apart."""
     gain, saturation = rng.uniform(*GAIN), rng.uniform(*SATURATION)
-    pixels = sample.picture.astype(np.float32)
-    grey = pixels.mean(2, keepdims=True)
-    changed = (grey + (pixels - grey) * np.float32(saturation)) * np.float32(gain)
-    return Sample(np.clip(changed, 0, 255).astype(np.uint8), sample.boxes, sample.label, sample.ignore)
+    return replace(sample, picture=recoloured(sample.picture, gain, saturation))

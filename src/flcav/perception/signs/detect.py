@@ -55,7 +55,10 @@ def padded(picture: Picture) -> Picture:
 
 
 def tensor_of(pictures: Sequence[Picture], network: SignDetector) -> torch.Tensor:
-    """Return pictures of one size as the network takes them, (B, 3, H, W) in 0..1, on its device."""
+    """Return pictures of one size as the network takes them, (B, 3, H, W) in 0..1, on its device.
+
+    Channels lie innermost in memory, which convolutions on a CPU are faster with.
+    """
     stacked = torch.from_numpy(np.stack(pictures)).to(next(network.parameters()).device)
     return stacked.permute(0, 3, 1, 2).float() / 255
 

@@ -15,6 +15,8 @@ from flcav.perception.signs.config import SignsConfig
 from flcav.perception.task import of_frames
 from flcav.sensors.frame import Frame
 
+KEPT_BYTES = 3_000_000_000  # of pictures that stay in memory once they are read
+
 
 @dataclass(frozen=True)
 class Sample:
@@ -27,8 +29,9 @@ class Sample:
 
 
 class RecordedPictures(Sequence[Sample]):
-    """Every camera's pictures in frames of a dataset with their ground truth, read when asked for.
+    """Every camera's pictures in frames of a dataset with their ground truth.
 
+    They are read when asked for, and stay in memory as long as they take no more than `KEPT_BYTES` together.
     Raises `InputError` where no frame has a camera.
     """
 
@@ -37,15 +40,23 @@ class RecordedPictures(Sequence[Sample]):
         self._of = [(number, camera) for number in of_frames(data, frames) for camera in data.frame(number).images]
         if not self._of:
             raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
+        self._kept: dict[int, Sample] = {}
+        self._kept_bytes = 0
 
     def __len__(self) -> int:
         return len(self._of)
 
     def __getitem__(self, index: Any) -> Any:
+        if index in self._kept:
+            return self._kept[index]
         number, camera = self._of[index]
         picture = self._data.plane(number, camera, "rgb")
         frame = self._data.frame(number)
-        return sample_of(frame, camera, checked_picture(picture, f"{self._data.folder} {frame.key}"), self._config)
+        sample = sample_of(frame, camera, checked_picture(picture, f"{self._data.folder} {frame.key}"), self._config)
+        if self._kept_bytes + picture.nbytes <= KEPT_BYTES:
+            self._kept[index] = sample
+            self._kept_bytes += picture.nbytes
+        return sample
 
     def scene(self, index: int) -> str:
         """Return the scene of a picture."""

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
@@ -44,9 +45,11 @@ class SignsTask:
         return draw(samples, index, config, rng)
 
     def loss(self, network: SignDetector, samples: Sequence[Sample]) -> Tensor:
-        """Return the loss of a batch of pictures of one size, both sides multiples of 32."""
-        raw = network(tensor_of([sample.picture for sample in samples], network))
-        return detection_loss(raw, assign(samples, network.config), network.config)
+        """Return the loss of a batch of pictures of one size, both sides multiples of 32; convolutions in bfloat16."""
+        pictures = tensor_of([sample.picture for sample in samples], network)
+        with torch.autocast(pictures.device.type, torch.bfloat16):
+            raw = network(pictures)
+        return detection_loss([maps.float() for maps in raw], assign(samples, network.config), network.config)
 
     def evaluate(
         self, network: SignDetector, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent

@@ -1,0 +1,81 @@
+"""The study of the sign task: three towns to learn from; held-out scenes and a held-out town to test.
+
+The recipes are those of recipes/signs.yaml, signs_suburb.yaml and signs_grid.yaml, of some scenes of the latter two.
+The held-out scenes have all eight classes; the held-out town has speed limits of 30, yield signs and lights alone.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from flcav.experiments.task_study import RecipeFields, Result, Study
+from flcav.perception.signs.task import SIGNS
+from flcav.report import style
+from flcav.report.precision import Bar, precisions
+
+RECIPE: RecipeFields = {
+    "spins_per_scene": 4,
+    "cavs": 8,
+    "vehicle_rig": {
+        "cameras": {
+            "camera": {
+                "mount": {"x": 0.5, "z": 1.5},
+                "settings": {"width": 640, "height": 384, "fov_deg": 45.0},
+            }
+        }
+    },
+    "weather": {"classes": ["clear", "cloudy", "overcast", "light_rain"]},
+}
+ARTERIAL: RecipeFields = {**RECIPE, "town": "arterial", "warmup_s": [86.0, 89.5], "every_s": 15.0}
+GRID: RecipeFields = {**RECIPE, "town": "grid", "warmup_s": [78.0, 80.5], "every_s": 15.0}
+SUBURB: RecipeFields = {**RECIPE, "town": "suburb", "warmup_s": [45.0, 105.0], "every_s": 5.0}
+RING: RecipeFields = {**RECIPE, "town": "ring", "warmup_s": [87.0, 89.5], "every_s": 15.0}
+
+
+def _numbers(result: Result) -> Mapping[str, float]:
+    """Return mAP, and AP50 by class and by size, of what there was to find."""
+    parts = {_name(row): row["ap50"] for row in result["classes"]} | {
+        _name(row): row["map50"] for row in result["sizes"]
+    }
+    known = {name: value for name, value in parts.items() if value is not None}
+    return {"mAP50": result["map50"], "mAP50-95": result["map50_95"], **known}
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    if "class" in row:
+        return row["class"].replace("_", " ")
+    return f"{row['from_px']:g} px on" if row["to_px"] is None else f"{row['from_px']:g} to {row['to_px']:g} px"
+
+
+def _draw(results: Mapping[str, Any]) -> bytes:
+    """Return a panel per test: AP50 of each class, of each size, and their mean."""
+    panels = {}
+    for test, means in results["summary"].items():
+        tested = [seed["tests"][test] for seed in results["seeds"]]
+        targets = {_name(row): row["targets"] for row in (*tested[0]["classes"], *tested[0]["sizes"])}
+        numbers = [_numbers(result) for result in tested]
+        panels[test] = [
+            Bar(name, mean["mean"], tuple(row[name] for row in numbers), targets.get(name))
+            for name, mean in means.items()
+            if name != "mAP50-95"
+        ]
+    return style.png(precisions(panels))
+
+
+STUDY = Study(
+    task=SIGNS,
+    network="n",
+    train=(
+        {**ARTERIAL, "seed": 14, "scenes": 24},
+        {**SUBURB, "seed": 15, "scenes": 7},
+        {**GRID, "seed": 16, "scenes": 7},
+    ),
+    validation={**ARTERIAL, "seed": 114, "split": "validation", "scenes": 6},
+    tests={
+        "held-out scenes": {**ARTERIAL, "seed": 214, "split": "test", "scenes": 12},
+        "held-out town": {**RING, "seed": 314, "split": "test", "scenes": 6},
+    },
+    epochs=24,
+    patience=24,
+    numbers=_numbers,
+    draw=_draw,
+)

@@ -1,0 +1,41 @@
+"""Average precision as bars: of the whole, of parts of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from flcav.report import style
+
+PANEL_IN, ROW_IN, HEAD_IN = 4.2, 0.27, 0.9
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One number of a test."""
+
+    name: str
+    mean: float  # over seeds
+    seeds: tuple[float, ...]  # one each
+    targets: int | None = None  # how many there were to find; None: all of the others
+
+
+@style.styled
+def precisions(panels: Mapping[str, Sequence[Bar]]) -> Figure:
+    """Return a panel per title: a bar for each number from 0 to 1, a dot for each seed."""
+    rows = max(len(bars) for bars in panels.values())
+    figure = style.canvas(PANEL_IN * len(panels), HEAD_IN + ROW_IN * rows)
+    drawn = np.atleast_1d(figure.subplots(1, len(panels)))
+    for axes, (title, bars) in zip(drawn, panels.items(), strict=True):
+        for row, bar in enumerate(bars):
+            axes.barh(row, bar.mean, height=0.7, color=style.BLUE if bar.targets is None else style.SKY)
+            axes.plot(bar.seeds, [row] * len(bar.seeds), "o", color=style.INK, markersize=3)
+        names = [bar.name if bar.targets is None else f"{bar.name} ({bar.targets})" for bar in bars]
+        axes.set_yticks(range(len(bars)), names)
+        axes.set_ylim(rows - 0.4, -0.6)
+        axes.set_xlim(0, 1)
+        axes.set_xlabel("average precision at IoU 0.5")
+        axes.set_title(title)
+        axes.grid(axis="x")
+    return figure
