@@ -74,8 +74,8 @@ STUDY = Study(
         "held-out scenes": {**ARTERIAL, "seed": 214, "split": "test", "scenes": 12},
         "held-out town": {**RING, "seed": 314, "split": "test", "scenes": 6},
     },
-    epochs=24,
-    patience=24,
+    epochs=20,
+    patience=20,
     numbers=_numbers,
     draw=_draw,
 )

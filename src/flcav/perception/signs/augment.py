@@ -18,7 +18,7 @@ from flcav.perception.signs.samples import Sample, size_px
 GREY = 114  # what lies beyond a picture
 MOSAIC = 0.7  # share of the samples that are mosaics
 AROUND_A_SIGN = 0.8  # share of the windows drawn so that they hold one, where the picture has any
-SCALE = (0.7, 1.5)
+SCALE = (0.6, 1.5)
 WHOLE = 0.8  # share of a box that must lie in the window for it to be found: a lamp may be in what is cut off
 LOOKS = 12  # pictures that are looked through for a sign of a class
 GAIN, SATURATION = (0.7, 1.3), (0.6, 1.4)

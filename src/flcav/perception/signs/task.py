@@ -1,6 +1,7 @@
 """Detection of signs and traffic lights as a `Task`."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ class SignsTask:
         self, network: SignDetector, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
     ) -> dict[str, Any]:
         """Return COCO's mAP, by class and by size, see `mean_average_precision`."""
-        recorded = RecordedPictures(data, network.config, frames)
+        recorded = _last_asked_for(data, network.config, None if frames is None else tuple(frames))
         truths, found = [], []
         for done, sample in enumerate(recorded, start=1):
             truths.append(Truth(sample.boxes, sample.label, sample.ignore))
@@ -95,6 +96,12 @@ class SignsTask:
 
 
 SIGNS = SignsTask()
+
+
+@lru_cache(maxsize=1)
+def _last_asked_for(data: Dataset, config: SignsConfig, frames: tuple[int, ...] | None) -> RecordedPictures:
+    """Return the pictures; training asks for those of its validation again and again."""
+    return RecordedPictures(data, config, frames)
 
 
 def box_rows(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
