@@ -17,6 +17,7 @@ def evaluate(
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
+    tracks: bool = typer.Option(False, "--tracks", help="objects: also MOTA, AMOTA and id switches of their tracks."),
     as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
 ) -> None:
     """Evaluate a network on recorded frames.
@@ -25,11 +26,19 @@ def evaluate(
     """
     from flcav import progress
     from flcav.cli.tasks import network_of, task_named
+    from flcav.config import InputError
     from flcav.dataset.store import Dataset
+    from flcav.perception.tracking.evaluate import evaluate_tracks, tracks_lines
 
     learner = task_named(task)
+    if tracks and task != "objects":
+        raise InputError(f"--tracks: only objects have tracks, not '{task}'")
     network = network_of(learner, weights)
     with progress.live(f"evaluate {task}") as report:
         result = learner.evaluate(network, Dataset.open(data), progress=report)
-    lines = [json.dumps(result, allow_nan=False)] if as_json else learner.evaluation_lines(result)
-    typer.echo("\n".join(lines))
+    lines = learner.evaluation_lines(result)
+    if tracks:
+        with progress.live("follow objects") as report:
+            result = {**result, "tracks": evaluate_tracks(network, Dataset.open(data), progress=report)}
+        lines += tracks_lines(result["tracks"])
+    typer.echo(json.dumps(result, allow_nan=False) if as_json else "\n".join(lines))

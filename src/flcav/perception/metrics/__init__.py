@@ -1,6 +1,15 @@
 """Detection metrics."""
 
 from flcav.perception.metrics.average_precision import average_precision, bootstrap_difference, bootstrap_interval
+from flcav.perception.metrics.calibration import calibration_error, fit_logistic
 from flcav.perception.metrics.matching import Matches, match
 
-__all__ = ["Matches", "average_precision", "bootstrap_difference", "bootstrap_interval", "match"]
+__all__ = [
+    "Matches",
+    "average_precision",
+    "bootstrap_difference",
+    "bootstrap_interval",
+    "calibration_error",
+    "fit_logistic",
+    "match",
+]

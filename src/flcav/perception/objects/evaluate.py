@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.geometry import Boxes, inverse
@@ -18,6 +19,7 @@ from flcav.perception.ops.rotated import Kind
 from flcav.progress import Report, silent
 from flcav.seeds import stream
 from flcav.sensors.frame import Frame
+from flcav.world.weather import weather_class
 
 OVERLAPS: tuple[tuple[Kind, float], ...] = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
 LOWEST_SCORE = 0.05  # detections below add nothing that the intervals would show
@@ -31,6 +33,8 @@ class Truth:
     targets: Boxes  # in range, with at least `MIN_RETURNS` returns
     neutral: Boxes  # finding them is neither right nor wrong; label = the class they are neutral for
     hidden: Boxes  # in range without a return: counted, not asked for
+    occlusion: NDArray[np.float64] | None = None  # (targets,) share that is hidden, in [0, 1]; None: not known
+    weather: str | None = None  # class of the frame's weather; None between the classes, and where it is not known
 
 
 @dataclass(frozen=True)
@@ -70,9 +74,9 @@ class Evaluation:
                 "class": score.name,
                 "kind": score.kind,
                 "iou": score.overlap,
-                "ap": _number(score.ap),
-                "low": _number(score.low),
-                "high": _number(score.high),
+                "ap": number_or_none(score.ap),
+                "low": number_or_none(score.low),
+                "high": number_or_none(score.high),
                 "targets": self.targets[score.name],
                 "hidden": self.hidden[score.name],
             }
@@ -96,20 +100,31 @@ def truth_of(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Tr
     hidden = (label != "") & inside & (annotations.returns == 0)
     neutral = ((label != "") & ~target) | lookalike
     boxes = Boxes(boxes.center, boxes.size, boxes.yaw, np.where(lookalike, "Car", label))
-    return Truth(frame.scene, boxes[target], boxes[neutral], boxes[hidden])
+    weather = None if frame.weather is None else weather_class(frame.weather)
+    return Truth(
+        frame.scene, boxes[target], boxes[neutral], boxes[hidden], annotations.occlusion[target].astype(float), weather
+    )
 
 
 def evaluate(
     network: Second, frames: Iterable[Frame], *, total: int = 0, seed: int = 0, progress: Report = silent
 ) -> Evaluation:
     """Return the evaluation of `network` on `frames`; raises `InputError` where there are none."""
+    detections, truths = detections_and_truths(network, frames, total=total, progress=progress)
+    return score_detections(detections, truths, network.config.classes, seed=seed)
+
+
+def detections_and_truths(
+    network: Second, frames: Iterable[Frame], *, total: int = 0, progress: Report = silent
+) -> tuple[list[Boxes], list[Truth]]:
+    """Return what `network` finds in each frame, from `LOWEST_SCORE` on, and what there is to find."""
     truths: list[Truth] = []
     detections: list[Boxes] = []
     for done, frame in enumerate(frames, start=1):
         truths.append(truth_of(frame, network.config))
         detections += detect_all(network, [frame.lidar[only_lidar(frame)]], score_threshold=LOWEST_SCORE)
         progress(done, max(total, done), "")
-    return score_detections(detections, truths, network.config.classes, seed=seed)
+    return detections, truths
 
 
 def score_detections(
@@ -121,9 +136,9 @@ def score_detections(
     scenes = tuple(truth.scene for truth in truths)
     scores = []
     for name in classes:
-        found = [_of_class(boxes, name) for boxes in detections]
-        targets = [_of_class(truth.targets, name) for truth in truths]
-        neutral = [_of_class(truth.neutral, name) for truth in truths]
+        found = [of_class(boxes, name) for boxes in detections]
+        targets = [of_class(truth.targets, name) for truth in truths]
+        neutral = [of_class(truth.neutral, name) for truth in truths]
         for kind, overlap in OVERLAPS:
             matches = match(found, targets, neutral, overlap, kind)
             low, high = bootstrap_interval(matches, scenes, rng=stream(seed, "bootstrap"))
@@ -133,9 +148,11 @@ def score_detections(
     return Evaluation(tuple(scores), len(truths), scenes, targets_of, hidden_of)
 
 
-def _of_class(boxes: Boxes, name: str) -> Boxes:
+def of_class(boxes: Boxes, name: str) -> Boxes:
+    """Return the boxes of one class."""
     return boxes[boxes.label == name]
 
 
-def _number(value: float) -> float | None:
+def number_or_none(value: float) -> float | None:
+    """Return what JSON knows of a number that may be NaN."""
     return None if np.isnan(value) else round(value, 6)

@@ -10,13 +10,15 @@ from torch import Tensor
 from flcav.dataset.store import Dataset
 from flcav.perception.objects.augment import augment
 from flcav.perception.objects.batch import batch_loss
+from flcav.perception.objects.calibrate import OVERLAP, trust
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
-from flcav.perception.objects.evaluate import evaluate
+from flcav.perception.objects.evaluate import detections_and_truths, score_detections
 from flcav.perception.objects.infer import box_rows, point_clouds
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.paste import pasted
 from flcav.perception.objects.samples import RecordedSweeps, Sample
+from flcav.perception.objects.slices import sliced
 from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
 
@@ -55,9 +57,11 @@ class ObjectsTask:
     def evaluate(
         self, network: Second, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
     ) -> dict[str, Any]:
-        """Return AP per class, kind of overlap and IoU, with intervals over scenes."""
-        numbers = of_frames(data, frames)
-        return evaluate(network, map(data.frame, numbers), total=len(numbers), progress=progress).summary()
+        """Return AP per class, kind of overlap and IoU, with intervals over scenes; its slices; what to trust."""
+        numbers, classes = of_frames(data, frames), network.config.classes
+        found, truths = detections_and_truths(network, map(data.frame, numbers), total=len(numbers), progress=progress)
+        summary = score_detections(found, truths, classes).summary()
+        return summary | {"slices": sliced(found, truths, classes), "trust": trust(found, truths, classes)}
 
     def score(self, result: Mapping[str, Any]) -> float:
         """Return the mean over classes of AP in 3D at IoU 0.5; 0 where there was nothing to find."""
@@ -78,6 +82,13 @@ class ObjectsTask:
                 found = f"AP {row['ap']:.3f} [{row['low']:.3f}, {row['high']:.3f}]"
             counts = f"{row['targets']} objects, {row['hidden']} more without a return"
             lines.append(f"{row['class']:<12}{row['kind']:>4} IoU {row['iou']:.1f}  {found}  ({counts})")
+        for row in result["slices"]:
+            if row["iou"] == OVERLAP:
+                place = f"{row['class']:<12}{row['kind']:>4} IoU {row['iou']:.1f}"
+                lines.append(f"{place}  AP {row['ap']:.3f}  {row['by']} {row['slice']}  ({row['targets']} objects)")
+        for row in result["trust"]:
+            if row["ece"] is not None:
+                lines.append(f"{row['class']:<12}expected calibration error {row['ece']:.3f}")
         return lines
 
     def finding_lines(self, result: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,121 @@
+"""How well tracks follow the true ones: CLEAR MOT, and its mean over recalls.
+
+MOTA is one minus misses, false positives and switches of identity per object to be followed (Bernardin and
+Stiefelhagen, "Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics", 2008). AMOTA is the mean of the
+scaled MOTA over 40 recalls, each reached by leaving out the tracks of lowest score (Weng et al., IROS 2020, eqs. 4-5).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+Array = NDArray[np.float64]
+
+RECALLS = np.arange(1, 41) / 40
+APART_M = 2.0  # centres further apart, seen from above, are different objects (as in nuScenes)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Objects and tracks of one class in one frame of one sequence; places are x, y in any one frame [m]."""
+
+    objects: NDArray[np.str_]  # (M,) identity of each object that is to be followed
+    places: Array  # (M, 2)
+    tracks: NDArray[np.int64]  # (N,) identity of each track
+    found: Array  # (N, 2)
+    score: Array  # (N,) of the whole track
+    neutral: NDArray[np.bool_]  # (N,) a track of what is neither right nor wrong to follow
+
+
+@dataclass(frozen=True)
+class Clear:
+    """Counts over all frames."""
+
+    objects: int
+    misses: int
+    false_positives: int
+    switches: int
+    distance_m: float  # sum over pairs
+
+    @property
+    def hits(self) -> int:
+        """Return the pairs of an object and its track."""
+        return self.objects - self.misses
+
+    @property
+    def mota(self) -> float:
+        """Return MOTA, at most 1; NaN without objects."""
+        wrong = self.misses + self.false_positives + self.switches
+        return 1 - wrong / self.objects if self.objects else float("nan")
+
+    @property
+    def motp_m(self) -> float:
+        """Return the mean distance of an object from its track [m]; NaN without pairs."""
+        return self.distance_m / self.hits if self.hits else float("nan")
+
+
+def clear(sequences: Sequence[Sequence[Moment]], threshold: float = -np.inf, apart_m: float = APART_M) -> Clear:
+    """Return the counts for tracks that score at least `threshold`; each sequence's moments are in time order.
+
+    A pair of before stays one while it is within `apart_m`; the rest is paired by least distance.
+    """
+    counts = np.zeros(4, dtype=np.int64)
+    distance = 0.0
+    for moments in sequences:
+        last: dict[str, int] = {}  # object -> the track that had it last
+        for moment in moments:
+            kept = np.flatnonzero(moment.score >= threshold)
+            apart = np.linalg.norm(moment.places[:, None] - moment.found[None, kept], axis=2)
+            pairs = _pairs(moment, kept, apart, last, apart_m)
+            switched = 0
+            for o, t in pairs:
+                identity, track = str(moment.objects[o]), int(moment.tracks[kept[t]])
+                switched += last.get(identity, track) != track
+                last[identity] = track
+                distance += float(apart[o, t])
+            taken = [t for _, t in pairs]
+            idle = np.delete(moment.neutral[kept], taken)
+            counts += (len(moment.objects), len(moment.objects) - len(pairs), int((~idle).sum()), switched)
+    objects, misses, wrong, switches = counts.tolist()
+    return Clear(objects, misses, wrong, switches, distance)
+
+
+def amota(sequences: Sequence[Sequence[Moment]], apart_m: float = APART_M) -> float:
+    """Return AMOTA in [0, 1]; a recall that is not reached counts 0. NaN without objects."""
+    everything = clear(sequences, apart_m=apart_m)
+    if not everything.objects:
+        return float("nan")
+    scores = sorted({float(s) for moments in sequences for moment in moments for s in moment.score}, reverse=True)
+    scores = scores if len(scores) <= 200 else list(np.quantile(scores, np.linspace(1, 0, 200)))
+    reached = [clear(sequences, score, apart_m) for score in scores]
+    values = []
+    for recall in RECALLS:
+        enough = [counts for counts in reached if counts.hits >= recall * counts.objects - 1e-9]
+        values.append(_scaled_mota(enough[0], recall) if enough else 0.0)
+    return float(np.mean(values))
+
+
+def _scaled_mota(counts: Clear, recall: float) -> float:
+    wanted = recall * counts.objects
+    wrong = counts.switches + counts.false_positives + counts.misses - (1 - recall) * counts.objects
+    return float(np.clip(1 - wrong / wanted, 0, 1))
+
+
+def _pairs(
+    moment: Moment, kept: NDArray[np.int64], apart: Array, last: dict[str, int], apart_m: float
+) -> list[tuple[int, int]]:
+    """Return pairs (object, place in `kept`)."""
+    place = {int(track): t for t, track in enumerate(moment.tracks[kept])}
+    pairs = []
+    for o, identity in enumerate(moment.objects):
+        t = place.get(last.get(str(identity), -1))
+        if t is not None and apart[o, t] <= apart_m and t not in (taken for _, taken in pairs):
+            pairs.append((o, t))
+    left = np.where(apart <= apart_m, apart, 1e6)
+    left[[o for o, _ in pairs]] = 1e6
+    left[:, [t for _, t in pairs]] = 1e6
+    more = zip(*linear_sum_assignment(left), strict=True)
+    return pairs + [(int(o), int(t)) for o, t in more if left[o, t] <= apart_m]

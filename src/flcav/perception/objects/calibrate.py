@@ -1,0 +1,62 @@
+"""Scores that say how often a detection is right, and how far that, and its variance, can be trusted."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from flcav.geometry import Boxes
+from flcav.perception.metrics import calibration_error, fit_logistic, match
+from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.objects.evaluate import Truth, detections_and_truths, number_or_none, of_class
+from flcav.perception.objects.model import Second
+from flcav.sensors.frame import Frame
+
+OVERLAP = 0.5  # 3D IoU that makes a detection right
+
+
+def calibrate(network: Second, frames: Iterable[Frame]) -> None:
+    """Set the calibration of `network` from frames that it was not trained on, see `fit_logistic`."""
+    network.config = replace(network.config, calibration=None)
+    detections, truths = detections_and_truths(network, frames)
+    fitted = []
+    for name in network.config.classes:
+        matches = _matches(detections, truths, name)
+        fitted.append(fit_logistic(matches.score, matches.hit))
+    network.config = replace(network.config, calibration=tuple(fitted))
+
+
+def trust(detections: Sequence[Boxes], truths: Sequence[Truth], classes: Sequence[str]) -> list[dict[str, Any]]:
+    """Return a row per class: the scores' expected calibration error, and where detections have variances, theirs.
+
+    `variance_ratio` is the mean squared error of found objects' x and y over the mean variance predicted: 1 is right,
+    more is too sure.
+    """
+    rows = []
+    for name in classes:
+        matches = _matches(detections, truths, name)
+        row = {"class": name, "detections": len(matches.score)}
+        row["ece"] = number_or_none(calibration_error(matches.score, matches.hit))
+        rows.append(row | {"variance_ratio": number_or_none(_variance_ratio(detections, truths, name))})
+    return rows
+
+
+def _matches(detections: Sequence[Boxes], truths: Sequence[Truth], name: str):
+    found = [of_class(boxes, name) for boxes in detections]
+    targets = [of_class(truth.targets, name) for truth in truths]
+    return match(found, targets, [of_class(truth.neutral, name) for truth in truths], OVERLAP)
+
+
+def _variance_ratio(detections: Sequence[Boxes], truths: Sequence[Truth], name: str) -> float:
+    error, variance = [0.0], [0.0]
+    for boxes, truth in zip(detections, truths, strict=True):
+        found, targets = of_class(boxes, name), of_class(truth.targets, name)
+        if found.variance is None or not len(found):
+            continue
+        target = assign_targets(found, targets, OVERLAP)
+        hit = target >= 0
+        error += ((found.center[hit] - targets.center[target[hit]])[:, :2] ** 2).sum(1).tolist()
+        variance += found.variance[hit, :2].sum(1).tolist()
+    total = float(np.sum(variance))
+    return float(np.sum(error)) / total if total else float("nan")

@@ -1,0 +1,6 @@
+"""Detections over time: tracks with velocities."""
+
+from flcav.perception.tracking.evaluate import evaluate_tracks
+from flcav.perception.tracking.tracker import Tracked, Tracker
+
+__all__ = ["Tracked", "Tracker", "evaluate_tracks"]

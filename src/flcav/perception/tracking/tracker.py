@@ -1,0 +1,119 @@
+"""Detections to tracks: predict, assign, update, begin, end.
+
+The loop of AB3DMOT (Weng et al., IROS 2020): a Kalman filter per object, the Hungarian method between predictions and
+detections. The cost of a pair is the negative log-likelihood of the detection under the prediction, and pairs beyond a
+gate are out (Chiu et al., "Probabilistic 3D Multi-Object Tracking for Autonomous Driving", 2020), so that the variances
+a detector predicts weigh in, and frames may be any time apart.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from flcav.geometry import Boxes
+from flcav.perception.tracking.kalman import Array, State, first_state, innovation, predicted, updated
+
+GATE = 9.21  # squared Mahalanobis distance in x, y that 99 % of true pairs stay below
+FASTEST = 40.0  # [m/s] no pair is further apart than this allows
+SLACK_M = 2.0
+UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of detections that come without
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """The objects of one moment."""
+
+    boxes: Boxes  # world frame; score: the mean of the track's detections so far; variance: the filter's
+    track: NDArray[np.int64]  # (N,) each object's number, the same as long as it is followed
+    velocity: Array  # (N, 2) along x and y of the world [m/s]
+
+
+@dataclass
+class _Track:
+    number: int
+    label: str
+    state: State
+    scores: list[float]
+    missed: int = 0  # frames since it was last seen
+
+
+class Tracker:
+    """Follows objects of all classes through one sequence of frames.
+
+    A track is told of from its `confirm`-th detection on, and ends after `patience` frames without one; those in
+    between are told of while `patience` lasts only in `coasting`.
+    """
+
+    def __init__(self, *, confirm: int = 2, patience: int = 3, coasting: bool = False) -> None:
+        self.confirm, self.patience, self.coasting = confirm, patience, coasting
+        self._tracks: list[_Track] = []
+        self._next = 0
+        self._time_s: float | None = None
+
+    def step(self, detections: Boxes, time_s: float) -> Tracked:
+        """Return the objects followed after `detections` (world frame) at `time_s`, which must not run backwards."""
+        after_s = 0.0 if self._time_s is None else time_s - self._time_s
+        if after_s < 0:
+            raise ValueError(f"frames must come in time order: {time_s} s after {self._time_s} s")
+        first, self._time_s = self._time_s is None, time_s
+        variance = detections.variance
+        if variance is None:
+            variance = np.tile(UNKNOWN_VARIANCE, (len(detections), 1))
+        scores = np.ones(len(detections)) if detections.score is None else detections.score
+        for track in self._tracks:
+            track.state = predicted(track.state, after_s)
+            track.missed += 1
+        rows = detections.array()
+        free = np.ones(len(rows), dtype=bool)
+        for label in sorted({track.label for track in self._tracks}):
+            tracks = [track for track in self._tracks if track.label == label]
+            own = np.flatnonzero(detections.label == label)
+            for t, d in assigned([track.state for track in tracks], rows[own], variance[own], after_s):
+                track, number = tracks[t], own[d]
+                track.state = updated(track.state, rows[number], variance[number])
+                track.scores.append(float(scores[number]))
+                track.missed = 0
+                free[number] = False
+        for number in np.flatnonzero(free):
+            state = first_state(rows[number], variance[number])
+            self._tracks.append(_Track(self._next, str(detections.label[number]), state, [float(scores[number])]))
+            self._next += 1
+        self._tracks = [track for track in self._tracks if track.missed <= self.patience]
+        return self._told(first)
+
+    def _told(self, first: bool) -> Tracked:
+        told = [
+            track
+            for track in self._tracks
+            if (len(track.scores) >= self.confirm or first) and (track.missed == 0 or self.coasting)
+        ]
+        mean = np.array([track.state.mean for track in told]).reshape(-1, 9)
+        boxes = Boxes(
+            mean[:, :3],
+            mean[:, 3:6],
+            mean[:, 6],
+            np.array([track.label for track in told], dtype=np.str_),
+            np.array([np.mean(track.scores) for track in told], dtype=np.float64),
+            np.array([np.diag(track.state.covariance)[:7] for track in told]).reshape(-1, 7),
+        )
+        return Tracked(boxes, np.array([track.number for track in told], dtype=np.int64), mean[:, 7:])
+
+
+def assigned(states: list[State], boxes: Array, variance: Array, after_s: float) -> list[tuple[int, int]]:
+    """Return pairs (state, box) of least total cost, among those that the gate lets through; variance (D, 7)."""
+    if not len(boxes) or not states:
+        return []
+    cost = np.full((len(states), len(boxes)), np.inf)
+    for t, state in enumerate(states):
+        reach = SLACK_M + FASTEST * after_s
+        near = np.flatnonzero(np.hypot(*(boxes[:, :2] - state.mean[:2]).T) <= reach)
+        for d in near:
+            off, spread = innovation(state, boxes[d], variance[d])
+            square = float(off[:2] @ np.linalg.solve(spread[:2, :2], off[:2]))
+            if square <= GATE:
+                cost[t, d] = square + np.linalg.slogdet(spread[:2, :2])[1]
+    bound = 1e4
+    pairs = zip(*linear_sum_assignment(np.where(np.isfinite(cost), cost, bound)), strict=True)
+    return [(int(t), int(d)) for t, d in pairs if np.isfinite(cost[t, d])]

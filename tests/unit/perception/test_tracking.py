@@ -1,0 +1,148 @@
+"""The tracker on motion it should follow, and CLEAR MOT on cases counted by hand."""
+
+import numpy as np
+import pytest
+
+from flcav.geometry import Boxes
+from flcav.perception.metrics.tracks import Moment, amota, clear
+from flcav.perception.tracking import Tracker
+from flcav.perception.tracking.kalman import State, first_state, predicted, updated
+
+
+def cars(*places, yaw=0.0, score=None):
+    rows = [(x, y, 0.0, 4.4, 1.8, 1.5, yaw) for x, y in places]
+    return Boxes.from_array(np.array(rows).reshape(-1, 7), "Car", np.ones(len(rows)) if score is None else score)
+
+
+def test_a_filter_is_the_textbooks_on_one_axis():
+    variance = np.full(7, 0.25)
+    state = first_state(np.zeros(7), variance)
+    mean, covariance = np.zeros(2), np.diag((0.25, 64.0))
+    for number in range(1, 6):
+        dt, seen = 0.5, 1.5 * number
+        box = np.zeros(7)
+        box[0] = seen
+        state = updated(predicted(state, dt), box, variance)
+        step = np.array(((1, dt), (0, 1)))
+        noise = 9.0 * np.array(((dt**4 / 4, dt**3 / 2), (dt**3 / 2, dt**2)))
+        mean, covariance = step @ mean, step @ covariance @ step.T + noise
+        gain = covariance[:, 0] / (covariance[0, 0] + 0.25)
+        mean = mean + gain * (seen - mean[0])
+        covariance = covariance - np.outer(gain, covariance[0])
+    assert state.mean[[0, 7]] == pytest.approx(mean)
+    assert state.covariance[np.ix_((0, 7), (0, 7))] == pytest.approx(covariance)
+
+
+def test_a_filter_keeps_a_covariance_that_is_one():
+    state = first_state(np.zeros(7), np.ones(7))
+    for _ in range(50):
+        state = updated(predicted(state, 0.1), np.zeros(7), np.ones(7))
+    assert np.allclose(state.covariance, state.covariance.T)
+    assert np.linalg.eigvalsh(state.covariance).min() > 0
+
+
+def test_a_heading_seen_the_wrong_way_round_does_not_turn_the_track():
+    state = State(np.zeros(9), np.eye(9))
+    box = np.zeros(7)
+    box[6] = np.pi - 0.1
+    assert abs(updated(state, box, np.full(7, 0.1)).mean[6]) < 0.2
+
+
+def test_cars_that_pass_keep_their_numbers_and_get_their_velocities():
+    tracker = Tracker()
+    rng = np.random.default_rng(0)
+    numbers = []
+    for step in range(20):
+        t = 0.5 * step
+        noisy = [(10 * t + rng.normal(0, 0.1), 0.0), (60 - 8 * t + rng.normal(0, 0.1), 3.5), (30.0, 7.0)]
+        order = rng.permutation(3)
+        seen = tracker.step(cars(*[noisy[i] for i in order]), t)
+        if step >= 3:
+            lanes = np.rint(seen.boxes.center[:, 1] / 3.5).astype(int)
+            numbers.append(tuple(seen.track[np.argsort(lanes)]))
+            velocity = seen.velocity[np.argsort(lanes), 0]
+    assert len(set(numbers)) == 1
+    assert velocity == pytest.approx((10, -8, 0), abs=0.5)
+
+
+def test_a_track_outlives_a_short_gap_and_not_a_long_one():
+    tracker = Tracker(patience=2)
+    first = [tracker.step(cars((5.0 * t, 0.0)), float(t)) for t in range(4)][-1].track[0]
+    for t in (4, 5):
+        assert not len(tracker.step(cars(), float(t)).track)
+    assert tracker.step(cars((30.0, 0.0)), 6.0).track[0] == first
+    for t in (7, 8, 9):
+        tracker.step(cars(), float(t))
+    tracker.step(cars((50.0, 0.0)), 10.0)
+    assert tracker.step(cars((55.0, 0.0)), 11.0).track[0] != first
+
+
+def test_a_single_detection_is_no_track_yet():
+    tracker = Tracker()
+    tracker.step(cars((0, 0)), 0.0)
+    seen = tracker.step(cars((0, 0), (50, 0)), 0.5)
+    assert seen.boxes.center[:, 0] == pytest.approx([0], abs=0.1)
+
+
+def test_time_does_not_run_backwards():
+    tracker = Tracker()
+    tracker.step(cars(), 1.0)
+    with pytest.raises(ValueError, match="time order"):
+        tracker.step(cars(), 0.5)
+
+
+def moment(objects, tracks, score=None, neutral=None):
+    """Objects and tracks are {identity: x}."""
+    return Moment(
+        objects=np.array(list(objects), dtype=np.str_),
+        places=np.array([(x, 0.0) for x in objects.values()]).reshape(-1, 2),
+        tracks=np.array(list(tracks), dtype=np.int64),
+        found=np.array([(x, 0.0) for x in tracks.values()]).reshape(-1, 2),
+        score=np.array([(score or {}).get(track, 1.0) for track in tracks]),
+        neutral=np.array([track in (neutral or ()) for track in tracks], dtype=bool),
+    )
+
+
+def test_clear_counts_by_hand():
+    sequence = [
+        moment({"a": 0, "b": 10}, {1: 0.5, 2: 10}),  # two pairs
+        moment({"a": 1, "b": 11}, {1: 1}),  # b missed
+        moment({"a": 2, "b": 12}, {3: 2, 2: 12}),  # a has another track: a switch
+        moment({"a": 3, "b": 13}, {3: 3, 2: 13, 4: 40}),  # one false positive
+    ]
+    counts = clear([sequence])
+    assert (counts.objects, counts.misses, counts.false_positives, counts.switches) == (8, 1, 1, 1)
+    assert counts.mota == pytest.approx(1 - 3 / 8)
+    assert counts.motp_m == pytest.approx(0.5 / 7)
+
+
+def test_a_pair_of_before_stays_though_another_track_comes_closer():
+    sequence = [moment({"a": 0}, {1: 0}), moment({"a": 0}, {1: 1.5, 2: 0.1})]
+    counts = clear([sequence])
+    assert (counts.switches, counts.false_positives, counts.misses) == (0, 1, 0)
+
+
+def test_tracks_of_what_is_neutral_are_not_wrong():
+    assert clear([[moment({"a": 0}, {1: 0, 2: 30}, neutral=(2,))]]).false_positives == 0
+
+
+def test_sequences_do_not_share_identities():
+    one = [moment({"a": 0}, {1: 0})]
+    other = [moment({"a": 0}, {7: 0})]
+    assert clear([one, other]).switches == 0
+    assert clear([one + other]).switches == 1
+
+
+def test_amota_of_perfect_tracks_and_of_half_of_them():
+    perfect = [[moment({"a": 0, "b": 10}, {1: 0, 2: 10})] * 4]
+    assert amota(perfect) == pytest.approx(1)
+    half = [[moment({"a": 0, "b": 10}, {1: 0})] * 4]
+    assert amota(half) == pytest.approx(0.5)  # recalls up to a half are reached without a mistake
+    assert np.isnan(amota([[moment({}, {})]]))
+
+
+def test_amota_leaves_out_false_tracks_of_low_score():
+    clean = [[moment({"a": 0, "b": 10}, {1: 0, 2: 10, 3: 50}, score={3: 0.1})] * 4]
+    worse = [[moment({"a": 0, "b": 10}, {1: 0, 2: 10, 3: 50}, score={1: 0.1})] * 4]
+    assert amota(clean) == pytest.approx(1)
+    assert amota(worse) < 0.8

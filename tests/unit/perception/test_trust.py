@@ -1,0 +1,81 @@
+"""Slices of average precision, and calibration against its definition and scikit-free oracles."""
+
+import numpy as np
+import pytest
+from scipy.special import expit, logit
+
+from flcav.geometry import Boxes
+from flcav.perception.metrics import calibration_error, fit_logistic
+from flcav.perception.objects.calibrate import trust
+from flcav.perception.objects.evaluate import Truth
+from flcav.perception.objects.slices import sliced
+
+
+def cars(*xs, scores=None):
+    rows = np.array([(x, 0.0, 0.0, 4.0, 1.8, 1.5, 0.0) for x in xs]).reshape(-1, 7)
+    return Boxes.from_array(rows, "Car", scores)
+
+
+def test_error_of_calibration_by_hand():
+    assert calibration_error([0.95, 0.95, 0.15, 0.15], [1, 0, 0, 0]) == pytest.approx((0.9 + 0.3) / 4)
+    assert calibration_error([1.0], [1]) == 0
+    assert np.isnan(calibration_error([], []))
+
+
+def test_scores_that_are_too_sure_are_put_right():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.05, 0.95, 20_000)
+    hit = rng.random(len(truth)) < truth
+    shown = expit(2 * logit(truth) + 1)
+    factor, summand = fit_logistic(shown, hit)
+    assert (factor, summand) == pytest.approx((0.5, -0.5), abs=0.03)
+    assert calibration_error(expit(factor * logit(shown) + summand), hit) < 0.01 < calibration_error(shown, hit)
+
+
+def test_nothing_changes_where_there_is_nothing_to_learn():
+    assert fit_logistic([0.2, 0.9], [1, 1]) == (1.0, 0.0)
+    assert fit_logistic([], []) == (1.0, 0.0)
+
+
+def truth(*xs, occlusion, weather="clear", neutral=()):
+    return Truth("s", cars(*xs), cars(*neutral), Boxes.empty(), np.array(occlusion, dtype=float), weather)
+
+
+def row(rows, by, name, kind="3d", iou=0.5):
+    (found,) = [r for r in rows if (r["by"], r["slice"], r["kind"], r["iou"]) == (by, name, kind, iou)]
+    return found["ap"], found["targets"]
+
+
+def test_slices_ask_for_their_own_objects_and_for_no_others():
+    truths = [truth(10, 30, 50, occlusion=(0, 0.5, 0.9))]
+    found = [cars(10, 30, scores=[0.9, 0.8])]
+    rows = sliced(found, truths, ("Car",))
+    assert row(rows, "distance", "0-20 m") == (1, 1)
+    assert row(rows, "distance", "20-40 m") == (1, 1)
+    assert row(rows, "distance", "40-80 m") == (0, 1)
+    assert row(rows, "occlusion", "0%-20%") == (1, 1)
+    assert row(rows, "occlusion", "60%-100%") == (0, 1)
+    assert not [r for r in rows if r["by"] == "weather"]
+
+
+def test_a_false_positive_counts_in_the_slice_of_its_distance():
+    rows = sliced([cars(10, 15, scores=[0.8, 0.9])], [truth(10, 30, occlusion=(0, 0))], ("Car",))
+    assert row(rows, "distance", "0-20 m") == (0.5, 1)
+    assert row(rows, "distance", "20-40 m") == (0, 1)
+
+
+def test_weathers_are_told_apart_where_there_are_several():
+    truths = [truth(10, occlusion=(0,)), truth(10, occlusion=(0,), weather="fog")]
+    rows = sliced([cars(10, scores=[0.9]), cars()], truths, ("Car",))
+    assert row(rows, "weather", "clear") == (1, 1)
+    assert row(rows, "weather", "fog") == (0, 1)
+
+
+def test_variances_are_judged_by_the_errors_they_foretell():
+    found = cars(10.2, 30.2, scores=[0.9, 0.9])
+    variance = np.full((2, 7), 0.02)
+    found = Boxes(found.center, found.size, found.yaw, found.label, found.score, variance)
+    (said,) = trust([found], [truth(10, 30, occlusion=(0, 0))], ("Car",))
+    assert said["variance_ratio"] == pytest.approx(0.04 / 0.04, abs=1e-6)
+    assert said["ece"] == pytest.approx(0.1)
+    assert said["detections"] == 2
