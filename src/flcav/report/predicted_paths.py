@@ -37,10 +37,11 @@ def draw_paths(layers: NDArray[np.bool_], result: Mapping[str, Any], title: str)
         axes.plot(*at, "s", markersize=3.5, color=colour, markeredgewidth=0, zorder=3)
     for agent in result["agents"]:
         _draw_agent(axes, agent, observer)
+    axes.plot(0, 0, "^", markersize=6, color=style.INK, markeredgecolor="white", zorder=8)
     style.bare(axes)
     style.scale_bar(axes, 10)
     axes.set_title(f"{title} · {len(result['agents'])} predicted")
-    style.key(figure, _legend(result["time_s"][-1]))
+    style.key(figure, _legend(result["time_s"][-1], bool(result["lights"])))
     return figure
 
 
@@ -81,11 +82,15 @@ def _on_page(points: Array, observer: Array) -> Array:
     return np.stack((sin * x - cos * y, cos * x + sin * y), axis=1)
 
 
-def _legend(horizon_s: float) -> list[Line2D]:
-    return [
+def _legend(horizon_s: float, lights: bool) -> list[Line2D]:
+    handles = [
+        Line2D([], [], linestyle="none", marker="^", markersize=6, color=style.INK, label="observer"),
         Line2D([], [], color=PREDICTED, linewidth=2.4, marker="o", markersize=4, label=f"predicted, {horizon_s:g} s"),
         Line2D([], [], color=TRUTH, linewidth=1.0, label="truth"),
         Line2D([], [], color=PLAIN, linewidth=1.2, linestyle=(0, (2, 1.5)), label="constant velocity"),
-        Line2D([], [], linestyle="none", marker="s", markersize=4, color=style.GREEN, label="green"),
-        Line2D([], [], linestyle="none", marker="s", markersize=4, color=style.VERMILLION, label="red or amber"),
     ]
+    if lights:
+        square: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 4}
+        handles.append(Line2D([], [], color=style.GREEN, label="green", **square))
+        handles.append(Line2D([], [], color=style.VERMILLION, label="red or amber", **square))
+    return handles

@@ -9,21 +9,22 @@ from numpy.typing import NDArray
 
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
-from flcav.geometry import yaw_of
+from flcav.geometry import pose, yaw_of
 from flcav.perception.task import Finding
-from flcav.perception.trajectory.config import FUTURE, STEP_S, Patch
+from flcav.perception.trajectory.config import FUTURE, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import predict
-from flcav.perception.trajectory.rasters import OPEN, centres
-from flcav.perception.trajectory.roads import RoadMap, roads_of
+from flcav.perception.trajectory.rasters import OPEN
+from flcav.perception.trajectory.roads import STATIC_ROWS, RoadMap, roads_of
 from flcav.perception.trajectory.samples import Samples, present_at, traffic
 from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame
+from flcav.world.lanes import rasterise
 from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
 
 AROUND_M = 50.0  # of the observing agent, ahead, behind and to both sides: shown, and predicted with rasters
-AROUND = Patch(cells=400, cell_m=2 * AROUND_M / 400, ahead=0.5)  # the map that is shown
+PIXEL_M = 0.2  # of the map that is shown
 TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())
 
 
@@ -33,7 +34,7 @@ def findings(network: TrajectoryNetwork, path: Path) -> Iterator[Finding]:
     The result is in the world's frame: {"time_s": [...], "observer": {"x", "y", "yaw"}, "lights": [{"x", "y",
     "open"}], "agents": [{"track", "class", "x", "y", "yaw", "speed", "length", "width", "modes": [{"probability",
     "path": [[x, y], ...]}], "constant_velocity": [...], "truth": [...] or None}]}. It is shown on the map around the
-    observer, (layers, H, W) as `RoadMap.static` has them, row 0 ahead of him and column 0 to his left. Frames whose
+    observer, (len(STATIC), H, W), row 0 ahead of him and column 0 to his left. Frames whose
     vehicles have no past of 2 s yet have no agents.
     """
     read_manifest(path)
@@ -50,10 +51,9 @@ def findings(network: TrajectoryNetwork, path: Path) -> Iterator[Finding]:
 
 
 def map_around(roads: RoadMap, observer: Array) -> NDArray[np.bool_]:
-    """Return (layers, H, W) the map within `AROUND_M` of x, y, yaw."""
-    return roads.static(out_of_frame(centres(AROUND)[None], observer[None])[0]).T.reshape(
-        -1, AROUND.cells, AROUND.cells
-    )
+    """Return (len(STATIC), H, W) the map within `AROUND_M` of x, y, yaw."""
+    middle = pose(float(observer[0]), float(observer[1]), yaw=float(observer[2]))
+    return rasterise(roads.layers, middle, (2 * AROUND_M, 2 * AROUND_M), PIXEL_M)[list(STATIC_ROWS)]
 
 
 def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Trace, observer: Array) -> dict[str, Any]:
@@ -70,10 +70,10 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
     agents = []
     if count:
         paths, probabilities = predict(network, Samples(data, columns, config.cameras))
-        pose, plain = columns["pose"], constant_velocity(columns["past"])
+        present, plain = columns["pose"], constant_velocity(columns["past"])
         for i, actor in enumerate(columns["actor"]):
             modes = [
-                {"probability": float(share), "path": _in_world(way, pose[i])}
+                {"probability": float(share), "path": _in_world(way, present[i])}
                 for share, way in zip(probabilities[i], paths[i])
             ]
             truth = columns["future"][i].astype(np.float64)
@@ -81,12 +81,12 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
                 {
                     "track": str(trace.actor[actor]),
                     "class": str(trace.category[actor]),
-                    **dict(zip(("x", "y", "yaw"), pose[i].tolist())),
+                    **dict(zip(("x", "y", "yaw"), present[i].tolist())),
                     "speed": float(columns["past"][i, -1, 3]),
                     **dict(zip(("length", "width"), trace.size[actor, :2].tolist())),
                     "modes": sorted(modes, key=lambda mode: -mode["probability"]),
-                    "constant_velocity": _in_world(plain[i], pose[i]),
-                    "truth": _in_world(truth, pose[i]) if np.isfinite(truth).all() else None,
+                    "constant_velocity": _in_world(plain[i], present[i]),
+                    "truth": _in_world(truth, present[i]) if np.isfinite(truth).all() else None,
                 }
             )
     return {
@@ -103,5 +103,5 @@ def _lights(trace: Trace, instant: int, roads: RoadMap) -> list[dict[str, Any]]:
     return [{"x": x, "y": y, "open": letters[name] in OPEN} for name, (x, y) in middles.items()]
 
 
-def _in_world(path: Array, pose: Array) -> list[list[float]]:
-    return out_of_frame(path[None], pose[None])[0].tolist()
+def _in_world(path: Array, present: Array) -> list[list[float]]:
+    return out_of_frame(path[None], present[None])[0].tolist()

@@ -20,6 +20,7 @@ from flcav.world.town import Town
 Array = NDArray[np.float64]
 
 STATIC = ("road", "lane", "crossing")  # layers of the map that are looked at
+STATIC_ROWS = tuple(RASTER_LAYERS.index(name) for name in STATIC)
 RESOLUTION_M = 0.5  # of the town's raster
 DOT_M = 0.7  # between two points of a lane's surface: each cell of a metre gets one
 REACH_M = 70.0  # how far along the lanes it matters where one leads
@@ -32,9 +33,8 @@ BAR_M = 2.0  # length of the bar that shows a light's state, across its lane's e
 class RoadMap:
     """A town's map; all in the world's frame."""
 
-    raster: NDArray[
-        np.bool_
-    ]  # (len(STATIC), H, W) cells of RESOLUTION_M, row 0 at the lowest x, column 0 at the lowest y
+    layers: MapLayers
+    raster: NDArray[np.bool_]  # (len(STATIC), H, W) cells of RESOLUTION_M; row 0 at the lowest x, column 0 the lowest y
     corner: Array  # (2,) x, y of the raster's first corner
     line: KDTree  # of the (P, 2) points of the lanes' middle lines
     line_lane: NDArray[np.int64]  # (P,) index of the lane
@@ -97,6 +97,7 @@ def road_map(town: Town) -> RoadMap:
         yaw.append(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
         ahead.append(np.zeros(len(xy)) if lane.junction in real else line.length - along if follows else along + np.inf)
     return RoadMap(
+        layers=layers,
         raster=_raster(layers, town.bounds),
         corner=np.array(town.bounds[:2]),
         line=KDTree(np.concatenate(points)),
@@ -114,7 +115,7 @@ def _raster(layers: MapLayers, bounds: tuple[float, float, float, float]) -> NDA
     size = cells * RESOLUTION_M
     middle = pose(float(low[0] + size[0] / 2), float(low[1] + size[1] / 2))
     found = rasterise(layers, middle, (float(size[0]), float(size[1])), RESOLUTION_M)
-    return found[[RASTER_LAYERS.index(name) for name in STATIC], ::-1, ::-1].copy()
+    return found[list(STATIC_ROWS), ::-1, ::-1].copy()
 
 
 def _where_streets_meet(lanes: Iterable[MapLane]) -> set[str]:
