@@ -1,5 +1,6 @@
 """Every example runs as it stands, and is short."""
 
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -48,3 +49,13 @@ def test_federate_a_detector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert said.count(" up cav1") == said.count("down cav0") == 2
     assert "of 6 MB" in said
     assert (tmp_path / "weights.safetensors").is_file()
+
+
+@pytest.mark.slow
+def test_bring_your_own_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    name = "05_bring_your_own_model.py"
+    assert len((EXAMPLES / name).read_text().splitlines()) <= 60
+    run(name, tmp_path, monkeypatch=monkeypatch)
+    found = re.fullmatch(r"a third vehicle's 6 pictures of 1 scenes: accuracy (\S+) .*\n", capsys.readouterr().out)
+    assert found is not None
+    assert float(found[1]) > 0.6  # 1/3 by chance

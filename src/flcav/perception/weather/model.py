@@ -58,12 +58,19 @@ class ScaledTanh(nn.Module):
         return 1.7159 * torch.tanh(maps * (2 / 3))
 
 
-class LeNet(nn.Module):
-    """Class scores of RGB pictures of 32 x 32 pixels."""
+class Classifier(nn.Module):
+    """Any network that returns (B, classes) logits of (B, 3, 32, 32) pictures in [-1, 1]."""
 
     def __init__(self, config: LeNetConfig) -> None:
         super().__init__()
         self.config = config
+
+
+class LeNet(Classifier):
+    """Class scores of RGB pictures of 32 x 32 pixels."""
+
+    def __init__(self, config: LeNetConfig) -> None:
+        super().__init__(config)
         act = ScaledTanh if config.original else nn.ReLU
         self.layers = nn.Sequential(
             nn.Conv2d(3, 6, 5),  # C1: 28 x 28

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,17 +37,21 @@ def labelled(
     Those of no class are left out. Raises `InputError` where there are no pictures, no record of the weather, or none
     of `classes`.
     """
-    found, weather_known = [], False
-    for frame, _, rgb in recorded(data, frames):
-        weather_known |= frame.weather is not None
-        name = named(frame.weather) if frame.weather else None
-        if name in classes:
-            found.append(Sample(small(rgb), classes.index(name), frame.scene))
-    if not weather_known:
+    seen = _reduced(data, None if frames is None else tuple(frames))
+    if all(weather is None for _, weather, _ in seen):
         raise InputError(f"{data.folder}: the weather was not recorded, which 'weather' needs")
+    names = [None if weather is None else named(weather) for _, weather, _ in seen]
+    found = [
+        Sample(picture, classes.index(name), scene) for (picture, _, scene), name in zip(seen, names) if name in classes
+    ]
     if not found:
         raise InputError(f"{data.folder}: no picture in any of the weathers {', '.join(classes)}")
     return found
+
+
+@lru_cache(maxsize=4)  # a validation looks at the same pictures after every epoch
+def _reduced(data: Dataset, frames: tuple[int, ...] | None) -> list[tuple[Picture, Weather | None, str]]:
+    return [(small(rgb), frame.weather, frame.scene) for frame, _, rgb in recorded(data, frames)]
 
 
 def small(picture: Picture) -> Picture:

@@ -14,7 +14,7 @@ from flcav.perception.images import Picture, pictures
 from flcav.perception.task import Finding, Practice
 from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
 from flcav.perception.weather.evaluate import classification
-from flcav.perception.weather.model import LeNet
+from flcav.perception.weather.model import Classifier, LeNet
 from flcav.perception.weather.samples import Sample, augment, batched, labelled, small
 from flcav.progress import Report, silent
 from flcav.world.weather import nearest_class
@@ -30,7 +30,7 @@ class WeatherTask:
     configurations = CONFIGURATIONS
     practice = Practice(batch=32, learning_rate=2e-3)
 
-    def build(self, config: LeNetConfig) -> LeNet:
+    def build(self, config: LeNetConfig) -> Classifier:
         """Return a fresh network."""
         return LeNet(config)
 
@@ -42,13 +42,13 @@ class WeatherTask:
         """Return the sample mirrored, moved and lit at random."""
         return augment(samples[index], rng)
 
-    def loss(self, network: LeNet, samples: Sequence[Sample]) -> Tensor:
+    def loss(self, network: Classifier, samples: Sequence[Sample]) -> Tensor:
         """Return the cross entropy of a batch."""
         logits = network(_tensor(network, [sample.picture for sample in samples]))
         return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
 
     def evaluate(
-        self, network: LeNet, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
+        self, network: Classifier, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
     ) -> dict[str, Any]:
         """Return accuracy, recall per class and the confusion matrix, see `classification`."""
         return classified(network, self.samples(data, network.config, frames), progress)
@@ -57,7 +57,7 @@ class WeatherTask:
         """Return the accuracy."""
         return float(result["accuracy"])
 
-    def infer(self, network: LeNet, path: Path, threshold: float = 0.0) -> Iterator[Finding]:
+    def infer(self, network: Classifier, path: Path, threshold: float = 0.0) -> Iterator[Finding]:
         """Yield {"class", "probabilities"} for each picture; the likeliest class, however unlikely."""
         classes = network.config.classes
         for origin, rgb in pictures(path):
@@ -85,20 +85,20 @@ class WeatherTask:
 WEATHER = WeatherTask()
 
 
-def classified(network: LeNet, samples: Sequence[Sample], progress: Report = silent) -> dict[str, Any]:
+def classified(network: Classifier, samples: Sequence[Sample], progress: Report = silent) -> dict[str, Any]:
     """Return how the network does on labelled pictures, see `classification`."""
     found = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
     truth = np.array([sample.label for sample in samples])
     return classification(truth, found, [sample.scene for sample in samples], network.config.classes)
 
 
-def over_the_whole_space(network: LeNet, data: Dataset) -> dict[str, Any]:
+def over_the_whole_space(network: Classifier, data: Dataset) -> dict[str, Any]:
     """Return {"nearest": as `classified`} where pictures between and beyond the regions count as of the nearest."""
     samples = labelled(data, network.config.classes, named=nearest_class)
     return {"nearest": classified(network, samples)}
 
 
-def probabilities(network: LeNet, small_pictures: Sequence[Picture], progress: Report = silent) -> np.ndarray:
+def probabilities(network: Classifier, small_pictures: Sequence[Picture], progress: Report = silent) -> np.ndarray:
     """Return (N, classes) probabilities of pictures of 32 x 32 pixels; the network's mode is left as it was."""
     training = network.training
     network.eval()
@@ -112,5 +112,5 @@ def probabilities(network: LeNet, small_pictures: Sequence[Picture], progress: R
     return np.concatenate(parts)
 
 
-def _tensor(network: LeNet, small_pictures: list[Picture]) -> Tensor:
+def _tensor(network: Classifier, small_pictures: list[Picture]) -> Tensor:
     return torch.from_numpy(batched(small_pictures)).to(next(network.parameters()).device)
