@@ -8,6 +8,7 @@ from pydantic import Field
 
 from flcav.sensors.lens import Lens, directions
 from flcav.sensors.shading.appearance import SEMANTICS
+from flcav.sensors.shading.rain import add_drops
 from flcav.sensors.shading.render import Picture, render
 from flcav.sensors.shading.tone import GRAINS, develop, grain
 from flcav.world.rays.compiled import compiled
@@ -19,6 +20,7 @@ class Camera(Lens):
     """What a camera is built like; its pose is the rig's."""
 
     noise: float = Field(default=0.8, ge=0, le=20)  # standard deviation of a byte
+    drops: bool = True  # whether rain leaves drops on the lens
 
 
 class Exposure(NamedTuple):
@@ -46,6 +48,8 @@ def photograph(
     """
     picture = render(scene, world_from_camera, camera, weather, rng, hidden=hidden)
     shape = (camera.height, camera.width)
+    if camera.drops and weather.rain_mm_h > 0:
+        add_drops(picture.radiance.reshape(*shape, 3), weather.rain_mm_h, rng)
     rgb = np.empty((*shape, 3), np.uint8)
     shift = int(rng.integers(GRAINS))
     develop(picture.radiance, picture.exposure, grain(), shift, np.float32(camera.noise), rgb.reshape(-1, 3))

@@ -85,7 +85,7 @@ class Look(NamedTuple):
 
 
 LOOKS: dict[Material, Look] = {
-    Material.GROUND: Look((0.085, 0.115, 0.035)),
+    Material.GROUND: Look((0.062, 0.094, 0.034)),
     Material.ROAD: Look((0.072, 0.072, 0.076)),
     Material.SIDEWALK: Look((0.27, 0.26, 0.245)),
     Material.WALL: Look((0.42, 0.37, 0.31)),
@@ -95,9 +95,9 @@ LOOKS: dict[Material, Look] = {
     Material.METAL: Look((0.20, 0.21, 0.22), mirror=0.10, gloss=30.0),
     Material.SIGN: Look((0.80, 0.80, 0.80), mirror=0.02),
     Material.PAINT: Look((0.30, 0.30, 0.30), mirror=0.045, gloss=400.0),
-    Material.GLASS: Look((0.012, 0.014, 0.015), mirror=0.06, gloss=900.0),
+    Material.GLASS: Look((0.016, 0.019, 0.019), mirror=0.11, gloss=900.0),
     Material.TYRE: Look((0.018, 0.018, 0.019)),
-    Material.RIM: Look((0.32, 0.33, 0.34), mirror=0.25, gloss=60.0),
+    Material.RIM: Look((0.19, 0.195, 0.20), mirror=0.18, gloss=60.0),
     Material.HEADLAMP: Look((0.50, 0.52, 0.55), mirror=0.20, gloss=300.0),
     Material.TAILLAMP: Look((0.35, 0.012, 0.010), mirror=0.06, gloss=300.0),
     Material.PLATE: Look((0.72, 0.72, 0.68), mirror=0.03),

@@ -14,6 +14,7 @@ from flcav.world.materials import Material
 from flcav.world.rays.compiled import compiled
 
 SIGN = int(Material.SIGN)
+ROOKS = np.float32(3)  # a further ray stands for so much narrower a part of its pixel
 _THREE = np.array([(-1, 1), (1, -1)], np.float32) / 3
 _NINE = np.array([(-4, -1), (-3, 2), (-2, -3), (-1, 4), (1, -4), (2, 3), (3, -2), (4, 1)], np.float32) / 9
 BRIGHTEST = 3.0  # what outshines this after exposure counts no more: edges of lamps would stay jagged

@@ -1,4 +1,4 @@
-"""Halos around lamps that shine into the lens."""
+"""Halos around lamps, and around the sun, that shine into the lens."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,6 +7,7 @@ from flcav.geometry import inverse, transform_points
 from flcav.sensors.lens import Lens, project
 from flcav.sensors.shading.appearance import things_of
 from flcav.sensors.shading.light import Light
+from flcav.sensors.shading.shadows import DARK
 from flcav.sensors.shading.state import AMBER, GREEN, RED, State, lamp_places
 from flcav.world.meshes.signals import LENS_PITCH_M
 from flcav.world.rays.compiled import compiled
@@ -16,6 +17,11 @@ HEAD, TAIL, STREET, SIGNAL = 9.0, 0.55, 1.6, 0.35  # how strong the halos are
 HEAD_COLOUR, TAIL_COLOUR, STREET_COLOUR = (1.0, 0.95, 0.86), (1.0, 0.05, 0.03), (1.0, 0.74, 0.40)
 SIGNAL_COLOURS = {RED: (1.0, 0.05, 0.03), AMBER: (1.0, 0.5, 0.03), GREEN: (0.06, 1.0, 0.55)}
 FARTHEST_M = 150.0
+SUN_RAYS, SUN_RAD, SUN_REACH_M = 16, 0.0046, 1000.0  # rays over the sun's disc, whose radius is that angle
+SUN_SPREAD_RAD, SUN_VEIL_RAD = 0.016, 0.16  # how wide the lens scatters the sun's light: most of it, and the rest
+SUN_STRENGTH, VEIL_STRENGTH = 9.0, 0.22
+HAZE_M = 500.0  # of air before the sun
+BESIDE = 0.25  # how far beside the picture, over its size, the sun still dazzles
 
 Glowing = tuple[NDArray[np.float64], tuple[float, float, float], float]
 
@@ -54,6 +60,37 @@ def add_glare(
     size = focal * 0.14 / near + focal * 0.010 * (1 + min(150.0 * float(light.extinction), 4.0))
     power = colour * (through / (1 + (near / 25.0) ** 2))[:, None] * 1.8 * (0.3 + 0.7 * float(light.lamps))
     _draw(image, pixels[kept], power, size)
+
+
+def add_sun_glare(
+    image: NDArray[np.float32],
+    scene: Scene,
+    light: Light,
+    world_from_camera: NDArray[np.float64],
+    lens: Lens,
+    hidden: int | None,
+) -> None:
+    """Add to an image (H, W, 3) what a lens scatters of the sun, as much as is in plain sight."""
+    to_sun, eye = np.array(light.to_sun, np.float64), world_from_camera[:3, 3]
+    towards = world_from_camera[:3, :3].T @ to_sun
+    pixel = project(lens, towards)[0]
+    size = np.array((lens.width, lens.height))
+    if max(light.sun) < DARK or not (np.abs(pixel - size / 2) < (0.5 + BESIDE) * size).all():
+        return
+    turn = np.arange(SUN_RAYS) * 2.399963
+    across = (
+        np.stack((np.cos(turn), np.sin(turn), 0 * turn), axis=1)
+        * np.sqrt((np.arange(SUN_RAYS) + 0.5) / SUN_RAYS)[:, None]
+    )
+    rays = (towards + SUN_RAD * across) @ world_from_camera[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    far = np.full(SUN_RAYS, SUN_REACH_M, np.float32)
+    eyes = np.tile(eye, (SUN_RAYS, 1)).astype(np.float32)
+    free = 1 - float(scene.blocked(eyes, rays.astype(np.float32), far, hidden=hidden).mean())
+    if free > 0:
+        power = free * np.array(light.sun) * np.exp(-float(light.extinction) * HAZE_M)
+        focal = lens.intrinsics()[0, 0]
+        _veil(image, pixel, power.astype(np.float32), 1 / (SUN_SPREAD_RAD * focal), 1 / (SUN_VEIL_RAD * focal))
 
 
 def _glowing(scene: Scene, state: State, light: Light, eye: NDArray[np.float64], hidden: int | None) -> list[Glowing]:
@@ -96,3 +133,14 @@ def _draw(image, pixel, power, size):
                 halo = edge * edge * (0.20 / (1 + 9 * share) + 0.012 / (1 + share))
                 for band in range(3):
                     image[y, x, band] += np.float32(power[lamp, band] * halo)
+
+
+@compiled
+def _veil(image, pixel, power, narrow, wide):
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            square = np.float32((x - pixel[0]) ** 2 + (y - pixel[1]) ** 2)
+            near, far = 1 + square * np.float32(narrow * narrow), 1 + square * np.float32(wide * wide)
+            share = np.float32(SUN_STRENGTH) / (near * np.sqrt(near)) + np.float32(VEIL_STRENGTH) / far
+            for band in range(3):
+                image[y, x, band] += share * power[band]

@@ -22,7 +22,7 @@ from flcav.world.rays.compiled import inlined
 
 CELL_M = 2.0
 REACH_M = 0.3  # how far beyond a rectangle its cells go
-STRIP_M = 0.12  # arrows are cut into strips of this length
+STRIP_M = 0.06  # arrows are cut into strips of this length
 COLOURS = {"white": (0.68, 0.68, 0.66), "yellow": (0.62, 0.42, 0.06)}
 
 Rectangle = tuple[float, float, float, float, float, float]  # centre x, y, direction x, y, half length, half width

@@ -1,4 +1,4 @@
-"""Wet roads that mirror, and falling drops."""
+"""Wet roads that mirror, falling drops, and drops on the lens."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,10 @@ from flcav.world.rays.compiled import compiled
 ROAD = int(Material.ROAD)
 WATER = 0.02  # reflectance face on
 SMEAR_PX = 11  # half height of the blur of mirrored things, in pixels of half size
-STREAKS_PER_MM = 26.0  # in a picture of 640 x 384, at 1 mm/h, growing with the rain's power of 0.6
+STREAKS_PER_MM = 55.0  # in a picture of 640 x 384, at 1 mm/h, growing with the rain's power of 0.6
+DROPS_PER_MM = 3.0  # on a lens, at 1 mm/h, growing alike; whatever its size
+DROP_VIEW = 0.45  # of the picture's height that a drop shows, upside down
+BLOCK_PX = 8  # a drop is too near to be sharp: it shows means over squares of this side
 
 
 @compiled
@@ -74,10 +77,10 @@ def add_streaks(
     count = int(STREAKS_PER_MM * rain_mm_h**0.6 * width * height / (640 * 384))
     size = rng.random(count) ** 3  # few are near
     place = rng.random((count, 2)) * (width, height)
-    length = (0.015 + 0.085 * size) * height
+    length = (0.02 + 0.16 * size) * height
     slant = rng.normal(0.06, 0.03, count)
-    strength = (0.10 + 0.22 * rng.random(count)) * (0.5 + 0.5 * size)
-    thick = 0.5 + 1.1 * size
+    strength = (0.14 + 0.26 * rng.random(count)) * (0.6 + 0.4 * size)
+    thick = (0.5 + 1.6 * size) * height / 384
     _draw_streaks(image, place, length, slant, strength, thick, brightness)
 
 
@@ -97,3 +100,49 @@ def _draw_streaks(image, place, length, slant, strength, thick, brightness):
                 share = strength[drop] * along * max(1 - abs(column - x) / (thick[drop] + 0.5), 0.0)
                 for band in range(3):
                     image[y, column, band] += np.float32(share * (brightness[band] - image[y, column, band]))
+
+
+def add_drops(image: NDArray[np.float32], rain_mm_h: float, rng: np.random.Generator) -> None:
+    """Put drops on the lens of an image (H, W, 3): each a small, blurred view of the scene, upside down."""
+    height, width = image.shape[:2]
+    count = int(rng.poisson(DROPS_PER_MM * rain_mm_h**0.6))
+    place = rng.random((count, 2)) * (width, height)
+    radius = height * np.minimum(0.012 * np.exp(0.5 * rng.standard_normal(count)), 0.045)
+    blocks = np.empty((max(height // BLOCK_PX, 1), max(width // BLOCK_PX, 1), 3), np.float32)
+    _shrink(image, blocks)
+    _draw_drops(image, blocks, place, radius, rng.uniform(1.0, 1.35, count))
+
+
+@compiled
+def _shrink(image, blocks):
+    for j in range(blocks.shape[0]):
+        for i in range(blocks.shape[1]):
+            for band in range(3):
+                total = np.float32(0)
+                for y in range(j * BLOCK_PX, (j + 1) * BLOCK_PX, 2):
+                    for x in range(i * BLOCK_PX, (i + 1) * BLOCK_PX, 2):
+                        total += image[min(y, image.shape[0] - 1), min(x, image.shape[1] - 1), band]
+                blocks[j, i, band] = total / (BLOCK_PX * BLOCK_PX // 4)
+
+
+@compiled
+def _draw_drops(image, blocks, place, radius, tall):
+    height, width = image.shape[0], image.shape[1]
+    for drop in range(len(radius)):
+        view = np.float32(DROP_VIEW / 2 * height) / radius[drop]
+        reach = radius[drop] * tall[drop]
+        for y in range(max(int(place[drop, 1] - reach), 0), min(int(place[drop, 1] + reach) + 2, height)):
+            for x in range(max(int(place[drop, 0] - reach), 0), min(int(place[drop, 0] + reach) + 2, width)):
+                right, down = x - place[drop, 0], (y - place[drop, 1]) / tall[drop]
+                if down < 0:
+                    right *= 1 - 0.25 * down / radius[drop]  # narrower above, where it runs down
+                apart = np.sqrt(right * right + down * down) / radius[drop]
+                share = np.float32(min(max((1 - apart) * 2, 0.0), 0.9))
+                if share <= 0:
+                    continue
+                bent = view * (1 + apart * apart)
+                i = int(min(max((place[drop, 0] - right * bent) / BLOCK_PX, 0), blocks.shape[1] - 1))
+                j = int(min(max((place[drop, 1] - down * bent) / BLOCK_PX, 0), blocks.shape[0] - 1))
+                rim = np.float32(1.05 - 0.45 * apart * apart * apart)
+                for band in range(3):
+                    image[y, x, band] += share * (rim * blocks[j, i, band] - image[y, x, band])

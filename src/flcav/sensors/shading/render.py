@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from flcav.sensors.lens import Lens, directions
 from flcav.sensors.shading import antialias, edges, rain
 from flcav.sensors.shading.appearance import Appearance, appearance_of
-from flcav.sensors.shading.glare import add_glare
+from flcav.sensors.shading.glare import add_glare, add_sun_glare
 from flcav.sensors.shading.light import Light, light_of
 from flcav.sensors.shading.memory import keep_freed_memory
 from flcav.sensors.shading.openness import openness
@@ -79,6 +79,7 @@ def render(
         rain.add_streaks(image, weather.rain_mm_h, 0.75 * np.array(light.horizon) + 0.05 * np.array(light.sun), rng)
     if state.head.any() or light.lamps > 0:
         add_glare(image, scene, state, light, world_from_camera, lens, hidden)
+    add_sun_glare(image, scene, light, world_from_camera, lens, hidden)
     return Picture(radiance, light.exposure, seen, painted, appearance)
 
 
@@ -122,7 +123,8 @@ def _further(
     out, rest = radiance[donor], np.flatnonzero(donor < 0)
     unknown = Hits(hits.distance[rest], hits.instance[rest], hits.face[rest])
     found = survey(scene, appearance, world_from_camera, rays[rest], unknown)
-    out[rest], _ = _radiance(world, found, open_sky[pixel[rest]])
+    finer = world._replace(pixel_angle=world.pixel_angle / antialias.ROOKS)
+    out[rest], _ = _radiance(finer, found, open_sky[pixel[rest]])
     return out
 
 

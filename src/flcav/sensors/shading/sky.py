@@ -32,7 +32,7 @@ def heaven_at(x, y, z, light, table):
     """Return the radiance where a ray meets nothing: sky, sun, clouds and the air before them."""
     red, green, blue = sky_at(x, y, z, light)
     beside = x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2]
-    sun = min(max((beside - np.float32(0.99980)) / np.float32(0.0001), np.float32(0)), np.float32(1)) * np.float32(30)
+    sun = min(max((beside - np.float32(0.99992)) / np.float32(0.00004), np.float32(0)), np.float32(1)) * np.float32(30)
     if z > np.float32(0.01) and light.cover > 0.02:
         far = 1 / (z + np.float32(0.06))
         u, v = x * far * np.float32(16), y * far * np.float32(16)
@@ -59,11 +59,14 @@ def heaven_at(x, y, z, light, table):
 
 
 @inlined
-def mirrored_at(x, y, z, light):
+def mirrored_at(x, y, z, light, table):
     """Return the radiance that a mirror sees in the unit direction x, y, z: sky above dim houses above the ground."""
     red, green, blue = sky_at(x, y, abs(z), light)
-    seen = min(max((z - np.float32(SKYLINE / 2)) / np.float32(SKYLINE), np.float32(0)), np.float32(1))
-    red = light.bounce[0] + seen * (red - light.bounce[0])
-    green = light.bounce[1] + seen * (green - light.bounce[1])
-    blue = light.bounce[2] + seen * (blue - light.bounce[2])
+    height = np.float32(SKYLINE) * (np.float32(0.4) + np.float32(1.2) * noise_at(table, x * 9.0, y * 9.0))
+    above = min(max((z - height) * np.float32(25), np.float32(0)), np.float32(1))
+    level = min(max(z * np.float32(25), np.float32(0)), np.float32(1))  # houses stand on the ground
+    dim = np.float32(1) + np.float32(0.7) * level
+    red = dim * light.bounce[0] + above * (red - dim * light.bounce[0])
+    green = dim * light.bounce[1] + above * (green - dim * light.bounce[1])
+    blue = dim * light.bounce[2] + above * (blue - dim * light.bounce[2])
     return red, green, blue

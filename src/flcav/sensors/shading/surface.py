@@ -21,6 +21,8 @@ LENS_RED, LENS_GREEN = int(Material.LENS_RED), int(Material.LENS_GREEN)
 BUILDING, CLUTTER = int(Part.BUILDING), int(Part.CLUTTER)
 
 LENS_RADIANCE = 2.2
+LOW_SUN = 0.4  # sine of the elevation below which a dry road gleams towards the sun
+SHEEN, SHEEN_GLOSS = 0.30, 22.0
 ROAD_LINE = 0.5  # share of a pixel from which on paint is what it shows
 
 
@@ -51,6 +53,7 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
         red, green, blue = own[instance, material, 0], own[instance, material, 1], own[instance, material, 2]
         mirror, gloss = appearance.mirror[material], appearance.gloss[material]
         shine_r, shine_g, shine_b = np.float32(0), np.float32(0), np.float32(0)
+        lit = np.float32(0) if shaded[ray] else np.float32(1)
         through = np.float32(0)  # share of the sun that shines through from behind
         if material == ROAD:
             tone = asphalt(x, y, slant, table)
@@ -65,6 +68,16 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
                 red += share * (colour[piece, 0] * tone - red)
                 green += share * (colour[piece, 1] * tone - green)
                 blue += share * (colour[piece, 2] * tone - blue)
+            if light.to_sun[2] < np.float32(LOW_SUN) and nz > np.float32(0.9):
+                beside = dx * light.to_sun[0] + dy * light.to_sun[1] - dz * light.to_sun[2]
+                sheen = (
+                    lit
+                    * np.float32(SHEEN)
+                    * (1 - facing)
+                    * (1 - facing)
+                    * np.exp(np.float32(SHEEN_GLOSS) * (beside - 1))
+                )
+                shine_r, shine_g, shine_b = sheen * light.sun[0], sheen * light.sun[1], sheen * light.sun[2]
         elif material == SIDEWALK:
             if nz > np.float32(0.5):
                 tone = paving(x, y, slant, table)
@@ -82,7 +95,7 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
                 red, green, blue = np.float32(0.75), np.float32(0.60), np.float32(0.16)
         elif material == GROUND:
             tone, dry = grass(x, y, slant, table)
-            red = (red + np.float32(0.055) * dry) * tone
+            red = (red + np.float32(0.045) * dry) * tone
             green = (green + np.float32(0.020) * dry) * tone
             blue = blue * tone
         elif material == WALL and appearance.part[row] == BUILDING:
@@ -151,7 +164,6 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
             if instance == 0:
                 red, green, blue = red * dark, green * dark, blue * dark
 
-        lit = np.float32(0) if shaded[ray] else np.float32(1)
         sun = nx * light.to_sun[0] + ny * light.to_sun[1] + nz * light.to_sun[2]
         if through > 0:
             sun = (np.float32(0.25) + np.float32(0.75) * max(sun, -sun * through)) * lit
@@ -176,7 +188,7 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
             mirror += (1 - mirror) * grazing * np.float32(0.8)
             turned = 2 * facing
             rx, ry, rz = dx + turned * nx, dy + turned * ny, dz + turned * nz
-            env_r, env_g, env_b = mirrored_at(rx, ry, rz, light)
+            env_r, env_g, env_b = mirrored_at(rx, ry, rz, light, table)
             if gloss > 0 and lit > 0:
                 beside = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
                 if beside > np.float32(0.6):

@@ -12,11 +12,22 @@ STEPS = 4096
 GRAINS = 65521  # a prime, so that rows of a picture do not repeat
 
 
-def _table() -> np.ndarray:
+CONTRAST, SHOULDER = 1.25, 0.977
+WHITE = 5.0  # exposed light that is shown as white: walls in the sun stay below
+MIDDLE, MIDDLE_SHOWN = 0.15, 0.17
+
+
+def _filmic(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what is shown, 0 to 1, of exposed light: Lottes, Optimization of HDR Color Pipelines, GDC 2016."""
+    low, high = MIDDLE ** (CONTRAST * SHOULDER), WHITE ** (CONTRAST * SHOULDER)
+    scale = (WHITE**CONTRAST * MIDDLE_SHOWN - MIDDLE**CONTRAST) / ((high - low) * MIDDLE_SHOWN)
+    shift = (high * MIDDLE**CONTRAST - WHITE**CONTRAST * low * MIDDLE_SHOWN) / ((high - low) * MIDDLE_SHOWN)
+    return np.minimum(light**CONTRAST / (light ** (CONTRAST * SHOULDER) * scale + shift), 1)
+
+
+def _table() -> NDArray[np.float32]:
     share = (np.arange(STEPS) + 0.5) / STEPS
-    light = share / (1 - share)  # the table runs over light / (1 + light)
-    filmic = light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14)  # Narkowicz 2015, of ACES
-    shown = np.clip(filmic, 0, 1)
+    shown = _filmic(share / (1 - share))  # the table runs over light / (1 + light)
     return (255 * np.where(shown < 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)).astype(np.float32)
 
 
