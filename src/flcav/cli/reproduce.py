@@ -14,6 +14,7 @@ class Target(StrEnum):
     fig6a_allocation = "fig6a-allocation"
     task_weather = "task-weather"
     task_signs = "task-signs"
+    task_objects = "task-objects"
     task_trajectory = "task-trajectory"
     task_trajectory_cameras = "task-trajectory-cameras"
 

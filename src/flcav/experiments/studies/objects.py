@@ -1,0 +1,108 @@
+"""The study of the object task: three towns to learn from, other scenes of each to test, tracks besides.
+
+The sweeps are those of recipes/objects.yaml, in every town. Scores are calibrated on the validation frames.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from flcav.dataset.store import Dataset
+from flcav.experiments.recording import opened
+from flcav.experiments.steps import Work
+from flcav.experiments.task_study import VALIDATION, RecipeFields, Result, Study
+from flcav.perception.card import Card, write_card
+from flcav.perception.objects.calibrate import calibrate
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.tracking import evaluate_tracks
+from flcav.perception.training.run import CARD, WEIGHTS
+from flcav.perception.weights import load_network, save_network
+from flcav.report import style
+from flcav.report.precision import Bar, precisions
+
+RECIPE: RecipeFields = {
+    "warmup_s": 60.0,
+    "spins_per_scene": 6,
+    "every_s": 4.0,
+    "cavs": 4,
+    "vehicle_rig": "kitti_lidar",
+}
+SEQUENCES: RecipeFields = {**RECIPE, "spins_per_scene": 30, "every_s": 0.5, "cavs": 1}
+TOWNS = ("suburb", "ring", "grid")
+TRACKS = "tracks"
+
+
+@dataclass(frozen=True)
+class CalibratedStudy(Study):
+    """A study whose networks are calibrated on the validation frames before they are tested."""
+
+    def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> dict[str, Any]:
+        """Train and calibrate one seed; return its card."""
+        card = Card.model_validate(super().learn(work, seed=seed, network=network, epochs=epochs, patience=patience))
+        path, held = work.folder / WEIGHTS, opened(work, VALIDATION)
+        learned = load_network(OBJECTS, path)
+        calibrate(learned, map(held.frame, range(len(held))))
+        card = card.model_copy(update={"metrics": OBJECTS.evaluate(learned, held)})
+        save_network(OBJECTS, learned, path, card)
+        write_card(card, work.folder / CARD)
+        return card.model_dump(mode="json")
+
+
+def followed(network: Second, data: Dataset) -> dict[str, Any]:
+    """Return the evaluation of the network's tracks."""
+    torch.set_num_threads(1)
+    return {TRACKS: evaluate_tracks(network, data)}
+
+
+def _numbers(result: Result) -> Mapping[str, float]:
+    """Return AP in 3D and from above of each class, the error of calibration, and MOTA where tracks were tested."""
+    ap = {
+        f"{row['class']} AP {row['kind']} at {row['iou']}": row["ap"]
+        for row in result["scores"]
+        if row["ap"] is not None
+    }
+    errors = {f"{row['class']} calibration error": row["ece"] for row in result["trust"] if row["ece"] is not None}
+    rows = result[TRACKS]["scores"] if TRACKS in result else []
+    tracks = {
+        f"{row['class']} {name.upper()}": row[name]
+        for row in rows
+        for name in ("mota", "amota")
+        if row[name] is not None
+    }
+    return ap | errors | tracks
+
+
+def _draw(results: Mapping[str, Any]) -> bytes:
+    """Return AP at IoU 0.5 in 3D of each test: of the classes, and of cars by distance and occlusion."""
+    panels = {}
+    for test in results["summary"]:
+        tested = [seed["tests"][test] for seed in results["seeds"]]
+        rows = {}
+        for result in tested:
+            for row in result["scores"] + [r for r in result["slices"] if r["class"] == "Car"]:
+                if (row["kind"], row["iou"]) == ("3d", 0.5) and row["ap"] is not None:
+                    name = row["class"] if "slice" not in row else f"cars, {row['by']} {row['slice']}"
+                    rows.setdefault((name, row["targets"]), []).append(row["ap"])
+        panels[test] = [Bar(name, float(np.mean(ap)), tuple(ap), count) for (name, count), ap in rows.items()]
+    return style.png(precisions(panels))
+
+
+STUDY = CalibratedStudy(
+    task=OBJECTS,
+    network="small",
+    train=tuple({**RECIPE, "town": town, "seed": 21, "scenes": 8} for town in TOWNS),
+    validation={**RECIPE, "town": "suburb", "seed": 121, "split": "validation", "scenes": 2},
+    tests={
+        **{town: {**RECIPE, "town": town, "seed": 221, "split": "test", "scenes": 3} for town in TOWNS},
+        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 321, "split": "test", "scenes": 3},
+    },
+    epochs=6,
+    patience=6,
+    numbers=_numbers,
+    draw=_draw,
+    extra={TRACKS: followed},
+)
