@@ -27,10 +27,12 @@ from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task, configuration, fresh
 from flcav.perception.training import Checkpointing, Validation, train
 from flcav.perception.training.run import Request, train_network
-from flcav.perception.weather.task import WEATHER
+from flcav.perception.weather.task import WEATHER, over_the_whole_space
 from flcav.perception.weights import load_network, save_network, to_arrays
 from flcav.report import style
 from flcav.report.inference import DRAWINGS
+from flcav.sensors.frame import Frame
+from flcav.world.weather import Weather
 
 each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 CONFIGS = {"signs": replace(configuration(SIGNS, "n"), window_px=(96, 64))}
@@ -241,3 +243,16 @@ def test_infer_writes_a_picture_of_each_input(task, data, tmp_path, capsys):
     assert capsys.readouterr().out.startswith(str(source))
     names = [path.stem for path in sorted(out.iterdir())]
     assert names == [f"{i:05d}_{name}" for i, name in enumerate([source.stem] if source.is_file() else shown(data))]
+
+
+def test_a_picture_of_the_whole_space_counts_as_of_the_nearest_class(tmp_path):
+    class Between(Drives):
+        def frame(self, scene: str, index: int) -> Frame:
+            return replace(super().frame(scene, index), weather=Weather(cloud_cover=0.31))  # nearest: cloudy
+
+    record(Between(spins=2), tmp_path)
+    data, network = Dataset.open(tmp_path), fresh(WEATHER, small(WEATHER), 1)
+    with pytest.raises(InputError, match="no picture in any of the weathers clear"):
+        WEATHER.evaluate(network, data)
+    nearest = over_the_whole_space(network, data)["nearest"]
+    assert nearest["pictures"] == sum(nearest["confusion"][1]) == 6

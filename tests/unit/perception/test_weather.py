@@ -65,7 +65,7 @@ def test_it_learns_colours(name):
     noisy = [colours[i % 8] + random.normal(0, 12, (32, 32, 3)) for i in range(48)]
     samples = [Sample(np.clip(picture, 0, 255).astype(np.uint8), i % 8) for i, picture in enumerate(noisy)]
     network = fresh(WEATHER, configuration(WEATHER, name), 0)
-    train(WEATHER, network, samples, steps=80, batch=16, seed=0)
+    train(WEATHER, network, samples, steps=120, batch=16, seed=0)
     found = probabilities(network, [sample.picture for sample in samples])
     assert found.shape == (48, 8)
     assert found.sum(1) == pytest.approx(1, abs=1e-5)
@@ -76,7 +76,7 @@ def test_augmentation_keeps_size_label_and_light():
     picture = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
     seen = [augment(Sample(picture, 3, "s"), np.random.default_rng(seed)) for seed in range(40)]
     assert all(one.picture.shape == (32, 32, 3) and (one.label, one.scene) == (3, "s") for one in seen)
-    assert all(abs(one.picture.mean() / picture.mean() - 1) < 0.1 for one in seen)
+    assert all(abs(one.picture.mean() / picture.mean() - 1) < 0.2 for one in seen)
     assert len({one.picture.tobytes() for one in seen}) == 40
 
 

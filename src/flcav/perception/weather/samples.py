@@ -13,7 +13,8 @@ from flcav.perception.images import Picture, recorded, resized
 from flcav.perception.weather.model import SIDE
 from flcav.world.weather import Weather, weather_class
 
-SHIFT_PX, GAIN = 3, 0.05  # the most that augmentation moves a picture, and brightens or darkens it
+SHIFT_PX = 3  # the most that augmentation moves a picture
+GAIN, GAMMA, SATURATION = 0.05, 0.2, 0.25  # and how much more it makes of its light, tones and colours: exp(+-)
 
 
 @dataclass(frozen=True)
@@ -60,16 +61,19 @@ def small(picture: Picture) -> Picture:
 
 
 def augment(sample: Sample, rng: np.random.Generator) -> Sample:
-    """Return the sample mirrored in half of the cases, moved by up to 3 pixels, up to 5 % brighter or darker.
+    """Return the sample mirrored in half of the cases, moved by up to 3 pixels, as another camera would show it.
 
-    The light itself tells the weather, so that no more than the camera's own gain is varied.
+    Cameras differ in gain, tone curve and colours. All three are varied little, since the light itself tells the
+    weather.
     """
     picture = sample.picture[:, ::-1] if rng.random() < 0.5 else sample.picture
     padded = np.pad(picture, ((SHIFT_PX, SHIFT_PX), (SHIFT_PX, SHIFT_PX), (0, 0)), mode="edge")
     top, left = rng.integers(0, 2 * SHIFT_PX + 1, 2)
-    moved = padded[top : top + SIDE, left : left + SIDE]
-    lit = np.clip(moved * rng.uniform(1 - GAIN, 1 + GAIN), 0, 255).astype(np.uint8)
-    return Sample(lit, sample.label, sample.scene)
+    gain, gamma, saturation = np.exp(rng.uniform(-1, 1, 3) * (GAIN, GAMMA, SATURATION))
+    lit = gain * (padded[top : top + SIDE, left : left + SIDE] / np.float32(255)) ** gamma
+    grey = lit.mean(axis=2, keepdims=True)
+    shown = np.clip(255 * (grey + saturation * (lit - grey)), 0, 255)
+    return Sample(shown.astype(np.uint8), sample.label, sample.scene)
 
 
 def batched(pictures: list[Picture]) -> NDArray[np.float32]:

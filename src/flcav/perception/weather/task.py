@@ -28,7 +28,7 @@ class WeatherTask:
     name = "weather"
     family = "lenet"
     configurations = CONFIGURATIONS
-    practice = Practice(batch=32, learning_rate=2e-3)
+    practice = Practice(batch=32, learning_rate=4e-3)
 
     def build(self, config: LeNetConfig) -> Classifier:
         """Return a fresh network."""
