@@ -7,6 +7,7 @@ The held-out scenes have all eight classes; the held-out town has speed limits o
 from collections.abc import Mapping
 from typing import Any
 
+from flcav.experiments.signs_tables import name_of
 from flcav.experiments.task_study import RecipeFields, Result, Study
 from flcav.perception.signs.task import SIGNS
 from flcav.report import style
@@ -33,17 +34,11 @@ RING: RecipeFields = {**RECIPE, "town": "ring", "warmup_s": [87.0, 89.5], "every
 
 def _numbers(result: Result) -> Mapping[str, float]:
     """Return mAP, and AP50 by class and by size, of what there was to find."""
-    parts = {_name(row): row["ap50"] for row in result["classes"]} | {
-        _name(row): row["map50"] for row in result["sizes"]
+    parts = {name_of(row): row["ap50"] for row in result["classes"]} | {
+        name_of(row): row["map50"] for row in result["sizes"]
     }
     known = {name: value for name, value in parts.items() if value is not None}
     return {"mAP50": result["map50"], "mAP50-95": result["map50_95"], **known}
-
-
-def _name(row: Mapping[str, Any]) -> str:
-    if "class" in row:
-        return row["class"].replace("_", " ")
-    return f"{row['from_px']:g} px on" if row["to_px"] is None else f"{row['from_px']:g} to {row['to_px']:g} px"
 
 
 def _draw(results: Mapping[str, Any]) -> bytes:
@@ -51,7 +46,7 @@ def _draw(results: Mapping[str, Any]) -> bytes:
     panels = {}
     for test, means in results["summary"].items():
         tested = [seed["tests"][test] for seed in results["seeds"]]
-        targets = {_name(row): row["targets"] for row in (*tested[0]["classes"], *tested[0]["sizes"])}
+        targets = {name_of(row): row["targets"] for row in (*tested[0]["classes"], *tested[0]["sizes"])}
         numbers = [_numbers(result) for result in tested]
         panels[test] = [
             Bar(name, mean["mean"], tuple(row[name] for row in numbers), targets.get(name))

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import ConcatDataset
 
@@ -65,7 +67,7 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
         parameters=sum(parameter.numel() for parameter in network.parameters()),
         seed=request.seed,
         samples=len(samples),
-        training=settings | {"loss": float(history.losses[-per_epoch:].mean())},
+        training=settings | {"loss": float(history.losses[-per_epoch:].mean()), "scores": _rounded(history.scores)},
         data=tuple(data_entry(data) for data in request.data),
         metrics=task.evaluate(network, request.validation) if request.validation else {},
     )
@@ -81,6 +83,10 @@ def _check_writable(folder: Path) -> None:
         tempfile.TemporaryFile(dir=nearest).close()
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
+
+
+def _rounded(scores: NDArray[np.float64]) -> list[float]:
+    return [round(float(score), 4) for score in scores]
 
 
 def _validation(task: Task[Any, Any, Any], request: Request, per_epoch: int) -> Validation | None:

@@ -1,0 +1,75 @@
+"""The study of the sign task: that it is of the recipes users have, its tables and its picture."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from flcav.dataset.formats.rectangles import SIGNS
+from flcav.experiments.intervals import mean_over_seeds
+from flcav.experiments.signs_tables import name_of, tables
+from flcav.experiments.studies.signs import STUDY
+
+RECIPES = Path(__file__).parents[3] / "recipes"
+MISSING = frozenset({"stop", "speed_90"})  # in the held-out town
+
+
+def evaluation(score: float, missing: frozenset[str] = frozenset()) -> dict[str, Any]:
+    classes = [
+        {
+            "class": name,
+            "ap50": None if name in missing else score,
+            "ap50_95": score / 2,
+            "targets": 7 * (name not in missing),
+        }
+        for name in SIGNS
+    ]
+    sizes = [{"from_px": 6.0, "to_px": 12.0, "map50": score - 0.1, "targets": 30}]
+    sizes += [{"from_px": 24.0, "to_px": None, "map50": score + 0.1, "targets": 26}]
+    return {"map50": score, "map50_95": score / 2, "classes": classes, "sizes": sizes}
+
+
+def results(*scores: float) -> dict[str, Any]:
+    names = list(STUDY.tests)
+    seeds = [
+        {
+            "seed": seed,
+            "card": {"samples": 80, "training": {"steps": 20, "scores": [0.1, score]}},
+            "tests": {names[0]: evaluation(score), names[1]: evaluation(score - 0.3, MISSING)},
+        }
+        for seed, score in enumerate(scores, start=1)
+    ]
+    rows = {name: [STUDY.numbers(seed["tests"][name]) for seed in seeds] for name in names}
+    summary = {
+        name: {key: mean_over_seeds([row[key] for row in of_seeds]) for key in of_seeds[0]}
+        for name, of_seeds in rows.items()
+    }
+    return {"seeds": seeds, "summary": summary}
+
+
+@pytest.mark.parametrize(("name", "number"), [("signs", 0), ("signs_suburb", 1), ("signs_grid", 2)])
+def test_it_learns_from_the_recipes_of_users(name: str, number: int):
+    recipe = yaml.safe_load((RECIPES / f"{name}.yaml").read_text())
+    assert recipe.pop("split") == "train"
+    assert recipe == STUDY.train[number]
+
+
+def test_tables_have_every_class_and_size_and_leave_out_what_was_not_there():
+    made = tables(results(0.8, 0.82, 0.78))
+    assert "**reached**, 0.800" in made["findings"]
+    assert "**not reached**, 0.500" in made["findings"]
+    assert "| stop | 7 | 0.800 | 0 | |" in made["classes"]
+    assert "| yield | 7 | 0.800 | 7 | 0.500 |" in made["classes"]
+    assert "| 6 to 12 px | 30 | 0.700 | 30 | 0.400 |" in made["sizes"]
+    assert "| 24 px on | 26 | 0.900 | 26 | 0.600 |" in made["sizes"]
+    assert "| 2 | 80 | 20 | 0.10, 0.82 |" in made["training"]
+
+
+def test_an_interval_around_what_was_wanted_decides_nothing():
+    assert "**undecided**" in tables(results(0.6, 0.9))["findings"]
+
+
+def test_the_picture_has_a_bar_for_each_number():
+    assert name_of({"class": "light_red"}) == "light red"
+    assert STUDY.draw(results(0.7, 0.8)).startswith(b"\x89PNG")
