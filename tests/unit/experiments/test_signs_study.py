@@ -6,10 +6,13 @@ from typing import Any
 import pytest
 import yaml
 
+from flcav.config import parse_config
 from flcav.dataset.formats.rectangles import SIGNS
 from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.signs_tables import name_of, tables
 from flcav.experiments.studies.signs import STUDY
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 MISSING = frozenset({"stop", "speed_90"})  # in the held-out town
@@ -53,6 +56,13 @@ def test_it_learns_from_the_recipes_of_users(name: str, number: int):
     recipe = yaml.safe_load((RECIPES / f"{name}.yaml").read_text())
     assert recipe.pop("split") == "train"
     assert recipe == STUDY.train[number]
+
+
+@pytest.mark.slow
+def test_half_of_the_spins_see_amber():
+    source = EmbeddedSource(parse_config(Recipe, {**STUDY.validation, "scenes": 1}, "study"))
+    states = source.trace(source.scenes()[0]).light_state
+    assert ((states == "y").any(1)).tolist() in ([True, False] * 2, [False, True] * 2)
 
 
 def test_tables_have_every_class_and_size_and_leave_out_what_was_not_there():

@@ -138,6 +138,12 @@ def test_all_situations_occur() -> None:
     assert grid.kind[7] == "straight"
 
 
+def test_every_kind_of_sign_and_lights_stand_in_arterial() -> None:
+    town = load_town("arterial")
+    assert set(town.signs.kind) == {"stop", "yield", "speed_30", "speed_60", "speed_90"}
+    assert len(town.signals.link) >= 15
+
+
 def test_suburb_is_aligned_with_the_axes_and_grid_is_not() -> None:
     def aligned(name: str) -> float:
         lines = [edge.lanes[-1].shape for edge in read_net(load_town(name).net).streets]
