@@ -12,6 +12,7 @@ class Target(StrEnum):
     demo_arms = "demo-arms"
     fig3a = "fig3a"
     fig6a_allocation = "fig6a-allocation"
+    sim_to_real = "sim-to-real"
     task_weather = "task-weather"
     task_signs = "task-signs"
     task_objects = "task-objects"
@@ -42,10 +43,17 @@ def reproduce(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
     ),
     jobs: int = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each."),
+    kitti: Path | None = typer.Option(None, "--kitti", help="sim-to-real: a folder of real frames in KITTI's layout."),
+    weights: Path | None = typer.Option(
+        None, "--weights", help="sim-to-real: the detector's; by default those of the package."
+    ),
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
     if target == Target.fig3a:
         _fig3a(out)
+        return
+    if target == Target.sim_to_real:
+        _sim_to_real(out, kitti, weights, jobs)
         return
     count = seeds or SEEDS.get(target, COMMON_SEEDS)
     numbers = range(1, count + 1)
@@ -93,6 +101,33 @@ def _fig6a_allocation(out: Path, seeds: range, scale: str, jobs: int) -> None:
     write_bytes(out / "plans.png", draw_allocation(results))
     for finding in results["findings"]:
         typer.echo(f"{finding['question']} {finding['verdict']}. {finding['sentence']}")
+
+
+def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int) -> None:
+    import torch
+
+    from flcav.cli.steps import live_steps
+    from flcav.cli.tasks import network_of
+    from flcav.config import InputError
+    from flcav.experiments.sim_to_real import draw_frame, run_sim_to_real
+    from flcav.files import write_bytes, write_json
+    from flcav.perception.objects.task import OBJECTS
+    from flcav.report import style
+    from flcav.report.clouds import compare
+
+    if kitti is None:
+        raise InputError("--kitti is missing: sim-to-real needs a folder of real frames in KITTI's layout")
+    torch.set_num_threads(1)
+    with live_steps(Target.sim_to_real.value) as notify:
+        results = run_sim_to_real(network_of(OBJECTS, weights), kitti, out, jobs=jobs, notify=notify)
+    write_json(out / "result.json", results)
+    write_bytes(out / "clouds.png", style.png(compare(results["clouds"])))
+    for story in results["frames"]:
+        write_bytes(out / f"{story['frame']}.png", draw_frame(kitti, story))
+    for row in results["scores"]:
+        if row["targets"]:
+            found = f"{row['found']} of {row['targets']} found, {row['false_positives']} false"
+            typer.echo(f"{row['class']} {row['kind']} at IoU {row['iou']}: {found}, AP {row['ap']:.3f}")
 
 
 def _task(target: str, out: Path, seeds: range, scale: str, jobs: int) -> None:

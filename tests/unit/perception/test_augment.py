@@ -29,7 +29,15 @@ def scene(seed: int, objects: int = 12, per_object: int = 20) -> Sample:
 
 
 EVERYTHING = Augmentation(
-    turn_rad=0.7, scale=0.05, resize=(0.8, 1.1), tilt_rad=0.02, lift_m=0.2, drop=0.3, paste=3, view=0.5
+    turn_rad=0.7,
+    scale=0.05,
+    shift_m=1.0,
+    resize=((0.8, 1.1),) * 3,
+    tilt_rad=0.02,
+    lift_m=0.2,
+    drop=0.3,
+    paste=3,
+    view=0.5,
 )
 
 

@@ -10,6 +10,7 @@ STRICT = ConfigDict(extra="forbid")
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 Count = Annotated[int, Field(gt=0)]
+Span = tuple[Positive, Positive]  # from, to
 Portion = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -32,7 +33,8 @@ class Augmentation:
     flip: bool = True  # left-right, in one of two samples
     turn_rad: Annotated[float, Field(ge=0, lt=math.pi / 2)] = 0.3  # about the sensor, to either side
     scale: Portion = 0.03  # of the whole scene, 1 -/+ scale
-    resize: tuple[Positive, Positive] = (1.0, 1.0)  # factor of each object's length, width and height, each by itself
+    shift_m: Annotated[float, Field(ge=0)] = 0.0  # of the whole scene, ahead or back and to either side
+    resize: tuple[Span, Span, Span] = ((1, 1), (1, 1), (1, 1))  # factor of each car's length, width and height
     tilt_rad: Portion = 0.0  # of the sensor, about any level axis
     lift_m: Portion = 0.0  # of the sensor, up or down
     drop: Portion = 0.0  # share of the returns that are lost
@@ -88,3 +90,4 @@ ANCHORS = {
     ),
     "Cyclist": Anchor(name="Cyclist", length_m=1.76, width_m=0.6, height_m=1.73, matched_iou=0.5, unmatched_iou=0.35),
 }
+KITTI_CAR = Anchor(name="Car", length_m=3.9, width_m=1.6, height_m=1.56, matched_iou=0.6, unmatched_iou=0.45)

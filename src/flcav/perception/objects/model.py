@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from flcav.config import InputError
-from flcav.perception.objects.config import ANCHORS, Anchor, Augmentation, SecondConfig
+from flcav.perception.objects.config import ANCHORS, KITTI_CAR, Anchor, Augmentation, SecondConfig
 from flcav.perception.ops.norm import NormReLU
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d
 from flcav.perception.ops.voxels import grid_shape, voxelize
@@ -168,10 +168,11 @@ def small_config(
     """Return what a CPU trains in minutes for KITTI's range: 0-70.4 m ahead, 32 m to either side, voxels of 0.1 m.
 
     It sees no intensity, which every LiDAR reports in its own way, and its training varies what differs between a
-    simulated street and a real one: the sensor's tilt and height, the sizes of cars, lost returns, the field of view.
+    simulated street and a real one: the sensor's tilt and height, how near cars stand and how large they are, lost
+    returns, the field of view. Cars on KITTI's streets are smaller than ours: its mean car is the published anchor.
     """
     return SecondConfig(
-        anchors=_anchors(classes),
+        anchors=tuple(KITTI_CAR if anchor.name == "Car" else anchor for anchor in _anchors(classes)),
         range_m=(0, -32, -3, 70.4, 32, 1),
         voxel_m=(0.1, 0.1, 0.1),
         sparse_channels=(16, 16, 32, 32),
@@ -185,12 +186,13 @@ def small_config(
         augmentation=Augmentation(
             turn_rad=math.pi / 4,
             scale=0.05,
-            resize=(0.8, 1.1),
+            shift_m=1.5,
+            resize=((0.7, 1.05), (0.8, 1.0), (0.95, 1.15)),
             tilt_rad=0.02,
             lift_m=0.2,
             drop=0.3,
             paste=8,
-            view=0.75,
+            view=0.9,
         ),
     )
 

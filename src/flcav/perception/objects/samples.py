@@ -97,7 +97,8 @@ def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.
     toward = x * np.cos(most.turn_rad) + side * np.sin(most.turn_rad)
     ahead = np.where(side < x * np.tan(most.turn_rad), distance, toward)  # furthest ahead that a turn brings it
     grow = 1 / (1 - most.scale)
-    kept = (distance <= config.reach_m * grow) & (ahead >= min(x0 * grow, x0 / grow))
+    kept = distance <= config.reach_m * grow + most.shift_m * np.sqrt(2)
+    kept &= ahead >= min(x0 * grow, x0 / grow) - most.shift_m * np.sqrt(2)
     slack = most.lift_m + distance * np.sin(most.tilt_rad)
     kept &= (z >= min(z0 * grow, z0 / grow) - slack) & (z <= max(z1 * grow, z1 / grow) + slack)
     return points[kept]

@@ -1,0 +1,102 @@
+"""Real and simulated clouds beside each other, and detections in a real one."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from flcav.geometry import Boxes
+from flcav.report import style
+from flcav.report.sweeps import draw_boxes, draw_points
+
+COLOURS = (style.INK, style.BLUE, style.ORANGE)
+FIELDS = ("x", "y", "z", "length", "width", "height", "yaw")
+EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+EXTENT = (0.0, 60.0, 22.0)
+
+
+@style.styled
+def compare(clouds: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Return four panels: returns per range, intensities, the street ahead, returns per car."""
+    figure = style.canvas(9.0, 6.4)
+    ranges, intensity, ground, cars = figure.subplots(2, 2).ravel()
+    for numbers, colour in zip(clouds.values(), COLOURS, strict=False):
+        width = 1.8 if colour == style.INK else 1.4
+        per_range = numbers["returns_per_range"]
+        ranges.plot(range(len(per_range)), list(per_range.values()), "o-", color=colour, linewidth=width, markersize=3)
+        ranges.set_xticks(range(len(per_range)), [key.removesuffix(" m") for key in per_range], rotation=45)
+        intensity.plot(numbers["intensity_quantiles"], (5, 25, 50, 75, 95), "o-", color=colour, linewidth=width)
+        street = numbers["ground"]
+        middle = [np.mean([float(limit) for limit in row["ahead_m"].split("-")]) for row in street]
+        ground.plot(middle, [row["intensity"] for row in street], "o-", color=colour, linewidth=width)
+        dots = np.array([(car["distance_m"], car["returns"]) for car in numbers["cars"]]).reshape(-1, 2)
+        size = 34 if colour == style.INK else 9
+        cars.scatter(*dots.T, s=size, color=colour, linewidths=0, zorder=3 if colour == style.INK else 2)
+    _name(ranges, "returns of a frame", "distance [m]")
+    _name(intensity, "share of returns below [%]", "intensity")
+    _name(ground, "median intensity of the street", "distance ahead [m]")
+    _name(cars, "returns of a car", "distance [m]")
+    cars.set_yscale("log")
+    ground.set_ylim(bottom=0)
+    handles = [
+        Line2D([], [], color=colour, marker="o", label=name) for name, colour in zip(clouds, COLOURS, strict=False)
+    ]
+    style.key(figure, handles)
+    return figure
+
+
+@style.styled
+def real_frame(
+    points: NDArray[np.float32],
+    image: NDArray[np.uint8],
+    image_from_lidar: NDArray[np.float64],
+    story: Mapping[str, Any],
+) -> Figure:
+    """Return a real frame's cloud from above beside its image, with the labelled cars and what was found.
+
+    image_from_lidar: (3, 4), LiDAR frame to pixels; story: "cars" with "found_at", "boxes" with "class" and "score".
+    """
+    figure = style.canvas(11.0, 4.9)
+    above, ahead = figure.subplots(1, 2, width_ratios=(1, 1.55))
+    cars, found = _boxes(story["cars"]), _boxes(story["boxes"])
+    hit = np.array([0.5 in car["found_at"] for car in story["cars"]], dtype=bool)
+    draw_points(above, points, -1.7, EXTENT)
+    draw_boxes(above, cars[hit], style.GREEN, fill=0.25, width=1.0)
+    draw_boxes(above, cars[~hit], style.MISSED, fill=0.35, width=1.0)
+    draw_boxes(above, found, style.BLUE, width=1.4)
+    style.bare(above)
+    style.scale_bar(above, 10)
+    above.set_title(f"{story['frame']}: {hit.sum()} of {len(cars)} cars found at IoU 0.5")
+    ahead.imshow(image)
+    for boxes, colour in ((cars[hit], style.GREEN), (cars[~hit], style.MISSED), (found, style.BLUE)):
+        _draw_projected(ahead, boxes, image_from_lidar, colour)
+    ahead.set(xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
+    style.bare(ahead)
+    colours = {"labelled, found": style.GREEN, "labelled, missed": style.MISSED, "detection": style.BLUE}
+    style.key(figure, [Line2D([], [], color=colour, label=name) for name, colour in colours.items()])
+    return figure
+
+
+def _draw_projected(axes: Axes, boxes: Boxes, image_from_lidar: NDArray[np.float64], colour: str) -> None:
+    for corners in boxes.corners():
+        if (corners[:, 0] < 1).any():
+            continue
+        pixels = np.concatenate((corners, np.ones((8, 1))), 1) @ image_from_lidar.T
+        u, v = (pixels[:, :2] / pixels[:, 2:]).T
+        for a, b in EDGES:
+            axes.plot(u[[a, b]], v[[a, b]], color=colour, linewidth=1.0)
+
+
+def _boxes(rows: Any) -> Boxes:
+    array = np.array([[row[name] for name in FIELDS] for row in rows]).reshape(-1, 7)
+    return Boxes.from_array(array, np.array([row["class"] for row in rows], dtype=np.str_))
+
+
+def _name(axes: Axes, y: str, x: str) -> None:
+    axes.set_ylabel(y)
+    axes.set_xlabel(x)
+    axes.grid(axis="y")

@@ -1,0 +1,64 @@
+"""Clouds in numbers, and detections in a real frame, against what can be counted by hand."""
+
+import numpy as np
+import pytest
+
+from flcav.dataset.formats.kitti.folder import KittiFrame
+from flcav.dataset.formats.kitti.frame import Calibration, Objects
+from flcav.experiments import sim_to_real
+from flcav.experiments.clouds import describe
+from flcav.geometry import Boxes
+from flcav.perception.objects.model import second, small_config
+
+LIDAR_TO_CAMERA = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=float)
+PROJECTION = np.array([[700, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]], dtype=float)
+
+
+def boxes(*places, label="Car", score=None):
+    rows = np.array([(x, y, -1.0, 4.0, 1.6, 1.5, 0.0) for x, y in places]).reshape(-1, 7)
+    return Boxes.from_array(rows, label, score)
+
+
+def frame(objects: Boxes) -> KittiFrame:
+    count = len(objects)
+    labelled = Objects(objects, np.zeros(count), np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros((count, 4)))
+    calibration = Calibration(LIDAR_TO_CAMERA, PROJECTION)
+    return KittiFrame("000001", np.ones((5, 4), np.float32), calibration, labelled, np.zeros((375, 1242, 3), np.uint8))
+
+
+def test_numbers_of_a_cloud_are_counts():
+    street = [(x, 0.0, -1.7, 0.3) for x in (6.2, 6.5, 7, 7.5)]
+    on_car = [(20.0, 0.0, -1.0, i) for i in (0.0, 0.0, 0.2)]
+    behind = [(-10.0, 0.0, -1.7, 0.9)]
+    said = describe([(np.array(street + on_car + behind, np.float32), boxes((20, 0), (40, 0)))])
+    assert said["returns"] == 7
+    assert said["returns_per_range"]["5-10 m"] == 4
+    assert said["returns_per_range"]["20-25 m"] == 3
+    assert said["without_intensity"] == pytest.approx(2 / 7)
+    assert said["ground"][0]["height_m"] == pytest.approx(-1.7)
+    assert said["ground"][0]["intensity"] == pytest.approx(0.3)
+    (car,) = said["cars"]
+    assert (car["returns"], car["length_m"], car["distance_m"]) == (3, 4.0, 20.0)
+    assert car["without_intensity"] == pytest.approx(2 / 3)
+
+
+def test_what_the_image_does_not_show_does_not_count():
+    everything = boxes((20, 0), (-20, 0), (10, 12))
+    np.testing.assert_array_equal(sim_to_real.shown(everything, frame(boxes())).center[:, 0], [20])
+
+
+def test_real_frames_are_judged_as_kitti_does(monkeypatch):
+    found = boxes((20, 0), (40, 0), (30, 5), (60, 0), score=np.array([0.9, 0.8, 0.7, 0.6]))
+    monkeypatch.setattr(sim_to_real, "detect", lambda network, points, score_threshold: found)
+    van = Boxes.from_array(np.array([(30, 5, -1.0, 5, 2, 2, 0.0)]), "Van")
+    cars = boxes((20, 0), (40.9, 0))
+    labelled = Boxes.from_array(np.concatenate((cars.array(), van.array())), np.array(["Car", "Car", "Van"]))
+    said = sim_to_real.detections(second(small_config()), [frame(labelled)])
+    row = {(r["class"], r["kind"], r["iou"]): r for r in said["scores"]}
+    assert row["Car", "3d", 0.5] == {
+        "class": "Car", "kind": "3d", "iou": 0.5, "targets": 2, "found": 2, "false_positives": 1, "ap": 1.0
+    }  # fmt: skip
+    assert (row["Car", "3d", 0.7]["found"], row["Car", "3d", 0.7]["false_positives"]) == (1, 2)
+    assert row["Pedestrian", "3d", 0.5]["ap"] is None
+    (story,) = said["frames"]
+    assert [car["found_at"] for car in story["cars"]] == [[0.5, 0.7], [0.5]]
