@@ -6,6 +6,7 @@ break up.
 """
 
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,11 +17,11 @@ from shapely.geometry import LineString, Polygon
 from shapely.ops import substring
 
 from flcav.sensors.shading.noise import overlap
-from flcav.world.layers import MapLayers, Marking
+from flcav.world.layers import Arrow, ArrowKind, MapLayers, Marking
 from flcav.world.paint import glyph, stripes
 from flcav.world.rays.compiled import inlined
 
-CELL_M = 2.0
+CELL_M = 1.0
 REACH_M = 0.3  # how far beyond a rectangle its cells go
 STRIP_M = 0.06  # arrows are cut into strips of this length
 COLOURS = {"white": (0.68, 0.68, 0.66), "yellow": (0.62, 0.42, 0.06)}
@@ -43,7 +44,7 @@ def markings_of(layers: MapLayers) -> Markings:
     pieces = [(piece, COLOURS.get(line.colour, COLOURS["white"])) for line in layers.markings for piece in _line(line)]
     white = COLOURS["white"]
     pieces += [(_box(stripe), white) for crossing in layers.crossings for stripe in stripes(crossing)]
-    pieces += [(strip, white) for arrow in layers.arrows for strip in _strips(glyph(arrow), arrow.yaw)]
+    pieces += [(strip, white) for arrow in layers.arrows for strip in _arrow(arrow)]
     rectangle = np.array([piece for piece, _ in pieces], np.float32).reshape(-1, 6)
     colour = np.array([colour for _, colour in pieces], np.float32).reshape(-1, 3)
     return Markings(rectangle, colour, *_grid(rectangle))
@@ -95,19 +96,25 @@ def _box(outline: NDArray[np.float64]) -> Rectangle:
     return x, y, one[0] / length, one[1] / length, length / 2, width / 2
 
 
-def _strips(outline: NDArray[np.float64], yaw: float) -> Iterator[Rectangle]:
-    """Yield a polygon as strips across the direction `yaw`."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    turned = Polygon(outline @ np.array([[cos, -sin], [sin, cos]]))
-    low_x, low_y, high_x, high_y = turned.bounds
+def _arrow(arrow: Arrow) -> Iterator[Rectangle]:
+    cos, sin = float(np.cos(arrow.yaw)), float(np.sin(arrow.yaw))
+    for x, y, half_length, half_width in _strips(arrow.kind):
+        yield arrow.x + cos * x - sin * y, arrow.y + sin * x + cos * y, cos, sin, half_length, half_width
+
+
+@lru_cache(maxsize=16)
+def _strips(kind: ArrowKind) -> tuple[tuple[float, float, float, float], ...]:
+    """Return an arrow about the origin, read along x, as strips: centre x, y, half length, half width."""
+    shape = Polygon(glyph(Arrow(kind, 0.0, 0.0, 0.0, "")))
+    low_x, low_y, high_x, high_y = shape.bounds
+    out = []
     for start in np.arange(low_x, high_x, STRIP_M):
         end = min(start + STRIP_M, high_x)
         middle = (start + end) / 2
-        chord = turned.intersection(LineString([(middle, low_y - 1), (middle, high_y + 1)]))
-        for part in getattr(chord, "geoms", [chord]):
-            if part.length > 0:
-                y = part.centroid.y
-                yield middle * cos - y * sin, middle * sin + y * cos, cos, sin, (end - start) / 2, part.length / 2
+        chord = shape.intersection(LineString([(middle, low_y - 1), (middle, high_y + 1)]))
+        parts = getattr(chord, "geoms", [chord])
+        out += [(middle, part.centroid.y, (end - start) / 2, part.length / 2) for part in parts if part.length > 0]
+    return tuple(out)
 
 
 def _grid(rectangle: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:
@@ -118,17 +125,18 @@ def _grid(rectangle: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[
     half_x, half_y = np.abs(tx) * length + np.abs(ty) * width, np.abs(ty) * length + np.abs(tx) * width
     corner = np.array([(x - half_x).min(), (y - half_y).min()]) - REACH_M
     cells = np.ceil((np.array([(x + half_x).max(), (y + half_y).max()]) + REACH_M - corner) / CELL_M).astype(int) + 1
-    found: list[NDArray[np.int64]] = []
-    for row in range(len(rectangle)):
-        spread = np.array([half_x[row], half_y[row]]) + REACH_M
-        low, high = ((np.array([x[row], y[row]]) + side * spread - corner) / CELL_M for side in (-1, 1))
-        i, j = np.mgrid[int(low[0]) : int(high[0]) + 1, int(low[1]) : int(high[1]) + 1].reshape(2, -1)
-        dx, dy = corner[0] + (i + 0.5) * CELL_M - x[row], corner[1] + (j + 0.5) * CELL_M - y[row]
-        near = 0.71 * CELL_M + REACH_M
-        within = np.abs(dx * tx[row] + dy * ty[row]) < length[row] + near
-        within &= np.abs(dy * tx[row] - dx * ty[row]) < width[row] + near
-        found.append(np.stack((i[within] * cells[1] + j[within], np.full(within.sum(), row)), axis=1))
-    pairs = np.concatenate(found)
+    spread = np.stack((half_x, half_y), axis=1) + REACH_M
+    low, high = ((rectangle[:, :2] + side * spread - corner) // CELL_M for side in (-1, 1))
+    across = high - low + 1
+    count = across.prod(axis=1).astype(np.int64)
+    row = np.repeat(np.arange(len(rectangle)), count)
+    number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    i, j = (low[row].T + np.divmod(number, across[row, 1])).astype(np.int64)
+    dx, dy = corner[0] + (i + 0.5) * CELL_M - x[row], corner[1] + (j + 0.5) * CELL_M - y[row]
+    near = 0.71 * CELL_M + REACH_M
+    within = np.abs(dx * tx[row] + dy * ty[row]) < length[row] + near
+    within &= np.abs(dy * tx[row] - dx * ty[row]) < width[row] + near
+    pairs = np.stack((i * cells[1] + j, row), axis=1)[within]
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
     starts = np.searchsorted(pairs[:, 0], np.arange(cells[0] * cells[1] + 1)).astype(np.int32)
     first = np.empty((cells[0], cells[1] + 1), np.int32)

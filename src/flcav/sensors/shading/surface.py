@@ -70,13 +70,8 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
                 blue += share * (colour[piece, 2] * tone - blue)
             if light.to_sun[2] < np.float32(LOW_SUN) and nz > np.float32(0.9):
                 beside = dx * light.to_sun[0] + dy * light.to_sun[1] - dz * light.to_sun[2]
-                sheen = (
-                    lit
-                    * np.float32(SHEEN)
-                    * (1 - facing)
-                    * (1 - facing)
-                    * np.exp(np.float32(SHEEN_GLOSS) * (beside - 1))
-                )
+                flat = 1 - facing
+                sheen = lit * np.float32(SHEEN) * flat * flat * np.exp(np.float32(SHEEN_GLOSS) * (beside - 1))
                 shine_r, shine_g, shine_b = sheen * light.sun[0], sheen * light.sun[1], sheen * light.sun[2]
         elif material == SIDEWALK:
             if nz > np.float32(0.5):
