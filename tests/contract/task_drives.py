@@ -44,7 +44,7 @@ class Drives:
     def trace(self, scene: str) -> Trace | None:
         if not self.traffic:
             return None
-        time_s = np.arange(-2.5, 3.6, 0.5)
+        time_s = np.arange(-25, 36) / 10
         count = len(time_s)
         position = np.stack((12 + SPEED * time_s, np.full(count, 3.0), np.zeros(count)), axis=1)
         return Trace(

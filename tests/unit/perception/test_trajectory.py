@@ -270,7 +270,7 @@ def test_paths_begin_as_constant_velocity_and_look_where_they_are():
 
 
 def test_rays_meet_the_ground_where_it_projects_from():
-    settings = CrossView()
+    settings = CrossView(width_px=128, height_px=64)
     intrinsics = np.array([[60.0, 0, 63.5], [0, 60.0, 31.5], [0, 0, 1]])
     optical = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     frame_from_camera = pose(1.0, 0.5, 1.5, 0.6, 0.2) @ optical
@@ -294,7 +294,7 @@ def test_resized_pictures_keep_their_rays():
 
 
 def test_cameras_are_learned_through_end_to_end():
-    network = fresh(TRAJECTORY, TrajectoryConfig(cameras=CrossView()), 1)
+    network = fresh(TRAJECTORY, TrajectoryConfig(cameras=CrossView(width_px=128, height_px=64)), 1)
     random = torch.Generator().manual_seed(0)
     pictures = torch.rand(2, 6, 3, 64, 128, generator=random)
     intrinsics = torch.tensor([[60.0, 0, 63.5], [0, 60.0, 31.5], [0, 0, 1]]).expand(2, 6, 3, 3)

@@ -33,8 +33,8 @@ class Patch:
 class CrossView:
     """A cross-view transformer: pictures of several cameras to features on the ground."""
 
-    width_px: Annotated[int, Field(ge=32, multiple_of=16)] = 128  # pictures are resized to this
-    height_px: Annotated[int, Field(ge=32, multiple_of=16)] = 64
+    width_px: Annotated[int, Field(ge=32, multiple_of=16)] = 96  # pictures are resized to this
+    height_px: Annotated[int, Field(ge=32, multiple_of=16)] = 48
     features: Annotated[int, Field(ge=8, multiple_of=8)] = 32
     heads: Annotated[int, Field(ge=1)] = 4
     layers: Annotated[int, Field(ge=1)] = 1  # of attention, one after another

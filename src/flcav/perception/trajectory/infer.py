@@ -16,7 +16,7 @@ from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.rasters import OPEN
 from flcav.perception.trajectory.roads import STATIC_ROWS, RoadMap, roads_of
-from flcav.perception.trajectory.samples import Samples, present_at, traffic
+from flcav.perception.trajectory.samples import Samples, present_at, seen_from, traffic
 from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame
 from flcav.world.lanes import rasterise
 from flcav.world.trace import Trace
@@ -60,7 +60,7 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
     key, config = data.keys[number], network.config
     instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
     if config.cameras:
-        wanted = trace.actor == key.agent
+        wanted = seen_from(trace, key)
     else:
         apart = into_frame(trace.position[None, instant, :, :2], observer[None])[0]
         wanted = (np.abs(apart) <= AROUND_M).all(axis=1)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
 from flcav.perception.task import of_frames
 from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
@@ -18,6 +19,7 @@ from flcav.perception.trajectory.surround import Surround, surround
 from flcav.perception.trajectory.tracks import check_instants, into_frame, tracks_around
 from flcav.world.trace import Trace
 
+SEEN_M = 25.0  # from the cameras to a road user whose way is predicted through them
 LOOKED_AT_AGAIN = 4  # so many sets of samples are kept, so that validation does not extract its own anew
 
 
@@ -67,8 +69,9 @@ class Samples(Sequence[Sample]):
 def samples_of(data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | None = None) -> Samples:
     """Return the samples of frames of a dataset whose past and future are known.
 
-    With rasters those are all vehicles on the road at the frames' instants, whoever observes; with cameras each frame's
-    own vehicle. Raises `InputError` where the dataset lacks traffic, or pictures, or holds no such sample.
+    With rasters those are all vehicles on the road at the frames' instants, whoever observes; with cameras those near
+    each frame's own vehicle, itself too. Raises `InputError` where the dataset lacks traffic, its map or pictures, or
+    holds no such sample.
     """
     return _samples(data, config.patch, config.cameras, tuple(of_frames(data, frames)))
 
@@ -78,8 +81,7 @@ def _samples(data: Dataset, patch: Patch, cameras: CrossView | None, frames: tup
     parts = list(_parts(data, patch, cameras, frames))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in COLUMNS}
     if not len(columns["past"]):
-        who = "observing vehicle" if cameras else "vehicle"
-        raise InputError(f"{data.folder}: no {who} is there from 2 s before to 3 s after any of the frames")
+        raise InputError(f"{data.folder}: no vehicle is there from 2 s before to 3 s after any of the frames")
     return Samples(data, columns, cameras)
 
 
@@ -96,7 +98,7 @@ def _parts(
         if cameras:
             if not data.cameras(number):
                 raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
-            wanted = trace.actor == key.agent
+            wanted = seen_from(trace, key)
         elif (key.scene, key.index) in seen:
             continue
         else:
@@ -114,6 +116,16 @@ def traffic(data: Dataset, scene: str) -> Trace:
         raise InputError(f"{data.folder}: no traffic of scene '{scene}' was recorded, which 'trajectory' needs")
     check_instants(trace, f"{data.folder}, scene '{scene}'")
     return trace
+
+
+def seen_from(trace: Trace, key: FrameKey) -> NDArray[np.bool_]:
+    """Return (A,) who is within `SEEN_M` of the observing vehicle, itself too; nobody where a pole observes."""
+    instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
+    own = trace.actor == key.agent
+    if not own.any():
+        return own
+    apart = trace.position[instant, :, :2] - trace.position[instant, own, :2]
+    return np.linalg.norm(apart, axis=1) <= SEEN_M  # not those who are absent
 
 
 def present_at(

@@ -1,5 +1,6 @@
 """What an agent's cameras see around a road user: small pictures, and how its ground projects into them."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ from flcav.perception.trajectory.config import CrossView
 
 Array = NDArray[np.float64]
 
+KEPT = 1000  # frames whose pictures are kept at hand
+
 
 class Surround(NamedTuple):
     """The pictures of n cameras around a road user at one instant."""
@@ -23,17 +26,21 @@ class Surround(NamedTuple):
 
 def surround(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
     """Return what the cameras of frame `number` see, as the agent believes them to be, around `present` x, y, yaw."""
+    pictures, intrinsics, camera_from_world = _seen(data, number, settings)
+    world_from_frame = pose(float(present[0]), float(present[1]), yaw=float(present[2]))
+    return Surround(pictures, intrinsics, camera_from_world @ world_from_frame)
+
+
+@lru_cache(maxsize=KEPT)
+def _seen(data: Dataset, number: int, settings: CrossView) -> tuple[NDArray[np.uint8], Array, Array]:
     frame = data.frame(number)
     pictures, intrinsics, views = [], [], []
     for camera in data.cameras(number):
         rgb = checked_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}/{camera}")
         pictures.append(resized(rgb, settings.width_px, settings.height_px))
         intrinsics.append(rescaled(frame.assumed.intrinsics[camera], rgb, settings))
-        views.append(
-            inverse(frame.assumed_world_from_sensor(camera))
-            @ pose(float(present[0]), float(present[1]), yaw=float(present[2]))
-        )
-    return Surround(np.stack(pictures), np.stack(intrinsics), np.stack(views))
+        views.append(inverse(frame.assumed_world_from_sensor(camera)))
+    return np.stack(pictures), np.stack(intrinsics), np.stack(views)
 
 
 def rescaled(intrinsics: Array, rgb: Picture, settings: CrossView) -> Array:
