@@ -9,7 +9,8 @@ from flcav.world.rays.compiled import compiled
 
 ROAD = int(Material.ROAD)
 WATER = 0.02  # reflectance face on
-SMEAR_PX = 11  # half height of the blur of mirrored things, in pixels of half size
+SMEAR_PX = 15  # half height of the blur of mirrored things, in pixels of half size
+RIPPLE_PX = 6.0  # how far ripples push what they mirror aside, alike
 STREAKS_PER_MM = 55.0  # in a picture of 640 x 384, at 1 mm/h, growing with the rain's power of 0.6
 DROPS_PER_MM = 3.0  # on a lens, at 1 mm/h, growing alike; whatever its size
 DROP_VIEW = 0.45  # of the picture's height that a drop shows, upside down
@@ -39,7 +40,8 @@ def smear(image, weight, width, height, out):
             total = np.float32(0)
             red, green, blue = np.float32(0), np.float32(0), np.float32(0)
             for b in range(max(j - SMEAR_PX, 0), min(j + SMEAR_PX + 1, height)):
-                share = weight[b, i] * np.float32(SMEAR_PX + 1 - abs(b - j))
+                near = np.float32(SMEAR_PX + 1 - abs(b - j))
+                share = weight[b, i] * near * near
                 total += share
                 red += share * image[b, i, 0]
                 green += share * image[b, i, 1]
@@ -64,7 +66,9 @@ def add_mirrored(radiance, seen, appearance, mirrored, wetness, extinction, widt
         share = np.float32(WATER) + (1 - np.float32(WATER)) * grazing * grazing * grazing * grazing * grazing
         share *= wetness * (np.float32(0.35) + np.float32(0.65) * puddle)
         share *= np.exp(-extinction * seen.distance[pixel])
-        j, i = min(pixel // width // 2, height // 2 - 1), min(pixel % width // 2, width // 2 - 1)
+        ripple = (noise_at(appearance.noise, x * 5.0, y * 5.0) - np.float32(0.5)) * RIPPLE_PX
+        j = min(pixel // width // 2, height // 2 - 1)
+        i = min(max(int(pixel % width / 2 + ripple), 0), width // 2 - 1)
         for band in range(3):
             radiance[pixel, band] += share * (mirrored[j, i, band] - np.float32(0.4) * radiance[pixel, band])
 
