@@ -52,13 +52,13 @@ STUDY = Study(
     network="tiny",
     train=(
         {**RECIPE, "town": "ring", "seed": 13, "scenes": 36},
-        {**RECIPE, "town": "suburb", "seed": 113, "scenes": 36},
+        {**RECIPE, "town": "suburb", "seed": 113, "scenes": 20},
     ),
-    validation={**RECIPE, "town": "ring", "seed": 213, "split": "validation", "scenes": 12},
+    validation={**RECIPE, "town": "ring", "seed": 213, "split": "validation", "scenes": 10},
     tests={
-        "held-out scenes": {**RECIPE, "town": "ring", "seed": 313, "split": "test", "scenes": 16},
-        "held-out town": {**RECIPE, "town": "grid", "seed": 413, "split": "test", "scenes": 16},
-        WHOLE_SPACE: {**RECIPE, "town": "ring", "seed": 513, "split": "test", "scenes": 16, "weather": ANY_WEATHER},
+        "held-out scenes": {**RECIPE, "town": "ring", "seed": 313, "split": "test", "scenes": 10},
+        "held-out town": {**RECIPE, "town": "grid", "seed": 413, "split": "test", "scenes": 10},
+        WHOLE_SPACE: {**RECIPE, "town": "ring", "seed": 513, "split": "test", "scenes": 10, "weather": ANY_WEATHER},
     },
     epochs=60,
     patience=15,
