@@ -1,4 +1,7 @@
-"""Predicted paths on the map: each mode as faint as it is unlikely, the truth, and where nobody would turn or brake."""
+"""Predicted paths on the map: each mode as faint as it is unlikely, the truth, and where nobody would turn or brake.
+
+The mode for who wants a single one is the thickest.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -28,6 +31,15 @@ def draw_paths(layers: NDArray[np.bool_], result: Mapping[str, Any], title: str)
     """
     figure = style.canvas(7.2, 7.9)
     axes = figure.add_subplot()
+    paths_on_map(axes, layers, result)
+    style.scale_bar(axes, 10)
+    axes.set_title(f"{title} · {len(result['agents'])} predicted")
+    style.key(figure, _legend(result["time_s"][-1], bool(result["lights"])))
+    return figure
+
+
+def paths_on_map(axes: Axes, layers: NDArray[np.bool_], result: Mapping[str, Any]) -> None:
+    """Draw the map with the paths of a finding on `axes`, see `draw_paths`; agents may have no modes."""
     axes.set(xlim=(-AROUND_M, AROUND_M), ylim=(-AROUND_M, AROUND_M), aspect="equal")
     axes.imshow(_ground(layers), extent=(-AROUND_M, AROUND_M, -AROUND_M, AROUND_M), interpolation="antialiased")
     observer = np.array([result["observer"][name] for name in ("x", "y", "yaw")])
@@ -39,10 +51,6 @@ def draw_paths(layers: NDArray[np.bool_], result: Mapping[str, Any], title: str)
         _draw_agent(axes, agent, observer)
     axes.plot(0, 0, "^", markersize=6, color=style.INK, markeredgecolor="white", zorder=8)
     style.bare(axes)
-    style.scale_bar(axes, 10)
-    axes.set_title(f"{title} · {len(result['agents'])} predicted")
-    style.key(figure, _legend(result["time_s"][-1], bool(result["lights"])))
-    return figure
 
 
 def _ground(layers: NDArray[np.bool_]) -> Array:
@@ -59,7 +67,6 @@ def _draw_agent(axes: Axes, agent: Mapping[str, Any], observer: Array) -> None:
     here = np.array([agent["x"], agent["y"]])
     outline = _on_page(corners @ turn + here, observer)
     axes.add_patch(Polygon(outline, facecolor="white", edgecolor=style.INK, linewidth=0.8, zorder=4))
-    likeliest = max(mode["probability"] for mode in agent["modes"])
 
     def line(path: Sequence[Sequence[float]], **look: Any) -> Array:
         points = _on_page(np.array([here, *path]), observer)
@@ -67,9 +74,9 @@ def _draw_agent(axes: Axes, agent: Mapping[str, Any], observer: Array) -> None:
         return points[-1]
 
     line(agent["constant_velocity"], color=PLAIN, linewidth=1.2, linestyle=(0, (2, 1.5)), zorder=5)
-    for mode in reversed(agent["modes"]):
+    for number, mode in reversed(list(enumerate(agent["modes"]))):
         look = {"color": PREDICTED, "alpha": max(FAINTEST, mode["probability"]), "zorder": 6}
-        end = line(mode["path"], linewidth=2.4 if mode["probability"] == likeliest else 1.6, **look)
+        end = line(mode["path"], linewidth=2.4 if number == 0 else 1.6, **look)
         axes.plot(*end, "o", markersize=4, markeredgewidth=0, **look)
     if agent["truth"] is not None:
         line(agent["truth"], color=TRUTH, linewidth=1.0, zorder=7)

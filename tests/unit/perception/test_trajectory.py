@@ -202,7 +202,10 @@ def test_errors_by_hand():
     errors = errors_of(paths, shares, future, plain)
     for i in range(5):
         off = [[np.hypot(*(paths[i, k, t] - future[i, t])) for t in range(FUTURE)] for k in range(4)]
-        first = off[int(np.argmax(shares[i]))]
+        expected = [
+            sum(shares[i, j] * np.hypot(*(paths[i, k] - paths[i, j]).T).mean() for j in range(4)) for k in range(4)
+        ]
+        first = off[int(np.argmin(expected))]
         assert np.isclose(errors["minADE_1"][i], np.mean(first))
         assert np.isclose(errors["minFDE_1"][i], first[-1])
         assert np.isclose(errors["minADE_K"][i], min(np.mean(row) for row in off))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.perception.trajectory.predict import single
 from flcav.perception.trajectory.tracks import constant_velocity
 
 Array = NDArray[np.float64]
@@ -43,9 +44,9 @@ def turning(future: Array) -> NDArray[np.bool_]:
 
 
 def errors_of(paths: Array, probabilities: Array, future: Array, baseline: Array) -> dict[str, Array]:
-    """Return (N,) errors [m] by name: average and final, of the likeliest mode, the best mode and the baseline."""
+    """Return (N,) errors [m] by name: average and final, of one mode (`single`), the best mode and the baseline."""
     off = np.linalg.norm(paths - future[:, None], axis=3)  # (N, K, FUTURE)
-    first = np.take_along_axis(off, probabilities.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+    first = np.take_along_axis(off, single(paths, probabilities)[:, None, None], axis=1)[:, 0]
     plain = np.linalg.norm(baseline - future, axis=2)
     return {
         "minADE_1": first.mean(axis=1),

@@ -13,7 +13,7 @@ from flcav.geometry import pose, yaw_of
 from flcav.perception.task import Finding
 from flcav.perception.trajectory.config import FUTURE, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.predict import predict
+from flcav.perception.trajectory.predict import predict, single
 from flcav.perception.trajectory.rasters import OPEN
 from flcav.perception.trajectory.roads import STATIC_ROWS, RoadMap, roads_of
 from flcav.perception.trajectory.samples import Samples, present_at, seen_from, traffic
@@ -33,9 +33,9 @@ def findings(network: TrajectoryNetwork, path: Path) -> Iterator[Finding]:
 
     The result is in the world's frame: {"time_s": [...], "observer": {"x", "y", "yaw"}, "lights": [{"x", "y",
     "open"}], "agents": [{"track", "class", "x", "y", "yaw", "speed", "length", "width", "modes": [{"probability",
-    "path": [[x, y], ...]}], "constant_velocity": [...], "truth": [...] or None}]}. It is shown on the map around the
-    observer, (len(STATIC), H, W), row 0 ahead of him and column 0 to his left. Frames whose
-    vehicles have no past of 2 s yet have no agents.
+    "path": [[x, y], ...]}], "constant_velocity": [...], "truth": [...] or None}]}. The first mode is the one for who
+    wants a single one, the others come by probability. All is shown on the map around the observer, (len(STATIC), H, W),
+    row 0 ahead of it and column 0 to its left. Frames whose vehicles have no past of 2 s yet have no agents.
     """
     read_manifest(path)
     data = Dataset.open(path)
@@ -70,6 +70,7 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
     agents = []
     if count:
         paths, probabilities = predict(network, Samples(data, columns, config.cameras))
+        first = single(paths, probabilities)
         present, plain = columns["pose"], constant_velocity(columns["past"])
         for i, actor in enumerate(columns["actor"]):
             modes = [
@@ -84,7 +85,7 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
                     **dict(zip(("x", "y", "yaw"), present[i].tolist())),
                     "speed": float(columns["past"][i, -1, 3]),
                     **dict(zip(("length", "width"), trace.size[actor, :2].tolist())),
-                    "modes": sorted(modes, key=lambda mode: -mode["probability"]),
+                    "modes": [modes.pop(first[i]), *sorted(modes, key=lambda mode: -mode["probability"])],
                     "constant_velocity": _in_world(plain[i], present[i]),
                     "truth": _in_world(truth, present[i]) if np.isfinite(truth).all() else None,
                 }

@@ -31,3 +31,13 @@ def predict(network: TrajectoryNetwork, samples: Sequence[Sample], progress: Rep
             progress(first + len(batch), len(samples), "")
     network.train(training)
     return np.concatenate(paths), np.concatenate(probabilities)
+
+
+def single(paths: Array, probabilities: Array) -> NDArray[np.int64]:
+    """Return (N,) which of the modes is given where only one is asked for: the medoid of the forecast.
+
+    Of all modes it has the least expected distance, over all steps, to the way that is taken, as far as the forecast
+    itself knows; several that go much the same way count together, which the likeliest alone would not.
+    """
+    apart = np.linalg.norm(paths[:, :, None] - paths[:, None], axis=4).mean(axis=3)  # (N, K, K)
+    return (apart * probabilities[:, None]).sum(axis=2).argmin(axis=1)

@@ -100,13 +100,12 @@ class TrajectoryTask:
         return lines
 
     def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return each road user's likeliest way."""
+        """Return where each road user will be, by one mode."""
         lines = []
         for agent in result["agents"]:
-            best = max(agent["modes"], key=lambda mode: mode["probability"])
-            x, y = best["path"][-1]
+            x, y = agent["modes"][0]["path"][-1]
             said = f"at ({agent['x']:.1f}, {agent['y']:.1f}), in {result['time_s'][-1]:g} s at ({x:.1f}, {y:.1f})"
-            lines.append(f"{agent['track']} {said}, {best['probability']:.2f}")
+            lines.append(f"{agent['track']} {said}")
         return lines or ["nobody to predict"]
 
 
