@@ -14,7 +14,7 @@ from flcav.config import InputError
 from flcav.geometry import inverse, pose
 from flcav.perception.task import configuration, fresh
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S, CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.cross_view import pixel_grid, place_grid, rays
+from flcav.perception.trajectory.cross_view import CrossViewEncoder, pixel_grid, place_grid, rays
 from flcav.perception.trajectory.evaluate import errors_of, metrics, turning
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
 from flcav.perception.trajectory.model import Forecast, Inputs
@@ -205,9 +205,9 @@ def test_errors_by_hand():
         expected = [
             sum(shares[i, j] * np.hypot(*(paths[i, k] - paths[i, j]).T).mean() for j in range(4)) for k in range(4)
         ]
-        first = off[int(np.argmin(expected))]
-        assert np.isclose(errors["minADE_1"][i], np.mean(first))
-        assert np.isclose(errors["minFDE_1"][i], first[-1])
+        for name, first in (("min%s_1", off[int(np.argmax(shares[i]))]), ("single_%s", off[int(np.argmin(expected))])):
+            assert np.isclose(errors[name % "ADE"][i], np.mean(first))
+            assert np.isclose(errors[name % "FDE"][i], first[-1])
         assert np.isclose(errors["minADE_K"][i], min(np.mean(row) for row in off))
         assert np.isclose(errors["minFDE_K"][i], min(row[-1] for row in off))
         assert np.isclose(errors["constant_velocity_FDE"][i], np.hypot(*(plain[i, -1] - future[i, -1])))
@@ -278,9 +278,8 @@ def test_rays_meet_the_ground_where_it_projects_from():
     optical = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     frame_from_camera = pose(1.0, 0.5, 1.5, 0.6, 0.2) @ optical
     camera_from_frame = inverse(frame_from_camera)
-    looks, stands = rays(
-        *(torch.from_numpy(a)[None, None] for a in (intrinsics, camera_from_frame)), pixel_grid(settings).double()
-    )
+    given = [torch.from_numpy(matrix)[None, None] for matrix in (intrinsics, camera_from_frame)]
+    looks, stands = rays(given[0], given[1], pixel_grid(settings).double())
     assert np.allclose(stands[0, 0] * 10, (1.0, 0.5, 1.5))
     down = looks[0, 0, :, 2] < -0.05
     ground = stands[0, 0] * 10 - looks[0, 0, down] * (1.5 / looks[0, 0, down, 2:])
@@ -306,6 +305,7 @@ def test_cameras_are_learned_through_end_to_end():
     assert forecast.map_logits is not None
     assert forecast.map_logits.shape == (2, 4, 32, 32)
     forecast_loss(forecast, torch.ones(2, FUTURE, 2)).backward()
+    assert isinstance(network.view, CrossViewEncoder)
     first = next(network.view.pictures.parameters())
     assert first.grad is not None
     assert first.grad.abs().sum() > 0

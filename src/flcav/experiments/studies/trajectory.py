@@ -35,7 +35,7 @@ CAMERA_RECIPE: RecipeFields = RECIPE | {
 }
 PREDICTORS = {
     "constant velocity": "constant_velocity_FDE",
-    "one mode": "minFDE_1",
+    "single path": "single_FDE",
     "best of six modes": "minFDE_K",
 }
 JUNCTIONS = "at junctions"

@@ -12,6 +12,7 @@ from flcav.perception.trajectory.tracks import constant_velocity
 Array = NDArray[np.float64]
 
 MISS_M = 2.0  # a last position farther off than this is a miss
+RATIOS = ("1", "K", "single")  # of final errors to constant velocity's
 TURN = np.radians(20.0)  # between heading at present and from the last second's displacement
 
 
@@ -44,15 +45,18 @@ def turning(future: Array) -> NDArray[np.bool_]:
 
 
 def errors_of(paths: Array, probabilities: Array, future: Array, baseline: Array) -> dict[str, Array]:
-    """Return (N,) errors [m] by name: average and final, of one mode (`single`), the best mode and the baseline."""
+    """Return (N,) errors [m] by name: average and final, of the likeliest and the best mode, `single`, the baseline."""
     off = np.linalg.norm(paths - future[:, None], axis=3)  # (N, K, FUTURE)
-    first = np.take_along_axis(off, single(paths, probabilities)[:, None, None], axis=1)[:, 0]
+    everyone = np.arange(len(off))
+    likeliest, only = off[everyone, probabilities.argmax(axis=1)], off[everyone, single(paths, probabilities)]
     plain = np.linalg.norm(baseline - future, axis=2)
     return {
-        "minADE_1": first.mean(axis=1),
-        "minFDE_1": first[:, -1],
+        "minADE_1": likeliest.mean(axis=1),
+        "minFDE_1": likeliest[:, -1],
         "minADE_K": off.mean(axis=2).min(axis=1),
         "minFDE_K": off[..., -1].min(axis=1),
+        "single_ADE": only.mean(axis=1),
+        "single_FDE": only[:, -1],
         "constant_velocity_ADE": plain.mean(axis=1),
         "constant_velocity_FDE": plain[:, -1],
     }
@@ -63,13 +67,12 @@ def _numbers(errors: Mapping[str, Array]) -> dict[str, Any] | None:
     if not count:
         return None
     means = {name: float(error.mean()) for name, error in errors.items()}
-    finals = {"1": "minFDE_1", "K": "minFDE_K", "constant_velocity": "constant_velocity_FDE"}
+    finals = {"1": "minFDE_1", "K": "minFDE_K", "single": "single_FDE", "constant_velocity": "constant_velocity_FDE"}
     misses = {f"miss_rate_{key}": float((errors[name] > MISS_M).mean()) for key, name in finals.items()}
     plain = means["constant_velocity_FDE"]
     return {
         "samples": count,
         **means,
         **misses,
-        "ratio_1": means["minFDE_1"] / plain if plain else None,
-        "ratio_K": means["minFDE_K"] / plain if plain else None,
+        **{f"ratio_{key}": means[name] / plain if plain else None for key, name in finals.items() if key in RATIOS},
     }

@@ -34,7 +34,7 @@ def findings(network: TrajectoryNetwork, path: Path) -> Iterator[Finding]:
     The result is in the world's frame: {"time_s": [...], "observer": {"x", "y", "yaw"}, "lights": [{"x", "y",
     "open"}], "agents": [{"track", "class", "x", "y", "yaw", "speed", "length", "width", "modes": [{"probability",
     "path": [[x, y], ...]}], "constant_velocity": [...], "truth": [...] or None}]}. The first mode is the one for who
-    wants a single one, the others come by probability. All is shown on the map around the observer, (len(STATIC), H, W),
+    wants a single one, the others come by probability. It is shown on the map around the observer, (len(STATIC), H, W),
     row 0 ahead of it and column 0 to its left. Frames whose vehicles have no past of 2 s yet have no agents.
     """
     read_manifest(path)

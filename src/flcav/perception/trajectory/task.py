@@ -61,13 +61,13 @@ class TrajectoryTask:
         *,
         progress: Report = silent,
     ) -> dict[str, Any]:
-        """Return errors of one and of K modes and of constant velocity by slice, see `metrics`."""
+        """Return errors of a single path, of K modes and of constant velocity by slice, see `metrics`."""
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
         return metrics(paths, probabilities, samples.columns)
 
     def score(self, result: Mapping[str, Any]) -> float:
-        """Return 1 / (1 + the mean of both final errors, of one and of K modes, in metres)."""
+        """Return 1 / (1 + the mean of the likeliest and the best mode's final error in metres)."""
         every = result["slices"]["all"]
         return 1 / (1 + (every["minFDE_1"] + every["minFDE_K"]) / 2)
 
@@ -84,7 +84,8 @@ class TrajectoryTask:
                 continue
             lines.append(f"{name}: {numbers['samples']} samples")
             for label, ade, fde, missed in (
-                ("one mode", "minADE_1", "minFDE_1", "miss_rate_1"),
+                ("single path", "single_ADE", "single_FDE", "miss_rate_single"),
+                ("likeliest mode", "minADE_1", "minFDE_1", "miss_rate_1"),
                 (f"best of {result['modes']}", "minADE_K", "minFDE_K", "miss_rate_K"),
                 (
                     "constant velocity",
