@@ -6,7 +6,7 @@ import torch.nn.functional as F
 
 from flcav.perception.ops import rules as rules_module
 from flcav.perception.ops.rules import cells_of, keys_of, strided_rules, submanifold_rules
-from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d
+from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d, sparse_convolution
 
 GRIDS = [((9, 14, 11), 2, 0.15), ((5, 20, 7), 3, 0.4), ((4, 3, 3), 1, 1.0), ((6, 9, 8), 2, 0.01)]
 STRIDED = [
@@ -78,9 +78,29 @@ def test_keys_and_cells_are_inverse():
     assert (x.keys.diff() > 0).all()
 
 
-def rows(rules):
-    grouped = [(group.order, group.begins) for group in (rules.by_target, rules.by_source) if group is not None]
-    return [rules.source, rules.target, *(tensor for group in grouped for tensor in group)]
+def assert_same_pairs(compiled, plain):
+    assert (compiled.counts, compiled.targets) == (plain.counts, plain.targets)
+    assert torch.equal(compiled.source, plain.source)
+    assert torch.equal(compiled.target, plain.target)
+
+
+@pytest.mark.parametrize(("shape", "samples", "share"), GRIDS)
+def test_the_grouped_sum_of_other_devices_equals_the_compiled_one(shape, samples, share):
+    x = scene(shape, samples, share)[3]
+    compiled = submanifold_rules(x.keys, shape)
+    plain = rules_module._submanifold_rules(x.keys, shape[1] + 2, shape[2] + 2)
+    pairs = [(compiled, plain)]
+    for kernel, stride, padding in STRIDED:
+        one, _, out_shape = strided_rules(x.keys, shape, kernel, stride, padding, samples)
+        pairs.append((one, rules_module._strided_rules(x.keys, shape, kernel, stride, padding, out_shape, samples)[0]))
+    for one, other in pairs:
+        weight = torch.randn(len(one.counts), 5, 6, dtype=torch.float64, requires_grad=True)
+        a, b = sparse_convolution(x.features, weight, one), sparse_convolution(x.features, weight, other)
+        assert torch.allclose(a, b, atol=1e-12)
+        for ours, theirs in zip(
+            *(torch.autograd.grad(y.square().sum(), (x.features, weight)) for y in (a, b)), strict=True
+        ):
+            assert torch.allclose(ours, theirs, atol=1e-10)
 
 
 @pytest.mark.parametrize(("shape", "samples", "share"), GRIDS)
@@ -88,17 +108,24 @@ def test_compiled_rules_equal_the_tensor_rules(shape, samples, share):
     x = scene(shape, samples, share)[3]
     compiled = submanifold_rules(x.keys, shape)
     plain = rules_module._submanifold_rules(x.keys, shape[1] + 2, shape[2] + 2)
-    assert compiled.counts == plain.counts
-    assert all(torch.equal(a, b) for a, b in zip(rows(compiled), rows(plain), strict=True))
+    assert_same_pairs(compiled, plain)
     for kernel, stride, padding in STRIDED:
         compiled, keys, out_shape = strided_rules(x.keys, shape, kernel, stride, padding, samples)
         plain, plain_keys = rules_module._strided_rules(x.keys, shape, kernel, stride, padding, out_shape, samples)
         assert torch.equal(keys, plain_keys)
-        assert compiled.counts == plain.counts
-        assert all(torch.equal(a, b) for a, b in zip(rows(compiled), rows(plain), strict=True))
+        assert_same_pairs(compiled, plain)
 
 
-def test_training_after_inference_reuses_the_buffers():
+def test_blocks_shorter_than_an_offset_give_the_same():
+    _, cells, features, x = scene((9, 14, 11), 2, 0.3, channels=70)  # blocks of 53 pairs
+    layer = SubmanifoldConv3d(70, 70).double()
+    kernel = layer.weight.view(3, 3, 3, 70, 70).permute(4, 3, 0, 1, 2)
+    dense = F.conv3d(dense_of(features, cells, (9, 14, 11), 2), kernel, padding=1)
+    wanted = dense.permute(0, 2, 3, 4, 1)[tuple(cells.t())]
+    assert (layer(x).features - wanted).abs().max() < 1e-9
+
+
+def test_training_after_inference():
     _, _, _, x = scene((5, 6, 7), 1, 0.3)
     layer = SubmanifoldConv3d(5, 6).double()
     with torch.inference_mode():

@@ -3,24 +3,24 @@
 Sorted keys make a neighbour search a merge of the list with itself, shifted: each offset costs one pass.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from flcav.world.rays.compiled import compiled
 
 Int32s = NDArray[np.int32]
 Int64s = NDArray[np.int64]
 
 
-@numba.njit(cache=True)
-def submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int64s, Int32s, Int32s]:
-    """Return source, target, pairs per offset, and the grouping by target (order, begins) of a 3x3x3 convolution.
+@compiled
+def submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int64s]:
+    """Return source, target and pairs per offset of a 3x3x3 convolution.
 
     keys (N,) ascending; steps (13,) key differences of the later half of the offsets.
     """
     count, half = len(keys), len(steps)
     later = np.empty((half, count), dtype=np.int32)  # the neighbour at each later offset, -1 for none
     per_offset = np.zeros(2 * half + 1, dtype=np.int64)
-    per_target = np.ones(count, dtype=np.int32)
     for k in range(half):
         place, found = 0, 0
         for row in range(count):
@@ -29,8 +29,6 @@ def submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int6
                 place += 1
             if place < count and keys[place] == wanted:
                 later[k, row] = place
-                per_target[row] += 1
-                per_target[place] += 1
                 found += 1
             else:
                 later[k, row] = -1
@@ -39,12 +37,6 @@ def submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int6
     per_offset[half] = count
     pairs = per_offset.sum()
     source, target = np.empty(pairs, dtype=np.int32), np.empty(pairs, dtype=np.int32)
-    begins, order = np.empty(count, dtype=np.int32), np.empty(pairs, dtype=np.int32)
-    total = 0
-    for row in range(count):
-        begins[row] = total
-        total += per_target[row]
-    cursor = begins.copy()
     pair = 0
     for offset in range(2 * half + 1):
         for row in range(count):
@@ -54,18 +46,14 @@ def submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int6
                 other = later[offset - half - 1, row]
             else:
                 other = later[half - 1 - offset, row]
-            if other < 0:
-                continue
-            to = other if offset < half else row
-            source[pair] = row if offset < half else other
-            target[pair] = to
-            order[cursor[to]] = pair
-            cursor[to] += 1
-            pair += 1
-    return source, target, per_offset, order, begins
+            if other >= 0:
+                source[pair] = row if offset < half else other
+                target[pair] = other if offset < half else row
+                pair += 1
+    return source, target, per_offset
 
 
-@numba.njit(cache=True)
+@compiled
 def strided_pairs(
     keys: Int64s, samples: int, shape: Int64s, kernel: Int64s, stride: Int64s, padding: Int64s, out_shape: Int64s
 ) -> tuple[Int32s, Int32s, Int64s, Int64s]:
@@ -117,20 +105,3 @@ def strided_pairs(
                 source[pair], target[pair] = row, number[key]
                 pair += 1
     return source, target, per_offset, out_keys
-
-
-@numba.njit(cache=True)
-def grouped(row: Int32s, rows: int) -> tuple[Int32s, Int32s]:
-    """Return pair numbers sorted by row (P,), stably, and where each row's pairs begin (rows,)."""
-    begins = np.zeros(rows + 1, dtype=np.int32)
-    for r in row:
-        begins[r + 1] += 1
-    for r in range(rows):
-        begins[r + 1] += begins[r]
-    cursor = begins[:-1].copy()
-    order = np.empty(len(row), dtype=np.int32)
-    for pair in range(len(row)):
-        r = row[pair]
-        order[cursor[r]] = pair
-        cursor[r] += 1
-    return order, begins[:-1]

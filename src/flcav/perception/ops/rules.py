@@ -33,8 +33,9 @@ class Rules:
     source: Tensor  # (P,) int32 row of the input
     target: Tensor  # (P,) int32 row of the output
     counts: tuple[int, ...]  # pairs per kernel offset, z-major
-    by_target: Groups
-    by_source: Groups | None  # None where the pairs of offset k are those of offset K-1-k with the roles exchanged
+    targets: int  # rows of the output
+    by_target: Groups | None = None  # None on a CPU, which adds pair by pair
+    by_source: Groups | None = None  # None too where the pairs of offset k are those of offset K-1-k, roles exchanged
 
 
 def _grouped(row: Tensor, counts: tuple[int, ...], rows: int) -> Groups:
@@ -72,9 +73,8 @@ def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
     _, height, width = (extent + 2 for extent in shape)
     if keys.device.type == "cpu":
         steps = [(z * height + y) * width + x for z, y, x in product((-1, 0, 1), repeat=3)]
-        source, target, counts, *groups = pairs.submanifold_pairs(keys.numpy(), np.array(steps[14:]))
-        by_target = Groups(*map(torch.from_numpy, groups))
-        return Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), by_target, None)
+        source, target, counts = pairs.submanifold_pairs(keys.numpy(), np.array(steps[14:]))
+        return Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(keys))
     return _submanifold_rules(keys, height, width)
 
 
@@ -101,7 +101,7 @@ def _submanifold_rules(keys: Tensor, height: int, width: int) -> Rules:
     source = torch.cat((*near_parts, itself, far)).int()
     target = torch.cat((*far_parts, itself, near)).int()
     counts = (*counts[::-1], count, *counts)
-    return Rules(source, target, counts, _grouped(target, counts, count), None)
+    return Rules(source, target, counts, count, _grouped(target, counts, count))
 
 
 def strided_rules(
@@ -117,9 +117,7 @@ def strided_rules(
     if keys.device.type == "cpu":
         triples = (np.array(triple) for triple in (shape, kernel, stride, padding, out_shape))
         source, target, counts, out_keys = pairs.strided_pairs(keys.numpy(), samples, *triples)
-        groups = (pairs.grouped(rows, n) for rows, n in ((target, len(out_keys)), (source, len(keys))))
-        by_target, by_source = (Groups(*map(torch.from_numpy, group)) for group in groups)
-        rules = Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), by_target, by_source)
+        rules = Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(out_keys))
         return rules, torch.from_numpy(out_keys), out_shape
     rules, out_keys = _strided_rules(keys, shape, kernel, stride, padding, out_shape, samples)
     return rules, out_keys, out_shape
@@ -156,4 +154,4 @@ def _strided_rules(
     source, target = torch.cat(sources).int(), torch.searchsorted(out_keys, all_keys).int()
     counts = tuple(len(part) for part in sources)
     by_target, by_source = _grouped(target, counts, len(out_keys)), _grouped(source, counts, len(keys))
-    return Rules(source, target, counts, by_target, by_source), out_keys
+    return Rules(source, target, counts, len(out_keys), by_target, by_source), out_keys

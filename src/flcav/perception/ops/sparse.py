@@ -1,18 +1,21 @@
-"""Sparse 3D convolution in plain PyTorch: gather, one matrix product per kernel offset, sum by target voxel.
+"""Sparse 3D convolution: gather, one matrix product per kernel offset, sum by target voxel.
 
-The sum by target is an `embedding_bag`, which reads each product once in target order; adding by index would write
-scattered rows. Both directions are written out, and only the input features are kept for the backward pass.
+On a CPU that is compiled, block by block (`blocks`); elsewhere the sum by target is an `embedding_bag`, which reads
+each product once in target order. Both directions are written out, and only the input features are kept for the
+backward pass.
 """
 
 import math
-import threading
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from flcav.perception.ops import blocks
 from flcav.perception.ops.rules import Groups, Rules, Triple, cells_of, strided_rules, submanifold_rules
 
 
@@ -62,56 +65,60 @@ class _SparseConvolution(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, rules: Rules) -> Tensor:
         ctx.save_for_backward(features, weight)
-        ctx.rules = rules
-        products = _scratch("products", len(rules.source), weight.shape[2], features)
-        parts = zip(rules.source.split(rules.counts), products.split(rules.counts), weight, strict=True)
-        for source, product, kernel in parts:
-            torch.mm(_gathered(features, source, "sent"), kernel, out=product)
-        return _sum(products, rules.by_target)
+        ctx.rules, ctx.sources = rules, len(features)
+        if rules.by_target is not None:
+            return _grouped(features, weight, rules, rules.by_target)
+        out = features.new_zeros(rules.targets, weight.shape[2])
+        arrays = (features.detach().contiguous().numpy(), weight.detach().contiguous().numpy())
+        blocks.convolve(*arrays, *_pairs(rules), out.numpy())
+        return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
         features, weight = ctx.saved_tensors
-        rules: Rules = ctx.rules
         gradient = gradients[0].contiguous()
         wants_features = ctx.needs_input_grad[0]
-        grad_weight = torch.empty_like(weight)
-        products = _scratch("products", len(rules.source), weight.shape[1], features)
-        slots = products.split(rules.counts)
-        if rules.by_source is None:  # grouped by the mirrored pairs' targets, which are these pairs' sources
-            slots = slots[::-1]
-        pairs = zip(rules.source.split(rules.counts), rules.target.split(rules.counts), slots, strict=True)
-        for k, (source, target, product) in enumerate(pairs):
-            arrived = _gathered(gradient, target, "arrived")
-            torch.mm(_gathered(features, source, "sent").t(), arrived, out=grad_weight[k])
-            if wants_features:
-                torch.mm(arrived, weight[k].t(), out=product)
+        if ctx.rules.by_target is not None:
+            return *_grouped_gradients(features, weight, gradient, ctx.rules, wants_features), None
+        grad_weight = torch.zeros_like(weight, memory_format=torch.contiguous_format)
+        arrays = (features.detach().contiguous().numpy(), gradient.numpy())
         if not wants_features:
+            blocks.weight_gradient(*arrays, *_pairs(ctx.rules), grad_weight.numpy())
             return None, grad_weight, None
-        return _sum(products, rules.by_source or rules.by_target), grad_weight, None
+        grad_features = torch.zeros_like(features, memory_format=torch.contiguous_format)
+        turned = weight.detach().transpose(1, 2).contiguous().numpy()
+        blocks.gradients(*arrays, turned, *_pairs(ctx.rules), grad_features.numpy(), grad_weight.numpy())
+        return grad_features, grad_weight, None
 
 
-_buffers = threading.local()
+def _pairs(rules: Rules) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+    """Return source and target, and where the pairs of each offset begin; the last entry is where they end."""
+    return rules.source.numpy(), rules.target.numpy(), np.cumsum((0, *rules.counts), dtype=np.int64)
 
 
-def _scratch(name: str, rows: int, columns: int, like: Tensor) -> Tensor:
-    """Return an uninitialised (rows, columns) view of a buffer that this thread's next call of that name reuses.
-
-    Fresh memory of this size would cost the CPU more in page faults than the arithmetic on it.
-    """
-    if like.device.type != "cpu":
-        return like.new_empty(rows, columns)
-    buffer = getattr(_buffers, name, None)
-    if buffer is None or buffer.dtype != like.dtype or buffer.numel() < rows * columns:
-        with torch.inference_mode(False):  # else training could not reuse it
-            buffer = like.new_empty(rows * columns * 5 // 4)
-        setattr(_buffers, name, buffer)
-    return buffer[: rows * columns].view(rows, columns)
+def _grouped(features: Tensor, weight: Tensor, rules: Rules, by_target: Groups) -> Tensor:
+    products = [
+        features[source] @ kernel for source, kernel in zip(rules.source.split(rules.counts), weight, strict=True)
+    ]
+    return _sum(torch.cat(products), by_target)
 
 
-def _gathered(rows: Tensor, index: Tensor, name: str) -> Tensor:
-    """Return rows[index] for one kernel offset: few enough rows to stay in the cache for the product that follows."""
-    return torch.index_select(rows, 0, index, out=_scratch(name, len(index), rows.shape[1], rows))
+def _grouped_gradients(
+    features: Tensor, weight: Tensor, gradient: Tensor, rules: Rules, wants_features: bool
+) -> tuple[Tensor | None, Tensor]:
+    grad_weight = torch.empty_like(weight)
+    products = []
+    pairs = zip(rules.source.split(rules.counts), rules.target.split(rules.counts), strict=True)
+    for k, (source, target) in enumerate(pairs):
+        arrived = gradient[target]
+        torch.mm(features[source].t(), arrived, out=grad_weight[k])
+        if wants_features:
+            products.append(arrived @ weight[k].t())
+    if not wants_features:
+        return None, grad_weight
+    if rules.by_source is None:  # grouped by the mirrored pairs' targets, which are these pairs' sources
+        return _sum(torch.cat(products[::-1]), cast(Groups, rules.by_target)), grad_weight
+    return _sum(torch.cat(products), rules.by_source), grad_weight
 
 
 def _sum(rows: Tensor, groups: Groups) -> Tensor:

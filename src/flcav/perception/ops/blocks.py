@@ -1,0 +1,99 @@
+"""Sparse convolution on a CPU, compiled: gather, multiply and add for a block of pairs at a time, within the cache.
+
+Products of all pairs at once would go through main memory; a block's never leave the cache. Matrices stay below the
+size from which BLAS would wake its other threads.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.world.rays.compiled import compiled
+
+Array = NDArray[np.floating]
+Int32s = NDArray[np.int32]
+Int64s = NDArray[np.int64]
+
+BLOCK = 1 << 18  # multiplications in a matrix product, at most
+LONGEST = 1024  # pairs
+
+
+@compiled
+def convolve(features: Array, weight: Array, source: Int32s, target: Int32s, begins: Int64s, out: Array) -> None:
+    """Add features[s] @ weight[k] to out[t] for the pairs (s, t) of every offset k, begins[k] to begins[k + 1].
+
+    features (N, C), weight (K, C, C'), out (M, C'); targets differ within an offset.
+    """
+    block = min(LONGEST, max(1, BLOCK // (weight.shape[1] * weight.shape[2])))
+    sent = np.empty((block, weight.shape[1]), dtype=features.dtype)
+    product = np.empty((block, weight.shape[2]), dtype=features.dtype)
+    for k in range(len(begins) - 1):
+        for first in range(begins[k], begins[k + 1], block):
+            n = min(block, begins[k + 1] - first)
+            _gather(features, source, first, sent[:n])
+            np.dot(sent[:n], weight[k], product[:n])
+            _scatter(product[:n], target, first, out)
+
+
+@compiled
+def weight_gradient(
+    features: Array, gradient: Array, source: Int32s, target: Int32s, begins: Int64s, out: Array
+) -> None:
+    """Add features[s]^T gradient[t] to out[k] (K, C, C') for the pairs (s, t) of every offset k."""
+    block = min(LONGEST, max(1, BLOCK // (out.shape[1] * out.shape[2])))
+    sent = np.empty((block, out.shape[1]), dtype=features.dtype)
+    arrived = np.empty((block, out.shape[2]), dtype=features.dtype)
+    part = np.empty((out.shape[1], out.shape[2]), dtype=features.dtype)
+    for k in range(len(begins) - 1):
+        for first in range(begins[k], begins[k + 1], block):
+            n = min(block, begins[k + 1] - first)
+            _gather(features, source, first, sent[:n])
+            _gather(gradient, target, first, arrived[:n])
+            np.dot(sent[:n].T, arrived[:n], part)
+            out[k] += part
+
+
+@compiled
+def gradients(
+    features: Array,
+    gradient: Array,
+    turned: Array,
+    source: Int32s,
+    target: Int32s,
+    begins: Int64s,
+    to_features: Array,
+    to_weight: Array,
+) -> None:
+    """Do as `weight_gradient` into `to_weight`, and add gradient[t] @ turned[k] to to_features[s] for the same pairs.
+
+    turned (K, C', C): each offset's weight, transposed.
+    """
+    block = min(LONGEST, max(1, BLOCK // (turned.shape[1] * turned.shape[2])))
+    sent = np.empty((block, turned.shape[2]), dtype=features.dtype)
+    arrived = np.empty((block, turned.shape[1]), dtype=features.dtype)
+    product = np.empty_like(sent)
+    part = np.empty((turned.shape[2], turned.shape[1]), dtype=features.dtype)
+    for k in range(len(begins) - 1):
+        for first in range(begins[k], begins[k + 1], block):
+            n = min(block, begins[k + 1] - first)
+            _gather(features, source, first, sent[:n])
+            _gather(gradient, target, first, arrived[:n])
+            np.dot(sent[:n].T, arrived[:n], part)
+            to_weight[k] += part
+            np.dot(arrived[:n], turned[k], product[:n])
+            _scatter(product[:n], source, first, to_features)
+
+
+@compiled
+def _gather(rows: Array, index: Int32s, first: int, out: Array) -> None:
+    for pair in range(out.shape[0]):
+        row = np.uint64(index[first + pair])
+        for column in range(out.shape[1]):
+            out[pair, column] = rows[row, column]
+
+
+@compiled
+def _scatter(rows: Array, index: Int32s, first: int, out: Array) -> None:
+    for pair in range(rows.shape[0]):
+        row = np.uint64(index[first + pair])
+        for column in range(rows.shape[1]):
+            out[row, column] += rows[pair, column]
