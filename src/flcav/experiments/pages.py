@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError
-from flcav.experiments import arms_tables, fig3a_tables, fig6a_tables, signs_tables
+from flcav.experiments import arms_tables, fig3a_tables, fig6a_tables, objects_tables, signs_tables, sim_to_real_tables
 from flcav.files import write_bytes
 
 Tables = Mapping[str, str]
@@ -20,6 +20,8 @@ TABLES: dict[str, Callable[[Mapping[str, Any]], Tables]] = {
     "demo": arms_tables.tables,
     "fig3a": fig3a_tables.tables,
     "fig6a-allocation": fig6a_tables.tables,
+    "sim-to-real": sim_to_real_tables.tables,
+    "task-objects": objects_tables.tables,
     "task-signs": signs_tables.tables,
 }
 _SPAN = re.compile(r"<!-- (?P<name>[a-z ]+) -->\n.*?<!-- end -->", re.DOTALL)
