@@ -10,6 +10,7 @@ class Target(StrEnum):
     """What can be reproduced."""
 
     demo_arms = "demo-arms"
+    fig1b = "fig1b"
     fig3a = "fig3a"
     fig6a_allocation = "fig6a-allocation"
     sim_to_real = "sim-to-real"
@@ -49,8 +50,9 @@ def reproduce(
     ),
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
-    if target == Target.fig3a:
-        _fig3a(out)
+    if target in (Target.fig1b, Target.fig3a):
+        draw = _fig1b if target == Target.fig1b else _fig3a
+        draw(out)
         return
     if target == Target.sim_to_real:
         _sim_to_real(out, kitti, weights, jobs)
@@ -64,6 +66,17 @@ def reproduce(
         run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
         run(out, numbers, "quick" if quick else "paper", jobs)
     typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
+
+
+def _fig1b(out: Path) -> None:
+    from flcav import progress
+    from flcav.experiments.fig1b import fig1b
+    from flcav.files import write_bytes
+
+    with progress.live("record") as report:
+        picture = fig1b(out, report)
+    write_bytes(out / "fig1b.png", picture)
+    typer.echo(f"{out / 'fig1b.png'}: four tasks on one scene")
 
 
 def _fig3a(out: Path) -> None:

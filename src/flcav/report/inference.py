@@ -1,6 +1,6 @@
 """What a network found in one input, drawn on that input."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,13 @@ def draw_signs(picture: NDArray[np.uint8], result: Mapping[str, Any], title: str
     figure = style.canvas(WIDTH_IN, WIDTH_IN * picture.shape[0] / picture.shape[1] + 0.3)
     axes = figure.add_subplot()
     _show(axes, picture, f"{title} · {len(result['boxes'])} found")
-    for box in result["boxes"]:
+    sign_boxes(axes, result["boxes"])
+    return figure
+
+
+def sign_boxes(axes: Axes, boxes: Sequence[Mapping[str, Any]]) -> None:
+    """Draw boxes of signs on a picture; each names its class and score."""
+    for box in boxes:
         colour = SIGN_COLOURS.get(box["class"], style.BLUE)
         size = (box["x2"] - box["x1"], box["y2"] - box["y1"])
         axes.add_patch(Rectangle((box["x1"], box["y1"]), *size, fill=False, edgecolor=colour, linewidth=1.4))
@@ -55,16 +61,18 @@ def draw_signs(picture: NDArray[np.uint8], result: Mapping[str, Any], title: str
             color="white",
             bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8},
         )
-    return figure
+
+
+def boxes_of(result: Mapping[str, Any]) -> Boxes:
+    """Return the boxes of objects that a finding's JSON holds, LiDAR frame."""
+    rows = np.array([[box[name] for name in BOX_FIELDS] for box in result["boxes"]]).reshape(-1, 7)
+    return Boxes.from_array(rows, [box["class"] for box in result["boxes"]])
 
 
 @style.styled
 def draw_objects(points: NDArray[np.float32], result: Mapping[str, Any], title: str) -> Figure:
     """Return the point cloud from above, forward up, with its boxes."""
-    boxes = Boxes.from_array(
-        np.array([[box[name] for name in BOX_FIELDS] for box in result["boxes"]]).reshape(-1, 7),
-        [box["class"] for box in result["boxes"]],
-    )
+    boxes = boxes_of(result)
     figure = style.canvas(6.5, 6.9)
     axes = figure.add_subplot()
     axes.set(xlim=(-30, 30), ylim=(-6, 54), aspect="equal")
