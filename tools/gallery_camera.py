@@ -108,8 +108,9 @@ def infrared() -> Picture:
         image = thermal_image(
             scene, at @ BODY_FROM_OPTICAL, Infrared(), WEATHERS[name], np.random.default_rng(0), hidden=own
         )
-        low, high = np.percentile(image, (8, 99.7))
-        grey = (255 * np.clip((image - low) / (high - low), 0, 1) ** 1.5).astype(np.uint8)
+        rank = np.searchsorted(np.sort(image.ravel()), image) / image.size  # as thermal cameras do: equalised in part
+        low, high = np.percentile(image, (30, 99.8))
+        grey = (255 * (0.45 * rank + 0.55 * np.clip((image - low) / (high - low), 0, 1))).astype(np.uint8)
         out.append(np.repeat(grey[..., None], 3, axis=2))
     return sheet(out, 2)
 

@@ -8,7 +8,8 @@ T = T_air + warmth: a surface in the sun is up to `sun_k` warmer (times the cosi
 through), one that faces a clear night sky up to `sky_k` colder, rain takes most of both away. Vehicles that move are
 warm where engine, tyres, brakes and lamps are; people are as warm as skin and clothes are. Rain and fog hide heat
 less than light: the extinction of fog in the long-wave infrared is taken as 0.6 of that of light, the clear air's as
-0.2 per km.
+0.2 per km. What other things hide from the sky cools less. Window panes mirror what is before them; the ground and
+walls are not as warm everywhere. The lens is no sharper than `BLUR_PX`.
 """
 
 from typing import NamedTuple
@@ -16,14 +17,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.ndimage import gaussian_filter
 
 from flcav.sensors.lens import Lens, directions
-from flcav.sensors.shading.appearance import appearance_of
+from flcav.sensors.shading.appearance import Appearance, appearance_of
+from flcav.sensors.shading.facade import wall_at
 from flcav.sensors.shading.light import light_of
+from flcav.sensors.shading.noise import noise_at
+from flcav.sensors.shading.openness import openness
 from flcav.sensors.shading.shadows import sun_shadows
 from flcav.sensors.shading.survey import Survey, survey
 from flcav.world.materials import Material
+from flcav.world.rays.compiled import compiled
 from flcav.world.scene import Scene
+from flcav.world.static import Part
 from flcav.world.weather import Weather
 
 Array = NDArray[np.float64]
@@ -33,6 +40,9 @@ KELVIN_STEP = 0.01  # of a thermal image
 FOG_SHARE, CLEAR_AIR_PER_M, RAIN_PER_M = 0.6, 0.0002, 0.0012
 ENGINE_SHARE = 0.28  # of a vehicle's length, from its front
 LAMP_K = 14.0  # how much warmer a lamp is that is on
+BLUR_PX = 0.6  # standard deviation of what the lens makes of a point
+PATCHES_K = 1.6  # between the warmest and the coldest spots of one surface
+PANE_EMISSIVITY = 0.85
 
 
 class Warmth(NamedTuple):
@@ -72,6 +82,7 @@ WARMTH: dict[Material, Warmth] = {
     Material.LENS_AMBER: Warmth(sun_k=8, sky_k=4),
     Material.LENS_GREEN: Warmth(sun_k=8, sky_k=4),
 }
+WALL, BUILDING = int(Material.WALL), int(Part.BUILDING)
 _SUN, _SKY, _EMISSIVITY, _MOVING = np.array([WARMTH[material][:4] for material in Material]).T
 _BODY = np.array([np.nan if WARMTH[material].body_c is None else WARMTH[material].body_c for material in Material])
 
@@ -100,23 +111,28 @@ def thermal_image(
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden)
     seen = survey(scene, appearance, world_from_camera, rays, hits)
     shaded = sun_shadows(scene, seen, light, hidden)
+    free = openness(scene, seen, infrared, hidden)
+    pane, patch = _texture_of(seen, appearance, infrared)
     met = seen.row >= 0
     material = appearance.material[np.maximum(seen.row, 0)]
     air = air_temperature(weather)
     heat = ~shaded * np.clip(seen.normal @ np.array(light.to_sun), 0, 1) * _sunshine(weather)
-    cold = np.clip(seen.normal[:, 2], 0, 1) * (1 - 0.9 * weather.cloud_cover)
+    cold = free * (0.5 + 0.5 * seen.normal[:, 2]) * (1 - 0.9 * weather.cloud_cover)
     night = float(np.clip((8.0 - weather.sun_elevation_deg) / 14.0, 0, 1))
     dry = 1 - 0.8 * max(weather.wetness, min(weather.rain_mm_h / 5.0, 1.0))
-    own = air + dry * (_SUN[material] * heat - night * _SKY[material] * np.where(_SKY[material] > 0, cold, 1.0))
-    own += _living(seen, material, air) + _driving(scene, seen, material, bool(light.lamps > 0.5))
-    mirrored = np.where(seen.normal[:, 2] > 0.3, sky_temperature(weather, 1.0), air)
-    emissivity = _EMISSIVITY[material]
+    own = _SUN[material] * heat - night * _SKY[material] * np.where(_SKY[material] > 0, cold, 1.0) + PATCHES_K * patch
+    own = air + dry * own + _living(seen, material, air) + _driving(scene, seen, material, bool(light.lamps > 0.5))
+    rise = seen.ray[:, 2] - 2 * np.einsum("ij,ij->i", seen.ray, seen.normal) * seen.normal[:, 2]
+    mirrored = np.where(rise > 0, sky_temperature(weather, rise), air)
+    emissivity = np.where(pane > 0, 1 - pane * (1 - PANE_EMISSIVITY), _EMISSIVITY[material])
     shown = emissivity * own + (1 - emissivity) * mirrored
     shown = np.where(met, shown, sky_temperature(weather, seen.ray[:, 2]))
     extinction = FOG_SHARE * weather.fog_per_m + CLEAR_AIR_PER_M + RAIN_PER_M * weather.rain_mm_h**0.6
     passes = np.where(met, np.exp(-extinction * np.where(met, seen.distance, 0)), np.exp(-extinction * 500.0))
-    kelvin = passes * shown + (1 - passes) * air + infrared.noise_k * rng.standard_normal(len(rays), np.float32)
-    return np.rint(kelvin / KELVIN_STEP).clip(0, 65535).astype(np.uint16).reshape(infrared.height, infrared.width)
+    shape = (infrared.height, infrared.width)
+    kelvin = gaussian_filter((passes * shown + (1 - passes) * air).reshape(shape), BLUR_PX)
+    kelvin += infrared.noise_k * rng.standard_normal(shape, np.float32)
+    return np.rint(kelvin / KELVIN_STEP).clip(0, 65535).astype(np.uint16)
 
 
 def air_temperature(weather: Weather) -> float:
@@ -161,3 +177,34 @@ def _driving(scene: Scene, seen: Survey, material: NDArray[np.uint8], lamps_on: 
         if lamps_on:
             warm[rows] += LAMP_K * ((own == Material.HEADLAMP) | (own == Material.TAILLAMP))
     return warm
+
+
+def _texture_of(
+    seen: Survey, appearance: Appearance, infrared: Infrared
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the share (N,) of window panes in each pixel, and by how much (N,) its spot is warmer, -0.5 to 0.5."""
+    pane, patch = np.zeros(len(seen), np.float32), np.zeros(len(seen), np.float32)
+    _texture(seen, appearance, np.float32(1 / infrared.intrinsics()[0, 0]), pane, patch)
+    return pane, patch
+
+
+@compiled
+def _texture(seen, appearance, pixel_angle, pane, patch):
+    table = appearance.noise
+    for ray in range(len(pane)):
+        row = seen.row[ray]
+        if row < 0 or seen.instance[ray] > 0:
+            continue
+        x, y, z = seen.position[ray, 0], seen.position[ray, 1], seen.position[ray, 2]
+        broad = noise_at(table, (x + z) * 0.25, (y - z) * 0.25)
+        patch[ray] = (
+            np.float32(0.7) * broad + np.float32(0.3) * noise_at(table, (x + z) * 2.1, (y - z) * 2.1) - np.float32(0.5)
+        )
+        if appearance.material[row] == WALL and appearance.part[row] == BUILDING:
+            nx, ny = seen.normal[ray, 0], seen.normal[ray, 1]
+            facing = -(seen.ray[ray, 0] * nx + seen.ray[ray, 1] * ny + seen.ray[ray, 2] * seen.normal[ray, 2])
+            across = seen.distance[ray] * pixel_angle
+            slant = across / max(facing, np.float32(0.02))
+            building = appearance.part_row[row]
+            found = wall_at(building, x, y, z, nx, ny, across, slant, appearance.facades, table)
+            pane[ray] = found[3]

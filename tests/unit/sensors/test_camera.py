@@ -155,7 +155,7 @@ def test_heat_shows_people_and_engines_by_night(small_town: Callable[..., Town],
     image = thermal_image(scene, AHEAD, settings, WEATHERS["night"], np.random.default_rng(0)) / 100.0
     instance = shot(scene, camera=Camera(width=320, height=192)).instance
     driving, parked, person, rest = (image[instance == number] for number in (1, 2, 3, 0))
-    assert np.percentile(person, 90) > 295 > np.median(rest)
+    assert np.percentile(person, 90) > np.median(rest) + 8
     assert np.percentile(driving, 90) > np.percentile(parked, 90) + 3
     by_day = thermal_image(scene, AHEAD, settings, CLEAR, np.random.default_rng(0)) / 100.0
     assert np.median(by_day[120:]) > np.median(image[120:]) + 10  # the road in the sun
