@@ -1,21 +1,27 @@
 """That each corner case truly happens, read off the trace alone."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import shapely
 from pydantic import ValidationError
 from shapely.geometry import LineString, Point, Polygon
 
-from flcav.config import InputError
+from flcav.config import InputError, read_config
 from flcav.geometry import wrap_angle
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
 from flcav.world.roads import read_net
 from flcav.world.scenarios.scenario import Scenario
+from flcav.world.scenarios.scripts import SCRIPTS
 from flcav.world.shapes import SHAPES
 from flcav.world.surfaces import footprint
 from flcav.world.town import Town, load_town
 from flcav.world.trace import Event, Trace
 from flcav.world.traffic import simulate
 
+RECIPES = Path(__file__).parents[3] / "recipes"
 STEP_S = 0.1
 FROM_S, UNTIL_S, AT_S = 44.0, 80.0, 45.0
 
@@ -201,6 +207,15 @@ def test_the_same_seed_the_same_accident_and_traffic_before_it_untouched() -> No
     assert one.events == other.events
     np.testing.assert_array_equal(one.position[:2], calm.position[:2])
     assert not np.array_equal(one.position[2], calm.position[2], equal_nan=True)
+
+
+@pytest.mark.slow
+def test_every_kind_happens_in_every_scene_of_the_recipe() -> None:
+    recipe = read_config(Recipe, RECIPES / "corner_cases.yaml")
+    assert {scenario.kind for scenario in recipe.scenarios} == set(SCRIPTS)
+    source = EmbeddedSource(recipe)
+    for scene in source.scenes():
+        assert {event.kind for event in source.trace(scene).events} == set(SCRIPTS), scene
 
 
 def test_what_cannot_happen_is_named() -> None:

@@ -7,7 +7,10 @@ from typing import NamedTuple
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Stage
 
-AHEAD_M = (6.0, 45.0)  # a vehicle that breaks down is so far ahead
+AHEAD_M = (6.0, 60.0)  # a vehicle that breaks down is so far ahead
+STREETS = 3  # on one of so many streets of the way
+STANDS_BEFORE_M = 15.0  # a junction, at least
+MOVES = 3.0  # [m/s] at least
 ROLLS_OUT_S = 2.5  # and takes so long to stop
 SEEN_M = 70.0  # a crash is as near as this
 APART_M = (4.0, 25.0)  # before it, the two are so far apart
@@ -20,14 +23,21 @@ TWIST_S = 0.4
 
 
 def cast_stalled(stage: Stage, scenario: Scenario) -> str | None:
-    """Return the vehicle ahead of one under test, on the same street and moving."""
+    """Return the nearest moving vehicle ahead of one under test, in its lane or on the next streets of its way."""
+    found: list[tuple[float, str]] = []
     for ego in stage.egos(scenario):
-        spot, ahead = stage.spot(ego), stage.leader(ego, AHEAD_M[1])
-        if spot and ahead and ahead[1] >= AHEAD_M[0] and not ahead[0].startswith("cav"):
-            other = stage.spot(ahead[0])
-            if other and other.lane is spot.lane and other.left > 15.0 and stage.state(ahead[0])[3] > 3.0:
-                return ahead[0]
-    return None
+        spot, way = stage.spot(ego), stage.onward(ego)[1:STREETS]
+        for name in stage.sumo.vehicle.getIDList():
+            other = stage.spot(name)
+            if name.startswith("cav") or not spot or not other or other.left < STANDS_BEFORE_M:
+                continue
+            in_lane = other.lane is spot.lane and other.along > spot.along
+            apart_m = math.dist(stage.state(name)[:2], stage.state(ego)[:2])
+            gap_m = apart_m - stage.sumo.vehicle.getLength(name)
+            on_way = in_lane or (other.edge.id in way and other.lane.kind == "driving")
+            if on_way and AHEAD_M[0] <= gap_m <= AHEAD_M[1] and stage.state(name)[3] > MOVES:
+                found.append((gap_m, name))
+    return min(found)[1] if found else None
 
 
 def stall(stage: Stage, scenario: Scenario, victim: str) -> Generator[None, None, None]:

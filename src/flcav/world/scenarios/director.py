@@ -9,6 +9,7 @@ from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.scripts import SCRIPTS
 from flcav.world.scenarios.stage import STEP_S, Stage, State
 
+ALONE_S = 15.0  # so long nothing else begins before a vehicle under test
 LOOKS_AGAIN = 3  # steps after which a scenario tries again to find its place
 
 
@@ -21,19 +22,26 @@ class Director:
         self.events: list[dict[str, Any]] = []  # as `Event`, of those that happened, in order of time
         self._busy: set[str] = set()  # who plays in one scenario plays in no other
         self._scenarios = scenarios
-        self._scripts: list[Generator[None, None, None] | None] = [self._play(scenario) for scenario in scenarios]
+        self._scripts: list[Generator[None, None, None] | None] = [
+            self._play(number, scenario) for number, scenario in enumerate(scenarios)
+        ]
+        self._needed: dict[int, set[str]] = {}  # scenario under way -> without whom it cannot go on
 
     def direct(self) -> None:
-        """Advance every script by the step that SUMO just made."""
+        """Advance every script by the step that SUMO just made; end those of somebody who has left the town."""
         self.stage.look()
+        there = set(self.stage.sumo.vehicle.getIDList())
         for i, (scenario, script) in enumerate(zip(self._scenarios, self._scripts)):
-            if script is not None and self.stage.step * STEP_S >= scenario.at_s - 1e-6:
+            if script is not None and self._needed.get(i, set()) - there:
+                self._scripts[i] = None
+            elif script is not None and self.stage.step * STEP_S >= scenario.at_s - 1e-6:
                 try:
                     next(script)
                 except StopIteration:
                     self._scripts[i] = None
+        self.stage.react(careless=self._busy)
 
-    def _play(self, scenario: Scenario) -> Generator[None, None, None]:
+    def _play(self, number: int, scenario: Scenario) -> Generator[None, None, None]:
         cast, act = SCRIPTS[scenario.kind]
         while (roles := cast(self.stage, scenario)) is None or self._busy & set(named(roles)):
             for _ in range(LOOKS_AGAIN):
@@ -44,6 +52,9 @@ class Director:
         actors = [name for name in named(roles) if name in there]
         actors += [name for name in self.stage.props if name not in known]
         self._busy |= {name for name in actors if not name.startswith("cav")}
+        self._needed[number] = {name for name in actors if name in there and not name.startswith("cav")}
+        until = self.stage.step + round(ALONE_S / STEP_S)
+        self.stage.engaged |= dict.fromkeys((name for name in actors if name.startswith("cav")), until)
         begins_s = round(self.stage.step * STEP_S, 1)
         self.events.append({"kind": scenario.kind, "begins_s": begins_s, "actors": actors})
         yield

@@ -15,6 +15,7 @@ NEXT_M = (-6.0, 16.0)  # when a car of the next lane begins to pass or to fall b
 FALLS_BACK_S = 5.0
 MOVES_OVER_S = 2.2
 FAST = 4.0  # [m/s] slower egos are not worth pushing in before
+TOO_FAST = 15.0  # [m/s] and faster ones could not brake for a car from the kerb
 ROOM_M = 45.0  # of lane ahead, for a car from the kerb
 NEXT_ROOM_M = 30.0  # and for one from the next lane
 KERB_GAP_M = 0.25  # between a standing car and the lane
@@ -39,14 +40,14 @@ class CutIn(NamedTuple):
 
 def cast_cut_in(stage: Stage, scenario: Scenario) -> CutIn | None:
     """Return a vehicle under test with room ahead, and who is beside that room."""
-    for ego in stage.egos(scenario):
+    for ego in stage.free_egos(scenario):
         spot = stage.spot(ego)
         if not spot or stage.state(ego)[3] < FAST or spot.left < NEXT_ROOM_M or stage.leader(ego, 15.0):
             continue
         neighbour = _beside(stage, spot)
         if neighbour is not None:
             return CutIn(ego, spot, neighbour)
-        if spot.left < ROOM_M or stage.leader(ego, 25.0):
+        if spot.left < ROOM_M or stage.state(ego)[3] > TOO_FAST or stage.leader(ego, 25.0):
             continue
         kind = scenario.actors.get("car", DEFAULT_CAR)
         x, y, _ = stage.point(spot.lane, _stands_at(spot, kind), _kerb(spot.lane, kind))

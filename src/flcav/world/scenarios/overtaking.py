@@ -6,19 +6,22 @@ from typing import NamedTuple
 
 from flcav.world.scenarios.manoeuvres import ease, length_of
 from flcav.world.scenarios.scenario import Scenario
-from flcav.world.scenarios.stage import STEP_S, Spot, Stage, State
+from flcav.world.scenarios.stage import STEP_S, Spot, Stage, State, braking_m
 
 KIND = "car.sedan"
 BEHIND_M = 4.0  # bumper to bumper, before it pulls out
 AHEAD_M = 3.0  # and before it moves back
-MEETS_M = (50.0, 120.0)  # how far away the vehicle under test is then
-STREETS = 3  # on one of so many next edges of its route
+TAKES_S = 5.5  # until it is back; whoever comes towards them can stop before that
+WITHIN_M = 70.0  # and the vehicle under test is at most so much further away
+STREETS = 4  # on one of so many next edges of its route
 ROOM_M = 42.0  # of lane for the manoeuvre
-FREE_M = 28.0  # ahead of the slow one
-SLOW = 3.0  # [m/s] what is overtaken is slow
+SLOW = 3.0  # [m/s] what is overtaken becomes slow
+FAST = 17.0  # [m/s] and was no faster than this
 ROLLS = 1.0  # [m/s] at least, whoever they meet
 FASTER = 8.0  # [m/s] by so much it is overtaken
 GAINS_MPS2, SLOWS_MPS2 = 4.5, 2.5
+SHARPEST = math.radians(25.0)  # turn, however slow it is
+STANDS_M = 2.0  # behind a queue that it finds
 SWINGS_S = 1.8  # from one lane to the other
 WAY_M = (4.0, 12.0, 20.0, 28.0)  # ahead of it, where others see that they must give way
 OUT = 0.6  # of it before it accelerates
@@ -42,12 +45,16 @@ def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
         oncoming = {(edge.end, edge.start) for edge in ahead}
         for name in stage.sumo.vehicle.getIDList():
             spot = stage.spot(name)
-            if name.startswith("cav") or not spot or spot.left < ROOM_M:
+            if name.startswith("cav") or not spot or spot.left < ROOM_M or stage.state(name)[3] > FAST:
                 continue
             if spot.lane.kind != "driving" or len(spot.edge.lanes_of("driving")) > 1:
                 continue
             follows_on_lane = spot.along > stage.sumo.vehicle.getLength(name) + BEHIND_M + 1.0
-            if (spot.edge.start, spot.edge.end) not in oncoming or not follows_on_lane or stage.leader(name, FREE_M):
+            if (
+                (spot.edge.start, spot.edge.end) not in oncoming
+                or not follows_on_lane
+                or stage.leader(name, _takes_m(stage.state(name)[3]))
+            ):
                 continue
             if _meets(stage.state(name), stage.state(ego)) and _way_is_free(stage, name) and _alone(stage, name):
                 return Overtaking(name, spot)
@@ -61,18 +68,25 @@ def _meets(one: State, other: State) -> bool:
         (math.sin(math.radians(state[2])), math.cos(math.radians(state[2]))) for state in (one, other)
     )
     facing = dx * x + dy * y > 0.0 > dx * other_x + dy * other_y
-    return facing and MEETS_M[0] <= math.hypot(dx, dy) <= MEETS_M[1] and one[3] > SLOW / 2
+    beyond_m = math.hypot(dx, dy) - _takes_m(one[3]) - braking_m(other[3])
+    return facing and 0.0 <= beyond_m <= WITHIN_M and one[3] > SLOW / 2
+
+
+def _takes_m(speed: float) -> float:
+    """Return how far it is until somebody is back who overtakes one at `speed` [m/s]."""
+    return TAKES_S * max(SLOW + FASTER, speed)
 
 
 def _way_is_free(stage: Stage, name: str) -> bool:
     """Say whether nobody comes towards a vehicle on the other lane, nearer than the vehicle under test may be."""
-    x, y, angle, _ = stage.state(name)
+    x, y, angle, own_speed = stage.state(name)
     heading = math.radians(90.0 - angle)
     for other in stage.sumo.vehicle.getIDList():
-        dx, dy = stage.state(other)[0] - x, stage.state(other)[1] - y
+        other_x, other_y, _, speed = stage.state(other)
+        dx, dy = other_x - x, other_y - y
         ahead = dx * math.cos(heading) + dy * math.sin(heading)
         left = -dx * math.sin(heading) + dy * math.cos(heading)
-        if -10.0 < ahead < MEETS_M[0] and 1.0 < left < 12.0:
+        if -10.0 < ahead < _takes_m(own_speed) + braking_m(speed) and 1.0 < left < 12.0:
             return False
     return True
 
@@ -97,6 +111,7 @@ def overtake(stage: Stage, scenario: Scenario, roles: Overtaking) -> Generator[N
     vehicle, slow, lane = stage.sumo.vehicle, roles.slow, roles.spot.lane
     kind = scenario.actors.get("car", KIND)
     name, length = stage.cast(kind), length_of(kind)
+    way = stage.onward(slow)  # from this lane on; the slow one may leave it first
     slow_length = vehicle.getLength(slow)
     for step, (x, y, angle, speed) in stage.trail(slow, BEHIND_M + slow_length):
         stage.place(name, x, y, math.radians(90.0 - angle), speed, step)
@@ -104,21 +119,23 @@ def overtake(stage: Stage, scenario: Scenario, roles: Overtaking) -> Generator[N
     room = roles.spot.along + roles.spot.left
     at = vehicle.getLanePosition(slow) - slow_length - BEHIND_M
     speed, out, back = stage.state(slow)[3], 0.0, 0.0
+    top = max(SLOW + FASTER, speed)
     while back < 1.0:
         yield
         vehicle.setSpeed(slow, max(SLOW, stage.state(slow)[3] - SLOWS_MPS2 * STEP_S))
         on_lane = vehicle.getLaneID(slow) == lane.id and at < room - length
         passed = not on_lane or at - length > vehicle.getLanePosition(slow) + AHEAD_M
-        faster = min(speed + GAINS_MPS2 * STEP_S, SLOW + FASTER)
+        faster = min(speed + GAINS_MPS2 * STEP_S, top)
         speed = faster if out >= OUT else min(faster, stage.state(slow)[3] + 0.5)
+        if passed:
+            speed = min(speed, math.sqrt(2 * SLOWS_MPS2 * max(stage.gap_ahead(lane, at) - STANDS_M, 0.0)))
         at += speed * STEP_S
         out = min(out + STEP_S / SWINGS_S, 1.0)
         back = back + STEP_S / SWINGS_S if passed and out >= 1.0 else back
         share, rate = ease(out if back == 0.0 else 1.0 - min(back, 1.0))
-        turn = math.atan2(lane.width * rate / SWINGS_S, speed) * (1 if back == 0.0 else -1)
+        turn = min(math.atan2(lane.width * rate / SWINGS_S, speed), SHARPEST) * (1 if back == 0.0 else -1)
         x, y, heading = stage.point(lane, at, lane.width * share)
         stage.place(name, x, y, heading + turn, speed)
         stage.brake_for([stage.point(lane, at + reach, lane.width)[:2] for reach in WAY_M], half_width_m=2.0)
-    stage.drive_on()
-    stage.enter(name, kind, (lane, min(at, room - 1.0)), stage.onward(slow), speed)
+    stage.enter(name, kind, (lane, min(at, room - 1.0)), way, speed)
     vehicle.setSpeed(slow, -1.0)

@@ -31,7 +31,7 @@ class BehindVan(NamedTuple):
 def cast_behind_van(stage: Stage, scenario: Scenario) -> BehindVan | None:
     """Return a vehicle under test that drives freely on the right lane, with room for a van at the kerb ahead."""
     kinds = scenario.actors.get("van", VAN), scenario.actors.get("pedestrian", PEDESTRIAN)
-    for ego in stage.egos(scenario):
+    for ego in stage.free_egos(scenario):
         spot, speed = stage.spot(ego), stage.state(ego)[3]
         if not spot or speed < FAST or spot.lane is not spot.edge.lanes_of("driving")[0]:
             continue
@@ -75,8 +75,6 @@ def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[Non
         stage.place(pedestrian, x, y, heading, RUNS_AT if crossing else 0.0)
         if crossing and at > -lane.width / 2 - 0.8:
             stage.brake_for([stage.point(lane, roles.along, at)[:2]], half_width_m=2.2)
-        elif running and not crossing:
-            stage.drive_on()
 
 
 def _walker(stage: Stage, roles: BehindVan, left: float) -> tuple[float, float, float]:

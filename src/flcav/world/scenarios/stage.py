@@ -6,7 +6,7 @@ speed [m/s].
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,8 +40,10 @@ class Stage:
         self.props: dict[str, tuple[str, dict[int, State]]] = {}  # name -> vehicle type, state by step
         self.shifted: dict[str, tuple[float, float]] = {}  # SUMO's vehicle -> metres to the left, radians to the left
         self.past: dict[str, list[tuple[int, State]]] = {}
+        self.engaged: dict[str, int] = {}  # vehicle under test -> step up to which a scenario has it to itself
         self._edge_of = {lane.id: (edge, lane) for edge in net.edges.values() for lane in edge.lanes}
         self._braking: set[str] = set()
+        self._dangers: list[tuple[float, float, float]] = []  # x, y, half width [m] of this step
         self._cast = 0
 
     def look(self) -> None:
@@ -65,6 +67,10 @@ class Stage:
             for name in names
             if name in there and (at is None or math.dist(self.sumo.vehicle.getPosition(name), at) <= NEAR_M)
         ]
+
+    def free_egos(self, scenario: Scenario) -> list[str]:
+        """Return those of `egos` before whom nothing else happens now."""
+        return [name for name in self.egos(scenario) if self.engaged.get(name, 0) <= self.step]
 
     def spot(self, name: str) -> Spot | None:
         """Return a vehicle's place on a street; None inside a junction."""
@@ -139,16 +145,23 @@ class Stage:
         return (found[0], gap) if gap <= within_m else None
 
     def brake_for(self, places: Sequence[tuple[float, float]], half_width_m: float) -> None:
-        """Have everybody brake who drives towards one of the places and could not stop before it any later."""
-        at = np.array(places)
-        for name in self.sumo.vehicle.getIDList():
-            x, y, angle, speed = self.state(name)
+        """Have everybody brake in this step who drives towards one of the places and could not stop before it later."""
+        self._dangers += [(x, y, half_width_m) for x, y in places]
+
+    def react(self, careless: Set[str]) -> None:
+        """Have everybody brake for what this step's scripts asked for, and drive on who needs not any more.
+
+        Those who are `careless` do neither: scripts move them.
+        """
+        x, y, half_width_m = np.array(self._dangers, np.float64).reshape(-1, 3).T
+        self._dangers.clear()
+        for name in set(self.sumo.vehicle.getIDList()) - careless:
+            front_x, front_y, angle, speed = self.state(name)
             heading = math.radians(90.0 - angle)
-            dx, dy = at[:, 0] - x, at[:, 1] - y
+            dx, dy = x - front_x, y - front_y
             ahead = dx * math.cos(heading) + dy * math.sin(heading)
             aside = np.abs(-dx * math.sin(heading) + dy * math.cos(heading))
-            reach = 4.0 + 0.7 * speed + speed**2 / (2 * CAREFUL_MPS2)
-            if ((ahead > -1.0) & (ahead < reach) & (aside < half_width_m)).any():
+            if ((ahead > -1.0) & (ahead < braking_m(speed)) & (aside < half_width_m)).any():
                 self.take(name)
                 self.sumo.vehicle.setSpeed(name, 0.0)
                 self._braking.add(name)
@@ -156,11 +169,14 @@ class Stage:
                 self.sumo.vehicle.setSpeed(name, -1.0)
                 self._braking.discard(name)
 
-    def drive_on(self) -> None:
-        """Let everybody go who was braking for a prop."""
-        for name in self._braking & set(self.sumo.vehicle.getIDList()):
-            self.sumo.vehicle.setSpeed(name, -1.0)
-        self._braking.clear()
+    def gap_ahead(self, lane: Lane, along: float) -> float:
+        """Return how far it is from a place of a lane to the next vehicle's tail on it; inf where there is none [m]."""
+        vehicle = self.sumo.vehicle
+        places = [
+            (vehicle.getLanePosition(name), vehicle.getLength(name))
+            for name in self.sumo.lane.getLastStepVehicleIDs(lane.id)
+        ]
+        return min((front - length - along for front, length in places if front > along), default=math.inf)
 
     def seen(self, name: str, state: State) -> State:
         """Return a vehicle's state as it is to be recorded: with what a script shifts it by."""
@@ -181,3 +197,8 @@ class Stage:
             if travelled >= behind_m:
                 x, y, angle = (np.interp(travelled - behind_m, done, values) for values in (*at.T, angles))
                 yield step, (float(x), float(y), float(angle), state[3])
+
+
+def braking_m(speed: float) -> float:
+    """Return how far before a prop somebody at `speed` [m/s] begins to brake."""
+    return 4.0 + 0.7 * speed + speed**2 / (2 * CAREFUL_MPS2)
