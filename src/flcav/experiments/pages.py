@@ -12,7 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError
-from flcav.experiments import arms_tables, fig3a_tables, fig6a_tables, objects_tables, signs_tables, sim_to_real_tables
+from flcav.experiments import (
+    arms_tables,
+    fig3a_tables,
+    fig6a_tables,
+    objects_tables,
+    signs_tables,
+    sim_to_real_tables,
+    weather_tables,
+)
 from flcav.files import write_bytes
 
 Tables = Mapping[str, str]
@@ -23,6 +31,7 @@ TABLES: dict[str, Callable[[Mapping[str, Any]], Tables]] = {
     "sim-to-real": sim_to_real_tables.tables,
     "task-objects": objects_tables.tables,
     "task-signs": signs_tables.tables,
+    "task-weather": weather_tables.tables,
 }
 _SPAN = re.compile(r"<!-- (?P<name>[a-z ]+) -->\n.*?<!-- end -->", re.DOTALL)
 
