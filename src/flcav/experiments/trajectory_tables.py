@@ -1,0 +1,73 @@
+"""The tables on the pages of the trajectory task's studies."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from flcav.experiments.markdown import bullets, interval, table
+
+WANTED = 0.7  # of constant velocity's final error at junctions, at most
+SLICE = "at junctions"
+PREDICTORS = {
+    "single path": ("single_ADE", "single_FDE", "miss_rate_single"),
+    "likeliest mode": ("minADE_1", "minFDE_1", "miss_rate_1"),
+    "best of six modes": ("minADE_K", "minFDE_K", "miss_rate_K"),
+    "constant velocity": ("constant_velocity_ADE", "constant_velocity_FDE", "miss_rate_constant_velocity"),
+}
+
+
+def tables(results: Mapping[str, Any]) -> dict[str, str]:
+    """Return the page's tables by name, from what `run_study` returned."""
+    return {
+        "findings": bullets(_finding(test, means, len(results["seeds"])) for test, means in results["summary"].items()),
+        "errors": table(
+            (
+                "test",
+                "slice",
+                "who predicts",
+                "average error m",
+                "final error m",
+                "missed by 2 m",
+                "of constant velocity",
+            ),
+            [row for test, means in results["summary"].items() for row in _errors(test, means)],
+        ),
+        "training": table(
+            (
+                "seed",
+                "samples",
+                "steps",
+                "loss of the last epoch",
+                "validation, final error m: likeliest mode, best of six",
+            ),
+            [_trained(seed["seed"], seed["card"]) for seed in results["seeds"]],
+        ),
+    }
+
+
+def _finding(test: str, means: Mapping[str, Any], seeds: int) -> str:
+    ratio = means[f"{SLICE}, ratio_single"]
+    verdict = "reached" if ratio["high"] <= WANTED else "not reached" if ratio["low"] > WANTED else "undecided"
+    over = f"{interval(ratio)} over {seeds} seeds" if seeds > 1 else f"{ratio['mean']:.3f} of one seed"
+    best, plain = (means[f"{SLICE}, {key}"]["mean"] for key in ("minFDE_K", "constant_velocity_FDE"))
+    return (
+        f"*A final error of {WANTED} times constant velocity's at junctions, {test}*: **{verdict}**, {over}. Of six "
+        f"modes the best ends {best:.2f} m off, constant velocity {plain:.2f} m."
+    )
+
+
+def _errors(test: str, means: Mapping[str, Any]) -> list[list[str]]:
+    rows = []
+    for name in dict.fromkeys(key.rpartition(", ")[0] for key in means):
+        count = round(means[f"{name}, samples"]["mean"])
+        for who, (ade, fde, missed) in PREDICTORS.items():
+            average, final, misses = (means[f"{name}, {key}"] for key in (ade, fde, missed))
+            share = final["mean"] / means[f"{name}, constant_velocity_FDE"]["mean"]
+            numbers = [f"{average['mean']:.2f}", interval(final), f"{misses['mean']:.1%}", f"{share:.2f}"]
+            rows.append([test, f"{name} ({count})", who, *numbers])
+    return rows
+
+
+def _trained(seed: int, card: Mapping[str, Any]) -> list[str]:
+    every = card["metrics"]["slices"]["all"]
+    known = ", ".join(f"{every[key]:.2f}" for key in ("minFDE_1", "minFDE_K"))
+    return [str(seed), str(card["samples"]), str(card["training"]["steps"]), f"{card['training']['loss']:.2f}", known]

@@ -1,0 +1,80 @@
+"""The trajectory task's studies: what they record, their numbers, tables and picture."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from flcav.config import parse_config
+from flcav.experiments.intervals import mean_over_seeds
+from flcav.experiments.studies import STUDIES
+from flcav.experiments.studies.trajectory import CAMERAS, STUDY
+from flcav.experiments.trajectory_tables import tables
+from flcav.perception.trajectory.config import FUTURE, PAST
+from flcav.perception.trajectory.evaluate import metrics
+from flcav.sources.recipe import Recipe
+
+RECIPES = Path(__file__).parents[3] / "recipes"
+
+
+@pytest.mark.parametrize(
+    ("name", "recorded"),
+    [
+        ("trajectory", STUDY.train[0]),
+        ("trajectory_suburb", STUDY.train[1]),
+        ("trajectory_ring", STUDY.tests["held-out town"]),
+        ("trajectory_cameras", CAMERAS.train[0]),
+    ],
+)
+def test_recipes_are_those_of_the_studies(name, recorded):
+    committed = parse_config(Recipe, yaml.safe_load((RECIPES / f"{name}.yaml").read_text()), name)
+    assert committed == parse_config(Recipe, dict(recorded), name)
+
+
+@pytest.mark.parametrize("study", [STUDY, CAMERAS])
+def test_no_split_shares_a_scene(study):
+    recipes = [*study.train, study.validation, *study.tests.values()]
+    assert len({(recipe["town"], recipe["seed"]) for recipe in recipes}) == len(recipes)
+
+
+def evaluated(off_m: float) -> dict:
+    """Return the evaluation of paths that end `off_m` to the side of a road user who stops 4 m ahead."""
+    future = np.zeros((2, FUTURE, 2))
+    future[..., 0] = np.minimum(np.arange(1, FUTURE + 1), 4)
+    past = np.zeros((2, PAST + 1, 4))
+    past[..., 3] = 4.0  # constant velocity ends 8 m off
+    paths = np.stack((future, future), axis=1)
+    paths[:, 0, :, 1] = off_m
+    columns = {"future": future, "past": past, "at_junction": np.ones(2, np.bool_), "scene": np.array(["a", "b"])}
+    return metrics(paths, np.tile((0.9, 0.1), (2, 1)), columns)
+
+
+def results(*off_m: float) -> dict:
+    runs = []
+    for seed, off in enumerate(off_m):
+        card = {"samples": 9, "training": {"steps": 7, "loss": 1.5}, "metrics": evaluated(off)}
+        runs.append({"seed": seed, "card": card, "tests": {"held-out scenes": evaluated(off)}})
+    rows = [STUDY.numbers(evaluated(off)) for off in off_m]
+    means = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
+    return {"seeds": runs, "summary": {"held-out scenes": means}}
+
+
+@pytest.mark.parametrize(
+    ("off_m", "verdict"), [((4.0, 4.1), "reached"), ((8.0, 8.1), "not reached"), ((4.0, 8.0), "undecided")]
+)
+def test_a_finding_names_its_verdict(off_m, verdict):
+    found = tables(results(*off_m))["findings"]
+    assert f"**{verdict}**, {np.mean(off_m) / 8:.3f}" in found
+    assert "the best ends 0.00 m off, constant velocity 8.00 m" in found
+
+
+def test_errors_have_a_row_for_each_slice_and_predictor():
+    lines = tables(results(4.0, 4.1))["errors"].splitlines()[2:]
+    assert len(lines) == 2 * 4  # nobody turns
+    assert lines[0].startswith("| held-out scenes | all (2) | single path | 4.05 | 4.050")
+
+
+def test_the_picture_shows_every_test():
+    assert STUDIES["trajectory"] is STUDY
+    assert STUDY.draw(results(4.0, 4.1)).startswith(b"\x89PNG")
