@@ -19,6 +19,7 @@ from flcav.experiments import (
     objects_tables,
     signs_tables,
     sim_to_real_tables,
+    trajectory_tables,
     weather_tables,
 )
 from flcav.files import write_bytes
@@ -31,6 +32,8 @@ TABLES: dict[str, Callable[[Mapping[str, Any]], Tables]] = {
     "sim-to-real": sim_to_real_tables.tables,
     "task-objects": objects_tables.tables,
     "task-signs": signs_tables.tables,
+    "task-trajectory": trajectory_tables.tables,
+    "task-trajectory-cameras": trajectory_tables.tables,
     "task-weather": weather_tables.tables,
 }
 _SPAN = re.compile(r"<!-- (?P<name>[a-z ]+) -->\n.*?<!-- end -->", re.DOTALL)
