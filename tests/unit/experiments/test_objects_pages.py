@@ -1,0 +1,89 @@
+"""The pages' tables, from small results made by hand."""
+
+import numpy as np
+
+from flcav.experiments import objects_tables, sim_to_real_tables
+from flcav.experiments.intervals import mean_over_seeds
+from flcav.experiments.studies.objects import STUDY
+from flcav.report import style
+from flcav.report.clouds import compare, real_frame
+
+
+def result(ap):
+    measures = [(kind, iou) for kind in ("3d", "bev") for iou in (0.5, 0.7)]
+    row = {"class": "Car", "low": ap, "high": ap, "targets": 12, "hidden": 0, "ap": ap}
+    sliced = {"class": "Car", "by": "distance", "slice": "0-20 m", "targets": 7, "ap": ap}
+    return {
+        "scores": [row | {"kind": kind, "iou": iou} for kind, iou in measures],
+        "slices": [sliced | {"kind": kind, "iou": iou} for kind, iou in measures],
+        "trust": [{"class": "Car", "detections": 9, "ece": 0.04, "variance_ratio": 1.1}],
+    }
+
+
+def tracked(ap):
+    row = {"class": "Car", "mota": 0.7, "amota": 0.6, "id_switches": 2, "velocity_error_mps": 0.5}
+    return result(ap) | {"tracks": {"sequences": 1, "frames": 3, "scores": [row]}}
+
+
+def study(aps):
+    seeds = [{"seed": n, "tests": {"suburb": result(ap), "tracks": tracked(ap)}} for n, ap in enumerate(aps)]
+    summary = {
+        test: {
+            name: mean_over_seeds([STUDY.numbers(seed["tests"][test])[name] for seed in seeds])
+            for name in STUDY.numbers(seeds[0]["tests"][test])
+        }
+        for test in ("suburb", "tracks")
+    }
+    return {"seeds": seeds, "summary": summary}
+
+
+def test_what_is_reached_is_said_with_its_interval():
+    assert "**reached**, 0.900 (0.900 to 0.900) over 2 seeds" in objects_tables.tables(study((0.9, 0.9)))["findings"]
+    assert "**undecided**" in objects_tables.tables(study((0.8, 0.9)))["findings"]
+    assert "**not reached**, 0.500 of one seed" in objects_tables.tables(study((0.5,)))["findings"]
+
+
+def test_tables_hold_classes_slices_and_tracks():
+    tables = objects_tables.tables(study((0.8, 0.9)))
+    assert "| suburb | Car | 12 | 0.850 | 0.850 | 0.850 | 0.850 | 0.040 |" in tables["classes"]
+    assert "| suburb | distance 0-20 m | 7 |" in tables["slices"]
+    assert "| Car | 0.700 | 0.600 | 2.000 | 0.500 |" in tables["tracks"]
+
+
+def test_a_study_is_drawn():
+    assert STUDY.draw(study((0.8, 0.9))).startswith(b"\x89PNG")
+
+
+def cloud():
+    return {
+        "returns": 100.0,
+        "returns_per_range": {"0-5 m": 40.0},
+        "intensity_quantiles": [0, 0.1, 0.2, 0.3, 0.4],
+        "without_intensity": 0.25,
+        "ground": [{"ahead_m": "5-8", "height_m": -1.7, "spread_m": 0.1, "intensity": 0.3}],
+        "cars": [{"distance_m": 5.0, "returns": 9, "length_m": 4.0, "width_m": 1.7, "height_m": 1.5}],
+    }
+
+
+def test_clouds_and_real_cars_stand_beside_each_other():
+    car = {"x": 3.0, "y": 4.0, "length": 4.0, "width": 1.7, "height": 1.5, "found_at": [0.5]}
+    score = {"class": "Car", "kind": "3d", "iou": 0.5, "targets": 1, "found": 1, "false_positives": 0, "ap": 1.0}
+    tables = sim_to_real_tables.tables(
+        {
+            "clouds": {"KITTI": cloud(), "simulated": cloud()},
+            "scores": [score],
+            "frames": [{"frame": "000008", "cars": [car], "boxes": []}],
+        }
+    )
+    assert "| 000008 | 5.0 | 4.00 x 1.70 x 1.50 | 0.5 |" in tables["cars"]
+    assert "| Car | 3d at 0.5 | 1 | 1 | 0 | 1.000 |" in tables["detections"]
+    assert "| returns without intensity | 25% | 25% |" in tables["clouds"]
+
+
+def test_clouds_and_frames_are_drawn():
+    assert style.png(compare({"KITTI": cloud(), "simulated": cloud()}), 40).startswith(b"\x89PNG")
+    box = {"class": "Car", "x": 12.0, "y": 0.0, "z": -1.0, "length": 4.0, "width": 1.7, "height": 1.5, "yaw": 0.1}
+    story = {"frame": "000008", "cars": [box | {"found_at": []}], "boxes": [box | {"score": 0.5}]}
+    image_from_lidar = np.array([[600, -700, 0, 0], [180, 0, -700, 0], [1, 0, 0, 0]], dtype=float)
+    figure = real_frame(np.ones((9, 4), np.float32), np.zeros((375, 1242, 3), np.uint8), image_from_lidar, story)
+    assert "0 of 1 cars found" in figure.axes[0].get_title(loc="left")
