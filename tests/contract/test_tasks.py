@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from safetensors import safe_open
 from task_drives import Drives
@@ -17,6 +18,7 @@ from flcav.cli.tasks import TASKS
 from flcav.config import InputError
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.experiments.fig1b_layers import LAYERS, watched
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import Trainable
@@ -31,6 +33,7 @@ from flcav.perception.weather.task import WEATHER, over_the_whole_space
 from flcav.perception.weights import load_network, save_network, to_arrays
 from flcav.report import style
 from flcav.report.inference import DRAWINGS
+from flcav.report.task_columns import show_layers
 from flcav.sensors.frame import Frame
 from flcav.world.weather import Weather
 
@@ -176,6 +179,20 @@ def test_evaluations_and_findings_are_json_and_words_and_pictures(task, data):
     assert task.finding_lines(finding.result)
     picture = style.png(DRAWINGS[task.name](finding.seen, finding.result, "title"), dpi=40)
     assert picture.startswith(b"\x89PNG")
+
+
+@each_task
+def test_the_layers_that_fig1b_shows_are_all_seen(task, data):
+    network = fresh(task, small(task), 1).eval()
+    layers = LAYERS[task.name](network)
+    with watched(layers) as seen:
+        list(task.infer(network, data.folder, 0.9))
+    assert set(seen) == set(layers)
+    assert all(layer.values.ndim in (1, 3) and np.isfinite(layer.values).all() for layer in seen.values())
+    assert not any(module._forward_hooks for module in layers.values())
+    figure = Figure()
+    show_layers(figure.add_subplot(), list(seen.values()))
+    assert style.png(figure, dpi=40).startswith(b"\x89PNG")
 
 
 @each_task
