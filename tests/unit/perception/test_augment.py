@@ -1,5 +1,7 @@
 """Augmentation: returns stay on their objects, labels stay true, pasted objects meet nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,8 +11,9 @@ from shapely.geometry import Polygon
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects.augment import augment, in_view, resized, sheared, thinned
 from flcav.perception.objects.config import Augmentation
+from flcav.perception.objects.model import small_config
 from flcav.perception.objects.paste import fitting, pasted
-from flcav.perception.objects.samples import MIN_RETURNS, Sample
+from flcav.perception.objects.samples import MIN_RETURNS, Sample, near_range
 
 
 def scene(seed: int, objects: int = 12, per_object: int = 20) -> Sample:
@@ -128,3 +131,18 @@ def test_the_same_stream_changes_a_sample_the_same_way():
     one, two = (augment(scene(9), EVERYTHING, np.random.default_rng(1)) for _ in range(2))
     np.testing.assert_array_equal(one.points, two.points)
     assert one.boxes.array() == pytest.approx(two.boxes.array())
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_no_point_is_left_out_that_augmentation_brings_into_the_range(seed):
+    rng = np.random.default_rng(seed)
+    config = small_config()
+    reach = 95
+    points = rng.uniform((-reach, -reach, -6, 0), (reach, reach, 4, 1), (4000, 4)).astype(np.float32)
+    points[:, 3] = np.arange(len(points))  # a number that stays with the point
+    how = replace(config.augmentation, drop=0.0, view=0.0)
+    moved = augment(Sample(points, Boxes.empty()), how, rng).points
+    low, high = np.array(config.range_m[:3]), np.array(config.range_m[3:])
+    within = ((moved[:, :3] >= low) & (moved[:, :3] < high)).all(1)
+    assert set(moved[within, 3]) <= set(near_range(points, config)[:, 3])
