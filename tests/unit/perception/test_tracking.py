@@ -1,12 +1,23 @@
 """The tracker on motion it should follow, and CLEAR MOT on cases counted by hand."""
 
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
 import numpy as np
 import pytest
 
+from flcav.config import InputError
+from flcav.dataset.layout import FrameKey
+from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
 from flcav.perception.metrics.tracks import Moment, amota, clear
-from flcav.perception.tracking import Tracker
+from flcav.perception.objects import second_tiny
+from flcav.perception.tracking import Tracker, evaluate_tracks
+from flcav.perception.tracking import evaluate as tracking_evaluation
 from flcav.perception.tracking.kalman import State, first_state, predicted, updated
+
+from .frames import detections, frame
 
 
 def cars(*places, yaw=0.0, score=None):
@@ -51,7 +62,7 @@ def test_a_heading_seen_the_wrong_way_round_does_not_turn_the_track():
 def test_cars_that_pass_keep_their_numbers_and_get_their_velocities():
     tracker = Tracker()
     rng = np.random.default_rng(0)
-    numbers = []
+    numbers, velocity = [], np.zeros(3)
     for step in range(20):
         t = 0.5 * step
         noisy = [(10 * t + rng.normal(0, 0.1), 0.0), (60 - 8 * t + rng.normal(0, 0.1), 3.5), (30.0, 7.0)]
@@ -146,3 +157,44 @@ def test_amota_leaves_out_false_tracks_of_low_score():
     worse = [[moment({"a": 0, "b": 10}, {1: 0, 2: 10, 3: 50}, score={1: 0.1})] * 4]
     assert amota(clean) == pytest.approx(1)
     assert amota(worse) < 0.8
+
+
+class Recording:
+    """As much of a dataset as evaluation looks at: one scene, 0.5 s from frame to frame."""
+
+    folder = Path("made up")
+
+    def __init__(self, frames, every_s=0.5):
+        self._frames = [replace(one, time_s=every_s * i) for i, one in enumerate(frames)]
+        self.keys = [FrameKey(one.scene, i, one.agent, one.time_s) for i, one in enumerate(self._frames)]
+
+    def __len__(self):
+        return len(self._frames)
+
+    def frame(self, number):
+        return self._frames[number]
+
+
+def drive(steps=8):
+    """Return frames of an agent that drives past a car, a bus and a car that has no returns."""
+    frames = []
+    for i in range(steps):
+        objects = [("a", "car", 40 - 2 * i, 3, 20), ("bus", "bus", 30 - 2 * i, -6, 50), ("b", "car", 30, 9, 0)]
+        frames.append(frame(objects, at=(2.0 * i, 0.0), index=i))
+    return frames
+
+
+def test_what_is_found_everywhere_is_followed_without_a_mistake(monkeypatch):
+    seen = iter(detections((40 - 2 * i, 3, 0.9), (30 - 2 * i, -6, 0.8)) for i in range(8))
+    monkeypatch.setattr(tracking_evaluation, "detect", lambda network, points, score_threshold: next(seen))
+    said = evaluate_tracks(second_tiny(), cast(Dataset, Recording(drive())))
+    (row,) = said["scores"]
+    assert (row["objects"], row["misses"], row["false_positives"], row["id_switches"]) == (8, 0, 0, 0)
+    assert row["mota"] == row["amota"] == 1
+    assert row["velocity_error_mps"] < 0.5  # both stand still in the world
+    assert "MOTA 1.000" in tracking_evaluation.tracks_lines(said)[1]
+
+
+def test_frames_too_far_apart_are_refused():
+    with pytest.raises(InputError, match="4 s apart"):
+        evaluate_tracks(second_tiny(), cast(Dataset, Recording(drive(3), every_s=4.0)))
