@@ -28,7 +28,7 @@ class Payload(NamedTuple):
     """One file of a frame."""
 
     path: str
-    data: bytes
+    data: bytes | memoryview
 
 
 def payloads(frame: Frame) -> Iterator[Payload]:
@@ -46,9 +46,9 @@ def payloads(frame: Frame) -> Iterator[Payload]:
         yield Payload(payload_path(name, frame.key, RADAR), encode_rows(detections))
 
 
-def encode_rows(rows: NDArray[np.float32]) -> bytes:
-    """Return the rows of a LiDAR or a radar as little-endian float32."""
-    return np.ascontiguousarray(rows, dtype="<f4").tobytes()
+def encode_rows(rows: NDArray[np.float32]) -> memoryview:
+    """Return the rows of a LiDAR or a radar as the bytes of little-endian float32, without a copy where they are."""
+    return memoryview(np.ascontiguousarray(rows, dtype="<f4").reshape(-1).view(np.uint8))
 
 
 def encode_plane(plane: str, pixels: NDArray) -> bytes:
