@@ -10,7 +10,7 @@ import torch
 from flcav.perception.ops.rectangles import complete_iou
 from flcav.perception.signs.augment import GREY, cut, draw, joined, window
 from flcav.perception.signs.config import CONFIGURATIONS, STRIDES, SignsConfig
-from flcav.perception.signs.detect import Detections, detect, tensor_of
+from flcav.perception.signs.detect import Detections, detect
 from flcav.perception.signs.evaluate import Truth, mean_average_precision
 from flcav.perception.signs.loss import BOX, CLASS, LEVELS, OBJECT, detection_loss
 from flcav.perception.signs.model import SignDetector, boxes_of, decode
@@ -142,9 +142,8 @@ def test_the_loss_is_the_sum_of_its_parts():
 def test_half_precision_hardly_changes_the_loss():
     samples = [painted(seed) for seed in range(4)]
     network = fresh(SIGNS, TINY, 0)
-    whole = detection_loss(
-        network(tensor_of([sample.picture for sample in samples], network)), assign(samples, TINY), TINY
-    )
+    pictures = torch.from_numpy(np.stack([sample.picture for sample in samples])).permute(0, 3, 1, 2).float() / 255
+    whole = detection_loss(network(pictures), assign(samples, TINY), TINY)
     loss = SIGNS.loss(network, samples)
     assert loss.dtype == torch.float32
     assert loss.item() == pytest.approx(whole.item(), rel=0.02)

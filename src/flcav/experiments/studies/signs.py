@@ -69,8 +69,8 @@ STUDY = Study(
         "held-out scenes": {**ARTERIAL, "seed": 214, "split": "test", "scenes": 12},
         "held-out town": {**RING, "seed": 314, "split": "test", "scenes": 6},
     },
-    epochs=20,
-    patience=20,
+    epochs=15,
+    patience=15,
     numbers=_numbers,
     draw=_draw,
 )

@@ -1,12 +1,14 @@
-"""Windows of pictures at random places and scales, four of them as a mosaic, in random colours. Never mirrored.
+"""Windows of pictures at random places and scales, several of them as a mosaic, in random colours. Never mirrored.
 
 The mosaic is that of Bochkovskiy et al., "YOLOv4", 2020, sec. 3.3, of windows at their own scale: signs are few and
-small, so that windows are drawn around them, and pictures are not made smaller. The other windows of a mosaic look for
-a sign of a class drawn at random, so that rare ones (amber lasts seconds of a minute) are seen as often as any.
+small, so that windows are drawn around them, and pictures are not made smaller. Small windows around signs show a
+network many digits for little calculation. All but the first look for a sign of a class drawn at random, so that rare
+ones (amber lasts seconds of a minute) are seen as often as any.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,32 +18,34 @@ from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.samples import Sample, size_px
 
 GREY = 114  # what lies beyond a picture
-MOSAIC = 0.7  # share of the samples that are mosaics
+SHARES = (0.15, 0.25, 0.3, 0.3)  # of the samples that are one window, a mosaic of 2 x 2, of 3 x 3, of 4 x 4
+UNEVEN = 0.3  # how far a border within a mosaic may lie off, as a share of a part
 AROUND_A_SIGN = 0.8  # share of the windows drawn so that they hold one, where the picture has any
-SCALE = (0.6, 1.5)
+SCALE = (0.6, 2.0)
 WHOLE = 0.8  # share of a box that must lie in the window for it to be found: a lamp may be in what is cut off
 LOOKS = 12  # pictures that are looked through for a sign of a class
 GAIN, SATURATION = (0.7, 1.3), (0.6, 1.4)
 
 
 def draw(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
-    """Return sample `index` as a training step sees it: a window of it, or a mosaic with windows of three others."""
+    """Return sample `index` as a training step sees it: a window of it, or a mosaic with windows of others."""
     width, height = config.window_px
-    if rng.random() >= MOSAIC:
-        return _in_other_colours(window(samples[index], width, height, config, rng), rng)
-    across = int(rng.uniform(0.3, 0.7) * width)
-    down = int(rng.uniform(0.3, 0.7) * height)
+    across = int(rng.choice(len(SHARES), p=SHARES)) + 1
+    columns, rows = _borders(width, across, rng), _borders(height, across, rng)
     parts = []
-    for place in range(4):
-        left, top = place % 2, place // 2
-        size = (width - across if left else across, height - down if top else down)
-        if place:
-            wanted = int(rng.integers(len(config.classes)))
-            part = window(_one_with(wanted, samples, rng), *size, config, rng, wanted)
-        else:
-            part = window(samples[index], *size, config, rng)
-        parts.append((part, across if left else 0, down if top else 0))
+    for number, (row, column) in enumerate(product(range(across), repeat=2)):
+        x, y = columns[column], rows[row]
+        size = (columns[column + 1] - x, rows[row + 1] - y)
+        wanted = int(rng.integers(len(config.classes))) if number else None
+        sample = samples[index] if wanted is None else _one_with(wanted, samples, rng)
+        parts.append((window(sample, *size, config, rng, wanted), x, y))
     return _in_other_colours(joined(parts, width, height), rng)
+
+
+def _borders(length: int, parts: int, rng: np.random.Generator) -> list[int]:
+    """Return where each of so many parts of about the same length begins, and the end."""
+    inner = (np.arange(1, parts) + rng.uniform(-UNEVEN, UNEVEN, parts - 1)) * length / parts
+    return [0, *inner.astype(int).tolist(), length]
 
 
 def _one_with(label: int, samples: Sequence[Sample], rng: np.random.Generator) -> Sample:

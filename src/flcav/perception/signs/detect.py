@@ -38,7 +38,7 @@ def detect(network: SignDetector, picture: Picture, *, threshold: float) -> Dete
     training = network.training
     network.eval()
     with torch.inference_mode():
-        raw = network(tensor_of([padded(picture)], network))
+        raw = predict(network, [padded(picture)])
         cells = [
             torch.cat((decode(maps, level, network.config), maps[..., 4:].sigmoid()), -1)[0].flatten(0, 2)
             for level, maps in enumerate(raw)
@@ -54,13 +54,22 @@ def padded(picture: Picture) -> Picture:
     return np.pad(picture, ((0, down), (0, across), (0, 0)), constant_values=GREY)
 
 
-def tensor_of(pictures: Sequence[Picture], network: SignDetector) -> torch.Tensor:
-    """Return pictures of one size as the network takes them, (B, 3, H, W) in 0..1, on its device.
+def predict(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Tensor]:
+    """Return the network's raw predictions on pictures of one size, both sides multiples of the largest stride.
 
-    Channels lie innermost in memory, which convolutions on a CPU are faster with.
+    Channels lie innermost in memory and convolutions are in bfloat16 where the processor multiplies it: half the time.
     """
-    stacked = torch.from_numpy(np.stack(pictures)).to(next(network.parameters()).device)
-    return stacked.permute(0, 3, 1, 2).float() / 255
+    device = next(network.parameters()).device
+    stacked = torch.from_numpy(np.stack(pictures)).to(device)
+    with torch.autocast(device.type, torch.bfloat16, enabled=_has_bfloat16(device)):
+        raw = network(stacked.permute(0, 3, 1, 2).float() / 255)
+    return [maps.float() for maps in raw]
+
+
+def _has_bfloat16(device: torch.device) -> bool:
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
 
 def _chosen(cells: torch.Tensor, threshold: float, picture: Picture) -> Detections:

@@ -11,7 +11,7 @@ from flcav.perception.signs.config import STRIDES, SignsConfig
 from flcav.perception.signs.model import boxes_of
 from flcav.perception.signs.targets import Targets
 
-BOX, OBJECT, CLASS = 1.0, 10.0, 1.0  # weights of the parts
+BOX, OBJECT, CLASS = 1.0, 10.0, 8.0  # weights of the parts
 LEVELS = (4.0, 1.0, 0.4)  # of objectness: finer levels have more cells, of which fewer hold an object
 
 

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
 from flcav.perception.images import pictures
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
-from flcav.perception.signs.detect import Detections, detect, tensor_of
+from flcav.perception.signs.detect import Detections, detect, predict
 from flcav.perception.signs.evaluate import Truth, mean_average_precision
 from flcav.perception.signs.loss import detection_loss
 from flcav.perception.signs.model import SignDetector
@@ -46,14 +45,9 @@ class SignsTask:
         return draw(samples, index, config, rng)
 
     def loss(self, network: SignDetector, samples: Sequence[Sample]) -> Tensor:
-        """Return the loss of a batch of pictures of one size, both sides multiples of 32.
-
-        Convolutions are in bfloat16 where the processor multiplies it: half the time.
-        """
-        pictures = tensor_of([sample.picture for sample in samples], network)
-        with torch.autocast(pictures.device.type, torch.bfloat16, enabled=_has_bfloat16(pictures.device)):
-            raw = network(pictures)
-        return detection_loss([maps.float() for maps in raw], assign(samples, network.config), network.config)
+        """Return the loss of a batch of pictures of one size, both sides multiples of 32."""
+        raw = predict(network, [sample.picture for sample in samples])
+        return detection_loss(raw, assign(samples, network.config), network.config)
 
     def evaluate(
         self, network: SignDetector, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
@@ -114,12 +108,6 @@ def box_rows(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
         | {name: float(value) for name, value in zip(("x1", "y1", "x2", "y2"), box, strict=True)}
         for box, label, score in zip(found.box, found.label, found.score, strict=True)
     ]
-
-
-def _has_bfloat16(device: torch.device) -> bool:
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    return bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
 
 def _known(value: float | None) -> str:
