@@ -62,7 +62,8 @@ def _errors(test: str, means: Mapping[str, Any]) -> list[list[str]]:
         for who, (ade, fde, missed) in PREDICTORS.items():
             average, final, misses = (means[f"{name}, {key}"] for key in (ade, fde, missed))
             share = final["mean"] / means[f"{name}, constant_velocity_FDE"]["mean"]
-            numbers = [f"{average['mean']:.2f}", interval(final), f"{misses['mean']:.1%}", f"{share:.2f}"]
+            shown = interval(final) if final["high"] > final["low"] else f"{final['mean']:.3f}"
+            numbers = [f"{average['mean']:.2f}", shown, f"{misses['mean']:.1%}", f"{share:.2f}"]
             rows.append([test, f"{name} ({count})", who, *numbers])
     return rows
 
