@@ -48,7 +48,7 @@ def payloads(frame: Frame) -> Iterator[Payload]:
 
 def encode_rows(rows: NDArray[np.float32]) -> memoryview:
     """Return the rows of a LiDAR or a radar as the bytes of little-endian float32, without a copy where they are."""
-    return memoryview(np.ascontiguousarray(rows, dtype="<f4").reshape(-1).view(np.uint8))
+    return np.ascontiguousarray(rows, dtype="<f4").reshape(-1).view(np.uint8).data
 
 
 def encode_plane(plane: str, pixels: NDArray) -> bytes:
