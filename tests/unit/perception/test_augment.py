@@ -20,7 +20,8 @@ def scene(seed: int, objects: int = 12, per_object: int = 20) -> Sample:
     """Return cars of random pose that do not stand in one another, with `per_object` returns each, and clutter."""
     rng = np.random.default_rng(seed)
     spots = rng.permutation(36)[:objects]
-    center = np.column_stack((8 + 8 * (spots % 6), 8 * (spots // 6) - 20, rng.uniform(-1.2, -0.8, objects)))
+    height = rng.uniform(-1.2, -0.8, objects)
+    center = np.column_stack((8 + 8 * (spots % 6), 8 * (spots // 6) - 20, height)).astype(np.float64)
     size = rng.uniform((3, 1.5, 1.4), (5, 2, 1.8), (objects, 3))
     boxes = Boxes(center, size, rng.uniform(-np.pi, np.pi, objects), np.full(objects, "Car"))
     local = rng.uniform(-0.49, 0.49, (objects, per_object, 3)) * size[:, None]
@@ -35,7 +36,7 @@ EVERYTHING = Augmentation(
     turn_rad=0.7,
     scale=0.05,
     shift_m=1.0,
-    resize=((0.8, 1.1),) * 3,
+    resize=((0.8, 1.1), (0.8, 1.1), (0.8, 1.1)),
     tilt_rad=0.02,
     lift_m=0.2,
     drop=0.3,
@@ -58,8 +59,8 @@ def test_resized_objects_keep_their_returns_and_their_foot(seed):
     factor = np.random.default_rng(seed).uniform(0.8, 1.1, (len(before.boxes), 3))
     after = resized(before, factor)
     np.testing.assert_allclose(after.boxes.size, before.boxes.size * factor)
-    foot = [b.center[:, 2] - b.size[:, 2] / 2 for b in (before.boxes, after.boxes)]
-    np.testing.assert_allclose(*foot)
+    foot, same = (b.center[:, 2] - b.size[:, 2] / 2 for b in (before.boxes, after.boxes))
+    np.testing.assert_allclose(foot, same)
     own = np.repeat(np.arange(len(before.boxes)), 20)
     inside = points_in_boxes(after.points[: len(own)], after.boxes, margin_m=1e-4)
     assert inside[own, np.arange(len(own))].all()

@@ -42,12 +42,12 @@ class _Track:
 class Tracker:
     """Follows objects of all classes through one sequence of frames.
 
-    A track is told of from its `confirm`-th detection on, and ends after `patience` frames without one; those in
-    between are told of while `patience` lasts only in `coasting`.
+    A track is told of from its `confirm`-th detection on, whenever it is seen, and ends after `patience` frames in
+    which it was not.
     """
 
-    def __init__(self, *, confirm: int = 2, patience: int = 3, coasting: bool = False) -> None:
-        self.confirm, self.patience, self.coasting = confirm, patience, coasting
+    def __init__(self, *, confirm: int = 2, patience: int = 3) -> None:
+        self.confirm, self.patience = confirm, patience
         self._tracks: list[_Track] = []
         self._next = 0
         self._time_s: float | None = None
@@ -84,11 +84,7 @@ class Tracker:
         return self._told(first)
 
     def _told(self, first: bool) -> Tracked:
-        told = [
-            track
-            for track in self._tracks
-            if (len(track.scores) >= self.confirm or first) and (track.missed == 0 or self.coasting)
-        ]
+        told = [track for track in self._tracks if (len(track.scores) >= self.confirm or first) and track.missed == 0]
         mean = np.array([track.state.mean for track in told]).reshape(-1, 9)
         boxes = Boxes(
             mean[:, :3],
