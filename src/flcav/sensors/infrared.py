@@ -25,7 +25,7 @@ from flcav.sensors.shading.facade import wall_at
 from flcav.sensors.shading.light import light_of
 from flcav.sensors.shading.noise import noise_at
 from flcav.sensors.shading.openness import openness
-from flcav.sensors.shading.shadows import sun_shadows
+from flcav.sensors.shading.shadows import soften, sunlit
 from flcav.sensors.shading.survey import Survey, survey
 from flcav.world.materials import Material
 from flcav.world.rays.compiled import compiled
@@ -110,13 +110,13 @@ def thermal_image(
     appearance, light = appearance_of(scene), light_of(weather)
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden)
     seen = survey(scene, appearance, world_from_camera, rays, hits)
-    shaded = sun_shadows(scene, seen, light, hidden)
+    lit = soften(sunlit(scene, seen, light, hidden), seen, infrared.width)
     free = openness(scene, seen, infrared, hidden)
     pane, patch = _texture_of(seen, appearance, infrared)
     met = seen.row >= 0
     material = appearance.material[np.maximum(seen.row, 0)]
     air = air_temperature(weather)
-    heat = ~shaded * np.clip(seen.normal @ np.array(light.to_sun), 0, 1) * _sunshine(weather)
+    heat = lit * np.clip(seen.normal @ np.array(light.to_sun), 0, 1) * _sunshine(weather)
     cold = free * (0.5 + 0.5 * seen.normal[:, 2]) * (1 - 0.9 * weather.cloud_cover)
     night = float(np.clip((8.0 - weather.sun_elevation_deg) / 14.0, 0, 1))
     dry = 1 - 0.8 * max(weather.wetness, min(weather.rain_mm_h / 5.0, 1.0))

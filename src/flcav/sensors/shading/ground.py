@@ -14,16 +14,16 @@ def asphalt(x, y, footprint, table):
     """Return the brightness of asphalt over its mean: grain, stains, old and new stretches, sealed cracks."""
     broad = noise_at(table, x * 0.9, y * 0.9)
     patch = noise_at(table, x * 0.11 + 40.0, y * 0.11)
-    tone = np.float32(0.80) + np.float32(0.22) * broad + np.float32(0.26) * patch
+    tone = np.float32(0.68) + np.float32(0.30) * broad + np.float32(0.40) * patch
     middle = fade(np.float32(0.12), footprint)
     if middle > 0:
-        tone += middle * np.float32(0.16) * (noise_at(table, x * 9.0, y * 9.0) - np.float32(0.5))
+        tone += middle * np.float32(0.30) * (noise_at(table, x * 9.0, y * 9.0) - np.float32(0.5))
         crack = abs(noise_at(table, x * 0.55 + 90.0, y * 0.55 + 17.0) - np.float32(0.5))
         if crack < np.float32(0.006) and patch > np.float32(0.45):
             tone -= middle * np.float32(0.35)
-    fine = fade(np.float32(0.015), footprint)
+    fine = fade(np.float32(0.022), footprint)
     if fine > 0:
-        tone += fine * np.float32(0.38) * (noise_at(table, x * 71.0, y * 71.0) - np.float32(0.5))
+        tone += fine * np.float32(0.55) * (noise_at(table, x * 71.0, y * 71.0) - np.float32(0.5))
     return tone
 
 

@@ -12,7 +12,7 @@ from flcav.sensors.shading.glare import add_glare, add_sun_glare
 from flcav.sensors.shading.light import Light, light_of
 from flcav.sensors.shading.memory import keep_freed_memory
 from flcav.sensors.shading.openness import openness
-from flcav.sensors.shading.shadows import lamp_light_on, sun_shadows
+from flcav.sensors.shading.shadows import lamp_light_on, soften, sunlit
 from flcav.sensors.shading.state import Lamps, State, lamps_of, no_lamps, state_of
 from flcav.sensors.shading.surface import shade
 from flcav.sensors.shading.survey import Survey, survey
@@ -65,7 +65,7 @@ def render(
     )
     seen = _meet(world, world_from_camera, rays)
     open_sky = openness(scene, seen, lens, hidden)
-    radiance, painted = _radiance(world, seen, open_sky)
+    radiance, painted = _radiance(world, seen, open_sky, lens.width)
     if light.wetness > MIRRORS:
         _mirror(world, world_from_camera, lens, rays, seen, radiance)
     kind = edges.rough_pixels(seen, radiance, light.exposure, appearance, lens)
@@ -94,14 +94,16 @@ def _meet(
 
 
 def _radiance(
-    world: _World, seen: Survey, open_sky: NDArray[np.float32]
+    world: _World, seen: Survey, open_sky: NDArray[np.float32], width: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     scene, light, hidden = world.scene, world.light, world.hidden
-    shaded = sun_shadows(scene, seen, light, hidden)
+    lit = sunlit(scene, seen, light, hidden)
+    if width is not None:  # the rays are a whole picture's
+        lit = soften(lit, seen, width)
     lamplight = lamp_light_on(scene, seen, world.lamps, hidden) if light.lamps > 0 else NO_LAMPS
     radiance, painted = np.empty((len(seen), 3), np.float32), np.empty(len(seen), np.bool_)
     tables = (light, world.appearance, world.state)
-    shade(seen, *tables, shaded, lamplight, open_sky, world.pixel_angle, radiance, painted)
+    shade(seen, *tables, lit, lamplight, open_sky, world.pixel_angle, radiance, painted)
     return radiance, painted
 
 

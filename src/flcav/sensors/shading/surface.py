@@ -22,20 +22,21 @@ BUILDING, CLUTTER = int(Part.BUILDING), int(Part.CLUTTER)
 
 LENS_RADIANCE = 2.2
 LOW_SUN = 0.4  # sine of the elevation below which a dry road gleams towards the sun
-SHEEN, SHEEN_GLOSS = 0.30, 22.0
+SHEEN, SHEEN_GLOSS = 0.28, 22.0
 ROAD_LINE = 0.5  # share of a pixel from which on paint is what it shows
 
 
 @compiled
-def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_angle, radiance, painted):
+def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angle, radiance, painted):
     """Write the `radiance` (N, 3) of what N rays met, and whether it is `painted` (N,) road.
 
-    `shaded` (N,) says where the sun is hidden, `lamplight` (N, 3) is what lamps throw there (or (0, 3): none is on),
+    `lit` (N,) is the share of the sun's light that arrives, `lamplight` (N, 3) what lamps throw there (or (0, 3): none
+    is on),
     `open_sky` (N,) how much of the sky is free; a pixel sees `pixel_angle` [rad].
     """
     lamps_on = len(lamplight) > 0
     table = appearance.noise
-    for ray in range(len(shaded)):
+    for ray in range(len(lit)):
         dx, dy, dz = survey.ray[ray, 0], survey.ray[ray, 1], survey.ray[ray, 2]
         row = survey.row[ray]
         painted[ray] = False
@@ -53,7 +54,7 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
         red, green, blue = own[instance, material, 0], own[instance, material, 1], own[instance, material, 2]
         mirror, gloss = appearance.mirror[material], appearance.gloss[material]
         shine_r, shine_g, shine_b = np.float32(0), np.float32(0), np.float32(0)
-        lit = np.float32(0) if shaded[ray] else np.float32(1)
+        sunny = lit[ray]
         through = np.float32(0)  # share of the sun that shines through from behind
         if material == ROAD:
             tone = asphalt(x, y, slant, table)
@@ -71,7 +72,7 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
             if light.to_sun[2] < np.float32(LOW_SUN) and nz > np.float32(0.9):
                 beside = dx * light.to_sun[0] + dy * light.to_sun[1] - dz * light.to_sun[2]
                 flat = 1 - facing
-                sheen = lit * np.float32(SHEEN) * flat * flat * np.exp(np.float32(SHEEN_GLOSS) * (beside - 1))
+                sheen = sunny * np.float32(SHEEN) * flat * flat * np.exp(np.float32(SHEEN_GLOSS) * (beside - 1))
                 shine_r, shine_g, shine_b = sheen * light.sun[0], sheen * light.sun[1], sheen * light.sun[2]
         elif material == SIDEWALK:
             if nz > np.float32(0.5):
@@ -161,9 +162,9 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
 
         sun = nx * light.to_sun[0] + ny * light.to_sun[1] + nz * light.to_sun[2]
         if through > 0:
-            sun = (np.float32(0.25) + np.float32(0.75) * max(sun, -sun * through)) * lit
+            sun = (np.float32(0.25) + np.float32(0.75) * max(sun, -sun * through)) * sunny
         else:
-            sun = max(sun, np.float32(0)) * lit
+            sun = max(sun, np.float32(0)) * sunny
         up = (np.float32(0.5) + np.float32(0.5) * nz) * open_sky[ray]
         down = (np.float32(0.5) - np.float32(0.5) * nz) * (np.float32(0.4) + np.float32(0.6) * open_sky[ray])
         arrive_r = sun * light.sun[0] + up * light.ambient[0] + down * light.bounce[0]
@@ -184,10 +185,10 @@ def shade(survey, light, appearance, state, shaded, lamplight, open_sky, pixel_a
             turned = 2 * facing
             rx, ry, rz = dx + turned * nx, dy + turned * ny, dz + turned * nz
             env_r, env_g, env_b = mirrored_at(rx, ry, rz, light, table)
-            if gloss > 0 and lit > 0:
+            if gloss > 0 and sunny > 0:
                 beside = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
                 if beside > np.float32(0.6):
-                    flash = np.exp(gloss * (beside - 1)) * lit * gloss * np.float32(0.02)
+                    flash = np.exp(gloss * (beside - 1)) * sunny * gloss * np.float32(0.02)
                     env_r += flash * light.sun[0]
                     env_g += flash * light.sun[1]
                     env_b += flash * light.sun[2]
