@@ -47,16 +47,19 @@ def draw_signs(picture: NDArray[np.uint8], result: Mapping[str, Any], title: str
 
 
 def sign_boxes(axes: Axes, boxes: Sequence[Mapping[str, Any]]) -> None:
-    """Draw boxes of signs on a picture; each names its class and score."""
+    """Draw boxes of signs on a picture that `axes` show; each names its class and score."""
+    width = max(axes.get_xlim())
     for box in boxes:
         colour = SIGN_COLOURS.get(box["class"], style.BLUE)
         size = (box["x2"] - box["x1"], box["y2"] - box["y1"])
         axes.add_patch(Rectangle((box["x1"], box["y1"]), *size, fill=False, edgecolor=colour, linewidth=1.4))
+        right = box["x1"] > 0.7 * width  # the name stays within the picture
         axes.annotate(
-            f"{box['class']} {box['score']:.2f}",
-            (box["x1"], box["y1"]),
+            f"{box['class'].replace('_', ' ')} {box['score']:.2f}",
+            (box["x2"] if right else box["x1"], box["y1"]),
             (0, 2),
             textcoords="offset points",
+            ha="right" if right else "left",
             fontsize=style.SMALL,
             color="white",
             bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8},

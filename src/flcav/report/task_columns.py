@@ -16,9 +16,9 @@ from flcav.report import style
 
 Draw = Callable[[Axes], None]
 ROWS = ("sensor", "processing", "network", "output")
-WIDTH_IN, HEIGHT_IN = 13.0, 9.6
+WIDTH_IN, HEIGHT_IN = 13.0, 9.0
 ASPECT = 0.6  # height of a panel by its width
-FROM_ABOVE: dict[str, Any] = {"xlim": (-33, 33), "ylim": (0, 39.6), "aspect": "auto"}  # of a sweep [m]
+FROM_ABOVE: dict[str, Any] = {"xlim": (-28, 28), "ylim": (0, 33.6), "aspect": "auto"}  # of a sweep [m]
 BEHIND_M, ABOVE_M = 9.0, 5.0  # where one stands to see a sweep, from its sensor
 SHOWN_MAPS = 3  # of a layer
 ACTIVE = LinearSegmentedColormap.from_list("active", ["#f4f7fa", style.SKY, style.BLUE, "#00284a"])
@@ -100,7 +100,7 @@ def _slab(axes: Axes, x: float, layer: Layer, *, lower: bool) -> float:
         width = 0.16 * (len(strongest) - 1) + 0.55 * size
         middle = x + width / 2
     words = {"ha": "center", "va": "top", "fontsize": style.SMALL - 2}
-    axes.text(middle, -0.38 if lower else 0.0, f"{layer.name}\n{layer.shape}", color=style.MUTED, **words)
+    axes.text(middle, -0.34 if lower else 0.02, f"{layer.name}\n{layer.shape}", color=style.MUTED, **words)
     return width + 0.24
 
 
