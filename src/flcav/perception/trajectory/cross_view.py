@@ -14,13 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from flcav.perception.trajectory.config import CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.rasters import STATIC
+from flcav.perception.trajectory.rasters import OTHERS, STATIC
 from flcav.perception.trajectory.views import Seen, Summary, conv
 
 if TYPE_CHECKING:
     from flcav.perception.trajectory.model import Inputs
 
-LEARNED = (*STATIC, "others 0 s ago")  # layers of the raster that cameras are taught to see
+LEARNED = (*STATIC, OTHERS[0])  # layers of the raster that cameras are taught to see
 STRIDE = 8  # pixels of a picture to a place of its features
 SHARPNESS = 10.0  # the first inverse temperature of the attention; it is learned
 

@@ -13,13 +13,14 @@ from flcav.world.trace import Trace
 Array = NDArray[np.float64]
 
 AGO = (0, 4, 8)  # steps before the present at which others are shown: 0, 1 and 2 s
+OTHERS = {steps: f"others {steps * STEP_S:g} s ago" for steps in AGO}
 LAYERS = (
     *STATIC,
     "way",  # the lanes that one gets to from where the road user is
     "red",  # bars across the lanes that a light closes, amber too
     "green",
     "self",
-    *(f"others {steps * STEP_S:g} s ago" for steps in AGO),
+    *OTHERS.values(),
     "pedestrian",
 )
 OPEN = ("G", "g")  # SUMO's letters of a green light
@@ -35,43 +36,66 @@ def rasters(
     `tracks` hold the past, the present at `PAST`; `lit` (L,) are the letters of the lights at present. Row 0 is
     farthest ahead and column 0 farthest left, as in `flcav.world.raster`.
     """
-    position, yaw = tracks.position[PAST, predicted], tracks.yaw[PAST, predicted]
-    frame = np.concatenate((position, yaw[:, None]), axis=1)
-    count, cells = len(predicted), patch.cells
-    out = np.zeros((count, len(LAYERS), cells * cells), np.bool_)
-    if not count:
-        return out.reshape(count, len(LAYERS), cells, cells)
-    grid = np.broadcast_to(centres(patch), (count, cells * cells, 2))
-    out[:, : len(STATIC)] = roads.static(out_of_frame(grid, frame)).transpose(0, 2, 1)
+    frame = np.concatenate((tracks.position[PAST, predicted], tracks.yaw[PAST, predicted, None]), axis=1)
+    sheets = Sheets(frame, patch)
+    if len(predicted):
+        _mark_map(sheets, roads)
+        _mark_lights(sheets, roads, trace, lit)
+        sheets.mark("self", np.arange(len(predicted)), _bodies(trace, tracks, PAST, predicted))
+        on_foot = trace.category == "pedestrian"
+        for steps in AGO:
+            _mark_others(sheets, OTHERS[steps], trace, tracks, predicted, PAST - steps, ~on_foot)
+        _mark_others(sheets, "pedestrian", trace, tracks, predicted, PAST, on_foot)
+    return sheets.cells.reshape(len(predicted), len(LAYERS), patch.cells, patch.cells)
 
-    def mark(layer: str, rows: NDArray[np.int64], world: Array) -> None:
-        """Set the cells of the points (R, D, 2) or (R, 2) in the pictures `rows` (R,)."""
-        at, inside = cell_of(into_frame(world, frame[rows]), patch)
-        number = np.broadcast_to(rows.reshape(-1, *(1,) * (at.ndim - 1)), at.shape)
-        out[number[inside], LAYERS.index(layer), at[inside]] = True
 
-    ways, _ = roads.lanes_at(position, yaw)
+class Sheets:
+    """The rasters of N road users while they are being made."""
+
+    def __init__(self, frame: Array, patch: Patch) -> None:
+        """Begin with nothing marked; `frame` (N, 3) is where the road users are, x, y, yaw."""
+        self.frame, self.patch = frame, patch
+        self.cells = np.zeros((len(frame), len(LAYERS), patch.cells**2), np.bool_)
+
+    def mark(self, layer: str, rows: NDArray[np.int64], world: Array) -> None:
+        """Mark the cells of the points `world` (R, D, 2) on the sheets `rows` (R,)."""
+        at, inside = cell_of(into_frame(world, self.frame[rows]), self.patch)
+        sheet = np.broadcast_to(rows[:, None], at.shape)
+        self.cells[sheet[inside], LAYERS.index(layer), at[inside]] = True
+
+
+def _mark_map(sheets: Sheets, roads: RoadMap) -> None:
+    frame = sheets.frame
+    grid = np.broadcast_to(centres(sheets.patch), (len(frame), sheets.patch.cells**2, 2))
+    sheets.cells[:, : len(STATIC)] = roads.static(out_of_frame(grid, frame)).transpose(0, 2, 1)
+    ways, _ = roads.lanes_at(frame[:, :2], frame[:, 2])
     for row, lanes in enumerate(ways):
         if lanes:
-            mark("way", np.array([row]), np.concatenate([roads.reach[lane] for lane in lanes])[None])
-    everyone = np.arange(count)
+            sheets.mark("way", np.array([row]), np.concatenate([roads.reach[lane] for lane in lanes])[None])
+
+
+def _mark_lights(sheets: Sheets, roads: RoadMap, trace: Trace, lit: NDArray[np.str_]) -> None:
+    everyone = np.arange(len(sheets.frame))
     for layer, wanted in (("green", True), ("red", False)):
         bars = _bars(roads, trace.light, lit, wanted)
-        if len(bars):
-            mark(layer, everyone, np.broadcast_to(bars, (count, *bars.shape)))
-    on_foot = trace.category == "pedestrian"
-    mark("self", everyone, _bodies(trace, tracks, PAST, predicted))
-    reach = patch.side_m
-    for layer, ago, kind in [(f"others {steps * STEP_S:g} s ago", steps, ~on_foot) for steps in AGO] + [
-        ("pedestrian", 0, on_foot)
-    ]:
-        then = PAST - ago
-        apart = tracks.position[then][None] - position[:, None]
-        near = (np.abs(apart) < reach).all(axis=2) & kind  # NaN is not near
-        near[everyone, predicted] = False
-        row, other = np.nonzero(near)
-        mark(layer, row, _bodies(trace, tracks, then, other))
-    return out.reshape(count, len(LAYERS), cells, cells)
+        sheets.mark(layer, everyone, np.broadcast_to(bars, (len(everyone), *bars.shape)))
+
+
+def _mark_others(
+    sheets: Sheets,
+    layer: str,
+    trace: Trace,
+    tracks: Tracks,
+    predicted: NDArray[np.int64],
+    instant: int,
+    kind: NDArray[np.bool_],
+) -> None:
+    """Mark who was near at an instant and is of the `kind` (A,), but for the road user himself."""
+    apart = tracks.position[instant][None] - sheets.frame[:, None, :2]
+    near = (np.abs(apart) < sheets.patch.side_m).all(axis=2) & kind  # NaN is not near
+    near[np.arange(len(predicted)), predicted] = False
+    row, other = np.nonzero(near)
+    sheets.mark(layer, row, _bodies(trace, tracks, instant, other))
 
 
 def centres(patch: Patch) -> Array:
