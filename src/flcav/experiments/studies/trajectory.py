@@ -24,7 +24,7 @@ RECIPE: RecipeFields = {
 }
 YAWS_DEG = {"front": 0.0, "front_left": 60.0, "front_right": -60.0, "back_left": 120.0, "back_right": -120.0}
 CAMERA_RECIPE: RecipeFields = RECIPE | {
-    "spins_per_scene": 31,
+    "spins_per_scene": 41,
     "cavs": 8,
     "vehicle_rig": {
         "cameras": {
@@ -93,9 +93,19 @@ STUDY = Study(
 CAMERAS = Study(
     task=TRAJECTORY,
     network="tiny-cameras",
-    train=({**CAMERA_RECIPE, "town": "grid", "seed": 31, "scenes": 1},),
-    validation={**CAMERA_RECIPE, "town": "grid", "seed": 131, "split": "validation", "cavs": 1, "scenes": 1},
-    tests={"held-out scenes": {**CAMERA_RECIPE, "town": "grid", "seed": 231, "split": "test", "cavs": 4, "scenes": 1}},
+    train=({**CAMERA_RECIPE, "town": "grid", "seed": 31, "scenes": 2},),
+    validation={**CAMERA_RECIPE, "town": "grid", "seed": 131, "split": "validation", "cavs": 3, "scenes": 1},
+    tests={
+        "held-out scenes": {
+            **CAMERA_RECIPE,
+            "town": "grid",
+            "seed": 231,
+            "split": "test",
+            "cavs": 4,
+            "spins_per_scene": 31,
+            "scenes": 1,
+        }
+    },
     epochs=12,
     patience=12,
     numbers=_numbers,
