@@ -24,8 +24,7 @@ def further_rays(
     rays: NDArray[np.float32], kind: NDArray[np.uint8], lens: Lens
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return the further unit rays (S, 3) of the pixels that need some, and the pixel (S,) each belongs to."""
-    count = np.array([0, len(_THREE), len(_NINE), len(_NINE)], np.int64)[kind]
-    total = int(count.sum())
+    total = int(np.bincount(kind, minlength=4) @ (0, len(_THREE), len(_NINE), len(_NINE)))
     directions, pixel = np.empty((total, 3), np.float32), np.empty(total, np.int32)
     _spread(rays, kind, lens.width, lens.height, _THREE, _NINE, directions, pixel)
     return directions, pixel

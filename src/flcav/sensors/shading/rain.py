@@ -10,7 +10,7 @@ from flcav.world.rays.compiled import compiled
 ROAD = int(Material.ROAD)
 WATER = 0.02  # reflectance face on
 SMEAR_PX = 15  # half height of the blur of mirrored things, in pixels of half size
-RIPPLE_PX = 6.0  # how far ripples push what they mirror aside, alike
+RIPPLE_PX = 4.0  # how far ripples push what they mirror aside, alike
 STREAKS_PER_MM = 55.0  # in a picture of 640 x 384, at 1 mm/h, growing with the rain's power of 0.6
 DROPS_PER_MM = 3.0  # on a lens, at 1 mm/h, growing alike; whatever its size
 DROP_VIEW = 0.45  # of the picture's height that a drop shows, upside down
