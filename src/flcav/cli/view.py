@@ -1,5 +1,7 @@
 """flcav view: a scene of a dataset in Rerun."""
 
+import os
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -27,6 +29,8 @@ def view(
         raise InputError("flcav view needs Rerun, which is not installed: pip install 'flcav[view]'")
     if save is not None and save.suffix != ".rrd":
         raise InputError(f"--save {save}: must be the name of an .rrd file")
+    if save is None and sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
+        raise InputError("flcav view has no display to open the viewer on: write a file with --save FILE.rrd instead")
     import rerun  # pyright: ignore[reportMissingImports]
 
     from flcav.report.rerun_log import blueprint, log_scene
@@ -49,8 +53,14 @@ def view(
         recording.flush()
 
     if save is None:
-        recording.spawn(default_blueprint=layout)
-        log()
+        try:
+            recording.spawn(default_blueprint=layout)
+            log()
+        except RuntimeError as error:
+            reason = str(error).partition("\n")[0]
+            raise InputError(
+                f"flcav view has no viewer to show it in ({reason.rstrip('.')}): use --save FILE.rrd instead"
+            ) from None
         return
     with atomic_path(save) as temporary:
         recording.save(temporary, default_blueprint=layout)

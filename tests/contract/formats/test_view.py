@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -100,3 +101,18 @@ def test_a_scene_can_be_chosen(dataset: Dataset, tmp_path: Path, capsys: pytest.
 def test_without_rerun_one_sentence_says_how_to_get_it(dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     assert _view(dataset) == 2
     assert "pip install 'flcav[view]'" in capsys.readouterr().err
+
+
+@needs_rerun
+def test_without_a_display_or_a_viewer_there_is_one_sentence(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    if sys.platform == "linux":
+        assert _view(dataset) == 2
+        assert "no display" in capsys.readouterr().err
+    monkeypatch.setenv("DISPLAY", ":77")
+    monkeypatch.setenv("PATH", "")
+    assert _view(dataset) == 2
+    assert capsys.readouterr().err.startswith("flcav: flcav view has no viewer to show it in (")
