@@ -106,7 +106,8 @@ def draw_frame(kitti: Path, story: Mapping[str, Any]) -> bytes:
     folder = KittiFolder.open(kitti)
     frame = folder.frame(folder.names.index(story["frame"]))
     image_from_lidar = frame.calibration.image_from_camera @ frame.calibration.camera_from_lidar
-    return style.png(real_frame(frame.points, frame.image, image_from_lidar, story))
+    cars = of_class(frame.objects.boxes, "Car")
+    return style.png(real_frame(frame.points, frame.image, image_from_lidar, cars, story))
 
 
 def _neutral(frame: KittiFrame, name: str) -> Boxes:
@@ -115,12 +116,16 @@ def _neutral(frame: KittiFrame, name: str) -> Boxes:
 
 
 def _story(frame: KittiFrame, found: Boxes) -> dict[str, Any]:
-    """Return the frame's found boxes and its labelled cars with the IoU limits at which each was found."""
+    """Return the frame's found boxes, and of its labelled cars the distance and the IoU limits at which each was found.
+
+    The labels themselves stay where they are: they are KITTI's.
+    """
     boxes = frame.objects.boxes
     cars = of_class(boxes, "Car")
     score = found.score if found.score is not None else np.ones(len(found))
     found = found[score >= SHOWN]
-    targets = [dict(row, found_at=[]) for row in box_rows(cars)]
+    distances = np.hypot(cars.center[:, 0], cars.center[:, 1]).round(1).tolist()
+    targets: list[dict[str, Any]] = [{"distance_m": distance, "found_at": []} for distance in distances]
     for overlap in (0.5, 0.7):
         for target in assign_targets(of_class(found, "Car"), cars, overlap):
             if target >= 0:

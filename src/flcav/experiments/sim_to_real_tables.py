@@ -21,7 +21,7 @@ def tables(results: Mapping[str, Any]) -> dict[str, str]:
             ],
         ),
         "cars": table(
-            ("frame", "car at [m]", "size [m]", "found at IoU"),
+            ("frame", "car at [m]", "found at IoU"),
             [(story["frame"], *_car(car)) for story in results["frames"] for car in story["cars"]],
         ),
         "clouds": table(("", *clouds), _clouds(clouds)),
@@ -32,15 +32,14 @@ def _found(row: Mapping[str, Any]) -> tuple[int, int, str]:
     return row["found"], row["false_positives"], f"{row['ap']:.3f}"
 
 
-def _car(car: Mapping[str, Any]) -> tuple[str, str, str]:
-    size = " x ".join(f"{car[side]:.2f}" for side in ("length", "width", "height"))
-    return f"{np.hypot(car['x'], car['y']):.1f}", size, ", ".join(map(str, car["found_at"])) or "no"
+def _car(car: Mapping[str, Any]) -> tuple[str, str]:
+    return f"{car['distance_m']:.1f}", ", ".join(map(str, car["found_at"])) or "no"
 
 
 def _clouds(clouds: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     columns = list(clouds.values())
     rows = [["returns per frame", *(f"{c['returns']:.0f}" for c in columns)]]
-    for name in columns[0]["returns_per_range"]:
+    for name in sorted(columns[0]["returns_per_range"], key=lambda limits: float(limits.split("-")[0])):
         rows.append([f"of them at {name}", *(f"{c['returns_per_range'][name]:.0f}" for c in columns)])
     for place, share in enumerate((5, 25, 50, 75, 95)):
         rows.append([f"intensity, {share} % are below", *(f"{c['intensity_quantiles'][place]:.2f}" for c in columns)])

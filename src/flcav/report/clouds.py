@@ -54,15 +54,16 @@ def real_frame(
     points: NDArray[np.float32],
     image: NDArray[np.uint8],
     image_from_lidar: NDArray[np.float64],
+    cars: Boxes,
     story: Mapping[str, Any],
 ) -> Figure:
     """Return a real frame's cloud from above beside its image, with the labelled cars and what was found.
 
-    image_from_lidar: (3, 4), LiDAR frame to pixels; story: "cars" with "found_at", "boxes" with "class" and "score".
+    image_from_lidar: (3, 4), LiDAR frame to pixels; story: "found_at" of each of `cars`, "boxes" with their classes.
     """
     figure = style.canvas(11.0, 4.9)
     above, ahead = figure.subplots(1, 2, width_ratios=(1, 1.55))
-    cars, found = _boxes(story["cars"]), _boxes(story["boxes"])
+    found = _boxes(story["boxes"])
     hit = np.array([0.5 in car["found_at"] for car in story["cars"]], dtype=bool)
     draw_points(above, points, -1.7, EXTENT)
     draw_boxes(above, cars[hit], style.GREEN, fill=0.25, width=1.0)

@@ -5,6 +5,7 @@ import numpy as np
 from flcav.experiments import objects_tables, sim_to_real_tables
 from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.studies.objects import STUDY
+from flcav.geometry import Boxes
 from flcav.report import style
 from flcav.report.clouds import compare, real_frame
 
@@ -66,7 +67,7 @@ def cloud():
 
 
 def test_clouds_and_real_cars_stand_beside_each_other():
-    car = {"x": 3.0, "y": 4.0, "length": 4.0, "width": 1.7, "height": 1.5, "found_at": [0.5]}
+    car = {"distance_m": 5.0, "found_at": [0.5]}
     score = {"class": "Car", "kind": "3d", "iou": 0.5, "targets": 1, "found": 1, "false_positives": 0, "ap": 1.0}
     tables = sim_to_real_tables.tables(
         {
@@ -75,7 +76,7 @@ def test_clouds_and_real_cars_stand_beside_each_other():
             "frames": [{"frame": "000008", "cars": [car], "boxes": []}],
         }
     )
-    assert "| 000008 | 5.0 | 4.00 x 1.70 x 1.50 | 0.5 |" in tables["cars"]
+    assert "| 000008 | 5.0 | 0.5 |" in tables["cars"]
     assert "| Car | 3d at 0.5 | 1 | 1 | 0 | 1.000 |" in tables["detections"]
     assert "| returns without intensity | 25% | 25% |" in tables["clouds"]
 
@@ -83,7 +84,8 @@ def test_clouds_and_real_cars_stand_beside_each_other():
 def test_clouds_and_frames_are_drawn():
     assert style.png(compare({"KITTI": cloud(), "simulated": cloud()}), 40).startswith(b"\x89PNG")
     box = {"class": "Car", "x": 12.0, "y": 0.0, "z": -1.0, "length": 4.0, "width": 1.7, "height": 1.5, "yaw": 0.1}
-    story = {"frame": "000008", "cars": [box | {"found_at": []}], "boxes": [box | {"score": 0.5}]}
+    story = {"frame": "000008", "cars": [{"distance_m": 12.0, "found_at": []}], "boxes": [box | {"score": 0.5}]}
+    cars = Boxes.from_array([[12, 0, -1, 4, 1.7, 1.5, 0.1]], "Car")
     image_from_lidar = np.array([[600, -700, 0, 0], [180, 0, -700, 0], [1, 0, 0, 0]], dtype=float)
-    figure = real_frame(np.ones((9, 4), np.float32), np.zeros((375, 1242, 3), np.uint8), image_from_lidar, story)
+    figure = real_frame(np.ones((9, 4), np.float32), np.zeros((375, 1242, 3), np.uint8), image_from_lidar, cars, story)
     assert "0 of 1 cars found" in figure.axes[0].get_title(loc="left")
