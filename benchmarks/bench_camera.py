@@ -2,10 +2,10 @@
 
 import argparse
 import json
-import time
 from collections.abc import Callable
 
 import numpy as np
+from cpu_time import cpu_ms
 
 from flcav.geometry import pose
 from flcav.sensors.camera import Camera, photograph
@@ -23,19 +23,12 @@ def measure(scene: Scene, agent: str, names: list[str], repeats: int) -> dict[st
     """Return the median CPU-ms of the bare trace ("bare") and of an image in each weather, taken in turns."""
     own, camera = int(np.flatnonzero(scene.trace.actor == agent)[0]), Camera()
     at = scene.world_from_actor(own) @ pose(0.8, 0.0, 1.5) @ BODY_FROM_OPTICAL
-    works: dict[str, Callable[[], object]] = {}
-    works["bare"] = lambda: scene.cast(at, directions(camera), far_m=FAR_M, hidden=own)
+    works: list[Callable[[], object]] = [lambda: scene.cast(at, directions(camera), far_m=FAR_M, hidden=own)]
     for name in names:
-        works[name] = lambda weather=WEATHERS[name]: photograph(
-            scene, at, camera, weather, np.random.default_rng(0), hidden=own
+        works.append(
+            lambda weather=WEATHERS[name]: photograph(scene, at, camera, weather, np.random.default_rng(0), hidden=own)
         )
-    taken = {name: np.empty(repeats) for name in works}
-    for repeat in range(-1, repeats):
-        for name, work in works.items():
-            start = time.process_time()
-            work()
-            taken[name][repeat] = time.process_time() - start
-    return {name: 1e3 * float(np.median(values)) for name, values in taken.items()}
+    return dict(zip(["bare", *names], cpu_ms(works, repeats)))
 
 
 def main() -> None:
