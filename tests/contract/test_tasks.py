@@ -204,6 +204,9 @@ def test_a_whole_training_leaves_weights_with_their_card_and_curves(task, data, 
     with safe_open(tmp_path / "weights.safetensors", framework="pt") as file:
         assert json.loads(file.metadata()[CARD_KEY]) == json.loads(card.model_dump_json())
     assert (tmp_path / "card.md").read_text() == card.markdown()
+    again = tmp_path / "again.safetensors"
+    save_network(task, load_network(task, tmp_path / "weights.safetensors"), again, card)
+    assert again.read_bytes() == (tmp_path / "weights.safetensors").read_bytes()
     assert len(list((tmp_path / "events").glob("events.out.tfevents.*"))) == 1
 
 

@@ -1,5 +1,6 @@
 """Weights on disk and as arrays: safetensors files that say which network they are of, and how it came about."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ def save_network(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path, 
     metadata = {config_key(task): _adapter(task).dump_json(network.config).decode()}
     if card is not None:
         metadata[CARD_KEY] = card.model_dump_json()
-    write_bytes(path, save(tensors, metadata))
+    write_bytes(path, _in_order(save(tensors, metadata)))
 
 
 def load_network(task: Task[ConfigT, NetworkT, Any], path: Path) -> NetworkT:
@@ -86,6 +87,16 @@ def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
                 f"weights of another network: '{name}' has shape {array.shape}, not {tuple(state[name].shape)}"
             )
         state[name].copy_(torch.from_numpy(np.ascontiguousarray(array)))
+
+
+def _in_order(data: bytes) -> bytes:
+    """Return the bytes of a safetensors file with its metadata sorted; the library's order is another each time."""
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data[8 + size :]
 
 
 def _learned(network: nn.Module) -> dict[str, torch.Tensor]:
