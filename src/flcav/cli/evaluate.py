@@ -28,17 +28,20 @@ def evaluate(
     from flcav.cli.tasks import network_of, task_named
     from flcav.config import InputError
     from flcav.dataset.store import Dataset
-    from flcav.perception.tracking.evaluate import evaluate_tracks, tracks_lines
+    from flcav.perception.tracking.evaluate import evaluate_tracks, sequences, tracks_lines
 
     learner = task_named(task)
     if tracks and task != "objects":
         raise InputError(f"--tracks: only objects have tracks, not '{task}'")
     network = network_of(learner, weights)
+    dataset = Dataset.open(data)
+    if tracks:
+        sequences(dataset)  # said before the long work
     with progress.live(f"evaluate {task}") as report:
-        result = learner.evaluate(network, Dataset.open(data), progress=report)
+        result = learner.evaluate(network, dataset, progress=report)
     lines = learner.evaluation_lines(result)
     if tracks:
         with progress.live("follow objects") as report:
-            result = {**result, "tracks": evaluate_tracks(network, Dataset.open(data), progress=report)}
+            result = {**result, "tracks": evaluate_tracks(network, dataset, progress=report)}
         lines += tracks_lines(result["tracks"])
     typer.echo(json.dumps(result, allow_nan=False) if as_json else "\n".join(lines))
