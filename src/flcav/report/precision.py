@@ -30,7 +30,7 @@ def precisions(panels: Mapping[str, Sequence[Bar]]) -> Figure:
     for axes, (title, bars) in zip(drawn, panels.items(), strict=True):
         for row, bar in enumerate(bars):
             axes.barh(row, bar.mean, height=0.7, color=style.BLUE if bar.targets is None else style.SKY)
-            axes.plot(bar.seeds, [row] * len(bar.seeds), "o", color=style.INK, markersize=3)
+            axes.plot(bar.seeds, [row] * len(bar.seeds), "o", color=style.INK, markersize=3, clip_on=False)
         names = [bar.name if bar.targets is None else f"{bar.name} ({bar.targets})" for bar in bars]
         axes.set_yticks(range(len(bars)), names)
         axes.set_ylim(rows - 0.4, -0.6)
