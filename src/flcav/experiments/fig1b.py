@@ -87,7 +87,7 @@ def fig1b(out: Path, progress: Report = silent) -> bytes:
         _objects(networks["objects"], data.folder / payload_path(LIDAR, data.name(number), POINTS)),
         _trajectory(networks["trajectory"], data, number),
     ]
-    return style.png(page.task_columns(columns))
+    return style.png(page.task_columns(columns), dpi=130)
 
 
 def most_to_see(data: Dataset) -> int:

@@ -47,7 +47,7 @@ def test_the_weather_recipe_is_the_users():
 
 def test_a_training_waits_for_its_frames_and_a_test_for_its_training():
     steps = {step.name: step for step in steps_of(weather.STUDY, [1, 2])}
-    assert set(steps["seed-2"].needs) == {"train-0", "train-1", "validation"}
+    assert set(steps["seed-2"].needs) == {"train-0", "train-1", "train-2", "validation"}
     assert set(steps["seed-2-tested"].needs) == {"seed-2", *(f"test-{name}" for name in weather.STUDY.tests)}
 
 
