@@ -19,6 +19,7 @@ from flcav.perception.signs.samples import Sample, size_px
 
 GREY = 114  # what lies beyond a picture
 SHARES = (0.15, 0.25, 0.3, 0.3)  # of the samples that are one window, a mosaic of 2 x 2, of 3 x 3, of 4 x 4
+PART_PX = 32  # a mosaic's parts are about so high at least
 UNEVEN = 0.3  # how far a border within a mosaic may lie off, as a share of a part
 AROUND_A_SIGN = 0.8  # share of the windows drawn so that they hold one, where the picture has any
 SCALE = (0.6, 2.0)
@@ -30,7 +31,7 @@ GAIN, SATURATION = (0.7, 1.3), (0.6, 1.4)
 def draw(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
     """Return sample `index` as a training step sees it: a window of it, or a mosaic with windows of others."""
     width, height = config.window_px
-    across = int(rng.choice(len(SHARES), p=SHARES)) + 1
+    across = max(min(int(rng.choice(len(SHARES), p=SHARES)) + 1, height // PART_PX), 1)
     columns, rows = _borders(width, across, rng), _borders(height, across, rng)
     parts = []
     for number, (row, column) in enumerate(product(range(across), repeat=2)):
