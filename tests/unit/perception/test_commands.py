@@ -127,7 +127,16 @@ def test_other_bad_input_is_one_sentence(data, weights, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     cases = {
         "choose one of weather": ("train", "poetry", "--data", data, "--out", tmp_path / "o"),
-        "choose one of tiny, paper": ("train", "objects", "--data", data, "--out", tmp_path / "o", "--network", "huge"),
+        "choose one of tiny, small, paper": (
+            "train",
+            "objects",
+            "--data",
+            data,
+            "--out",
+            tmp_path / "o",
+            "--network",
+            "huge",
+        ),
         "manifest": ("train", "objects", "--data", tmp_path / "empty", "--out", tmp_path / "o"),
         "damaged": ("evaluate", "objects", "--data", data, "--weights", tmp_path / "broken"),
         "--weights": ("infer", "objects", data),

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import ConcatDataset
 
-from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.perception.card import Card, data_entry, write_card
 from flcav.perception.task import Task, configuration, fresh
@@ -39,8 +38,8 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     """Train, going on from where an interrupted run left off in `out`; write weights, card and curves there.
 
     One learning-rate cycle over all epochs. With validation data, the network of the best epoch is kept and its
-    evaluation is in the card. Raises `InputError` for an unknown network, for data that the task cannot use, and where
-    `out` cannot be written.
+    evaluation is in the card. Raises `InputError` for an unknown network and for data that the task cannot use, `OSError`
+    before anything is read where `out` cannot be written.
     """
     _check_writable(out)
     config = configuration(task, request.network)
@@ -77,12 +76,12 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
 
 
 def _check_writable(folder: Path) -> None:
-    """Raise `InputError` where nothing can be written below `folder`; leaves nothing behind."""
+    """Raise `OSError` where nothing can be written below `folder`; leaves nothing behind."""
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
         tempfile.TemporaryFile(dir=nearest).close()
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
+        raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
 def _rounded(scores: NDArray[np.float64]) -> list[float]:
