@@ -38,8 +38,8 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     """Train, going on from where an interrupted run left off in `out`; write weights, card and curves there.
 
     One learning-rate cycle over all epochs. With validation data, the network of the best epoch is kept and its
-    evaluation is in the card. Raises `InputError` for an unknown network and for data that the task cannot use, `OSError`
-    before anything is read where `out` cannot be written.
+    evaluation is in the card. Raises `InputError` for an unknown network and for data that the task cannot use,
+    `OSError` before anything is read where `out` cannot be written.
     """
     _check_writable(out)
     config = configuration(task, request.network)
