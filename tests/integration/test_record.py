@@ -14,6 +14,7 @@ from PIL import Image
 
 from flcav.cli.main import run
 from flcav.config import read_config
+from flcav.dataset import tasks
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.sources.embedded import EmbeddedSource
@@ -175,10 +176,10 @@ def test_output_that_cannot_be_written_exits_1(recipe: Path, capsys: pytest.Capt
 def test_a_full_disk_exits_1_and_leaves_no_dataset(
     recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    def full(path: Path, data: bytes) -> int:
+    def full(path: Path, data: memoryview) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(tasks, "fill", full)
     assert flcav("record", recipe, "--out", tmp_path / "data") == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith(f"flcav: {tmp_path / 'data'}")

@@ -19,7 +19,7 @@ from flcav.dataset.layout import CALIBRATION, FILES, TRACES, table_path
 from flcav.dataset.payloads import payloads
 from flcav.dataset.rows import rows_of, table_of
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
-from flcav.files import write_bytes
+from flcav.files import fill, write_bytes
 from flcav.sensors.frame import Frame
 from flcav.sources.source import Replayable, Source
 from flcav.world.trace import Trace
@@ -96,7 +96,7 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
         for payload in payloads(frame):
             path = part / PAYLOADS / payload.path
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(payload.data)
+            fill(path, payload.data)
             files.append((payload.path, len(payload.data), hashlib.sha256(payload.data).hexdigest()))
         for name, rows in rows_of(frame).items():
             tables[name].append(rows)

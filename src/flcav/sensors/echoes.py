@@ -29,9 +29,9 @@ QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of t
 
 
 class Trace(Protocol):
-    """`Target.trace` with everything but the rays settled."""
+    """`Target.trace` with everything but the rays settled, of which it is told the numbers."""
 
-    def __call__(self, directions: NDArray[np.float32], *, near_m: NDArray[np.float32] | None = None) -> Hits:
+    def __call__(self, rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
         """Return the first hits."""
         ...
 
@@ -48,22 +48,21 @@ class Echoes(NamedTuple):
 
 def cast_through_glass(
     trace: Trace,
-    directions: NDArray[np.float32],
     passes: NDArray[np.bool_],
     first: NDArray[np.int64],
     material: NDArray[np.uint8],
 ) -> Echoes:
-    """Return what comes back along `directions` (N, 3) when the rays that `passes` (N,) marks go through glass.
+    """Return what comes back along N rays when those that `passes` (N,) marks go through glass.
 
     Face f of instance i is of `material[first[i] + f]`.
     """
-    hits = trace(directions)
+    hits = trace(slice(None))
     found, through = _look_up(hits.instance, hits.face, first, material, passes, GLASS)
-    echoes = Echoes(*hits, found, np.zeros(len(directions), np.uint8))
+    echoes = Echoes(*hits, found, np.zeros(len(passes), np.uint8))
     for _ in range(PANES):
         if not len(through):
             break
-        beyond = trace(directions[through], near_m=echoes.distance[through] + np.float32(AFTER_PANE_M))
+        beyond = trace(through, near_m=echoes.distance[through] + np.float32(AFTER_PANE_M))
         found, again = _look_up(beyond.instance, beyond.face, first, material, passes[through], GLASS)
         for known, further in zip(echoes, (*beyond, found)):
             known[through] = further

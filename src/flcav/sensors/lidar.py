@@ -5,7 +5,7 @@ detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3). Rain, 
 weather they cost nothing and draw no random numbers.
 """
 
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from flcav.sensors.beams import BEAMS
 from flcav.sensors.carla import CarlaReturns, carla_returns
 from flcav.sensors.echoes import LEVELS, QUANTILES, Echoes, brightness, cast_through_glass, detect
 from flcav.sensors.rolling import sectors, time_in_spin_s
+from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import OFFSET_S, Scene
 from flcav.world.weather import Weather
 
@@ -123,8 +124,12 @@ def cast(
     pattern, surfaces = ray_pattern(lidar), scene.surfaces
 
     def part(pose: NDArray[np.float64], rays: NDArray[np.int64] | slice) -> Echoes:
-        trace = partial(scene.cast, pose, far_m=lidar.range_m, hidden=hidden)
-        return cast_through_glass(trace, pattern[rays], passes[rays], surfaces.first, surfaces.material)
+        directions = pattern[rays]
+
+        def trace(rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
+            return scene.cast(pose, directions[rays], near_m=near_m, far_m=lidar.range_m, hidden=hidden)
+
+        return cast_through_glass(trace, passes[rays], surfaces.first, surfaces.material)
 
     if not lidar.rolling:
         return part(world_from_sensor, slice(None))

@@ -1,13 +1,12 @@
 """How much more of each actor a sensor would see if nothing stood in the way: rays stopped before it, traced on."""
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.echoes import cast_through_glass
 from flcav.sensors.lidar import Lidar, ray_pattern
 from flcav.world.rays.compiled import compiled
+from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
 
 BOX_MARGIN_M = 0.01
@@ -31,17 +30,18 @@ def occluded_rays(
     rays, counts = _stopped_rays(
         pattern, lidar.azimuth_steps, body_from_sensor, scene.trace.size[actors], BOX_MARGIN_M, distance
     )
-    found = np.zeros(len(actors), np.int64)
-    ends = np.cumsum(counts)
-    for row in np.flatnonzero(counts).tolist():
-        chosen, actor = rays[ends[row] - counts[row] : ends[row]], int(actors[row])
-        if lidar.rolling:  # it may have been met before, or on its way to, where it is at the scene's instant
-            chosen = chosen[instance[chosen] != actor + 1]
-        trace = partial(scene.cast_alone, actor, body_from_sensor[row], far_m=lidar.range_m)
-        first = surfaces.first[actor + 1 : actor + 2]
-        echoes = cast_through_glass(trace, pattern[chosen], passes[chosen], first, surfaces.material)
-        found[row] = np.count_nonzero(echoes.instance >= 0)
-    return found
+    group = np.repeat(np.arange(len(actors)), counts)
+    if lidar.rolling:  # an actor may have been met before, or on its way to, where it is at the scene's instant
+        others = instance[rays] != actors[group] + 1
+        rays, group = rays[others], group[others]
+    directions = pattern[rays]
+
+    def trace(rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
+        ends = np.searchsorted(group[rays], np.arange(len(actors)), side="right")
+        return scene.cast_each(actors, body_from_sensor, ends, directions[rays], near_m=near_m, far_m=lidar.range_m)
+
+    echoes = cast_through_glass(trace, passes[rays], surfaces.first[actors + 1], surfaces.material)
+    return np.bincount(group[echoes.instance >= 0], minlength=len(actors))
 
 
 def _bodies_from(poses: NDArray[np.float64], world_from_sensor: NDArray[np.float64]) -> NDArray[np.float64]:

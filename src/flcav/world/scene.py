@@ -44,7 +44,8 @@ class Scene:
         models = [_town_model(town), *(_actor_model(*shape) for shape in shapes)]
         self.surfaces = _surfaces(models, [str(name) for name in trace.actor])
         self._solids = [model.solid for model in models]
-        self._assembly = Embree().assembly(self._solids)
+        self._engine = Embree()
+        self._assembly = self._engine.assembly(self._solids)
         self._assembly.place(0, np.eye(4))
         self._placed = np.full((len(trace.actor), 4), np.nan)  # x, y, z, yaw; NaN where an actor is nowhere
         self._hidden: int | None = None
@@ -107,17 +108,23 @@ class Scene:
         self._hide(hidden)
         return self._assembly.blocked(origins, directions, far_m)
 
-    def cast_alone(
+    def cast_each(
         self,
-        actor: int,
+        actors: NDArray[np.int64],
         body_from_rays: NDArray[np.float64],
+        ends: NDArray[np.int64],
         directions: NDArray[np.float32],
         *,
         near_m: NDArray[np.float32] | None = None,
         far_m: float = np.inf,
     ) -> Hits:
-        """Return what each ray meets of one actor in an empty world; rays are placed in the actor's body frame."""
-        return self._solids[actor + 1].trace(body_from_rays, directions, near_m=near_m, far_m=far_m)
+        """Return what groups of rays meet, each of its own one of `actors` (K,) in an empty world.
+
+        `instance` is the group's number. Group k is `directions[ends[k - 1] : ends[k]]`; `body_from_rays` (K, 4, 4)
+        places it in its actor's body frame.
+        """
+        solids = [self._solids[actor + 1] for actor in actors.tolist()]
+        return self._engine.trace_each(solids, body_from_rays, ends, directions, near_m=near_m, far_m=far_m)
 
     def _hide(self, hidden: int | None) -> None:
         if hidden != self._hidden:

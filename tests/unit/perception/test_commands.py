@@ -128,18 +128,10 @@ def test_other_bad_input_is_one_sentence(data, weights, tmp_path, capsys):
     cases = {
         "choose one of weather": ("train", "poetry", "--data", data, "--out", tmp_path / "o"),
         "choose one of tiny, small, paper": (
-            "train",
-            "objects",
-            "--data",
-            data,
-            "--out",
-            tmp_path / "o",
-            "--network",
-            "huge",
+            *("train", "objects", "--data", data, "--out", tmp_path / "o", "--network", "huge"),
         ),
         "manifest": ("train", "objects", "--data", tmp_path / "empty", "--out", tmp_path / "o"),
         "damaged": ("evaluate", "objects", "--data", data, "--weights", tmp_path / "broken"),
-        "--weights": ("infer", "objects", data),
         "neither a dataset": ("infer", "objects", "--weights", weights, tmp_path / "empty"),
     }
     for sentence, arguments in cases.items():

@@ -75,8 +75,13 @@ def test_surfaces_tell_face_and_paint(scene: Scene):
 
 
 def test_one_actor_alone_is_seen_in_its_own_frame(scene: Scene):
-    hits = scene.cast_alone(1, pose(-10.0, 0.0, 0.5), AHEAD)
-    assert hits.distance[0] == pytest.approx(10.0 - 3.9, abs=0.2)
+    frames = np.stack((pose(-10.0, 0.0, 0.5), pose(-20.0, 0.0, 0.5), pose(-10.0, 30.0, 0.5)))
+    rays = np.repeat(AHEAD[:1], 4, axis=0)
+    hits = scene.cast_each(np.array([1, 0, 1]), frames, np.array([1, 3, 4]), rays)
+    assert hits.distance == pytest.approx([10.0 - 3.9, 20.0 - 3.9, 20.0 - 3.9, np.inf], abs=0.2)
+    assert hits.instance.tolist() == [0, 1, 1, -1]
+    beyond = scene.cast_each(np.array([1]), frames[:1], np.array([1]), rays[:1], near_m=hits.distance[:1] + 1)
+    assert beyond.distance[0] > hits.distance[0] + 1
 
 
 def test_a_town_is_built_once(small_town: Callable[..., Town], standing: Callable[..., Trace]):

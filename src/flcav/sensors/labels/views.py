@@ -66,4 +66,5 @@ def _unoccluded(
     if not len(rays):
         return 0
     body_from_camera = inverse(scene.world_from_actor(actor)) @ world_from_camera
-    return int(np.count_nonzero(scene.cast_alone(actor, body_from_camera, rays).face >= 0))
+    hits = scene.cast_each(np.array([actor]), body_from_camera[None], np.array([len(rays)]), rays)
+    return int(np.count_nonzero(hits.face >= 0))

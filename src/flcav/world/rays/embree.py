@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import pose
 from flcav.world.rays import loader as c
-from flcav.world.rays.packets import LANES, block_packets, trace_packets
+from flcav.world.rays.packets import LANES, block_packets, trace_groups, trace_packets
 from flcav.world.rays.raycaster import Hits
 
 _ARGUMENTS = c.IntersectArguments(flags=c.QUERY_COHERENT, feature_mask=0xFFFFFFFF)
@@ -141,6 +141,44 @@ class Embree:
         """Return an assembly of `solids`, none placed yet."""
         return Assembly(solids)
 
+    def trace_each(
+        self,
+        solids: Sequence[Solid],
+        solid_from_rays: NDArray[np.float64],
+        ends: NDArray[np.int64],
+        directions: NDArray[np.float32],
+        *,
+        near_m: NDArray[np.float32] | None = None,
+        far_m: float = np.inf,
+    ) -> Hits:
+        """Trace groups of rays, each against its own solid: see `Raycaster.trace_each`."""
+        rays, near, hits = _buffers(directions, near_m)
+        trace_groups(
+            _address("rtcIntersect16"),
+            np.array([solid.handle for solid in solids], np.int64),
+            ctypes.addressof(_ARGUMENTS),
+            np.ascontiguousarray(solid_from_rays[:, :3, 3], np.float32),
+            np.ascontiguousarray(solid_from_rays[:, :3, :3], np.float32),
+            rays,
+            near,
+            np.float32(far_m),
+            ends,
+            *hits,
+        )
+        return hits
+
+
+def _buffers(
+    directions: NDArray[np.float32], near_m: NDArray[np.float32] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Hits]:
+    """Return rays (N, 3), where they begin (N,) or (1,), and room for what they meet."""
+    rays = np.ascontiguousarray(directions, np.float32)
+    near = np.zeros(1, np.float32) if near_m is None else np.ascontiguousarray(near_m, np.float32)
+    if near_m is not None and len(near) != len(rays):
+        raise ValueError(f"near_m has {len(near)} values for {len(rays)} rays")
+    count = len(rays)
+    return rays, near, Hits(np.empty(count, np.float32), np.empty(count, np.int32), np.empty(count, np.int32))
+
 
 def _trace(
     handle: int,
@@ -150,11 +188,7 @@ def _trace(
     far_m: float,
     threads: int,
 ) -> Hits:
-    rays = np.ascontiguousarray(directions, np.float32)
-    near = np.zeros(1, np.float32) if near_m is None else np.ascontiguousarray(near_m, np.float32)
-    if near_m is not None and len(near) != len(rays):
-        raise ValueError(f"near_m has {len(near)} values for {len(rays)} rays")
-    hits = Hits(np.empty(len(rays), np.float32), np.empty(len(rays), np.int32), np.empty(len(rays), np.int32))
+    rays, near, hits = _buffers(directions, near_m)
     origin = target_from_rays[:3, 3].astype(np.float32)
     rotation = np.ascontiguousarray(target_from_rays[:3, :3], np.float32)
     arguments = ctypes.addressof(_ARGUMENTS)

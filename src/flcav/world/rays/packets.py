@@ -84,6 +84,27 @@ def trace_packets(
 
 
 @compiled
+def trace_groups(
+    intersect, scenes, arguments, origins, rotations, directions, near, far, ends, distance, instance, face
+):
+    """Trace group k of the rays, from `ends[k - 1]` to `ends[k]`, against `scenes[k]`, whose number is then `instance`.
+
+    `origins` (K, 3) and `rotations` (K, 3, 3) place the groups' frames; all else is as `trace_packets` has it.
+    """
+    first = 0
+    for group in range(len(scenes)):
+        last = ends[group]
+        trace_packets(
+            *(intersect, scenes[group], arguments, origins[group], rotations[group], directions, near, far),
+            *(first, last, distance, instance, face),
+        )
+        for ray in range(first, last):
+            if instance[ray] >= 0:
+                instance[ray] = group
+        first = last
+
+
+@compiled
 def block_packets(occluded, scene, arguments, origins, directions, far, blocked):
     """Write for each ray whether anything lies before its end `far` (N,); where that is not positive: nothing does.
 

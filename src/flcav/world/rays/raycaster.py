@@ -71,3 +71,19 @@ class Raycaster(Protocol[SolidT]):
     def assembly(self, solids: Sequence[SolidT]) -> Assembly:
         """Return an assembly of `solids`, none placed yet; instance i is solid i."""
         ...
+
+    def trace_each(
+        self,
+        solids: Sequence[SolidT],
+        solid_from_rays: NDArray[np.float64],
+        ends: NDArray[np.int64],
+        directions: NDArray[np.float32],
+        *,
+        near_m: NDArray[np.float32] | None = None,
+        far_m: float = np.inf,
+    ) -> Hits:
+        """Return what groups of rays meet first, each of one of K `solids` alone; `instance` is the group's number.
+
+        Group k is `directions[ends[k - 1] : ends[k]]`, unit vectors of a frame that `solid_from_rays` (K, 4, 4) places.
+        """
+        ...
