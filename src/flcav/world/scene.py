@@ -2,7 +2,7 @@
 
 import pickle
 import zlib
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from hashlib import sha256
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Mater
 from flcav.world.meshes import Mesh, actor_mesh
 from flcav.world.rays.embree import Embree, Solid
 from flcav.world.rays.raycaster import Hits
-from flcav.world.static import town_mesh
+from flcav.world.static import Things, town_mesh, town_things
 from flcav.world.town import Town
 from flcav.world.trace import Trace
 
@@ -50,6 +50,11 @@ class Scene:
         self._placed = np.full((len(trace.actor), 4), np.nan)  # x, y, z, yaw; NaN where an actor is nowhere
         self._hidden: int | None = None
         self._place()
+
+    @cached_property
+    def things(self) -> Things:
+        """Return the town's signs and signal heads."""
+        return town_things(self.town)
 
     def move_to(self, index: int, offset_s: float = 0.0) -> None:
         """Put every actor where it is at instant `index` of the trace, or `offset_s` (-0.1 to 0.1) later.

@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 from flcav.sensors.frame import Array, SignViews
 from flcav.sensors.labels.regions import thing_regions
 from flcav.world.scene import Scene
-from flcav.world.static import town_things
 
 READABLE = np.cos(np.radians(80.0))  # of the angle between the line of sight and where the sign faces
 STATES = {
@@ -23,7 +22,7 @@ def view_signs(scene: Scene, world_from_camera: Array, instance: NDArray[np.int3
 
     `instance` (H, W) is -(t + 1) at the town's thing t. The scene stands at the instant of the image.
     """
-    things = town_things(scene.town)
+    things = scene.things
     regions = thing_regions(instance, len(things))
     camera = world_from_camera[:3, 3]
     sight = camera - things.position

@@ -27,7 +27,7 @@ from flcav.world.materials import (
 )
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
-from flcav.world.static import Part, Things, static_world, town_things
+from flcav.world.static import Part, static_world
 from flcav.world.town import Town
 
 # Numbers and names of CARLA's semantic tags (0.9.15)
@@ -96,7 +96,6 @@ class Appearance(NamedTuple):
     noise: NDArray[np.float32]
 
 
-_THINGS: WeakKeyDictionary[Scene, Things] = WeakKeyDictionary()
 _KNOWN: WeakKeyDictionary[Scene, Appearance] = WeakKeyDictionary()
 
 
@@ -105,13 +104,6 @@ def appearance_of(scene: Scene) -> Appearance:
     if scene not in _KNOWN:
         _KNOWN[scene] = _appearance(scene)
     return _KNOWN[scene]
-
-
-def things_of(scene: Scene) -> Things:
-    """Return the signs and signal heads of a scene's town, looked up once."""
-    if scene not in _THINGS:
-        _THINGS[scene] = town_things(scene.town)
-    return _THINGS[scene]
 
 
 def _appearance(scene: Scene) -> Appearance:
@@ -124,7 +116,7 @@ def _appearance(scene: Scene) -> Appearance:
     leafy = (world.part == Part.CLUTTER) & (world.mesh.material == Material.LEAF)
     semantic[:actors] = np.where(leafy, SEMANTICS["vegetation"], numbers[world.part])
     part[:actors], part_row[:actors] = world.part, world.row
-    thing[:actors] = -(things_of(scene).face + 1)
+    thing[:actors] = -(scene.things.face + 1)
     corner = np.zeros((rows - actors, 3, 3), np.float32)
     corner_normal = np.zeros((rows - actors, 3, 3), np.float32)
     for instance, (category, shape) in enumerate(zip(trace.category, trace.shape), start=1):

@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 
 from flcav.geometry import inverse, transform_points
 from flcav.sensors.lens import Lens, project
-from flcav.sensors.shading.appearance import things_of
 from flcav.sensors.shading.light import Light
 from flcav.sensors.shading.shadows import DARK
 from flcav.sensors.shading.state import AMBER, GREEN, RED, State, lamp_places
@@ -109,7 +108,7 @@ def _glowing(scene: Scene, state: State, light: Light, eye: NDArray[np.float64],
     if light.lamps > 0:
         street = STREET * float(light.lamps)
         out.extend((np.array((x, y, z - 0.2)), STREET_COLOUR, street) for x, y, z in scene.town.lamps)
-        things = things_of(scene)
+        things = scene.things
         for number, (place, yaw, kind) in enumerate(zip(things.position, things.yaw, things.kind)):
             ahead = (eye - place) @ (np.cos(yaw), np.sin(yaw), 0.0)
             if kind == "signal" and ahead > 0:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import transform_points
-from flcav.sensors.shading.appearance import things_of
 from flcav.world.materials import Material
 from flcav.world.meshes import actor_mesh
 from flcav.world.rays.compiled import compiled, inlined
@@ -46,7 +45,7 @@ def state_of(scene: Scene, lamps_on: float, low_sight: bool) -> State:
     """Return what is lit; `low_sight`: rain or fog that vehicles have their lamps on in by day."""
     trace, index = scene.trace, scene.index
     letters = dict(zip(trace.light.tolist(), trace.light_state[index].tolist()))
-    lens = [LENSES.get(letters.get(link, ""), 0) for link in things_of(scene).link]
+    lens = [LENSES.get(letters.get(link, ""), 0) for link in scene.things.link]
     parked = np.char.startswith(trace.actor, "parked")
     on = np.where(parked | ~trace.present[index], 0.0, max(lamps_on, 0.8 if low_sight else 0.0))
     forward = np.stack((np.cos(trace.yaw[index]), np.sin(trace.yaw[index])), axis=1)
