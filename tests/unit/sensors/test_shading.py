@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -133,7 +134,11 @@ def test_brightness_rises_and_walls_in_the_sun_are_not_burnt_out():
     assert at[6.0] > 253
 
 
-def test_memory_is_kept_only_where_the_library_can(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(memory.platform, "libc_ver", lambda: ("", ""))
-    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: pytest.fail("no such library here"))
+@pytest.mark.parametrize(("library", "calls"), [("glibc", 2), ("", 0)])
+def test_memory_is_kept_only_where_the_library_can(monkeypatch: pytest.MonkeyPatch, library: str, calls: int):
+    set_to: list[tuple[int, int]] = []
+    monkeypatch.setattr(memory.platform, "libc_ver", lambda: (library, ""))
+    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: SimpleNamespace(mallopt=lambda *pair: set_to.append(pair)))
     memory.keep_freed_memory.__wrapped__()
+    assert len(set_to) == calls
+    assert all(size in (memory.KEPT_BYTES, memory.LARGEST_BYTES) for _, size in set_to)
