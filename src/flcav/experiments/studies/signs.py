@@ -49,9 +49,9 @@ def _draw(results: Mapping[str, Any]) -> bytes:
         targets = {name_of(row): row["targets"] for row in (*tested[0]["classes"], *tested[0]["sizes"])}
         numbers = [_numbers(result) for result in tested]
         panels[test] = [
-            Bar(name, mean["mean"], tuple(row[name] for row in numbers), targets.get(name))
-            for name, mean in means.items()
-            if name != "mAP50-95"
+            Bar(name, means[name]["mean"], tuple(row[name] for row in numbers), targets.get(name))
+            for name in numbers[0]
+            if name in means and name != "mAP50-95"
         ]
     return style.png(precisions(panels))
 
