@@ -66,8 +66,8 @@ STUDY = Study(
     ),
     validation={**ARTERIAL, "seed": 114, "split": "validation", "scenes": 6},
     tests={
-        "held-out scenes": {**ARTERIAL, "seed": 214, "split": "test", "scenes": 12},
-        "held-out town": {**RING, "seed": 314, "split": "test", "scenes": 6},
+        "held-out scenes": {**ARTERIAL, "seed": 414, "split": "test", "scenes": 12},
+        "held-out town": {**RING, "seed": 514, "split": "test", "scenes": 6},
     },
     epochs=15,
     patience=15,
