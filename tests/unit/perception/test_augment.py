@@ -12,7 +12,7 @@ from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects.augment import augment, in_view, resized, sheared, thinned
 from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.model import small_config
-from flcav.perception.objects.paste import fitting, pasted
+from flcav.perception.objects.paste import cut, free, pasted
 from flcav.perception.objects.samples import MIN_RETURNS, Sample, near_range
 
 
@@ -32,6 +32,7 @@ def scene(seed: int, objects: int = 12, per_object: int = 20) -> Sample:
     return Sample(np.column_stack((points, rng.random(len(points)))).astype(np.float32), boxes)
 
 
+CONFIG = small_config()
 EVERYTHING = Augmentation(
     turn_rad=0.7,
     scale=0.05,
@@ -104,7 +105,7 @@ def footprint(box: Boxes) -> Polygon:
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_pasted_objects_meet_no_other_from_above(seed):
-    both = pasted(scene(seed), [scene(seed + 1), scene(seed + 2)], 5, np.random.default_rng(seed))
+    both = pasted(scene(seed), cut([scene(seed + 1), scene(seed + 2)], CONFIG), 17, np.random.default_rng(seed))
     shapes = [footprint(both.boxes[i : i + 1]) for i in range(len(both.boxes))]
     new = range(12, len(shapes))
     assert len(new) <= 5
@@ -116,7 +117,7 @@ def test_pasted_objects_meet_no_other_from_above(seed):
 def test_pasted_objects_bring_their_returns_and_push_the_scenes_out():
     donor = scene(7, objects=1)
     clutter = np.column_stack((donor.points[:5, :3], np.full(5, 9.0))).astype(np.float32)
-    both = pasted(Sample(clutter, Boxes.empty()), [donor], 1, np.random.default_rng(0))
+    both = pasted(Sample(clutter, Boxes.empty()), cut([donor], CONFIG), 1, np.random.default_rng(0))
     assert len(both.boxes) == 1
     assert not (both.points[:, 3] == 9).any()
     np.testing.assert_array_equal(np.sort(both.points[:, 0]), np.sort(donor.points[:20, 0]))
@@ -124,8 +125,18 @@ def test_pasted_objects_bring_their_returns_and_push_the_scenes_out():
 
 def test_nothing_is_pasted_where_there_is_no_room():
     sample = scene(8)
-    assert not len(fitting(sample.boxes, sample.boxes, 5))
-    assert len(pasted(sample, [Sample(sample.points, Boxes.empty())], 5, np.random.default_rng(0)).boxes) == 12
+    assert not len(free(sample.boxes, sample.boxes))
+    nothing = cut([Sample(sample.points, Boxes.empty())], CONFIG)
+    assert len(pasted(sample, nothing, 50, np.random.default_rng(0)).boxes) == 12
+
+
+def test_a_sample_is_filled_up_with_objects_of_known_pose():
+    donor = replace(scene(7), exact=np.arange(12) < 4)
+    empty = Sample(scene(8).points[-200:], Boxes.empty())
+    known = cut([donor], CONFIG)
+    assert len(known.boxes) == 4
+    assert len(pasted(empty, known, 3, np.random.default_rng(0)).boxes) == 3
+    assert len(pasted(scene(8), known, 12, np.random.default_rng(0)).boxes) == 12  # full already
 
 
 def test_the_same_stream_changes_a_sample_the_same_way():

@@ -33,6 +33,8 @@ RECIPE: RecipeFields = {
 }
 SEQUENCES: RecipeFields = {**RECIPE, "spins_per_scene": 30, "every_s": 0.5, "cavs": 1}
 TOWNS = ("suburb", "ring", "grid")
+CHANGING = {"classes": ["clear", "light_rain", "heavy_rain", "fog"], "turn_s": 4.0}
+WEATHERS = "weathers"
 TRACKS = "tracks"
 
 
@@ -94,14 +96,15 @@ def _draw(results: Mapping[str, Any]) -> bytes:
 STUDY = CalibratedStudy(
     task=OBJECTS,
     network="small",
-    train=tuple({**RECIPE, "town": town, "seed": 21, "scenes": 8} for town in TOWNS),
+    train=tuple({**RECIPE, "town": town, "seed": 21, "scenes": 16} for town in TOWNS),
     validation={**RECIPE, "town": "suburb", "seed": 121, "split": "validation", "scenes": 2},
     tests={
-        **{town: {**RECIPE, "town": town, "seed": 221, "split": "test", "scenes": 3} for town in TOWNS},
-        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 321, "split": "test", "scenes": 3},
+        **{town: {**RECIPE, "town": town, "seed": 421, "split": "test", "scenes": 3} for town in TOWNS},
+        WEATHERS: {**RECIPE, "town": "suburb", "seed": 521, "split": "test", "scenes": 4, "weather": CHANGING},
+        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 621, "split": "test", "scenes": 3},
     },
-    epochs=5,
-    patience=5,
+    epochs=8,
+    patience=8,
     numbers=_numbers,
     draw=_draw,
     extra={TRACKS: followed},

@@ -24,7 +24,8 @@ def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Samp
     low, high = np.transpose(how.resize)
     if (low != 1).any() or (high != 1).any():
         factor = rng.uniform(low, high, size=(len(sample.boxes), 3))
-        sample = resized(sample, np.where((sample.boxes.label == "Car")[:, None], factor, 1.0))
+        changed = (sample.boxes.label == "Car") & (rng.random(len(factor)) < how.resized)
+        sample = resized(sample, np.where(changed[:, None], factor, 1.0))
     sample = transformed(sample, mirror, turn, scale)
     if how.shift_m:
         sample = shifted(sample, rng.uniform(-how.shift_m, how.shift_m, size=2))
@@ -62,7 +63,8 @@ def resized(sample: Sample, factor: NDArray[np.float64]) -> Sample:
     """
     boxes, points = sample.boxes, sample.points.copy()
     foot = boxes.center - boxes.size * (0, 0, 0.5)
-    for row, inside in enumerate(points_in_boxes(sample.points, boxes)):
+    changed = np.flatnonzero((factor != 1).any(1))
+    for row, inside in zip(changed, points_in_boxes(sample.points, boxes[changed]), strict=True):
         along = _unit(boxes.yaw[row])
         frame = np.array([[*along, 0], [-along[1], along[0], 0], [0, 0, 1]])  # rows: the box's axes
         stretch = frame.T @ np.diag(factor[row]) @ frame

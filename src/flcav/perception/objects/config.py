@@ -35,6 +35,7 @@ class Augmentation:
     scale: Portion = 0.03  # of the whole scene, 1 -/+ scale
     shift_m: Annotated[float, Field(ge=0)] = 0.0  # of the whole scene, ahead or back and to either side
     resize: tuple[Span, Span, Span] = ((1, 1), (1, 1), (1, 1))  # factor of each car's length, width and height
+    resized: Annotated[float, Field(ge=0, le=1)] = 1.0  # share of the cars
     tilt_rad: Portion = 0.0  # of the sensor, about any level axis
     lift_m: Portion = 0.0  # of the sensor, up or down
     drop: Portion = 0.0  # share of the returns that are lost
@@ -57,6 +58,7 @@ class SecondConfig:
     ground_z_m: float = -1.8  # height of the ground the anchors stand on: the sensor's height, negated
     intensity: bool = True  # whether the network sees it
     uncertainty: bool = False  # whether it predicts the variance of each residual beside it
+    bfloat16: bool = False  # whether the bird's-eye part trains in it, where the processor has it; inference never is
     calibration: tuple[tuple[float, float], ...] | None = None  # of each class: factor and summand of its logits
     augmentation: Augmentation = Augmentation()
 

@@ -1,5 +1,6 @@
 """What the detector learns from: a point cloud, the boxes to find, the places to leave out of the loss."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -94,12 +95,12 @@ def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.
     most = config.augmentation
     x, side, z = points[:, 0], np.abs(points[:, 1]), points[:, 2]
     distance = np.hypot(x, side)
-    toward = x * np.cos(most.turn_rad) + side * np.sin(most.turn_rad)
-    ahead = np.where(side < x * np.tan(most.turn_rad), distance, toward)  # furthest ahead that a turn brings it
+    toward = x * math.cos(most.turn_rad) + side * math.sin(most.turn_rad)
+    ahead = np.where(side < x * math.tan(most.turn_rad), distance, toward)  # furthest ahead that a turn brings it
     grow = 1 / (1 - most.scale)
-    kept = distance <= config.reach_m * grow + most.shift_m * np.sqrt(2)
-    kept &= ahead >= min(x0 * grow, x0 / grow) - most.shift_m * np.sqrt(2)
-    slack = most.lift_m + distance * np.sin(most.tilt_rad)
+    kept = distance <= config.reach_m * grow + most.shift_m * math.sqrt(2)
+    kept &= ahead >= min(x0 * grow, x0 / grow) - most.shift_m * math.sqrt(2)
+    slack = most.lift_m + distance * math.sin(most.tilt_rad)
     kept &= (z >= min(z0 * grow, z0 / grow) - slack) & (z <= max(z1 * grow, z1 / grow) + slack)
     return points[kept]
 

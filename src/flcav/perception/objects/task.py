@@ -16,13 +16,11 @@ from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import detections_and_truths, score_detections
 from flcav.perception.objects.infer import box_rows, point_clouds
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
-from flcav.perception.objects.paste import pasted
+from flcav.perception.objects.paste import Cutouts, cut, pasted
 from flcav.perception.objects.samples import RecordedSweeps, Sample
 from flcav.perception.objects.slices import sliced
 from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
-
-DONORS = 2  # other samples that objects are pasted from
 
 
 class ObjectsTask:
@@ -33,6 +31,9 @@ class ObjectsTask:
     configurations = CONFIGURATIONS
     practice = Practice(batch=2, learning_rate=2e-3)
 
+    def __init__(self) -> None:
+        self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # what was cut out last, and of which samples
+
     def build(self, config: SecondConfig) -> Second:
         """Return a fresh network."""
         return second(config)
@@ -42,13 +43,20 @@ class ObjectsTask:
         return RecordedSweeps(data, config, of_frames(data, frames))
 
     def draw(self, samples: Sequence[Sample], index: int, config: SecondConfig, rng: np.random.Generator) -> Sample:
-        """Return the sample with objects of others pasted into it, then changed as `config.augmentation` says."""
+        """Return the sample with objects of all pasted into it, then changed as `config.augmentation` says.
+
+        What can be pasted is cut out of all samples when one of them is drawn first.
+        """
         how = config.augmentation
         sample = samples[index]
         if how.paste:
-            donors = [samples[int(i)] for i in rng.integers(len(samples), size=DONORS)]
-            sample = pasted(sample, donors, how.paste, rng)
+            sample = pasted(sample, self._cutouts(samples, config), how.paste, rng)
         return augment(sample, how, rng)
+
+    def _cutouts(self, samples: Sequence[Sample], config: SecondConfig) -> Cutouts:
+        if self._cut is None or self._cut[0] is not samples:
+            self._cut = samples, cut((samples[number] for number in range(len(samples))), config)
+        return self._cut[1]
 
     def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
         """Return SECOND's loss of a batch."""
@@ -70,8 +78,9 @@ class ObjectsTask:
 
     def infer(self, network: Second, path: Path, threshold: float = 0.3) -> Iterator[Finding]:
         """Yield {"boxes": [...]} for each point cloud of `path`, see `infer.point_clouds`."""
-        for origin, points in point_clouds(path):
-            yield Finding(origin, points, {"boxes": box_rows(detect(network, points, score_threshold=threshold))})
+        for cloud in point_clouds(path):
+            found = detect(network, cloud.points, score_threshold=threshold)
+            yield Finding(cloud.path, cloud.points, {"boxes": box_rows(found)}, cloud.view)
 
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
         """Return one line per class, kind of overlap and IoU."""
