@@ -40,7 +40,7 @@ def cut(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
 
 
 def pasted(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator) -> Sample:
-    """Return the sample filled up to `most` objects of each class with cut-outs that `rng` draws and that meet nothing."""
+    """Return the sample filled up to `most` objects of each class with cut-outs drawn by `rng` that meet nothing."""
     drawn = []
     for label in np.unique(cutouts.boxes.label):
         known = np.flatnonzero(cutouts.boxes.label == label)
