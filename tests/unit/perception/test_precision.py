@@ -1,0 +1,51 @@
+"""Training in bfloat16: the same network, nearly the same loss and gradient, the same inference."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from flcav.geometry import Boxes
+from flcav.perception.objects import Sample
+from flcav.perception.objects.batch import batch_loss, predict
+from flcav.perception.objects.model import second, tiny_config
+from flcav.perception.ops.precision import multiplies_bfloat16
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def sample():
+    rng = np.random.default_rng(0)
+    points = rng.uniform((0, -20, -2, 0), (40, 20, 0, 1), size=(4000, 4)).astype(np.float32)
+    car = Boxes(np.array([[12.0, 3.0, -1.0]]), np.array([[4.4, 1.8, 1.6]]), np.array([0.3]), np.array(["Car"]))
+    return Sample(points, car)
+
+
+def networks():
+    config = tiny_config()
+    for lower in (False, True):
+        torch.manual_seed(0)
+        yield second(replace(config, bfloat16=lower))
+
+
+@pytest.mark.skipif(not multiplies_bfloat16(CPU), reason="this processor does not multiply in bfloat16")
+def test_bfloat16_changes_the_loss_and_its_gradient_a_little(sample):
+    losses, gradients = [], []
+    for network in networks():
+        loss = batch_loss(network.train(), [sample])
+        losses.append(float(loss.detach()))
+        gradients.append(torch.cat([each.flatten() for each in torch.autograd.grad(loss, list(network.parameters()))]))
+        assert loss.dtype == torch.float32
+        assert all(parameter.dtype == torch.float32 for parameter in network.parameters())
+    assert losses[0] != losses[1]
+    assert losses[1] == pytest.approx(losses[0], rel=0.01)
+    assert torch.cosine_similarity(*gradients, dim=0) > 0.99
+
+
+def test_inference_is_in_full_precision(sample):
+    with torch.inference_mode():
+        full, lower = (predict(network.eval(), [sample.points]) for network in networks())
+    assert torch.equal(full.score, lower.score)
+    assert torch.equal(full.box, lower.box)
