@@ -177,7 +177,7 @@ def test_evaluations_and_findings_are_json_and_words_and_pictures(task, data):
     finding = next(iter(task.infer(network, data.folder, 0.0)))
     assert json.loads(json.dumps(finding.result, allow_nan=False)) == finding.result
     assert task.finding_lines(finding.result)
-    picture = style.png(DRAWINGS[task.name](finding.seen, finding.result, "title"), dpi=40)
+    picture = style.png(DRAWINGS[task.name](finding), dpi=40)
     assert picture.startswith(b"\x89PNG")
 
 

@@ -54,4 +54,4 @@ def _draw(task: str, finding: "Finding", path: Path) -> None:
     from flcav.report import style
     from flcav.report.inference import DRAWINGS
 
-    write_bytes(path, style.png(DRAWINGS[task](finding.seen, finding.result, finding.path.name)))
+    write_bytes(path, style.png(DRAWINGS[task](finding)))

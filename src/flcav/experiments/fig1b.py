@@ -20,6 +20,7 @@ from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.fig1b_layers import LAYERS, given_to, watched
 from flcav.geometry import inverse, transform_points
+from flcav.perception.objects.infer import boxes_of_rows
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.config import STRIDES
 from flcav.perception.signs.task import SIGNS
@@ -32,7 +33,7 @@ from flcav.perception.weights import load_network, shipped
 from flcav.progress import Report, silent
 from flcav.report import style
 from flcav.report import task_columns as page
-from flcav.report.inference import boxes_of, sign_boxes
+from flcav.report.inference import sign_boxes
 from flcav.report.predicted_paths import MAP_COLOURS, paths_on_map
 from flcav.report.sweeps import draw_boxes, draw_points
 from flcav.sensors.rig import RIGS
@@ -153,7 +154,7 @@ def _signs(network: Any, picture: Path) -> page.Column:
 def _objects(network: Any, points: Path) -> page.Column:
     finding, layers = _looked(OBJECTS, network, points)
     cloud, range_m, ground_m = finding.seen, network.config.range_m, network.config.ground_z_m
-    boxes = boxes_of(finding.result)
+    boxes = boxes_of_rows(finding.result["boxes"])
 
     def output(axes: Axes) -> None:
         draw_points(axes, cloud, ground_m, (range_m[0], range_m[3], range_m[4]))

@@ -15,7 +15,8 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.clouds import Labelled, describe
 from flcav.experiments.recording import DATA, record_split
 from flcav.experiments.steps import Notify, Step, run_steps
-from flcav.geometry import Boxes, inverse, transform_points
+from flcav.geometry import Boxes, inverse
+from flcav.perception.camera_view import kitti_view
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.detect import detect
@@ -93,21 +94,15 @@ def detections(network: Second, frames: Sequence[KittiFrame]) -> dict[str, Any]:
 
 def shown(boxes: Boxes, frame: KittiFrame) -> Boxes:
     """Return the boxes whose centre the frame's image shows."""
-    camera = transform_points(frame.calibration.camera_from_lidar, boxes.center)
-    pixels = np.concatenate((camera, np.ones((len(camera), 1))), 1) @ frame.calibration.image_from_camera.T
-    ahead = camera[:, 2] > 0
-    u, v = (pixels[:, :2] / np.where(ahead, pixels[:, 2], 1)[:, None]).T
-    height, width = frame.image.shape[:2]
-    return boxes[ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)]
+    return boxes[kitti_view(frame.image, frame.calibration).shows(boxes.center)]
 
 
 def draw_frame(kitti: Path, story: Mapping[str, Any]) -> bytes:
     """Return the picture of one frame of the results: its cloud from above and its image, with boxes."""
     folder = KittiFolder.open(kitti)
     frame = folder.frame(folder.names.index(story["frame"]))
-    image_from_lidar = frame.calibration.image_from_camera @ frame.calibration.camera_from_lidar
-    cars = of_class(frame.objects.boxes, "Car")
-    return style.png(real_frame(frame.points, frame.image, image_from_lidar, cars, story))
+    view = kitti_view(frame.image, frame.calibration)
+    return style.png(real_frame(frame.points, view, of_class(frame.objects.boxes, "Car"), story))
 
 
 def _neutral(frame: KittiFrame, name: str) -> Boxes:

@@ -4,10 +4,10 @@ Training is `flcav.perception.training`, files of weights are `flcav.perception.
 `flcav.perception.client`: each works with any `Task`, and so do the command line and the federation.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.progress import Report, silent
 from flcav.seeds import child_seed
+
+if TYPE_CHECKING:
+    from flcav.perception.camera_view import CameraView
 
 ConfigT = TypeVar("ConfigT")
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
@@ -33,6 +36,10 @@ class Practice:
     schedule: str = "one_cycle"
 
 
+def no_view() -> None:
+    """Return no camera's view."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """What a network found in one input."""
@@ -40,6 +47,7 @@ class Finding:
     path: Path  # the input's own
     seen: NDArray[Any]  # point cloud (N, 4) or image (H, W, 3) u8
     result: dict[str, Any]  # as JSON knows it, without the path
+    view: Callable[[], "CameraView | None"] = no_view  # of a camera beside the LiDAR, read when asked for
 
 
 class Task(Protocol[ConfigT, NetworkT, SampleT]):

@@ -10,12 +10,13 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes
+from flcav.perception.camera_view import CameraView
+from flcav.perception.objects.infer import boxes_of_rows
 from flcav.report import style
+from flcav.report.on_picture import boxes_on_picture, show_view
 from flcav.report.sweeps import draw_boxes, draw_points
 
 COLOURS = (style.INK, style.BLUE, style.ORANGE)
-FIELDS = ("x", "y", "z", "length", "width", "height", "yaw")
-EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 EXTENT = (0.0, 60.0, 22.0)
 
 
@@ -50,20 +51,14 @@ def compare(clouds: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 @style.styled
-def real_frame(
-    points: NDArray[np.float32],
-    image: NDArray[np.uint8],
-    image_from_lidar: NDArray[np.float64],
-    cars: Boxes,
-    story: Mapping[str, Any],
-) -> Figure:
+def real_frame(points: NDArray[np.float32], view: CameraView, cars: Boxes, story: Mapping[str, Any]) -> Figure:
     """Return a real frame's cloud from above beside its image, with the labelled cars and what was found.
 
-    image_from_lidar: (3, 4), LiDAR frame to pixels; story: "found_at" of each of `cars`, "boxes" with their classes.
+    story: "found_at" of each of `cars`, "boxes" with their classes.
     """
     figure = style.canvas(11.0, 4.9)
     above, ahead = figure.subplots(1, 2, width_ratios=(1, 1.55))
-    found = _boxes(story["boxes"])
+    found = boxes_of_rows(story["boxes"])
     hit = np.array([0.5 in car["found_at"] for car in story["cars"]], dtype=bool)
     draw_points(above, points, -1.7, EXTENT)
     draw_boxes(above, cars[hit], style.GREEN, fill=0.25, width=1.0)
@@ -72,29 +67,12 @@ def real_frame(
     style.bare(above)
     style.scale_bar(above, 10)
     above.set_title(f"{story['frame']}: {hit.sum()} of {len(cars)} cars found at IoU 0.5")
-    ahead.imshow(image)
+    show_view(ahead, view)
     for boxes, colour in ((cars[hit], style.GREEN), (cars[~hit], style.MISSED), (found, style.BLUE)):
-        _draw_projected(ahead, boxes, image_from_lidar, colour)
-    ahead.set(xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
-    style.bare(ahead)
+        boxes_on_picture(ahead, boxes, view, colour, width=1.0)
     colours = {"labelled, found": style.GREEN, "labelled, missed": style.MISSED, "detection": style.BLUE}
     style.key(figure, [Line2D([], [], color=colour, label=name) for name, colour in colours.items()])
     return figure
-
-
-def _draw_projected(axes: Axes, boxes: Boxes, image_from_lidar: NDArray[np.float64], colour: str) -> None:
-    for corners in boxes.corners():
-        if (corners[:, 0] < 1).any():
-            continue
-        pixels = np.concatenate((corners, np.ones((8, 1))), 1) @ image_from_lidar.T
-        u, v = (pixels[:, :2] / pixels[:, 2:]).T
-        for a, b in EDGES:
-            axes.plot(u[[a, b]], v[[a, b]], color=colour, linewidth=1.0)
-
-
-def _boxes(rows: Any) -> Boxes:
-    array = np.array([[row[name] for name in FIELDS] for row in rows]).reshape(-1, 7)
-    return Boxes.from_array(array, np.array([row["class"] for row in rows], dtype=np.str_))
 
 
 def _name(axes: Axes, y: str, x: str) -> None:

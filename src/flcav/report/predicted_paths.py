@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
+from flcav.perception.task import Finding
 from flcav.perception.trajectory.infer import AROUND_M
 from flcav.report import style
 
@@ -24,22 +25,23 @@ PREDICTED, TRUTH, PLAIN = style.BLUE, style.INK, style.ORANGE
 
 
 @style.styled
-def draw_paths(layers: NDArray[np.bool_], result: Mapping[str, Any], title: str) -> Figure:
-    """Return the map (layers, H, W) around the observer with the paths of a finding of the trajectory task.
+def draw_paths(finding: Finding) -> Figure:
+    """Return the map around the observer with the predicted paths of a finding of the trajectory task.
 
     Ahead of the observer is up.
     """
     figure = style.canvas(7.2, 7.9)
     axes = figure.add_subplot()
-    paths_on_map(axes, layers, result)
+    result = finding.result
+    paths_on_map(axes, finding.seen, result)
     style.scale_bar(axes, 10)
-    axes.set_title(f"{title} · {len(result['agents'])} predicted")
+    axes.set_title(f"{finding.path.name} · {len(result['agents'])} predicted")
     style.key(figure, _legend(result["time_s"][-1], bool(result["lights"])))
     return figure
 
 
 def paths_on_map(axes: Axes, layers: NDArray[np.bool_], result: Mapping[str, Any]) -> None:
-    """Draw the map with the paths of a finding on `axes`, see `draw_paths`; agents may have no modes."""
+    """Draw the map (layers, H, W) with the paths of a finding on `axes`, see `draw_paths`; agents may have no modes."""
     axes.set(xlim=(-AROUND_M, AROUND_M), ylim=(-AROUND_M, AROUND_M), aspect="equal")
     axes.imshow(_ground(layers), extent=(-AROUND_M, AROUND_M, -AROUND_M, AROUND_M), interpolation="antialiased")
     observer = np.array([result["observer"][name] for name in ("x", "y", "yaw")])

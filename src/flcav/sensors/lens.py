@@ -59,10 +59,15 @@ class Lens(Config):
 
 def project(lens: Lens, points: ArrayLike) -> Array:
     """Return the pixels (N, 2) u, v of points (N, 3) in the optical frame; NaN for those not in front of the lens."""
+    return projected(lens.intrinsics(), lens.distortion(), points)
+
+
+def projected(intrinsics: Array, distortion: Array, points: ArrayLike) -> Array:
+    """Return `project` of a lens of which the matrix (3, 3) and the coefficients (5,) are known."""
     x, y, z = np.asarray(points, np.float64).reshape(-1, 3).T
     z = np.where(z > 1e-9, z, np.nan)
-    fx, fy, cx, cy = _focus(lens.intrinsics())
-    return _distort(lens.distortion(), np.stack((x / z, y / z), axis=1)) * (fx, fy) + (cx, cy)
+    fx, fy, cx, cy = _focus(intrinsics)
+    return _distort(distortion, np.stack((x / z, y / z), axis=1)) * (fx, fy) + (cx, cy)
 
 
 def unproject(lens: Lens, pixels: ArrayLike) -> Array:

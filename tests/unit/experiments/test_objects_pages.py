@@ -6,6 +6,7 @@ from flcav.experiments import objects_tables, sim_to_real_tables
 from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.studies.objects import STUDY
 from flcav.geometry import Boxes
+from flcav.perception.camera_view import CameraView
 from flcav.report import style
 from flcav.report.clouds import compare, real_frame
 
@@ -86,6 +87,8 @@ def test_clouds_and_frames_are_drawn():
     box = {"class": "Car", "x": 12.0, "y": 0.0, "z": -1.0, "length": 4.0, "width": 1.7, "height": 1.5, "yaw": 0.1}
     story = {"frame": "000008", "cars": [{"distance_m": 12.0, "found_at": []}], "boxes": [box | {"score": 0.5}]}
     cars = Boxes.from_array([[12, 0, -1, 4, 1.7, 1.5, 0.1]], "Car")
-    image_from_lidar = np.array([[600, -700, 0, 0], [180, 0, -700, 0], [1, 0, 0, 0]], dtype=float)
-    figure = real_frame(np.ones((9, 4), np.float32), np.zeros((375, 1242, 3), np.uint8), image_from_lidar, cars, story)
+    camera_from_lidar = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=float)
+    intrinsics = np.array([[700, 0, 600], [0, 700, 180], [0, 0, 1]], dtype=float)
+    view = CameraView(np.zeros((375, 1242, 3), np.uint8), camera_from_lidar, intrinsics, np.zeros(5))
+    figure = real_frame(np.ones((9, 4), np.float32), view, cars, story)
     assert "0 of 1 cars found" in figure.axes[0].get_title(loc="left")

@@ -1,8 +1,9 @@
 """Point clouds from what a user names, and boxes as JSON knows them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,22 @@ from flcav.dataset.formats.kitti import read_points
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
+from flcav.perception.camera_view import CameraView, recorded_view, view_beside
 from flcav.perception.objects.samples import checked_points, only_lidar
 
 FIELDS = ("x", "y", "z", "length", "width", "height", "yaw")
 
 
-def point_clouds(path: Path) -> Iterator[tuple[Path, NDArray[np.float32]]]:
-    """Yield the point clouds of a KITTI .bin file, a folder of them, or a dataset folder, each with its own path.
+class Cloud(NamedTuple):
+    """A point cloud to look into."""
+
+    path: Path  # its own
+    points: NDArray[np.float32]  # (N, 4) x, y, z [m], intensity [0, 1]
+    view: Callable[[], CameraView | None]  # of a camera that looks the same way, read when asked for
+
+
+def point_clouds(path: Path) -> Iterator[Cloud]:
+    """Yield the point clouds of a KITTI .bin file, a folder of them, or a dataset folder.
 
     Raises `InputError` for anything else, and for a cloud that is empty, truncated or not of finite numbers.
     """
@@ -28,12 +38,12 @@ def point_clouds(path: Path) -> Iterator[tuple[Path, NDArray[np.float32]]]:
         files = sorted(path.glob("*.bin"))
         if not files:
             raise InputError(f"{path}: neither a dataset nor a folder with .bin files")
-        clouds = ((file, read_points(file)) for file in files)
+        clouds = map(_of_file, files)
     elif path.is_file():
-        clouds = iter([(path, read_points(path))])
+        clouds = map(_of_file, [path])
     else:
         raise InputError(f"{path}: no such file or folder")
-    return ((origin, checked_points(points, origin)) for origin, points in clouds)
+    return (cloud._replace(points=checked_points(cloud.points, cloud.path)) for cloud in clouds)
 
 
 def box_rows(boxes: Boxes) -> list[dict[str, Any]]:
@@ -45,8 +55,19 @@ def box_rows(boxes: Boxes) -> list[dict[str, Any]]:
     ]
 
 
-def _recorded(folder: Path) -> Iterator[tuple[Path, NDArray[np.float32]]]:
+def boxes_of_rows(rows: Sequence[Mapping[str, Any]]) -> Boxes:
+    """Return the boxes that `box_rows` made rows of."""
+    array = np.array([[row[name] for name in FIELDS] for row in rows]).reshape(-1, len(FIELDS))
+    return Boxes.from_array(array, [row["class"] for row in rows], [row["score"] for row in rows])
+
+
+def _of_file(path: Path) -> Cloud:
+    return Cloud(path, read_points(path), partial(view_beside, path))
+
+
+def _recorded(folder: Path) -> Iterator[Cloud]:
     dataset = Dataset.open(folder)
     for i in range(len(dataset)):
         frame = dataset.frame(i)
-        yield folder / frame.key, frame.lidar[only_lidar(frame)]
+        lidar = only_lidar(frame)
+        yield Cloud(folder / frame.key, frame.lidar[lidar], partial(recorded_view, dataset, i, lidar))
