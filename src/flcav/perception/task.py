@@ -7,7 +7,7 @@ Training is `flcav.perception.training`, files of weights are `flcav.perception.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -115,6 +115,15 @@ class Task(Protocol[ConfigT, NetworkT, SampleT]):
 
     def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
         """Return the result of a `Finding` in words."""
+        ...
+
+
+@runtime_checkable
+class Calibrates(Protocol):
+    """A task whose trained networks are told, by frames they did not learn from, how far to trust their scores."""
+
+    def calibrate(self, network: Any, data: Dataset) -> None:
+        """Set the calibration in the network's configuration from all frames of `data`."""
         ...
 
 

@@ -15,9 +15,12 @@ import pytest
 
 from flcav.cli.main import run
 from flcav.dataset.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.perception.objects import calibrate
 from flcav.perception.objects.model import second_tiny
+from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.weights import load_network, save_network
-from flcav.perception.weights import to_arrays
+from flcav.perception.weights import read_card, to_arrays
 
 from .frames import cloud_in, detections, frame
 
@@ -84,6 +87,18 @@ def test_train_writes_weights_that_evaluate_and_infer_take(data, tmp_path, capsy
     assert result["scores"][0]["targets"] == 24
     assert called("evaluate", "objects", "--data", data, "--weights", weights) == 0
     assert "8 frames of 2 scenes" in capsys.readouterr().out
+
+
+def test_scores_are_calibrated_on_the_validation_data(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(calibrate, "fit_logistic", lambda scores, hits: (2.0, -0.25))
+    options = ("train", "objects", "--data", data, "--epochs", 1, "--seed", 3)
+    assert called(*options, "--out", tmp_path / "without") == 0
+    assert called(*options, "--out", tmp_path / "with", "--validation", data) == 0
+    without, held = (load_network(tmp_path / name / "weights.safetensors") for name in ("without", "with"))
+    assert (without.config.calibration, held.config.calibration) == (None, ((2.0, -0.25),))
+    assert all(np.array_equal(to_arrays(held)[name], array) for name, array in to_arrays(without).items())
+    card = read_card(tmp_path / "with" / "weights.safetensors")
+    assert card.metrics == OBJECTS.evaluate(held, Dataset.open(data))  # of the calibrated scores
 
 
 def test_infer_takes_files_folders_and_datasets(data, weights, tmp_path, capsys):

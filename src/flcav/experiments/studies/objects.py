@@ -4,23 +4,16 @@ The sweeps are those of recipes/objects.yaml, in every town. Scores are calibrat
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
 from flcav.dataset.store import Dataset
-from flcav.experiments.recording import opened
-from flcav.experiments.steps import Work
-from flcav.experiments.task_study import VALIDATION, RecipeFields, Result, Study
-from flcav.perception.card import Card, write_card
-from flcav.perception.objects.calibrate import calibrate
+from flcav.experiments.task_study import RecipeFields, Result, Study
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.tracking import evaluate_tracks
-from flcav.perception.training.run import CARD, WEIGHTS
-from flcav.perception.weights import load_network, save_network
 from flcav.report import style
 from flcav.report.precision import Bar, precisions
 
@@ -36,22 +29,6 @@ TOWNS = ("suburb", "ring", "grid")
 CHANGING = {"classes": ["clear", "light_rain", "heavy_rain", "fog"], "turn_s": 4.0}
 WEATHERS = "weathers"
 TRACKS = "tracks"
-
-
-@dataclass(frozen=True)
-class CalibratedStudy(Study):
-    """A study whose networks are calibrated on the validation frames before they are tested."""
-
-    def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> dict[str, Any]:
-        """Train and calibrate one seed; return its card."""
-        card = Card.model_validate(super().learn(work, seed=seed, network=network, epochs=epochs, patience=patience))
-        path, held = work.folder / WEIGHTS, opened(work, VALIDATION)
-        learned = load_network(OBJECTS, path)
-        calibrate(learned, map(held.frame, range(len(held))))
-        card = card.model_copy(update={"metrics": OBJECTS.evaluate(learned, held)})
-        save_network(OBJECTS, learned, path, card)
-        write_card(card, work.folder / CARD)
-        return card.model_dump(mode="json")
 
 
 def followed(network: Second, data: Dataset) -> dict[str, Any]:
@@ -93,7 +70,7 @@ def _draw(results: Mapping[str, Any]) -> bytes:
     return style.png(precisions(panels))
 
 
-STUDY = CalibratedStudy(
+STUDY = Study(
     task=OBJECTS,
     network="small",
     train=tuple({**RECIPE, "town": town, "seed": 21, "scenes": 16} for town in TOWNS),

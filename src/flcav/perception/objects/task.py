@@ -10,7 +10,7 @@ from torch import Tensor
 from flcav.dataset.store import Dataset
 from flcav.perception.objects.augment import augment
 from flcav.perception.objects.batch import batch_loss
-from flcav.perception.objects.calibrate import OVERLAP, trust
+from flcav.perception.objects.calibrate import OVERLAP, calibrate, trust
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import detections_and_truths, score_detections
@@ -70,6 +70,10 @@ class ObjectsTask:
         found, truths = detections_and_truths(network, map(data.frame, numbers), total=len(numbers), progress=progress)
         summary = score_detections(found, truths, classes).summary()
         return summary | {"slices": sliced(found, truths, classes), "trust": trust(found, truths, classes)}
+
+    def calibrate(self, network: Second, data: Dataset) -> None:
+        """Set the calibration of the network's scores, see `flcav.perception.objects.calibrate`."""
+        calibrate(network, map(data.frame, range(len(data))))
 
     def score(self, result: Mapping[str, Any]) -> float:
         """Return the mean over classes of AP in 3D at IoU 0.5; 0 where there was nothing to find."""

@@ -13,7 +13,7 @@ from torch.utils.data import ConcatDataset
 
 from flcav.dataset.store import Dataset
 from flcav.perception.card import Card, data_entry, write_card
-from flcav.perception.task import Task, configuration, fresh
+from flcav.perception.task import Calibrates, Task, configuration, fresh
 from flcav.perception.training.events import event_files
 from flcav.perception.training.loop import Checkpointing, Validation, train
 from flcav.perception.weights import save_network
@@ -37,9 +37,9 @@ class Request:
 def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progress: Report = silent) -> Card:
     """Train, going on from where an interrupted run left off in `out`; write weights, card and curves there.
 
-    One learning-rate cycle over all epochs. With validation data, the network of the best epoch is kept and its
-    evaluation is in the card. Raises `InputError` for an unknown network and for data that the task cannot use,
-    `OSError` before anything is read where `out` cannot be written.
+    One learning-rate cycle over all epochs. With validation data, the network of the best epoch is kept, its scores are
+    calibrated where the task does so, and its evaluation is in the card. Raises `InputError` for an unknown network and
+    for data that the task cannot use, `OSError` before anything is read where `out` cannot be written.
     """
     _check_writable(out)
     config = configuration(task, request.network)
@@ -59,6 +59,8 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
             watch=watch,
             progress=progress,
         )
+    if request.validation is not None and isinstance(task, Calibrates):
+        task.calibrate(network, request.validation)
     settings = vars(task.practice) | {"epochs": request.epochs, "steps": len(history.losses)}
     card = Card(
         task=task.name,
