@@ -7,8 +7,8 @@ from scipy.special import expit, logit
 from flcav.geometry import Boxes
 from flcav.perception.metrics import calibration_error, fit_logistic
 from flcav.perception.objects.calibrate import trust
-from flcav.perception.objects.evaluate import Truth
-from flcav.perception.objects.slices import sliced
+from flcav.perception.objects.evaluate import Truth, score_detections
+from flcav.perception.objects.slices import slice_lines, sliced
 
 
 def cars(*xs, scores=None):
@@ -37,7 +37,7 @@ def test_nothing_changes_where_there_is_nothing_to_learn():
     assert fit_logistic([], []) == (1.0, 0.0)
 
 
-def truth(*xs, occlusion, weather="clear", neutral=()):
+def truth(*xs, occlusion, weather: str | None = "clear", neutral=()):
     return Truth("s", cars(*xs), cars(*neutral), Boxes.empty(), np.array(occlusion, dtype=float), weather)
 
 
@@ -69,6 +69,25 @@ def test_weathers_are_told_apart_where_there_are_several():
     rows = sliced([cars(10, scores=[0.9]), cars()], truths, ("Car",))
     assert row(rows, "weather", "clear") == (1, 1)
     assert row(rows, "weather", "fog") == (0, 1)
+    assert slice_lines(rows, 0.5)[-1] == "Car         weather    fog         AP 3d 0.000  bev 0.000  (objects: 1)"
+
+
+def test_a_weather_s_slice_is_the_evaluation_of_its_frames():
+    rng, names = np.random.default_rng(0), ("clear", "fog", "night")
+    places = [np.sort(rng.choice(np.arange(5, 60, 6), 4, replace=False)) for _ in range(12)]
+    truths = [truth(*xs, occlusion=(0,) * 4, weather=names[i % 3]) for i, xs in enumerate(places)]
+    found = [cars(*xs[:3] + rng.normal(0, 0.7, 3), 70.0, scores=rng.random(4)) for xs in places]
+    rows = sliced(found, truths, ("Car",))
+    for number, name in enumerate(names):
+        alone = score_detections(found[number::3], truths[number::3], ("Car",)).score("Car", "3d", 0.5).ap
+        assert 0 < row(rows, "weather", name)[0] < 1
+        assert row(rows, "weather", name) == (pytest.approx(alone, abs=1e-6), 16)
+
+
+def test_weathers_come_in_the_order_of_their_classes():
+    names = ("night", "heavy_rain", None, "clear")
+    rows = sliced([cars()] * 4, [truth(10, occlusion=(0,), weather=name) for name in names], ("Car",))
+    assert list(dict.fromkeys(r["slice"] for r in rows if r["by"] == "weather")) == ["clear", "heavy_rain", "night"]
 
 
 def test_variances_are_judged_by_the_errors_they_foretell():

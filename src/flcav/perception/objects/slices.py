@@ -1,6 +1,6 @@
 """Average precision where it is hard and where it is easy: by distance, by occlusion, by weather."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from flcav.geometry import Boxes, concatenate
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.objects.evaluate import OVERLAPS, Truth, number_or_none, of_class
+from flcav.world.weather import WEATHER_CLASSES
 
 DISTANCES_M = ((0, 20), (20, 40), (40, 80))
 OCCLUSIONS = ((0.0, 0.2), (0.2, 0.6), (0.6, 1.01))
@@ -45,6 +46,21 @@ def sliced(detections: Sequence[Boxes], truths: Sequence[Truth], classes: Sequen
     return rows
 
 
+def slice_lines(rows: Sequence[Mapping[str, Any]], overlap: float) -> list[str]:
+    """Return the rows of `sliced` in words, of one IoU: a line per class and slice, of one class after the other."""
+    parts: dict[str, dict[tuple[str, str], dict[str, Any]]] = {}
+    for row in rows:
+        if row["iou"] == overlap:
+            own = parts.setdefault(row["class"], {}).setdefault((row["by"], row["slice"]), {"targets": row["targets"]})
+            own[row["kind"]] = row["ap"]
+    return [
+        f"{label:<12}{by:<11}{name.replace('_', ' '):<12}AP 3d {found['3d']:.3f}  bev {found['bev']:.3f}"
+        f"  (objects: {found['targets']})"
+        for label, own in parts.items()
+        for (by, name), found in own.items()
+    ]
+
+
 def slices(detections: Sequence[Boxes], truths: Sequence[Truth]) -> Iterator[Slice]:
     """Yield the slices of frames; occlusions where they are known, weathers where there are several."""
     everything = np.arange(len(truths))
@@ -58,7 +74,8 @@ def slices(detections: Sequence[Boxes], truths: Sequence[Truth]) -> Iterator[Sli
         for low, high in OCCLUSIONS:
             wanted = [_between(share, low, high) for share in hidden]
             yield Slice("occlusion", f"{low:.0%}-{min(high, 1):.0%}", list(detections), wanted, everything)
-    weathers = sorted({truth.weather for truth in truths if truth.weather is not None})
+    seen = {truth.weather for truth in truths}
+    weathers = [name for name in WEATHER_CLASSES if name in seen]
     for name in weathers if len(weathers) > 1 else ():
         wanted = [np.ones(len(truth.targets), dtype=bool) for truth in truths]
         frames = np.flatnonzero([truth.weather == name for truth in truths])

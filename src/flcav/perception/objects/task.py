@@ -18,7 +18,7 @@ from flcav.perception.objects.infer import box_rows, point_clouds
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.paste import Cutouts, cut, pasted
 from flcav.perception.objects.samples import RecordedSweeps, Sample
-from flcav.perception.objects.slices import sliced
+from flcav.perception.objects.slices import slice_lines, sliced
 from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
 
@@ -87,18 +87,15 @@ class ObjectsTask:
             yield Finding(cloud.path, cloud.points, {"boxes": box_rows(found)}, cloud.view)
 
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return one line per class, kind of overlap and IoU."""
+        """Return one line per class, kind of overlap and IoU, and one per class and slice."""
         lines = [f"{result['frames']} frames of {result['scenes']} scenes"]
         for row in result["scores"]:
             found = "nothing to find"
             if row["ap"] is not None:
                 found = f"AP {row['ap']:.3f} [{row['low']:.3f}, {row['high']:.3f}]"
-            counts = f"{row['targets']} objects, {row['hidden']} more without a return"
+            counts = f"objects: {row['targets']}, and {row['hidden']} without a return"
             lines.append(f"{row['class']:<12}{row['kind']:>4} IoU {row['iou']:.1f}  {found}  ({counts})")
-        for row in result["slices"]:
-            if row["iou"] == OVERLAP:
-                place = f"{row['class']:<12}{row['kind']:>4} IoU {row['iou']:.1f}"
-                lines.append(f"{place}  AP {row['ap']:.3f}  {row['by']} {row['slice']}  ({row['targets']} objects)")
+        lines += [f"at IoU {OVERLAP:g} by distance, occlusion and weather:", *slice_lines(result["slices"], OVERLAP)]
         for row in result["trust"]:
             if row["ece"] is not None:
                 lines.append(f"{row['class']:<12}expected calibration error {row['ece']:.3f}")
