@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from matplotlib.figure import Figure
 from PIL import Image
 from safetensors import safe_open
@@ -25,6 +26,7 @@ from flcav.federation.trainable import Trainable
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.card import CARD_KEY
 from flcav.perception.client import TaskClient
+from flcav.perception.device import device_named
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task, configuration, fresh
 from flcav.perception.training import Checkpointing, Validation, train
@@ -91,6 +93,18 @@ def test_a_seed_names_a_training(task, samples):
     assert same(networks[0], networks[1])
     assert not same(networks[0], networks[2])
     assert not same(networks[0], fresh(task, small(task), 1))
+
+
+@each_task
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_a_gpu_trains_evaluates_and_goes_on_to_the_same_weights(task, data, samples, tmp_path):
+    network, again = (fresh(task, small(task), 1).to(device_named("cuda")) for _ in range(2))
+    checkpointing = Checkpointing(tmp_path / "checkpoint.pt", every=2)
+    history = train(task, network, samples[task.name], steps=2, batch=2, seed=3, checkpointing=checkpointing)
+    train(task, again, samples[task.name], steps=2, batch=2, seed=3, checkpointing=checkpointing)
+    assert np.isfinite(history.losses).all()
+    assert same(network, again)
+    assert np.isfinite(task.score(task.evaluate(network, data)))
 
 
 class Killed(Exception):

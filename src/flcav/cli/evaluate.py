@@ -17,6 +17,7 @@ def evaluate(
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
+    device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
     tracks: bool = typer.Option(False, "--tracks", help="objects: also MOTA, AMOTA and id switches of their tracks."),
     as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
 ) -> None:
@@ -33,7 +34,7 @@ def evaluate(
     learner = task_named(task)
     if tracks and task != "objects":
         raise InputError(f"--tracks: only objects have tracks, not '{task}'")
-    network = network_of(learner, weights)
+    network = network_of(learner, weights, device)
     dataset = Dataset.open(data)
     if tracks:
         sequences(dataset)  # said before the long work

@@ -24,6 +24,7 @@ def infer(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
     threshold: float = typer.Option(0.3, "--threshold", min=0.0, max=1.0, help="Lowest score shown."),
+    device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
     pictures: Path | None = typer.Option(None, "--pictures", help="Folder for a picture of each input with findings."),
     as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
 ) -> None:
@@ -36,7 +37,7 @@ def infer(
     from flcav.cli.tasks import network_of, task_named
 
     learned = task_named(task)
-    network = network_of(learned, weights)
+    network = network_of(learned, weights, device)
     results = []
     for number, finding in enumerate(found for path in inputs for found in learned.infer(network, path, threshold)):
         results.append({"path": str(finding.path), **finding.result})

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError
+from flcav.perception.device import device_named
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task
@@ -21,6 +22,6 @@ def task_named(name: str) -> Task[Any, Any, Any]:
     return TASKS[name]
 
 
-def network_of(task: Task[Any, Any, Any], weights: Path | None) -> Any:
-    """Return the network in the file `weights`, by default in the one that comes with the package."""
-    return load_network(task, weights or shipped(task))
+def network_of(task: Task[Any, Any, Any], weights: Path | None, device: str = "cpu") -> Any:
+    """Return the network in the file `weights`, by default in the one that comes with the package, on the device."""
+    return load_network(task, weights or shipped(task)).to(device_named(device))

@@ -23,6 +23,7 @@ def train(
     epochs: int = typer.Option(10, "--epochs", min=1, help="Passes through the data."),
     patience: int = typer.Option(5, "--patience", min=1, help="Epochs without a better validation before it stops."),
     seed: int = typer.Option(0, "--seed", help="Initial weights, order and augmentation."),
+    device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
 ) -> None:
     """Train a network on recorded frames with their ground truth; writes OUT/weights.safetensors and its card.
 
@@ -31,11 +32,12 @@ def train(
     from flcav import progress
     from flcav.cli.tasks import task_named
     from flcav.dataset.store import Dataset
+    from flcav.perception.device import device_named
     from flcav.perception.training.run import Request, train_network
 
-    learner = task_named(task)
+    learner, place = task_named(task), device_named(device)
     held = Dataset.open(validation) if validation else None
-    request = Request([Dataset.open(folder) for folder in data], held, network, epochs, patience, seed)
+    request = Request([Dataset.open(folder) for folder in data], held, network, epochs, patience, seed, place)
     with progress.live(f"train {task}") as report:
         card = train_network(learner, request, out, report)
     told = f"{out / 'weights.safetensors'}: trained on {card.samples} samples, {card.training['steps']} steps"

@@ -58,7 +58,7 @@ class SecondConfig:
     ground_z_m: float = -1.8  # height of the ground the anchors stand on: the sensor's height, negated
     intensity: bool = True  # whether the network sees it
     uncertainty: bool = False  # whether it predicts the variance of each residual beside it
-    bfloat16: bool = False  # whether the bird's-eye part trains in it, where the processor has it; inference never is
+    bfloat16: bool = False  # whether training multiplies in it where the hardware does: on a CPU in the 2D part alone
     calibration: tuple[tuple[float, float], ...] | None = None  # of each class: factor and summand of its logits
     augmentation: Augmentation = Augmentation()
 

@@ -132,10 +132,10 @@ class Second(nn.Module):
 
     def forward(self, voxels: SparseTensor) -> HeadOutput:
         """Return the raw predictions for every anchor."""
-        seen = self.backbone(voxels).birds_eye()
-        with bfloat16(seen.device, self.training and self.config.bfloat16):
-            maps = self.head(self.birds_eye(seen))
-        cells = maps.to(seen.dtype).permute(0, 2, 3, 1).flatten(1, 2)  # (B, H W, channels)
+        features = voxels.features
+        with bfloat16(features.device, self.training and self.config.bfloat16):
+            maps = self.head(self.birds_eye(self.backbone(voxels).birds_eye()))
+        cells = maps.to(features.dtype).permute(0, 2, 3, 1).flatten(1, 2)  # (B, H W, channels)
         parts = cells.split([self.anchors_per_cell * width for width in self.per_anchor], 2)
         return HeadOutput(*(part.reshape(len(cells), -1, n) for part, n in zip(parts, self.per_anchor, strict=True)))
 
@@ -220,6 +220,7 @@ def paper_config(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), gr
         bev_channels=(128, 256),
         bev_up_channels=(256, 256),
         ground_z_m=ground_z_m,
+        bfloat16=True,
     )
 
 

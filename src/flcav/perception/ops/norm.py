@@ -1,8 +1,8 @@
 """Batch normalisation followed by ReLU, of maps and of rows of features.
 
-Written out for rows in one differentiable step, because the framework's own kernel is several times slower on tall,
-narrow matrices on a CPU. Equations of Ioffe and Szegedy, "Batch Normalization", ICML 2015, alg. 1, and their gradient;
-as there, the running variance is the unbiased one.
+Written out for rows on a CPU in one differentiable step, because the framework's own kernel is several times slower on
+tall, narrow matrices there. Equations of Ioffe and Szegedy, "Batch Normalization", ICML 2015, alg. 1, and their
+gradient; as there, the running variance is the unbiased one.
 """
 
 from typing import Any
@@ -28,7 +28,7 @@ class NormReLU(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return max(0, weight * (x - mean) / deviation + bias), by the batch's own statistics in training mode."""
-        if x.dim() == 4:
+        if x.dim() == 4 or x.device.type != "cpu":
             known = self.running_mean, self.running_variance, self.weight, self.bias
             return F.batch_norm(x, *known, self.training, self.momentum, self.epsilon).relu_()
         if self.training:
@@ -40,6 +40,8 @@ class NormReLU(nn.Module):
 
     @torch.no_grad()
     def _follow(self, mean: Tensor, variance: Tensor, count: int) -> None:
+        if not count:
+            return
         self.running_mean.lerp_(mean, self.momentum)
         self.running_variance.lerp_(variance * (count / max(count - 1, 1)), self.momentum)
 

@@ -1,15 +1,18 @@
 """Where numbers of half the length are multiplied faster."""
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 
 
-def bfloat16(device: torch.device, wanted: bool) -> torch.autocast:
+def bfloat16(device: torch.device, wanted: bool) -> AbstractContextManager[object]:
     """Return a context whose convolutions and matrix products are in bfloat16 where `wanted` and in the hardware.
 
-    Elsewhere it changes nothing: a context around it stays in force.
+    Elsewhere it changes nothing.
     """
-    around = torch.is_autocast_enabled(device.type)
-    return torch.autocast(device.type, torch.bfloat16, enabled=around or (wanted and multiplies_bfloat16(device)))
+    if wanted and multiplies_bfloat16(device):
+        return torch.autocast(device.type, torch.bfloat16)
+    return nullcontext()
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:

@@ -4,6 +4,8 @@ A voxel of sample b at grid cell (z, y, x) has the integer key ((b D + z + 1) H 
 the grid's extents plus two: with one cell of padding on every side, adding an offset's key difference never wraps to
 another row. Keys are kept sorted, so a neighbour is found by binary search. (Graham et al., "3D Semantic Segmentation
 with Submanifold Sparse Convolutional Networks", CVPR 2018, names the two kinds of convolution.)
+
+On a GPU the host waits once for each set of rules: for the number of pairs of every offset and of outputs, all at once.
 """
 
 from dataclasses import dataclass
@@ -38,14 +40,19 @@ class Rules:
     by_source: Groups | None = None  # None too where the pairs of offset k are those of offset K-1-k, roles exchanged
 
 
-def _grouped(row: Tensor, counts: tuple[int, ...], rows: int) -> Groups:
+def _grouped(row: Tensor, offset: Tensor, offsets: int, rows: int) -> Groups:
     number = torch.arange(len(row), device=row.device, dtype=torch.int32)
-    offset = torch.repeat_interleave(torch.tensor(counts, device=row.device), output_size=len(row))
-    table = torch.full((rows, len(counts)), -1, device=row.device, dtype=torch.int32)
-    table.view(-1)[row.long() * len(counts) + offset] = number  # a row meets each offset once at most
+    table = torch.full((rows * offsets,), -1, device=row.device, dtype=torch.int32)
+    table[row.long() * offsets + offset] = number  # a row meets each offset once at most
     used = table >= 0
-    per_row = used.sum(1, dtype=torch.int32)
-    return Groups(table[used], per_row.cumsum(0, dtype=torch.int32) - per_row)
+    per_row = used.view(rows, offsets).sum(1, dtype=torch.int32)
+    return Groups(table[_places(used, len(row))], per_row.cumsum(0, dtype=torch.int32) - per_row)
+
+
+def _places(mask: Tensor, count: int) -> Tensor:
+    """Return the (count,) ascending places where a flat mask is True: `nonzero` without waiting for their number."""
+    rank = mask.cumsum(0, dtype=torch.int32)
+    return torch.searchsorted(rank, torch.arange(1, count + 1, device=mask.device, dtype=torch.int32))
 
 
 def keys_of(cells: Tensor, shape: Triple) -> Tensor:
@@ -81,8 +88,8 @@ def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
 def _submanifold_rules(keys: Tensor, height: int, width: int) -> Rules:
     count = len(keys)
     later = torch.cat((keys, keys.new_full((3,), -1)))  # so that looking up to 3 rows past the end finds no key
-    lines = keys.new_tensor([width, (height - 1) * width, height * width, (height + 1) * width])
-    wanted = keys[None] + lines[:, None] - 1  # (4, N): the first of three consecutive keys
+    lines = (width, (height - 1) * width, height * width, (height + 1) * width)
+    wanted = torch.stack([keys + (line - 1) for line in lines])  # (4, N): the first of three consecutive keys
     place = torch.searchsorted(keys, wanted)
     found, where = [later[1 : count + 1] == keys + 1], [torch.arange(1, count + 1, device=keys.device)]
     for line in range(4):
@@ -93,15 +100,18 @@ def _submanifold_rules(keys: Tensor, height: int, width: int) -> Rules:
             where.append(at)
             at = at + hit
     hits = torch.stack(found)  # (13, N): whether voxel n has a neighbour at the offset
-    counts = hits.sum(1).tolist()
-    offset, near = hits.nonzero(as_tuple=True)
-    far = torch.stack(where)[offset, near]
+    per_offset = hits.sum(1)
+    counts = per_offset.tolist()
+    flat = _places(hits.flatten(), sum(counts))
+    near, far = flat % max(count, 1), torch.stack(where).flatten()[flat]
     itself = torch.arange(count, device=keys.device)
     near_parts, far_parts = near.split(counts)[::-1], far.split(counts)[::-1]
     source = torch.cat((*near_parts, itself, far)).int()
     target = torch.cat((*far_parts, itself, near)).int()
+    per_offset = torch.cat((per_offset.flip(0), per_offset.new_full((1,), count), per_offset))
+    offset = torch.repeat_interleave(per_offset, output_size=len(source))
     counts = (*counts[::-1], count, *counts)
-    return Rules(source, target, counts, count, _grouped(target, counts, count))
+    return Rules(source, target, counts, count, _grouped(target, offset, len(counts), count))
 
 
 def strided_rules(
@@ -128,30 +138,29 @@ def _strided_rules(
 ) -> tuple[Rules, Tensor]:
     depth, height, width = (extent + 2 for extent in out_shape)
     cells = cells_of(keys, shape)
-    reaches: list[list[tuple[Tensor, Tensor]]] = []
-    for axis, key_step in enumerate((height * width, width, 1)):
+    reached = cells[:, 0] * (depth * height * width)  # grows to (kz, ky, kx, N): the output's key
+    valid = torch.ones_like(reached, dtype=torch.bool)  # and whether there is one
+    for axis, key_step in zip((2, 1, 0), (1, width, height * width), strict=True):
         shifted = cells[:, axis + 1] + padding[axis]
-        axis_reaches = []
-        for k in range(kernel[axis]):
-            place = (shifted - k).div(stride[axis], rounding_mode="floor")
-            valid = (place * stride[axis] == shifted - k) & (place >= 0) & (place < out_shape[axis])
-            axis_reaches.append((valid, (place + 1) * key_step))
-        reaches.append(axis_reaches)
-    first = cells[:, 0] * (depth * height * width)
-    sources, reached = [], []
-    for (z_valid, z_key), (y_valid, y_key) in product(reaches[0], reaches[1]):
-        line = (z_valid & y_valid).nonzero()[:, 0]
-        line_key = (first + z_key + y_key)[line]
-        for x_valid, x_key in reaches[2]:
-            kept = x_valid[line].nonzero()[:, 0]
-            source = line[kept]
-            sources.append(source)
-            reached.append(line_key[kept] + x_key[source])
-    all_keys = torch.cat(reached)
-    occupied = torch.zeros(samples * depth * height * width, dtype=torch.bool, device=keys.device)
-    occupied[all_keys] = True
-    out_keys = occupied.nonzero()[:, 0]
-    source, target = torch.cat(sources).int(), torch.searchsorted(out_keys, all_keys).int()
-    counts = tuple(len(part) for part in sources)
-    by_target, by_source = _grouped(target, counts, len(out_keys)), _grouped(source, counts, len(keys))
-    return Rules(source, target, counts, len(out_keys), by_target, by_source), out_keys
+        place = [(shifted - k).div(stride[axis], rounding_mode="floor") for k in range(kernel[axis])]
+        whole = [p * stride[axis] == shifted - k for k, p in enumerate(place)]
+        along = torch.stack([(p + 1) * key_step for p in place])
+        inside = torch.stack([w & (p >= 0) & (p < out_shape[axis]) for w, p in zip(whole, place, strict=True)])
+        wider = (len(place), *[1] * (reached.dim() - 1), len(keys))
+        reached, valid = reached + along.view(wider), valid & inside.view(wider)
+    offsets = kernel[0] * kernel[1] * kernel[2]
+    reached, valid = reached.flatten(), valid.flatten()
+    size = samples * depth * height * width
+    occupied = torch.zeros(size + 1, dtype=torch.bool, device=keys.device)
+    occupied = occupied.index_fill_(0, torch.where(valid, reached, size), True)[:size]  # the last takes what is invalid
+    number = occupied.cumsum(0, dtype=torch.int32)
+    per_offset = valid.view(offsets, -1).sum(1)
+    *counts, targets = torch.cat((per_offset, number[-1:])).tolist()
+    flat = _places(valid, sum(counts))
+    source = (flat % max(len(keys), 1)).int()
+    target = number[reached[flat]] - 1
+    offset = torch.repeat_interleave(per_offset, output_size=len(source))
+    by_target, by_source = (
+        _grouped(row, offset, offsets, rows) for row, rows in ((target, targets), (source, len(keys)))
+    )
+    return Rules(source, target, tuple(counts), targets, by_target, by_source), _places(occupied, targets)

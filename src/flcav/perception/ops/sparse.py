@@ -55,9 +55,13 @@ class SparseTensor:
 def sparse_convolution(features: Tensor, weight: Tensor, rules: Rules) -> Tensor:
     """Return (targets, C_out): target t gets the sum over its pairs (s, t, k) of features[s] @ weight[k].
 
-    features: (sources, C_in); weight: (K, C_in, C_out). Differentiable in both; always in the features' own precision.
+    features: (sources, C_in); weight: (K, C_in, C_out). Differentiable in both. On a CPU in the features' precision,
+    elsewhere in autocast's where that is on.
     """
-    with torch.autocast(features.device.type, enabled=False):
+    kind = features.device.type
+    if rules.by_target is not None and torch.is_autocast_enabled(kind):
+        features = features.to(torch.get_autocast_dtype(kind))
+    with torch.autocast(kind, enabled=False):
         return _SparseConvolution.apply(features, weight.to(features.dtype), rules)
 
 

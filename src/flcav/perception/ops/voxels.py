@@ -27,9 +27,11 @@ def voxelize(
     low, size = points.new_tensor(range_m[:3]), points.new_tensor(voxel_m)
     cell = torch.floor((points[:, :3] - low) / size)
     inside = ((cell >= 0) & (cell < points.new_tensor((shape[2], shape[1], shape[0] - 1)))).all(1)
-    x, y, z = cell[inside].long().unbind(1)
-    points = points[inside]
-    keys, order = keys_of(torch.stack((sample[inside], z, y, x), 1), shape).sort(stable=True)
+    kept = inside.nonzero()[:, 0]
+    x, y, z = cell[kept].long().unbind(1)
+    keys, order = keys_of(torch.stack((sample[kept], z, y, x), 1), shape).sort(stable=True)
     keys, count = torch.unique_consecutive(keys, return_counts=True)
-    means = torch.segment_reduce(points[order], "mean", lengths=count, axis=0, unsafe=True)  # unchecked: may be empty
+    means = torch.segment_reduce(
+        points[kept[order]], "mean", lengths=count, axis=0, unsafe=True
+    )  # unchecked: may be empty
     return means, keys

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from flcav.perception.images import Picture
+from flcav.perception.ops.precision import bfloat16
 from flcav.perception.ops.rectangles import nms
 from flcav.perception.signs.augment import GREY
 from flcav.perception.signs.config import STRIDES
@@ -61,15 +62,9 @@ def predict(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Te
     """
     device = next(network.parameters()).device
     stacked = torch.from_numpy(np.stack(pictures)).to(device)
-    with torch.autocast(device.type, torch.bfloat16, enabled=_has_bfloat16(device)):
+    with bfloat16(device, wanted=True):
         raw = network(stacked.permute(0, 3, 1, 2).float() / 255)
     return [maps.float() for maps in raw]
-
-
-def _has_bfloat16(device: torch.device) -> bool:
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    return bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
 
 def _chosen(cells: torch.Tensor, threshold: float, picture: Picture) -> Detections:

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import ConcatDataset
 
 from flcav.dataset.store import Dataset
 from flcav.perception.card import Card, data_entry, write_card
+from flcav.perception.device import CPU
 from flcav.perception.task import Calibrates, Task, configuration, fresh
 from flcav.perception.training.events import event_files
 from flcav.perception.training.loop import Checkpointing, Validation, train
@@ -32,6 +34,7 @@ class Request:
     epochs: int = 10
     patience: int = 5  # epochs without a better validation after which training ends
     seed: int = 0
+    device: torch.device = CPU
 
 
 def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progress: Report = silent) -> Card:
@@ -43,7 +46,7 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     """
     _check_writable(out)
     config = configuration(task, request.network)
-    network = fresh(task, config, request.seed)
+    network = fresh(task, config, request.seed).to(request.device)
     parts = [task.samples(data, config) for data in request.data]
     samples: Any = ConcatDataset(parts)  # pyright: ignore[reportArgumentType]
     per_epoch = max(1, len(samples) // task.practice.batch)

@@ -1,0 +1,139 @@
+"""Where networks run: the choice by name, and on a GPU the same numbers with one wait for each set of rules."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from flcav.cli.main import run
+from flcav.config import InputError
+from flcav.geometry import Boxes
+from flcav.perception.device import CPU, device_named
+from flcav.perception.objects import Sample
+from flcav.perception.objects.batch import batch_loss
+from flcav.perception.objects.model import Second, second, tiny_config
+from flcav.perception.ops import rules
+from flcav.perception.ops.rules import keys_of, strided_rules, submanifold_rules
+from flcav.perception.ops.sparse import sparse_convolution
+
+SHAPE, SAMPLES = (9, 14, 11), 2
+STRIDED = ((3, 3, 3), (2, 2, 2), (1, 1, 1))
+with_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+without_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is there")
+
+
+@pytest.fixture
+def keys():
+    occupied = torch.rand(SAMPLES, *SHAPE, generator=torch.Generator().manual_seed(7)) < 0.2
+    return keys_of(occupied.nonzero(), SHAPE)
+
+
+@pytest.fixture
+def sample():
+    rng = np.random.default_rng(0)
+    points = rng.uniform((0, -20, -2, 0), (40, 20, 0, 1), size=(4000, 4)).astype(np.float32)
+    car = Boxes(np.array([[12.0, 3.0, -1.0]]), np.array([[4.4, 1.8, 1.6]]), np.array([0.3]), np.array(["Car"]))
+    return Sample(points, car)
+
+
+def network(device: torch.device, bfloat16: bool = False) -> Second:
+    torch.manual_seed(0)
+    return second(replace(tiny_config(), bfloat16=bfloat16)).to(device).train()
+
+
+class SizesAsked(TorchDispatchMode):
+    """Collects the operations whose result, or its size, the host has to wait for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        tags = {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(func.tags)
+        if func is torch.ops.aten.index.Tensor:
+            tags = {index for index in args[1] if index is not None and index.dtype == torch.bool}
+        if tags and kwargs.get("output_size") is None:
+            self.found.append(str(func))
+        return func(*args, **kwargs)
+
+
+def test_a_device_has_a_name():
+    assert device_named("cpu") == CPU
+    assert device_named("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+    with pytest.raises(InputError, match="device 'gpu': choose one of auto, cpu, cuda"):
+        device_named("gpu")
+
+
+@without_gpu
+def test_a_gpu_that_is_not_there_is_one_sentence(tmp_path, capsys):
+    (tmp_path / "sweep.bin").write_bytes(np.zeros((9, 4), np.float32).tobytes())
+    with pytest.raises(SystemExit) as stopped:
+        run(["infer", "objects", str(tmp_path / "sweep.bin"), "--device", "cuda"])
+    assert stopped.value.code == 2
+    assert "device 'cuda': torch finds no GPU it can use; choose cpu or auto" in capsys.readouterr().err
+
+
+def test_the_tensor_rules_ask_for_all_sizes_at_once(keys, monkeypatch):
+    waits = []
+    to_list = torch.Tensor.tolist
+    monkeypatch.setattr(torch.Tensor, "tolist", lambda tensor: waits.append(1) or to_list(tensor))
+    with SizesAsked() as asked:
+        keys.nonzero()
+        assert asked.found == ["aten.nonzero.default"]
+        rules._submanifold_rules(keys, SHAPE[1] + 2, SHAPE[2] + 2)
+        rules._strided_rules(keys, SHAPE, *STRIDED, (5, 7, 6), SAMPLES)
+    assert asked.found == ["aten.nonzero.default"]
+    assert len(waits) == 2
+
+
+def test_the_grouped_product_follows_autocast(keys):
+    made = rules._submanifold_rules(keys, SHAPE[1] + 2, SHAPE[2] + 2)
+    features = torch.randn(len(keys), 8, requires_grad=True)
+    weight = torch.randn(27, 8, 6, requires_grad=True)
+    full = sparse_convolution(features, weight, made)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = sparse_convolution(features, weight, made)
+    assert half.dtype == torch.bfloat16
+    assert torch.allclose(half.float(), full, rtol=0.05, atol=0.2)
+    gradients = torch.autograd.grad(half.float().sum(), (features, weight))
+    for ours, theirs in zip(gradients, torch.autograd.grad(full.sum(), (features, weight)), strict=True):
+        assert ours.dtype == torch.float32
+        assert torch.cosine_similarity(ours.flatten(), theirs.flatten(), dim=0) > 0.999
+
+
+@with_gpu
+def test_rules_are_those_of_the_cpu_after_one_wait(keys):
+    expected = [submanifold_rules(keys, SHAPE), *strided_rules(keys, SHAPE, *STRIDED, SAMPLES)[:1]]
+    there = keys.cuda()
+    for one, make in zip(
+        expected,
+        (lambda: submanifold_rules(there, SHAPE), lambda: strided_rules(there, SHAPE, *STRIDED, SAMPLES)[0]),
+        strict=True,
+    ):
+        torch.cuda.synchronize()
+        torch.cuda.set_sync_debug_mode("warn")
+        with warnings.catch_warnings(record=True) as waits:
+            warnings.simplefilter("always")
+            made = make()
+        torch.cuda.set_sync_debug_mode("default")
+        assert len(waits) == 1
+        assert (made.counts, made.targets) == (one.counts, one.targets)
+        assert torch.equal(made.source.cpu(), one.source)
+        assert torch.equal(made.target.cpu(), one.target)
+
+
+@with_gpu
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_a_gpu_finds_the_loss_and_gradient_of_the_cpu(sample, bfloat16):
+    losses, gradients = [], []
+    for one in (network(CPU), network(torch.device("cuda"), bfloat16)):
+        loss = batch_loss(one, [sample])
+        losses.append(float(loss.detach()))
+        parts = torch.autograd.grad(loss, list(one.parameters()))
+        gradients.append(torch.cat([part.flatten().cpu() for part in parts]))
+    assert losses[1] == pytest.approx(losses[0], rel=0.02 if bfloat16 else 1e-3)
+    assert torch.cosine_similarity(*gradients, dim=0) > (0.98 if bfloat16 else 0.999)
