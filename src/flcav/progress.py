@@ -15,7 +15,10 @@ def silent(done: int, total: int, note: str = "") -> None:
 
 @contextlib.contextmanager
 def live(title: str) -> Iterator[Report]:
-    """Yield a `Report` that draws a bar with the time left on stderr, where that is a terminal."""
+    """Yield a `Report` that draws a bar with the time left on stderr, where that is a terminal.
+
+    What its first call says to be done was done before: it does not count for the speed.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -26,4 +29,13 @@ def live(title: str) -> Iterator[Report]:
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
         task = bars.add_task(title, total=None, note="")
-        yield lambda done, total, note="": bars.update(task, completed=done, total=total, note=note)
+        begun = False
+
+        def report(done: int, total: int, note: str = "") -> None:
+            nonlocal begun
+            if not begun:
+                bars.reset(task, completed=done, total=total)
+                begun = True
+            bars.update(task, completed=done, total=total, note=note)
+
+        yield report

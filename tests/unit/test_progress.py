@@ -1,0 +1,36 @@
+"""The live display, as a terminal shows it."""
+
+import io
+import re
+import time
+
+import pytest
+from rich.console import Console
+
+from flcav import progress
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    out = io.StringIO()
+    monkeypatch.setattr(progress, "Console", lambda **_: Console(file=out, force_terminal=True, width=120))
+    return out
+
+
+def test_work_done_before_does_not_shorten_the_time_left(shown):
+    with progress.live("train") as report:
+        for done in range(900, 906):
+            report(done, 2000, "loss 0.31")
+            time.sleep(0.05)
+    left = re.findall(r"905/2000 (\S+)", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue()))[-1]
+    hours, minutes, seconds = map(int, left.split(":"))
+    assert 40 <= 3600 * hours + 60 * minutes + seconds <= 600  # 1095 more of at least 0.05 s each
+    assert "loss 0.31" in shown.getvalue()
+
+
+def test_nothing_is_drawn_where_nobody_looks(monkeypatch):
+    out = io.StringIO()
+    monkeypatch.setattr(progress, "Console", lambda **_: Console(file=out))
+    with progress.live("train") as report:
+        report(1, 2, "loss 0.31")
+    assert out.getvalue() == ""
