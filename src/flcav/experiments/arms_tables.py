@@ -6,7 +6,7 @@ from typing import Any
 
 from flcav.experiments.demo_arms import ARMS
 from flcav.experiments.findings import HELD, NOT_HELD, UNDECIDED, verdict
-from flcav.experiments.markdown import interval, table
+from flcav.markdown import interval, table
 
 
 def tables(results: Mapping[str, Any]) -> dict[str, str]:

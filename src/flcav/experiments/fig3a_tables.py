@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from flcav.experiments.markdown import bullets, table
+from flcav.markdown import bullets, table
 
 
 def tables(results: Mapping[str, Any]) -> dict[str, str]:

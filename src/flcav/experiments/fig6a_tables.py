@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from flcav.experiments.fig6a_findings import EQUAL, JOINT, STAGE_NAMES, TOWN
-from flcav.experiments.markdown import bullets, interval, signed, table
+from flcav.markdown import bullets, interval, signed, table
 
 NAMES = {EQUAL: "equal stages", JOINT: "joint"}
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.experiments.markdown import bullets, interval, table
+from flcav.markdown import bullets, interval, table
 
 WANTED = 0.85  # AP of cars in 3D at IoU 0.5, on other scenes of the towns that were learned from
 MEASURES = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from flcav.experiments.markdown import bullets, interval, table
+from flcav.markdown import bullets, interval, table
 
 WANTED = 0.75  # mAP50 on scenes that were not learned from
 

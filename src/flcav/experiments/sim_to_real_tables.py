@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.experiments.markdown import table
+from flcav.markdown import table
 
 
 def tables(results: Mapping[str, Any]) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from flcav.experiments.markdown import bullets, interval, table
+from flcav.markdown import bullets, interval, table
 
 WANTED = 0.7  # of constant velocity's final error at junctions, at most
 SLICE = "at junctions"

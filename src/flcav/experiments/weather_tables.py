@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.experiments.markdown import bullets, interval, table
+from flcav.markdown import bullets, interval, table
 
 WANTED = 0.95  # accuracy
 

@@ -1,5 +1,6 @@
 """What one should know of a network before using it: a model card, after Mitchell et al. (FAT* 2019)."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,24 @@ from flcav.config import Config
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import sha256, write_bytes
+from flcav.markdown import bullets, table
+from flcav.sensors.rig import RIGS
 
 CARD_KEY = "flcav.card"  # metadata entry of a file of weights
 LICENCE = "Apache-2.0"
-RECIPE_FIELDS = ("town", "seed", "split", "scenes", "spins_per_scene", "every_s", "cavs", "poles", "weather")
+RECIPE_FIELDS = (
+    "town",
+    "seed",
+    "split",
+    "scenes",
+    "warmup_s",
+    "spins_per_scene",
+    "every_s",
+    "cavs",
+    "poles",
+    "weather",
+)
+RIG_FIELDS = ("vehicle_rig", "pole_rig")
 
 
 class Card(Config):
@@ -24,34 +39,95 @@ class Card(Config):
     samples: int
     training: dict[str, Any]  # settings
     data: tuple[dict[str, Any], ...]  # one entry per dataset, see `data_entry`
+    validation: dict[str, Any] | None = None  # entry of the dataset that `metrics` are of
     metrics: dict[str, Any]  # on the validation data; empty where there were none
     licence: str = LICENCE
     flcav: str = __version__
 
     def markdown(self) -> str:
-        """Return the card as a page of text."""
-        lines = [f"# {self.task}: {self.network}", ""]
-        lines += [f"- {name}: {getattr(self, name)}" for name in ("parameters", "seed", "samples", "licence", "flcav")]
-        for title, entries in (("Training", [self.training]), ("Data", self.data), ("Validation", [self.metrics])):
-            rows = [f"- {key}: {value}" for entry in entries for key, value in entry.items()]
-            lines += ["", f"## {title}", "", *(rows or ["- none"])]
-        return "\n".join(lines) + "\n"
+        """Return the card as a page of text; its numbers are rounded, the file of weights has them whole."""
+        facts = {name: getattr(self, name) for name in ("parameters", "seed", "samples", "licence", "flcav")}
+        held = [] if self.validation is None else [bullets([_entry(self.validation)])]
+        blocks = [
+            f"# {self.task}: {self.network}",
+            f"A network for `flcav infer {self.task}`, trained on frames of simulated streets.",
+            *_blocks(facts),
+            "## Training",
+            *_blocks(self.training),
+            "## Data",
+            bullets(_entry(entry) for entry in self.data),
+            "## Validation",
+            *held,
+            *(_blocks(self.metrics) or ["- none"]),
+        ]
+        return "\n\n".join(blocks) + "\n"
 
 
 def data_entry(data: Dataset) -> dict[str, Any]:
     """Return what a dataset is: its name, its number of frames, its manifest's fingerprint, and its recipe.
 
-    Of the recipe, what makes two datasets differ most: town, seed and weather; the manifest has the whole.
+    Of the recipe, what makes two datasets differ most, and the rigs that have a name; the manifest has the whole.
     """
     recipe = data.manifest.get("recipe", {})
+    rigs = {name: _rig_name(recipe[name]) for name in RIG_FIELDS if name in recipe}
     return {
-        "name": data.folder.resolve().name,
+        "name": "/".join(data.folder.resolve().parts[-2:]),
         "frames": len(data),
         "manifest": sha256(data.folder / MANIFEST),
-        "recipe": {name: recipe[name] for name in RECIPE_FIELDS if name in recipe},
+        "recipe": {name: recipe[name] for name in RECIPE_FIELDS if name in recipe}
+        | {name: rig for name, rig in rigs.items() if rig is not None},
     }
 
 
 def write_card(card: Card, path: Path) -> None:
     """Write the card as Markdown, atomically."""
     write_bytes(path, card.markdown().encode())
+
+
+def _rig_name(rig: Any) -> str | None:
+    return next((name for name, known in RIGS.items() if known.model_dump(mode="json") == rig), None)
+
+
+def _entry(entry: Mapping[str, Any]) -> str:
+    recipe = {name: value for name, value in entry["recipe"].items() if value not in ([], {}, None)}
+    return f"{entry['name']}: {entry['frames']} frames; {_text(recipe)}; SHA-256 of its manifest {entry['manifest']}"
+
+
+def _blocks(values: Mapping[str, Any]) -> list[str]:
+    """Return a list of what fits a line each, and a table below its name of what does not."""
+    tables = {name: _table(value, values.get("classes")) for name, value in values.items()}
+    plain = [f"{name}: {_text(value)}" for name, value in values.items() if tables[name] is None]
+    named = [f"### {name}\n\n{text}" for name, text in tables.items() if text is not None]
+    return ([bullets(plain)] if plain else []) + named
+
+
+def _table(value: Any, classes: Any) -> str | None:
+    """Return the table of a list or a mapping of records, or of a square over the classes; None of anything else."""
+    rows = value
+    if isinstance(value, Mapping):
+        rows = [{"": name} | dict(row) for name, row in value.items() if isinstance(row, Mapping)]
+    if not isinstance(rows, list) or not rows:
+        return None
+    if isinstance(rows[0], list) and isinstance(classes, list) and len(classes) == len(rows):
+        rows = [{"": name} | dict(zip(classes, row, strict=True)) for name, row in zip(classes, rows, strict=True)]
+    if not all(isinstance(row, Mapping) for row in rows):
+        return None
+    header = list(dict.fromkeys(name for row in rows for name in row))
+    return table(header, [[_text(row.get(name)) for name in header] for row in rows])
+
+
+def _text(value: Any) -> str:
+    """Return a value on one line; what is nested is in brackets, and left out where it is empty."""
+    if isinstance(value, float):
+        return f"{round(value, 4):g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_nested(part)}" for name, part in value.items() if part not in ([], {}, None))
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_nested, value)) or "none"
+    return "none" if value is None else str(value)
+
+
+def _nested(value: Any) -> str:
+    if isinstance(value, list | tuple) and len(value) == 1:
+        return _nested(value[0])
+    return f"({_text(value)})" if isinstance(value, Mapping | list | tuple) else _text(value)

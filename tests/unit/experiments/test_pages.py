@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from flcav.config import InputError
-from flcav.experiments.markdown import interval, table
 from flcav.experiments.pages import TABLES, fill, fill_folder
+from flcav.markdown import interval, table
 
 PAGES = [folder for folder in (Path(__file__).parents[3] / "reproductions").iterdir() if folder.name in TABLES]
 MADE = [folder for folder in PAGES if (folder / "result.json").exists()]

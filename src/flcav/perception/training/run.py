@@ -73,6 +73,7 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
         samples=len(samples),
         training=settings | {"loss": float(history.losses[-per_epoch:].mean()), "scores": _rounded(history.scores)},
         data=tuple(data_entry(data) for data in request.data),
+        validation=data_entry(request.validation) if request.validation else None,
         metrics=task.evaluate(network, request.validation) if request.validation else {},
     )
     save_network(task, network, out / WEIGHTS, card)
