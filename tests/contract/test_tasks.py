@@ -244,6 +244,29 @@ def test_a_dataset_without_its_sensor_is_one_sentence(task, tmp_path, capsys):
 
 
 @each_task
+def test_validation_data_without_its_sensor_are_refused_before_training(task, data, tmp_path, capsys, monkeypatch):
+    lacking, said = LACKING.get(task.name, ({"camera": False}, "no camera pictures"))
+    blind = folder_of(Drives(spins=1, **lacking), tmp_path / "data")
+    monkeypatch.setattr(type(task), "draw", None)  # not even called
+    out = tmp_path / "out"
+    assert called("train", task.name, "--data", data.folder, "--validation", blind, "--out", out) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert f"{blind}: {said}" in told
+    assert not out.exists()
+
+
+@each_task
+def test_weights_that_are_no_numbers_are_refused(task, tmp_path):
+    network = fresh(task, small(task), 1)
+    name, first = next(iter(network.named_parameters()))
+    first.data.flatten()[0] = float("nan")
+    save_network(task, network, tmp_path / "weights.safetensors")
+    with pytest.raises(InputError, match=rf"weights that are not finite numbers, in '{name}'"):
+        load_network(task, tmp_path / "weights.safetensors")
+
+
+@each_task
 def test_where_nothing_can_be_written_no_training_starts(task, data, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(type(task), "samples", None)  # not even called
     (tmp_path / "file").touch()
@@ -257,15 +280,24 @@ def test_where_nothing_can_be_written_no_training_starts(task, data, tmp_path, c
 def test_a_bad_picture_is_one_sentence(task, tmp_path, capsys):
     weights = tmp_path / "weights.safetensors"
     save_network(task, fresh(task, small(task), 1), weights)
-    grey, small_one = np.zeros((40, 60), np.uint8), np.zeros((20, 60, 3), np.uint8)
-    for number, (pixels, said) in enumerate(((grey, "1 channels (L); 3 are wanted"), (small_one, "60 x 20 pixels"))):
+    bad = {
+        "a picture of 1 channels (L); 3 are wanted": np.zeros((40, 60), np.uint8),
+        "a picture of 1 channels (I;16); 3 are wanted": np.zeros((40, 60), np.uint16),
+        "a picture of 4 channels (RGBA); 3 are wanted": np.zeros((40, 60, 4), np.uint8),
+        "a picture of 60 x 20 pixels": np.zeros((20, 60, 3), np.uint8),
+        "a picture of 1 x 1 pixels": np.zeros((1, 1, 3), np.uint8),
+        "not a picture, or a damaged one": np.zeros((40, 60, 3), np.uint8),
+    }
+    for number, (said, pixels) in enumerate(bad.items()):
         path = tmp_path / f"{number}.png"
         Image.fromarray(pixels).save(path)
+        if "damaged" in said:
+            path.write_bytes(path.read_bytes()[:60])
         assert called("infer", task.name, path, "--weights", weights, "--json") == 2
         told = capsys.readouterr()
         assert told.out == ""
         assert told.err.count("\n") == 1
-        assert f"{path}: a picture of {said}" in told.err
+        assert f"{path}: {said}" in told.err
 
 
 @each_task

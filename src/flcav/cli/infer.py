@@ -1,6 +1,7 @@
 """flcav infer: a network on what sensors saw."""
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +36,10 @@ def infer(
     with "constant_velocity" beside them and "truth" where the recording goes on for long enough.
     """
     from flcav.cli.tasks import network_of, task_named
+    from flcav.config import InputError
 
+    if math.isnan(threshold):
+        raise InputError("--threshold nan: a score from 0 to 1 is wanted")
     learned = task_named(task)
     network = network_of(learned, weights, device)
     results = []

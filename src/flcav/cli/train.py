@@ -22,7 +22,7 @@ def train(
     ),
     epochs: int = typer.Option(10, "--epochs", min=1, help="Passes through the data."),
     patience: int = typer.Option(5, "--patience", min=1, help="Epochs without a better validation before it stops."),
-    seed: int = typer.Option(0, "--seed", help="Initial weights, order and augmentation."),
+    seed: int = typer.Option(0, "--seed", min=0, help="Initial weights, order and augmentation."),
     device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
 ) -> None:
     """Train a network on recorded frames with their ground truth; writes OUT/weights.safetensors and its card.

@@ -134,6 +134,8 @@ def _read(task: Task[ConfigT, Any, Any], path: Path) -> tuple[ConfigT, dict[str,
 
 
 def _fill(network: nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
+    if odd := [name for name, tensor in tensors.items() if not torch.isfinite(tensor).all()]:
+        raise InputError(f"{path}: weights that are not finite numbers, in '{odd[0]}'")
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:

@@ -143,6 +143,10 @@ def test_a_view_beside_a_point_cloud(folder):
     assert view.picture.shape == (60, 200, 3)
     np.testing.assert_allclose(view.project(np.array([(10.0, 1.0, 0.0)])), [(89.5, 29.5)])
     assert view_beside(folder / "velodyne" / "000004.bin") is None
+    flat = "P2:" + " 0" * 12 + "\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 1 0 0 0 0 1 0 0 0 0 1 0\n"
+    (folder / "calib" / "000003.txt").write_text(flat)
+    with pytest.raises(InputError, match="'P2:' are no projection"):
+        view_beside(folder / "velodyne" / "000003.bin")
     (folder / "image_2" / "000003.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"image_2/000003\.png: not a picture"):
         view_beside(folder / "velodyne" / "000003.bin")

@@ -148,6 +148,9 @@ def test_other_bad_input_is_one_sentence(data, weights, tmp_path, capsys):
         "manifest": ("train", "objects", "--data", tmp_path / "empty", "--out", tmp_path / "o"),
         "damaged": ("evaluate", "objects", "--data", data, "--weights", tmp_path / "broken"),
         "neither a dataset": ("infer", "objects", "--weights", weights, tmp_path / "empty"),
+        "2.0 is not in the range": ("infer", "objects", "--weights", weights, data, "--threshold", 2),
+        "a score from 0 to 1": ("infer", "objects", "--weights", weights, data, "--threshold", "nan"),
+        "-3 is not in the range": ("train", "objects", "--data", data, "--out", tmp_path / "o", "--seed", -3),
     }
     for sentence, arguments in cases.items():
         assert called(*arguments) == 2, sentence

@@ -57,9 +57,14 @@ def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = No
 
 
 class RecordedSweeps(Sequence[Sample]):
-    """The frames of a dataset as samples with their ground truth, read when asked for."""
+    """The frames of a dataset as samples with their ground truth, read when asked for.
+
+    Raises `InputError` where one of the frames has no LiDAR.
+    """
 
     def __init__(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> None:
+        if blind := [data.name(number) for number in frames if not data.lidars(number)]:
+            raise InputError(f"{data.folder}: no LiDAR in {len(blind)} of {len(frames)} frames, as in {blind[0]}")
         self._data, self._config, self._frames = data, config, frames
 
     def __len__(self) -> int:
@@ -85,7 +90,8 @@ def only_lidar(frame: Frame, name: str | None = None) -> str:
     if name is None and frame.lidar:
         return next(iter(frame.lidar))
     if name is None or name not in frame.lidar:
-        raise InputError(f"frame {frame.key}: no LiDAR {name or ''} in it; it has {sorted(frame.lidar)}")
+        wanted = "no LiDAR in it" if name is None else f"no LiDAR '{name}' in it; it has {sorted(frame.lidar)}"
+        raise InputError(f"frame {frame.key}: {wanted}")
     return name
 
 

@@ -49,6 +49,8 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     network = fresh(task, config, request.seed).to(request.device)
     parts = [task.samples(data, config) for data in request.data]
     samples: Any = ConcatDataset(parts)  # pyright: ignore[reportArgumentType]
+    if request.validation is not None:
+        task.samples(request.validation, config)  # what is wrong with them is said before the long work
     per_epoch = max(1, len(samples) // task.practice.batch)
     with event_files(out / EVENTS) as watch:
         history = train(

@@ -49,7 +49,7 @@ def read_points(path: Path) -> NDArray[np.float32]:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Return the calibration of a frame; raises `InputError` where one of its matrices is missing or no matrix."""
+    """Return the calibration of a frame; raises `InputError` where one of its matrices is missing or cannot be one."""
     rows = dict(line.split(":", 1) for line in _lines(path) if ":" in line)
     matrices = {}
     for name, (height, width) in MATRICES.items():
@@ -57,6 +57,8 @@ def read_calibration(path: Path) -> Calibration:
             matrices[name] = np.array(rows[name].split(), dtype=np.float64).reshape(height, width)
         except (KeyError, ValueError):
             raise InputError(f"{path}: needs {height * width} numbers after '{name}:'") from None
+        if not np.isfinite(matrices[name]).all() or np.linalg.matrix_rank(matrices[name][:, :3]) < 3:
+            raise InputError(f"{path}: the numbers after '{name}:' are no projection and no pose")
     rectified, camera = np.eye(4), np.eye(4)
     rectified[:3, :3] = matrices["R0_rect"]
     camera[:3] = matrices["Tr_velo_to_cam"]
