@@ -28,7 +28,7 @@ class NormReLU(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return max(0, weight * (x - mean) / deviation + bias), by the batch's own statistics in training mode."""
-        if x.dim() == 4 or x.device.type != "cpu":
+        if x.dim() == 4 or not _written_out(x):
             known = self.running_mean, self.running_variance, self.weight, self.bias
             return F.batch_norm(x, *known, self.training, self.momentum, self.epsilon).relu_()
         if self.training:
@@ -44,6 +44,10 @@ class NormReLU(nn.Module):
             return
         self.running_mean.lerp_(mean, self.momentum)
         self.running_variance.lerp_(variance * (count / max(count - 1, 1)), self.momentum)
+
+
+def _written_out(rows: Tensor) -> bool:
+    return rows.device.type == "cpu"
 
 
 class _NormReLU(torch.autograd.Function):

@@ -40,6 +40,10 @@ class Rules:
     by_source: Groups | None = None  # None too where the pairs of offset k are those of offset K-1-k, roles exchanged
 
 
+def _compiled(keys: Tensor) -> bool:
+    return keys.device.type == "cpu"
+
+
 def _grouped(row: Tensor, offset: Tensor, offsets: int, rows: int) -> Groups:
     number = torch.arange(len(row), device=row.device, dtype=torch.int32)
     table = torch.full((rows * offsets,), -1, device=row.device, dtype=torch.int32)
@@ -78,7 +82,7 @@ def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
     differ in x only share one search, because their keys are consecutive.
     """
     _, height, width = (extent + 2 for extent in shape)
-    if keys.device.type == "cpu":
+    if _compiled(keys):
         steps = [(z * height + y) * width + x for z, y, x in product((-1, 0, 1), repeat=3)]
         source, target, counts = pairs.submanifold_pairs(keys.numpy(), np.array(steps[14:]))
         return Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(keys))
@@ -124,7 +128,7 @@ def strided_rules(
     """
     depth, height, width = ((n + 2 * p - k) // s + 1 for n, k, s, p in zip(shape, kernel, stride, padding, strict=True))
     out_shape = (depth, height, width)
-    if keys.device.type == "cpu":
+    if _compiled(keys):
         triples = (np.array(triple) for triple in (shape, kernel, stride, padding, out_shape))
         source, target, counts, out_keys = pairs.strided_pairs(keys.numpy(), samples, *triples)
         rules = Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(out_keys))
