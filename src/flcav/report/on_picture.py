@@ -38,7 +38,7 @@ def points_on_picture(axes: Axes, points: NDArray[np.float32], view: CameraView)
     return scale
 
 
-def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *, width: float = 1.2) -> None:
+def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *, width: float = 1.0) -> None:
     """Draw the edges of boxes (LiDAR frame) as far as they are in front of the camera."""
     ends = boxes.corners()[:, EDGES]  # (boxes, edges, 2, 3)
     along = ends[:, :, :1] + ALONG[:, None] * (ends[:, :, 1:] - ends[:, :, :1])
@@ -46,7 +46,7 @@ def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *,
         list(view.project(along.reshape(-1, 3)).reshape(-1, len(ALONG), 2)),
         colors=colour,
         linewidths=width,
-        path_effects=[withStroke(linewidth=width + 1.2, foreground="white")],
+        path_effects=[withStroke(linewidth=width + 1.0, foreground="white")],
         zorder=3,
     )
     axes.add_collection(lines, autolim=False)
