@@ -267,6 +267,16 @@ def test_weights_that_are_no_numbers_are_refused(task, tmp_path):
 
 
 @each_task
+def test_where_no_picture_can_be_drawn_nothing_is_inferred(task, data, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(type(task), "infer", None)  # not even called
+    weights, taken = tmp_path / "weights.safetensors", tmp_path / "file"
+    save_network(task, fresh(task, small(task), 1), weights)
+    taken.touch()
+    assert called("infer", task.name, data.folder, "--weights", weights, "--pictures", taken) == 1
+    assert capsys.readouterr() == ("", f"flcav: {taken}: Not a directory\n")
+
+
+@each_task
 def test_where_nothing_can_be_written_no_training_starts(task, data, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(type(task), "samples", None)  # not even called
     (tmp_path / "file").touch()

@@ -37,9 +37,12 @@ def infer(
     """
     from flcav.cli.tasks import network_of, task_named
     from flcav.config import InputError
+    from flcav.files import check_writable
 
     if math.isnan(threshold):
         raise InputError("--threshold nan: a score from 0 to 1 is wanted")
+    if pictures is not None:
+        check_writable(pictures)
     learned = task_named(task)
     network = network_of(learned, weights, device)
     results = []

@@ -1,6 +1,5 @@
 """A whole training of any task, from datasets to a file of weights with its card."""
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from torch import nn
 from torch.utils.data import ConcatDataset
 
 from flcav.dataset.store import Dataset
+from flcav.files import check_writable
 from flcav.perception.card import Card, data_entry, write_card
 from flcav.perception.device import CPU
 from flcav.perception.task import Calibrates, Task, configuration, fresh
@@ -44,7 +44,7 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     calibrated where the task does so, and its evaluation is in the card. Raises `InputError` for an unknown network and
     for data that the task cannot use, `OSError` before anything is read where `out` cannot be written.
     """
-    _check_writable(out)
+    check_writable(out)
     config = configuration(task, request.network)
     network = fresh(task, config, request.seed).to(request.device)
     parts = [task.samples(data, config) for data in request.data]
@@ -81,15 +81,6 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     save_network(task, network, out / WEIGHTS, card)
     write_card(card, out / CARD)
     return card
-
-
-def _check_writable(folder: Path) -> None:
-    """Raise `OSError` where nothing can be written below `folder`; leaves nothing behind."""
-    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    try:
-        tempfile.TemporaryFile(dir=nearest).close()
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
 def _rounded(scores: NDArray[np.float64]) -> list[float]:
