@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
 def infer(
     task: str = typer.Argument(help="What to find: weather, signs, objects or trajectory."),
     inputs: list[Path] = typer.Argument(
-        help="KITTI .bin files (objects) or PNG and JPEG files, folders of them, or dataset folders (trajectory)."
+        help="KITTI .bin files (objects) or PNG, JPEG and WebP files, folders of them, or dataset folders."
     ),
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."

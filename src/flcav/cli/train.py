@@ -15,10 +15,15 @@ def train(
     data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
     out: Path = typer.Option(..., "--out", help="Folder of the weights; an interrupted training goes on."),
     validation: Path | None = typer.Option(
-        None, "--validation", help="Dataset of other scenes: keeps the epoch that is best on it, and may stop early."
+        None,
+        "--validation",
+        help="Dataset of other scenes: keeps the epoch that is best on it, may stop early, calibrates scores.",
     ),
     network: str | None = typer.Option(
-        None, "--network", help="tiny (default) or paper; signs: n (default) or s; trajectory also tiny-cameras."
+        None,
+        "--network",
+        help="tiny (default) or paper; objects also small; signs n (default) or s; trajectory also tiny-cameras, "
+        "paper-cameras.",
     ),
     epochs: int = typer.Option(10, "--epochs", min=1, help="Passes through the data."),
     patience: int = typer.Option(5, "--patience", min=1, help="Epochs without a better validation before it stops."),
