@@ -14,7 +14,17 @@ from flcav.config import InputError
 from flcav.geometry import inverse, pose
 from flcav.perception.task import configuration, fresh
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S, CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.cross_view import CrossViewEncoder, pixel_grid, place_grid, rays
+from flcav.perception.trajectory.cross_view import (
+    FAR_M,
+    LEARNED,
+    SCALE_M,
+    CrossAttention,
+    CrossViewEncoder,
+    met_ground,
+    pixel_grid,
+    place_grid,
+    rays,
+)
 from flcav.perception.trajectory.evaluate import errors_of, metrics, turning
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
 from flcav.perception.trajectory.model import Forecast, Inputs
@@ -253,7 +263,7 @@ def test_only_the_nearest_mode_learns_much():
 def test_a_map_is_judged_by_its_own_layers():
     raster = torch.zeros(1, len(LAYERS), 64, 64)
     raster[:, LAYERS.index("road"), :32] = 1
-    right = torch.full((1, 4, 32, 32), -9.0)
+    right = torch.full((1, len(LEARNED), 32, 32), -9.0)
     right[:, 0, :16] = 9.0
     assert map_loss(right, raster) < 0.01 < map_loss(right.flip(2), raster)
 
@@ -280,13 +290,36 @@ def test_rays_meet_the_ground_where_it_projects_from():
     camera_from_frame = inverse(frame_from_camera)
     given = [torch.from_numpy(matrix)[None, None] for matrix in (intrinsics, camera_from_frame)]
     looks, stands = rays(given[0], given[1], pixel_grid(settings).double())
-    assert np.allclose(stands[0, 0] * 10, (1.0, 0.5, 1.5))
+    assert np.allclose(stands[0, 0] * SCALE_M, (1.0, 0.5, 1.5))
     down = looks[0, 0, :, 2] < -0.05
-    ground = stands[0, 0] * 10 - looks[0, 0, down] * (1.5 / looks[0, 0, down, 2:])
-    seen = np.concatenate((ground, np.ones((len(ground), 1))), axis=1) @ camera_from_frame.T
+    met = SCALE_M * met_ground(looks, stands)[0, 0]
+    ground = torch.cat((met[down], torch.zeros(int(down.sum()), 1), torch.ones(int(down.sum()), 1)), dim=1)
+    seen = ground.numpy() @ camera_from_frame.T
     pixel = seen[:, :3] @ intrinsics.T
     assert np.allclose(pixel[:, :2] / pixel[:, 2:], pixel_grid(settings)[down, :2], atol=1e-4)
+    up = looks[0, 0, :, 2] >= 0
+    assert 0 < up.sum() < len(up) - down.sum()
+    assert torch.allclose((met[up] - met.new_tensor((1.0, 0.5))).norm(dim=1), met.new_tensor(FAR_M))
     assert len(place_grid(settings, PATCH)) == settings.queries**2
+
+
+def test_the_ground_attends_by_cosine_and_nearness():
+    random = torch.Generator().manual_seed(2)
+    attend = CrossAttention(width=16, heads=2).double()
+    ground, places = (torch.randn(shape, generator=random).double() for shape in ((1, 3, 16), (3, 2)))
+    seen, met = (torch.randn(shape, generator=random).double() for shape in ((1, 5, 16), (1, 5, 2)))
+    found = []
+    query, key, value = (
+        part[0].unflatten(-1, (2, -1)) for part in (attend.query(ground), attend.key(seen), attend.value(seen))
+    )
+    for q in range(3):
+        for head in range(2):
+            cosine = torch.cosine_similarity(query[q, head][None], key[:, head], dim=1)
+            apart = (places[q] - met[0]).square().sum(dim=1)
+            share = (attend.sharpness[head, 0] * cosine - attend.nearness[head, 0] * apart).softmax(dim=0)
+            found.append(share @ value[:, head])
+    after = ground + attend.out(torch.cat(found).reshape(1, 3, 16))
+    assert torch.allclose(attend(ground, places, seen, met), after + attend.after(after))
 
 
 def test_resized_pictures_keep_their_rays():
@@ -303,7 +336,7 @@ def test_cameras_are_learned_through_end_to_end():
     views = torch.eye(4).expand(2, 6, 4, 4)
     forecast = network(Inputs(torch.zeros(2, PAST + 1, 4), None, pictures, intrinsics, views))
     assert forecast.map_logits is not None
-    assert forecast.map_logits.shape == (2, 4, 32, 32)
+    assert forecast.map_logits.shape == (2, len(LEARNED), 32, 32)
     forecast_loss(forecast, torch.ones(2, FUTURE, 2)).backward()
     assert isinstance(network.view, CrossViewEncoder)
     first = next(network.view.pictures.parameters())

@@ -24,11 +24,12 @@ RECIPE: RecipeFields = {
 }
 YAWS_DEG = {"front": 0.0, "front_left": 60.0, "front_right": -60.0, "back_left": 120.0, "back_right": -120.0}
 CAMERA_RECIPE: RecipeFields = RECIPE | {
+    "warmup_s": [40.0, 120.0],
     "spins_per_scene": 41,
-    "cavs": 8,
+    "cavs": 4,
     "vehicle_rig": {
         "cameras": {
-            name: {"mount": {"z": 1.7, "yaw_deg": yaw_deg}, "settings": {"width": 96, "height": 48, "fov_deg": 90.0}}
+            name: {"mount": {"z": 1.7, "yaw_deg": yaw_deg}, "settings": {"width": 96, "height": 48, "fov_deg": 64.0}}
             for name, yaw_deg in (YAWS_DEG | {"back": 180.0}).items()
         }
     },
@@ -93,21 +94,11 @@ STUDY = Study(
 CAMERAS = Study(
     task=TRAJECTORY,
     network="tiny-cameras",
-    train=({**CAMERA_RECIPE, "town": "grid", "seed": 31, "scenes": 2},),
-    validation={**CAMERA_RECIPE, "town": "grid", "seed": 131, "split": "validation", "cavs": 3, "scenes": 1},
-    tests={
-        "held-out scenes": {
-            **CAMERA_RECIPE,
-            "town": "grid",
-            "seed": 231,
-            "split": "test",
-            "cavs": 4,
-            "spins_per_scene": 31,
-            "scenes": 1,
-        }
-    },
-    epochs=12,
-    patience=12,
+    train=({**CAMERA_RECIPE, "town": "grid", "seed": 31, "scenes": 24},),
+    validation={**CAMERA_RECIPE, "town": "grid", "seed": 131, "split": "validation", "cavs": 3, "scenes": 4},
+    tests={"held-out scenes": {**CAMERA_RECIPE, "town": "grid", "seed": 331, "split": "test", "cavs": 3, "scenes": 6}},
+    epochs=5,
+    patience=5,
     numbers=_numbers,
     draw=_draw,
     quick_scenes=1,

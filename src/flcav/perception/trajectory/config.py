@@ -36,10 +36,10 @@ class CrossView:
     width_px: Annotated[int, Field(ge=32, multiple_of=16)] = 96  # pictures are resized to this
     height_px: Annotated[int, Field(ge=32, multiple_of=16)] = 48
     features: Annotated[int, Field(ge=8, multiple_of=8)] = 32
-    heads: Annotated[int, Field(ge=1)] = 4
+    heads: Annotated[int, Field(ge=1)] = 2
     layers: Annotated[int, Field(ge=1)] = 1  # of attention, one after another
     queries: Annotated[int, Field(ge=4)] = 16  # along each side of the patch
-    map_weight: Annotated[float, Field(ge=0)] = 2.0  # of the map's segmentation in the loss
+    map_weight: Annotated[float, Field(ge=0)] = 8.0  # of the map's segmentation in the loss
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

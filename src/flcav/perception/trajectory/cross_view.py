@@ -1,10 +1,12 @@
 """A cross-view transformer: pictures of several cameras to features and a map of the ground.
 
-Zhou and Kraehenbuehl, "Cross-view Transformers for Real-time Map-view Semantic Segmentation", CVPR 2022, sec. 3. Each
-place in a picture is known by the direction in which its camera looks there (eq. 2), each place on the ground by where
-it is, both relative to where the camera stands; the ground attends to the pictures by the cosine of the two (eq. 3).
-Small convolutions take the place of the paper's EfficientNet, there are one or two rounds of attention to one
-resolution, and the ground lies around the road user that is predicted instead of the vehicle with the cameras.
+Zhou and Kraehenbuehl, "Cross-view Transformers for Real-time Map-view Semantic Segmentation", CVPR 2022, sec. 3: the
+ground attends to all places of all pictures at once, by the cosine of what they are (eq. 3); a place in a picture is
+known by what is seen there, from where, and in which direction (eq. 2). Besides, it is known where its ray meets a flat
+ground, and the ground first looks at what lies near: a Gaussian of that distance, as wide as each head learns, after
+Chen et al., "Efficient and Robust 2D-to-BEV Representation Learning via Geometry-guided Kernel Transformer", 2022.
+Small convolutions take the place of EfficientNet, there are one or two rounds of attention to one resolution, and the
+ground lies around the road user that is predicted instead of the vehicle with the cameras.
 """
 
 from typing import TYPE_CHECKING
@@ -14,15 +16,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from flcav.perception.trajectory.config import CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.rasters import OTHERS, STATIC
+from flcav.perception.trajectory.rasters import OTHERS
 from flcav.perception.trajectory.views import Seen, Summary, conv
 
 if TYPE_CHECKING:
     from flcav.perception.trajectory.model import Inputs
 
-LEARNED = (*STATIC, OTHERS[0])  # layers of the raster that cameras are taught to see
-STRIDE = 8  # pixels of a picture to a place of its features
-SHARPNESS = 10.0  # the first inverse temperature of the attention; it is learned
+LEARNED = {"road": 1.0, "lane": 1.0, "crossing": 5.0, "way": 3.0, "red": 10.0, "green": 10.0, OTHERS[0]: 8.0}
+"""Layers of the raster that cameras are taught to see, and how much more a cell in one weighs: some are rare."""
+SCALE_M = 10.0  # places on the ground are divided by this
+STRIDES = (4, 8)  # pixels of a picture, down and to the right, to a place of its features: ground is seen flat
+FAR_M = 100.0  # rays that meet the ground beyond this, or never, end there
+SHARPNESS = 3.0  # the first inverse temperature of the cosines; it is learned
+NEAR = 3  # features of a place by which the attention knows how near two are
 
 
 class CrossViewEncoder(nn.Module):
@@ -33,7 +39,7 @@ class CrossViewEncoder(nn.Module):
         assert config.cameras is not None
         settings, width = config.cameras, config.cameras.features
         self.summary = 2 * config.hidden
-        self.pictures = nn.Sequential(conv(3, width // 2, 2), conv(width // 2, width, 2), conv(width, width, 2))
+        self.pictures = nn.Sequential(conv(3, width // 2, 2), conv(width // 2, width, 2), conv(width, width, (1, 2)))
         self.direction = nn.Linear(3, width)
         self.standpoint = nn.Linear(3, width)
         self.place = nn.Linear(2, width)
@@ -48,7 +54,7 @@ class CrossViewEncoder(nn.Module):
         self.sum_up = Summary(config.maps[1], config.maps[2], self.summary)
 
     pixels: Tensor  # (P, 3) homogeneous
-    places: Tensor  # (Q, 2) x, y [patch sides]
+    places: Tensor  # (Q, 2) x, y [SCALE_M]
 
     def forward(self, inputs: "Inputs") -> Seen:
         """Return what is seen in (B, n, 3, height, width) pictures; places are half as far apart as the queries."""
@@ -57,73 +63,88 @@ class CrossViewEncoder(nn.Module):
         assert inputs.camera_from_frame is not None
         batch, cameras = inputs.pictures.shape[:2]
         features = self.pictures(inputs.pictures.flatten(0, 1)).flatten(2).transpose(1, 2)
-        features = features.unflatten(0, (batch, cameras))  # (B, n, P, width)
         looks, stands = rays(inputs.intrinsics, inputs.camera_from_frame, self.pixels)
-        standpoint = self.standpoint(stands)[:, :, None]  # (B, n, 1, width)
-        key = features + functional.normalize(self.direction(looks) - standpoint, dim=-1)
-        where = functional.normalize(self.place(self.places)[None, None] - standpoint, dim=-1)  # (B, n, Q, width)
-        ground = self.ground.expand(batch, -1, -1)
+        position = functional.normalize(self.direction(looks) - self.standpoint(stands)[:, :, None], dim=-1)
+        seen = features.unflatten(0, (batch, cameras)) + position  # (B, n, P, width)
+        seen, met = seen.flatten(1, 2), met_ground(looks, stands).flatten(1, 2)
+        ground = (self.ground + self.place(self.places)).expand(batch, -1, -1)
         for attend in self.rounds:
-            ground = attend(ground, where, key, features)
+            ground = attend(ground, self.places, seen, met)
         side = round(len(self.places) ** 0.5)
         maps = self.refine(ground.transpose(1, 2).unflatten(2, (side, side)))
         return Seen(self.sum_up(maps), maps, self.map(maps))
 
 
 class CrossAttention(nn.Module):
-    """The ground attends to the places of all pictures at once (eq. 3), then a perceptron."""
+    """The ground attends to all places of all pictures at once, then a perceptron."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.query, self.key, self.value = (nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width)) for _ in "qkv")
+        self.query, self.key = (
+            nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width - heads * NEAR)) for _ in "qk"
+        )
+        self.value = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width))
         self.out = nn.Linear(width, width)
         self.after = nn.Sequential(
             nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
         )
         self.sharpness = nn.Parameter(torch.full((heads, 1, 1), SHARPNESS))
+        self.nearness = nn.Parameter(torch.logspace(1, -1, heads)[:, None, None])  # the first looks most narrowly
 
-    def forward(self, ground: Tensor, where: Tensor, key: Tensor, features: Tensor) -> Tensor:
-        """Return the ground (B, Q, width) after a look at n pictures.
+    def forward(self, ground: Tensor, places: Tensor, seen: Tensor, met: Tensor) -> Tensor:
+        """Return the ground (B, Q, width) after a look at what is `seen` (B, P, width).
 
-        `where` (B, n, Q, width) is its position relative to each camera, `key` and `features` are (B, n, P, width).
+        `places` (Q, 2) are those of the ground, `met` (B, P, 2) where rays meet it. Softmax is over P of
+        sharpness * cosine - nearness * |place - met|^2, in which |place|^2 makes no difference.
         """
-        query = functional.normalize(self._split(self.query(ground[:, None] + where)), dim=-1)
-        keys = functional.normalize(self._split(self.key(key)), dim=-1)
-        alike = self.sharpness * (query @ keys.transpose(-1, -2))  # (B, n, heads, Q, P)
-        share = alike.permute(0, 2, 3, 1, 4).flatten(3).softmax(dim=-1)  # over the places of all pictures
-        value = self._split(self.value(features)).transpose(1, 2).flatten(2, 3)  # (B, heads, n P, width / heads)
-        found = (share @ value).transpose(1, 2).flatten(2)
-        ground = ground + self.out(found)
+        query = self.sharpness * functional.normalize(self._split(self.query(ground)), dim=-1)
+        key = functional.normalize(self._split(self.key(seen)), dim=-1)
+        asks = self.nearness * functional.pad(2 * places, (0, 1), value=-1.0)  # (heads, Q, 3)
+        lies = torch.cat((met, met.square().sum(dim=2, keepdim=True)), dim=2)[:, None]  # (B, 1, P, 3)
+        query = torch.cat((query, asks.expand(len(query), -1, -1, -1)), dim=3)
+        key = torch.cat((key, lies.expand(-1, self.heads, -1, -1)), dim=3)
+        found = functional.scaled_dot_product_attention(query, key, self._split(self.value(seen)), scale=1.0)
+        ground = ground + self.out(found.transpose(1, 2).flatten(2))
         return ground + self.after(ground)
 
     def _split(self, tokens: Tensor) -> Tensor:
-        return tokens.unflatten(-1, (self.heads, -1)).transpose(2, 3)
+        return tokens.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
 
 def rays(intrinsics: Tensor, camera_from_frame: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """Return unit directions (B, n, P, 3) of the homogeneous `pixels` (P, 3), and where the cameras stand (B, n, 3).
 
-    Both are in the frame of the road user; the standpoint is divided by 10 m.
+    Both are in the frame of the road user; the standpoint is divided by SCALE_M.
     """
     frame_from_camera = camera_from_frame[..., :3, :3].transpose(-1, -2)
     back = frame_from_camera @ torch.linalg.inv(intrinsics)
     looks = functional.normalize(pixels @ back.transpose(-1, -2), dim=-1)
     stands = -(frame_from_camera @ camera_from_frame[..., :3, 3:])[..., 0]
-    return looks, stands / 10.0
+    return looks, stands / SCALE_M
+
+
+def met_ground(looks: Tensor, stands: Tensor) -> Tensor:
+    """Return (B, n, P, 2) where rays along `looks` from `stands`, as of `rays`, meet the ground at z = 0 [SCALE_M]."""
+    level = torch.linalg.vector_norm(looks[..., :2], dim=-1, keepdim=True).clamp(min=1e-6)
+    fall = (-looks[..., 2:] / level).clamp(min=1e-6)
+    reach = (stands[:, :, None, 2:] / fall).clamp(max=FAR_M / SCALE_M)
+    return stands[:, :, None, :2] + reach * looks[..., :2] / level
 
 
 def pixel_grid(settings: CrossView) -> Tensor:
     """Return (P, 3) the homogeneous middles of the features' places in a picture, row by row [px]."""
-    down = torch.arange(settings.height_px // STRIDE) * STRIDE + (STRIDE - 1) / 2
-    right = torch.arange(settings.width_px // STRIDE) * STRIDE + (STRIDE - 1) / 2
+    down, right = (
+        torch.arange(size // stride) * stride + (stride - 1) / 2
+        for size, stride in zip((settings.height_px, settings.width_px), STRIDES)
+    )
     v, u = torch.meshgrid(down, right, indexing="ij")
     return torch.stack((u, v, torch.ones_like(u)), dim=-1).reshape(-1, 3)
 
 
 def place_grid(settings: CrossView, patch: Patch) -> Tensor:
-    """Return (Q, 2) x, y of the places on the ground that ask, row by row, divided by 10 m."""
+    """Return (Q, 2) x, y of the places on the ground that ask, row by row, divided by SCALE_M."""
     step = patch.side_m / settings.queries
     fore = patch.middle_x_m + patch.side_m / 2 - (torch.arange(settings.queries) + 0.5) * step
     left = patch.side_m / 2 - (torch.arange(settings.queries) + 0.5) * step
-    return torch.stack(torch.meshgrid(fore, left, indexing="ij"), dim=-1).reshape(-1, 2) / 10.0
+    return torch.stack(torch.meshgrid(fore, left, indexing="ij"), dim=-1).reshape(-1, 2) / SCALE_M

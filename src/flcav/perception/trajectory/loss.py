@@ -10,7 +10,6 @@ from flcav.perception.trajectory.rasters import LAYERS
 
 SHARED = 0.05  # of the loss goes to all modes, so that none is lost: Rupprecht et al., ICCV 2017, eq. 5
 MODE_WEIGHT = 1.0
-RARE = 3.0  # a cell that is in a layer weighs so much more than one that is not
 
 
 def forecast_loss(forecast: Forecast, future: Tensor) -> Tensor:
@@ -31,5 +30,5 @@ def map_loss(map_logits: Tensor, raster: Tensor) -> Tensor:
     """Return the cross entropy of the learned map (B, LEARNED, h, w) against the raster's layers at its resolution."""
     wanted = raster[:, [LAYERS.index(name) for name in LEARNED]]
     wanted = functional.adaptive_avg_pool2d(wanted, map_logits.shape[-1])
-    weight = torch.full((len(LEARNED), 1, 1), RARE, device=map_logits.device)
+    weight = map_logits.new_tensor(list(LEARNED.values()))[:, None, None]
     return functional.binary_cross_entropy_with_logits(map_logits, wanted, pos_weight=weight)

@@ -1,6 +1,7 @@
 """What an agent's cameras see around a road user: small pictures, and how its ground projects into them."""
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,10 @@ from flcav.perception.trajectory.config import CrossView
 
 Array = NDArray[np.float64]
 
-KEPT = 1000  # frames whose pictures are kept at hand
+CAMERAS = 6  # around a vehicle, as a rule
+KEPT_BYTES = 2**30  # of pictures at hand
+
+Pictured = tuple[NDArray[np.uint8], Array, Array]  # pictures, intrinsics and views, without the road user
 
 
 class Surround(NamedTuple):
@@ -26,13 +30,19 @@ class Surround(NamedTuple):
 
 def surround(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
     """Return what the cameras of frame `number` see, as the agent believes them to be, around `present` x, y, yaw."""
-    pictures, intrinsics, camera_from_world = _seen(data, number, settings)
+    pictures, intrinsics, camera_from_world = _kept(settings)(data, number)
     world_from_frame = pose(float(present[0]), float(present[1]), yaw=float(present[2]))
     return Surround(pictures, intrinsics, camera_from_world @ world_from_frame)
 
 
-@lru_cache(maxsize=KEPT)
-def _seen(data: Dataset, number: int, settings: CrossView) -> tuple[NDArray[np.uint8], Array, Array]:
+@lru_cache(maxsize=2)
+def _kept(settings: CrossView) -> Callable[[Dataset, int], Pictured]:
+    """Return `_read` that keeps the frames read last, as many as fit into `KEPT_BYTES`."""
+    frame_bytes = CAMERAS * settings.height_px * settings.width_px * 3
+    return lru_cache(maxsize=KEPT_BYTES // frame_bytes)(partial(_read, settings))
+
+
+def _read(settings: CrossView, data: Dataset, number: int) -> Pictured:
     frame = data.frame(number)
     pictures, intrinsics, views = [], [], []
     for camera in data.cameras(number):

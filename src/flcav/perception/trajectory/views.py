@@ -52,6 +52,6 @@ class RasterEncoder(nn.Module):
         return Seen(self.sum_up(ground), ground)
 
 
-def conv(maps: int, out: int, stride: int = 1) -> nn.Sequential:
+def conv(maps: int, out: int, stride: int | tuple[int, int] = 1) -> nn.Sequential:
     """Return a 3 x 3 convolution with its normalisation over groups of maps, and a rectifier."""
     return nn.Sequential(nn.Conv2d(maps, out, 3, stride, 1, bias=False), nn.GroupNorm(out // 8, out), nn.ReLU())
