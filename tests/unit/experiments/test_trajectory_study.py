@@ -57,7 +57,7 @@ def results(*off_m: float) -> dict:
         runs.append({"seed": seed, "card": card, "tests": {"held-out scenes": evaluated(off)}})
     rows = [STUDY.numbers(evaluated(off)) for off in off_m]
     means = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
-    return {"seeds": runs, "summary": {"held-out scenes": means}}
+    return {"network": "tiny", "seeds": runs, "summary": {"held-out scenes": means}}
 
 
 @pytest.mark.parametrize(
@@ -67,6 +67,11 @@ def test_a_finding_names_its_verdict(off_m, verdict):
     found = tables(results(*off_m))["findings"]
     assert f"**{verdict}**, {np.mean(off_m) / 8:.3f}" in found
     assert "the best ends 0.00 m off, constant velocity 8.00 m" in found
+
+
+def test_cameras_are_measured_against_constant_velocity_too():
+    found = tables(results(7.0, 7.1) | {"network": "tiny-cameras"})["findings"].splitlines()
+    assert [line.partition("**")[2].partition("**")[0] for line in found] == ["reached", "not reached"]
 
 
 def test_errors_have_a_row_for_each_slice_and_predictor():
