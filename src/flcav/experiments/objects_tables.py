@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from flcav.experiments.task_study import training_rows
 from flcav.markdown import bullets, interval, table
 
 WANTED = 0.85  # AP of cars in 3D at IoU 0.5, on other scenes of the towns that were learned from
@@ -18,14 +19,18 @@ def tables(results: Mapping[str, Any]) -> dict[str, str]:
         "findings": bullets(_findings(results)),
         "classes": table(("test", "class", "to find", *heads, "calibration error"), _classes(results)),
         "slices": table(("test", "cars", "to find", *heads), _slices(results)),
+        "training": table(
+            ("seed", "sweeps", "steps", "validation, mean AP3D@0.5 of the classes, after each epoch; the best is kept"),
+            training_rows(results),
+        ),
         "tracks": table(("class", "MOTA", "AMOTA", "id switches", "velocity off by [m/s]"), _tracks(results)),
     }
 
 
 def _findings(results: Mapping[str, Any]) -> list[str]:
     seeds, said = len(results["seeds"]), []
-    for test, means in results["summary"].items():
-        mean = means["Car AP 3d at 0.5"]
+    for test in dict.fromkeys(recipe["town"] for recipe in results["recipes"]["train"]):
+        mean = results["summary"][test]["Car AP 3d at 0.5"]
         verdict = "reached" if mean["low"] >= WANTED else "not reached" if mean["high"] < WANTED else "undecided"
         over = f"{interval(mean)} over {seeds} seeds" if seeds > 1 else f"{mean['mean']:.3f} of one seed"
         said.append(f"*Car AP3D@0.5 of {WANTED} on {test}*: **{verdict}**, {over}.")

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from flcav.experiments.task_study import training_rows
 from flcav.markdown import bullets, interval, table
 
 WANTED = 0.75  # mAP50 on scenes that were not learned from
@@ -16,7 +17,7 @@ def tables(results: Mapping[str, Any]) -> dict[str, str]:
         "sizes": table(("root of the box's area", *_heads(results)), _rows(results, "sizes", "map50")),
         "training": table(
             ("seed", "pictures", "steps", "validation mAP50 after each epoch; the network of the best is kept"),
-            [(row["seed"], *_trained(row["card"])) for row in results["seeds"]],
+            training_rows(results),
         ),
     }
 
@@ -57,8 +58,3 @@ def _rows(results: Mapping[str, Any], part: str, measure: str) -> list[list[str]
 
 def _tested(results: Mapping[str, Any], test: str) -> list[Mapping[str, Any]]:
     return [seed["tests"][test] for seed in results["seeds"]]
-
-
-def _trained(card: Mapping[str, Any]) -> tuple[int, int, str]:
-    scores = card["training"]["scores"]
-    return card["samples"], card["training"]["steps"], ", ".join(f"{score:.2f}" for score in scores)

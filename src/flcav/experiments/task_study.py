@@ -84,6 +84,16 @@ def run_study(
     }
 
 
+def training_rows(results: Mapping[str, Any]) -> list[tuple[int, int, int, str]]:
+    """Return of each seed of a study's results: its number, samples, steps, and the score after each epoch."""
+    rows = []
+    for run in results["seeds"]:
+        card = run["card"]
+        scores = ", ".join(f"{score:.2f}" for score in card["training"]["scores"])
+        rows.append((run["seed"], card["samples"], card["training"]["steps"], scores))
+    return rows
+
+
 def at_scale(study: Study, scale: str) -> Study:
     """Return the study as it stands ("full") or in minutes ("quick"); raises `InputError` for another scale."""
     if scale not in SCALES:

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from flcav.report import style
 
 PANEL_IN, ROW_IN, HEAD_IN = 4.2, 0.27, 0.9
+ABREAST = 3  # panels side by side, at most
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,13 @@ class Bar:
 def precisions(panels: Mapping[str, Sequence[Bar]]) -> Figure:
     """Return a panel per title: a bar for each number from 0 to 1, a dot for each seed."""
     rows = max(len(bars) for bars in panels.values())
-    figure = style.canvas(PANEL_IN * len(panels), HEAD_IN + ROW_IN * rows)
-    drawn = np.atleast_1d(figure.subplots(1, len(panels)))
-    for axes, (title, bars) in zip(drawn, panels.items(), strict=True):
+    columns = min(len(panels), ABREAST)
+    lines = -(-len(panels) // columns)
+    figure = style.canvas(PANEL_IN * columns, (HEAD_IN + ROW_IN * rows) * lines)
+    drawn = np.atleast_1d(figure.subplots(lines, columns)).ravel()
+    for axes in drawn[len(panels) :]:
+        axes.remove()
+    for axes, (title, bars) in zip(drawn, panels.items()):
         for row, bar in enumerate(bars):
             axes.barh(row, bar.mean, height=0.7, color=style.BLUE if bar.targets is None else style.SKY)
             axes.plot(bar.seeds, [row] * len(bar.seeds), "o", color=style.INK, markersize=3, clip_on=False)

@@ -28,7 +28,10 @@ def tracked(ap):
 
 
 def study(aps):
-    seeds = [{"seed": n, "tests": {"suburb": result(ap), "tracks": tracked(ap)}} for n, ap in enumerate(aps)]
+    card = {"samples": 40, "training": {"steps": 60, "scores": [0.25, 0.5]}}
+    seeds = [
+        {"seed": n, "card": card, "tests": {"suburb": result(ap), "tracks": tracked(ap)}} for n, ap in enumerate(aps)
+    ]
     summary = {
         test: {
             name: mean_over_seeds([STUDY.numbers(seed["tests"][test])[name] for seed in seeds])
@@ -36,7 +39,7 @@ def study(aps):
         }
         for test in ("suburb", "tracks")
     }
-    return {"seeds": seeds, "summary": summary}
+    return {"seeds": seeds, "summary": summary, "recipes": {"train": [{"town": "suburb"}]}}
 
 
 def test_what_is_reached_is_said_with_its_interval():
@@ -50,6 +53,8 @@ def test_tables_hold_classes_slices_and_tracks():
     assert "| suburb | Car | 12 | 0.850 | 0.850 | 0.850 | 0.850 | 0.040 |" in tables["classes"]
     assert "| suburb | distance 0-20 m | 7 |" in tables["slices"]
     assert "| Car | 0.700 | 0.600 | 2.000 | 0.500 |" in tables["tracks"]
+    assert "| 1 | 40 | 60 | 0.25, 0.50 |" in tables["training"]
+    assert "tracks" not in tables["findings"]
 
 
 def test_a_study_is_drawn():
