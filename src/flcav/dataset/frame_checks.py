@@ -79,9 +79,11 @@ def check_points(frame: Frame, trace: Trace | None = None) -> Iterator[str]:
     """Check that each box, grown by the margin, holds as many points as its actor is said to have returned.
 
     Points of a spin that takes time are judged by where carrier and actor were when each was measured, and not at all
-    where the frame's traffic is not known.
+    where the frame's traffic is not known, or a point is not finite.
     """
     if not frame.lidar or (frame.point_times and trace is None):
+        return
+    if not all(np.isfinite(points).all() for points in frame.lidar.values()):
         return
     motions = _motions(frame, trace) if trace is not None and frame.point_times else {}
     everything, times_s = _in_world(frame, motions.get(frame.agent))
