@@ -10,7 +10,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.geometry import Boxes
 from flcav.perception.device import CPU, device_named
 from flcav.perception.objects import Sample
 from flcav.perception.objects.batch import batch_loss
@@ -31,14 +30,6 @@ def keys():
     return keys_of(occupied.nonzero(), SHAPE)
 
 
-@pytest.fixture
-def sample():
-    rng = np.random.default_rng(0)
-    points = rng.uniform((0, -20, -2, 0), (40, 20, 0, 1), size=(4000, 4)).astype(np.float32)
-    car = Boxes(np.array([[12.0, 3.0, -1.0]]), np.array([[4.4, 1.8, 1.6]]), np.array([0.3]), np.array(["Car"]))
-    return Sample(points, car)
-
-
 def network(device: torch.device, bfloat16: bool = False) -> Second:
     torch.manual_seed(0)
     return second(replace(tiny_config(), bfloat16=bfloat16)).to(device).train()
@@ -50,9 +41,9 @@ def loss_and_gradient(network: Second, sample: Sample) -> tuple[float, torch.Ten
     return float(loss.detach()), torch.cat([part.flatten().cpu() for part in parts])
 
 
-def agrees(one: tuple[float, torch.Tensor], other: tuple[float, torch.Tensor], bfloat16: bool) -> None:
-    assert other[0] == pytest.approx(one[0], rel=0.02 if bfloat16 else 1e-4)
-    assert torch.cosine_similarity(one[1], other[1], dim=0) > (0.98 if bfloat16 else 0.9999)
+def apart(one: tuple[float, torch.Tensor], other: tuple[float, torch.Tensor]) -> tuple[float, float]:
+    """Return how much two losses differ, relative to the first, and 1 - the cosine between their gradients."""
+    return abs(other[0] / one[0] - 1), 1 - float(torch.cosine_similarity(one[1], other[1], dim=0))
 
 
 class SizesAsked(TorchDispatchMode):
@@ -121,7 +112,9 @@ def test_the_network_is_the_same_from_tensor_operations(sample, bfloat16, monkey
     compiled = loss_and_gradient(network(CPU), sample)
     monkeypatch.setattr(rules, "_compiled", lambda keys: False)
     monkeypatch.setattr(norm, "_written_out", lambda x: False)
-    agrees(compiled, loss_and_gradient(network(CPU, bfloat16), sample), bfloat16)
+    loss, gradient = apart(compiled, loss_and_gradient(network(CPU, bfloat16), sample))
+    assert loss <= (0.02 if bfloat16 else 1e-4)
+    assert gradient < (0.02 if bfloat16 else 0.0001)
 
 
 @with_gpu
@@ -149,4 +142,6 @@ def test_rules_are_those_of_the_cpu_after_one_wait(keys):
 @pytest.mark.parametrize("bfloat16", [False, True])
 def test_a_gpu_finds_the_loss_and_gradient_of_the_cpu(sample, bfloat16):
     compiled = loss_and_gradient(network(CPU), sample)
-    agrees(compiled, loss_and_gradient(network(torch.device("cuda"), bfloat16), sample), bfloat16)
+    loss, gradient = apart(compiled, loss_and_gradient(network(torch.device("cuda"), bfloat16), sample))
+    assert loss <= (0.02 if bfloat16 else 1e-4)
+    assert gradient < (0.02 if bfloat16 else 0.0001)

@@ -2,25 +2,14 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
-from flcav.geometry import Boxes
-from flcav.perception.objects import Sample
 from flcav.perception.objects.batch import batch_loss, predict
 from flcav.perception.objects.model import second, tiny_config
 from flcav.perception.ops.precision import multiplies_bfloat16
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture
-def sample():
-    rng = np.random.default_rng(0)
-    points = rng.uniform((0, -20, -2, 0), (40, 20, 0, 1), size=(4000, 4)).astype(np.float32)
-    car = Boxes(np.array([[12.0, 3.0, -1.0]]), np.array([[4.4, 1.8, 1.6]]), np.array([0.3]), np.array(["Car"]))
-    return Sample(points, car)
 
 
 def networks():
