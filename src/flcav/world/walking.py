@@ -29,7 +29,7 @@ class Walkers:
         self._behind = {name: path for name, path in self._behind.items() if path and name in targets}
 
     def _follow(self, name: str, target: State) -> State:
-        """Return `target`, or, where it is out of reach, a state on the way there with angle and speed of the motion."""
+        """Return `target`, or, if it is out of reach, a state on the way with angle and speed of the motion."""
         if name not in self.states:
             return target
         path = self._behind.setdefault(name, deque())

@@ -1,6 +1,12 @@
 """Detection metrics."""
 
-from flcav.perception.metrics.average_precision import average_precision, bootstrap_difference, bootstrap_interval
+from flcav.perception.metrics.average_precision import (
+    average_precision,
+    bootstrap_difference,
+    bootstrap_interval,
+    orientation_similarity,
+    right_headings,
+)
 from flcav.perception.metrics.calibration import calibration_error, fit_logistic
 from flcav.perception.metrics.matching import Matches, match
 
@@ -12,4 +18,6 @@ __all__ = [
     "calibration_error",
     "fit_logistic",
     "match",
+    "orientation_similarity",
+    "right_headings",
 ]
