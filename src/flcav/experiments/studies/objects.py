@@ -82,9 +82,9 @@ STUDY = Study(
     train=tuple({**RECIPE, "town": town, "seed": 21, "scenes": 16} for town in TOWNS),
     validation={**RECIPE, "town": "suburb", "seed": 121, "split": "validation", "scenes": 2},
     tests={
-        **{town: {**RECIPE, "town": town, "seed": 421, "split": "test", "scenes": 3} for town in TOWNS},
-        WEATHERS: {**RECIPE, "town": "suburb", "seed": 521, "split": "test", "scenes": 4, "weather": CHANGING},
-        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 621, "split": "test", "scenes": 3},
+        **{town: {**RECIPE, "town": town, "seed": 431, "split": "test", "scenes": 6} for town in TOWNS},
+        WEATHERS: {**RECIPE, "town": "suburb", "seed": 531, "split": "test", "scenes": 4, "weather": CHANGING},
+        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 631, "split": "test", "scenes": 3},
     },
     epochs=8,
     patience=8,

@@ -57,7 +57,7 @@ def _times(matches: Matches, frames: ArrayLike | None) -> NDArray[np.int64]:
     return np.bincount(np.asarray(frames, dtype=np.int64), minlength=len(matches.targets))
 
 
-def _weighted(matches: Matches, times: NDArray[np.int64], worth: ArrayLike = 1.0) -> float:
+def _weighted(matches: Matches, times: NDArray[np.int64], worth: NDArray[np.float64] | float = 1.0) -> float:
     """Return AP where each frame counts `times` (F,) and each hit `worth` (D,) towards the precision."""
     wanted = int((matches.targets * times).sum())
     if not wanted:
