@@ -21,7 +21,7 @@ from flcav.experiments.testing import difference
 from flcav.files import write_bytes, write_json
 from flcav.geometry import Boxes
 from flcav.network.ledger import LINKS, Ledger
-from flcav.perception.errors import MISS, load_errors
+from flcav.perception.errors import load_errors
 from flcav.perception.objects.samples import only_lidar
 from flcav.report import figures, html, maps, style, sweeps
 from flcav.world.town import load_town
@@ -165,14 +165,15 @@ def _difference(work: Path, protocol: Protocol, before: str, after: str) -> dict
 
 def draw(work: Path, values: dict[str, Any], results: dict[str, Any]) -> dict[str, bytes]:
     """Return the report's pictures as PNG files by name."""
-    errors = load_errors(work / "grid-errors" / ERRORS)
+    town, errors = load_town("grid"), load_errors(work / "grid-errors" / ERRORS)
     placed = results["placement"]
     scene = maps.ErrorMap(
-        load_town("grid"),
+        town,
         np.array([(error.x, error.y, error.z) for error in errors]).reshape(-1, 3),
-        np.array([error.kind == MISS for error in errors], dtype=bool),
-        (placed["chosen"],),
-        placed["densest"],
+        np.array([error.kind for error in errors], dtype=np.str_),
+        maps.poles_of(town),
+        (str(placed["chosen"]),),
+        str(placed["densest"]),
         placed["range_m"],
     )
     sweep = _sweep(work, values["sweep"])

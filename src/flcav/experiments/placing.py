@@ -11,8 +11,9 @@ from flcav.experiments.protocol import Protocol
 from flcav.experiments.recording import opened
 from flcav.experiments.steps import Work
 from flcav.optimization.placement import coverage, place
-from flcav.perception.errors import FALSE_POSITIVE, MISS, load_errors, register_errors, save_errors
+from flcav.perception.errors import FALSE_POSITIVE, MISS, load_errors, save_errors
 from flcav.perception.objects.detect import detect_all
+from flcav.perception.objects.errors import register_errors
 from flcav.perception.objects.weights import load_network
 from flcav.world.density import poles_density
 from flcav.world.town import load_town

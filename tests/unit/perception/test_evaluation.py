@@ -7,8 +7,9 @@ import pytest
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
-from flcav.perception.errors import load_errors, register_errors, save_errors
+from flcav.perception.errors import load_errors, save_errors
 from flcav.perception.objects import sample_from_frame, second_paper, second_tiny
+from flcav.perception.objects.errors import register_errors
 from flcav.perception.objects.evaluate import evaluate, score_detections, truth_of
 from flcav.perception.objects.samples import checked_points
 
@@ -104,7 +105,7 @@ def test_false_positives_need_a_return_and_are_one_per_place():
 
 def test_detections_on_a_bus_or_a_hidden_car_are_no_mistakes():
     found = detections((40, 0, 0.9), (20, 12, 0.9))
-    assert register_errors([frame(MIXED[3:5], points=cloud_in(found))], [found], CONFIG) == []
+    assert register_errors([frame(MIXED[3:5], points=cloud_in(found))], [found], CONFIG) == ()
 
 
 def test_the_registry_is_a_parquet_table(tmp_path):
@@ -113,7 +114,7 @@ def test_the_registry_is_a_parquet_table(tmp_path):
     save_errors(errors, tmp_path / "errors.parquet")
     assert repr(load_errors(tmp_path / "errors.parquet")) == repr(errors)
     save_errors([], tmp_path / "none.parquet")
-    assert load_errors(tmp_path / "none.parquet") == []
+    assert load_errors(tmp_path / "none.parquet") == ()
 
 
 @pytest.mark.parametrize(

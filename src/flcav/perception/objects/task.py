@@ -8,16 +8,19 @@ import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.geometry import Boxes
+from flcav.perception.errors import Registry
 from flcav.perception.objects.augment import augment
 from flcav.perception.objects.batch import batch_loss
 from flcav.perception.objects.calibrate import OVERLAP, calibrate, trust
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
+from flcav.perception.objects.errors import THRESHOLD, register_errors
 from flcav.perception.objects.evaluate import detections_and_truths, score_detections
 from flcav.perception.objects.infer import box_rows, point_clouds
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.paste import Cutouts, cut, pasted
-from flcav.perception.objects.samples import RecordedSweeps, Sample
+from flcav.perception.objects.samples import RecordedSweeps, Sample, only_lidar
 from flcav.perception.objects.slices import slice_lines, sliced
 from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
@@ -85,6 +88,25 @@ class ObjectsTask:
         for cloud in point_clouds(path):
             found = detect(network, cloud.points, score_threshold=threshold)
             yield Finding(cloud.path, cloud.points, {"boxes": box_rows(found)}, cloud.view)
+
+    def register_errors(
+        self,
+        network: Second,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        threshold: float = THRESHOLD,
+        progress: Report = silent,
+    ) -> Registry:
+        """Return the objects that are missed and invented, see `errors.register_errors`."""
+        numbers = of_frames(data, frames)
+
+        def found() -> Iterator[Boxes]:
+            for done, number in enumerate(numbers, start=1):
+                frame = data.frame(number)
+                yield detect(network, frame.lidar[only_lidar(frame)], score_threshold=threshold)
+                progress(done, len(numbers), "")
+
+        return Registry(register_errors(map(data.frame, numbers), found(), network.config, threshold))
 
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
         """Return one line per class, kind of overlap and IoU, and one per class and slice."""

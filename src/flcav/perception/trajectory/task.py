@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.perception.errors import Registry
 from flcav.perception.task import Finding, Practice
 from flcav.perception.trajectory.batch import futures_of, inputs_of, rasters_of
 from flcav.perception.trajectory.config import CONFIGURATIONS, TrajectoryConfig
+from flcav.perception.trajectory.errors import register_errors
 from flcav.perception.trajectory.evaluate import metrics
 from flcav.perception.trajectory.infer import findings
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
@@ -74,6 +76,17 @@ class TrajectoryTask:
     def infer(self, network: TrajectoryNetwork, path: Path, threshold: float = 0.0) -> Iterator[Finding]:
         """Yield the predicted paths of each frame of a dataset, see `findings`; all modes, however unlikely."""
         yield from findings(network, path)
+
+    def register_errors(
+        self,
+        network: TrajectoryNetwork,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        threshold: float = 0.0,
+        progress: Report = silent,
+    ) -> Registry:
+        """Return who went elsewhere than predicted, see `errors.register_errors`; a path has no score."""
+        return register_errors(network, data, samples_of(data, network.config, frames), progress)
 
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
         """Return a line per slice."""
