@@ -1,4 +1,4 @@
-"""The error registry of signs and trajectories, on a recorded drive: misses in their place, inventions where rays meet."""
+"""The error registry of signs and trajectories on a drive: misses in their place, inventions where their rays meet."""
 
 from pathlib import Path
 
