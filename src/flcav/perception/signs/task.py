@@ -66,9 +66,11 @@ class SignsTask:
         """Return mAP at IoU 0.5; 0 where there was nothing to find."""
         return result["map50"] or 0.0
 
-    def infer(self, network: SignDetector, path: Path, threshold: float = 0.3) -> Iterator[Finding]:
+    def infer(
+        self, network: SignDetector, path: Path, threshold: float = 0.3, frames: Sequence[int] | None = None
+    ) -> Iterator[Finding]:
         """Yield {"boxes": [...]} for each picture of `path`, best first."""
-        for origin, rgb in pictures(path):
+        for origin, rgb in pictures(path, frames):
             found = detect(network, rgb, threshold=threshold)
             yield Finding(origin, rgb, {"boxes": box_rows(found, network.config.classes)})
 
