@@ -139,7 +139,7 @@ def _stages(values: dict[str, Any], book: Ledger, town: str) -> list[dict[str, A
             {
                 "name": STAGE_NAMES[key],
                 "town": town,
-                **{name: test[name] for name in ("ap50", "ap50_low", "ap50_high", "ap70")},
+                **{name: test[name] for name in ("ap50", "ap50_low", "ap50_high", "ap70", "aos50", "right_headings")},
                 "samples": samples,
                 "rounds": rounds,
                 **{f"{link}_mb": book.used_mb(link, stage=key) for link in LINKS},

@@ -139,4 +139,4 @@ def _tested_step(seed: int) -> str:
 
 def _mean(results: Sequence[Result], numbers: Callable[[Result], Mapping[str, float]]) -> dict[str, dict[str, float]]:
     rows = [numbers(result) for result in results]
-    return {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
+    return {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}

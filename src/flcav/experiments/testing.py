@@ -37,6 +37,8 @@ def test_arm(work: Work, arm: str, town: str) -> dict[str, Any]:
         "ap70_low": number_or_none(strict.low),
         "ap70_high": number_or_none(strict.high),
         "bev50": bev.ap,
+        "aos50": half.aos,
+        "right_headings": None if np.isnan(half.right) else half.right,
         "frames": result.frames,
         "scenes": len(set(result.scenes)),
         "targets": result.targets["Car"],

@@ -63,7 +63,8 @@ def test_scores_count_targets_and_hidden_objects():
     assert result.score("Car", "3d", 0.7).ap == 1
     row = result.summary()["scores"][0]
     assert row == {
-        "class": "Car", "kind": "3d", "iou": 0.5, "ap": 1.0, "low": 1.0, "high": 1.0, "targets": 6, "hidden": 3
+        "class": "Car", "kind": "3d", "iou": 0.5, "ap": 1.0, "low": 1.0, "high": 1.0, "aos": 1.0,
+        "right_headings": 1.0, "targets": 6, "hidden": 3
     }  # fmt: skip
     assert result.frames == 3
     nothing = score_detections([Boxes.empty()], [truth_of(frame([]), CONFIG)], ("Car",))

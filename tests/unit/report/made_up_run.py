@@ -18,6 +18,8 @@ def stage(name: str, town: str, ap50: float, **more: float) -> dict[str, Any]:
         "ap50_low": ap50 - 0.041,
         "ap50_high": ap50 + 0.038,
         "ap70": ap50 - 0.19,
+        "aos50": ap50 - 0.02,
+        "right_headings": 0.96,
         "samples": 0,
         "rounds": 0,
         "wireless_mb": 0.0,

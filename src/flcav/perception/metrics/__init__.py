@@ -6,6 +6,8 @@ from flcav.perception.metrics.average_precision import (
     bootstrap_difference,
     bootstrap_interval,
     interval_words,
+    orientation_similarity,
+    right_headings,
 )
 from flcav.perception.metrics.calibration import calibration_error, fit_logistic
 from flcav.perception.metrics.matching import Matches, match
@@ -20,4 +22,6 @@ __all__ = [
     "fit_logistic",
     "interval_words",
     "match",
+    "orientation_similarity",
+    "right_headings",
 ]

@@ -1,4 +1,4 @@
-"""How well detections agree with the truth: AP per class, in 3D and bird's-eye, at IoU 0.5 and 0.7."""
+"""How well detections agree with the truth: AP and AOS per class, in 3D and bird's-eye, at IoU 0.5 and 0.7."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.geometry import Boxes, inverse
-from flcav.perception.metrics import Matches, average_precision, bootstrap_interval, match
+from flcav.perception.metrics import (
+    Matches,
+    average_precision,
+    bootstrap_interval,
+    match,
+    orientation_similarity,
+    right_headings,
+)
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect_all
 from flcav.perception.objects.model import Second
@@ -47,6 +54,8 @@ class Score:
     ap: float  # [0, 1]; NaN where there was nothing to find
     low: float  # 95 % interval over scenes; NaN where one scene holds all targets
     high: float
+    aos: float  # average orientation similarity, [0, ap]
+    right: float  # share of found objects whose heading is off by less than 90 degrees; NaN where none was found
     matches: Matches
 
 
@@ -77,6 +86,8 @@ class Evaluation:
                 "ap": number_or_none(score.ap),
                 "low": number_or_none(score.low),
                 "high": number_or_none(score.high),
+                "aos": number_or_none(score.aos),
+                "right_headings": number_or_none(score.right),
                 "targets": self.targets[score.name],
                 "hidden": self.hidden[score.name],
             }
@@ -151,7 +162,8 @@ def score_detections(
         for kind, overlap in OVERLAPS:
             matches = match(found, targets, neutral, overlap, kind)
             low, high = bootstrap_interval(matches, scenes, rng=stream(seed, "bootstrap"))
-            scores.append(Score(name, kind, overlap, average_precision(matches), low, high, matches))
+            ap, aos = average_precision(matches), orientation_similarity(matches)
+            scores.append(Score(name, kind, overlap, ap, low, high, aos, right_headings(matches), matches))
     targets_of = {name: sum(int((truth.targets.label == name).sum()) for truth in truths) for name in classes}
     hidden_of = {name: sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes}
     return Evaluation(tuple(scores), len(truths), scenes, targets_of, hidden_of)

@@ -111,7 +111,9 @@ class ObjectsTask:
         for row in result["scores"]:
             found = "nothing to find"
             if row["ap"] is not None:
-                found = f"AP {row['ap']:.3f} {interval_words(row['low'], row['high'])}"
+                found = f"AP {row['ap']:.3f} {interval_words(row['low'], row['high'])}  AOS {row['aos']:.3f}"
+            if row["right_headings"] is not None:
+                found += f", {row['right_headings']:.0%} of those found head the right way"
             counts = f"objects: {row['targets']}, and {row['hidden']} without a return"
             lines.append(f"{row['class']:<12}{row['kind']:>4} IoU {row['iou']:.1f}  {found}  ({counts})")
         lines += [f"at IoU {OVERLAP:g} by distance, occlusion and weather:", *slice_lines(result["slices"], OVERLAP)]
