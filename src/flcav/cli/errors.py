@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from flcav.cli.options import AGENTS, THREADS
+from flcav.threads import use_threads
+
 if TYPE_CHECKING:
     from flcav.perception.errors import Registry
     from flcav.world.town import Town
@@ -30,6 +33,8 @@ def errors(
         None, "--threshold", min=0.0, max=1.0, help="objects, signs: lowest score of a detection; 0.3 if not given."
     ),
     map_: Path | None = typer.Option(None, "--map", help="PNG file: the errors in the dataset's town."),
+    agents: str | None = AGENTS,
+    threads: int = THREADS,
     device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
 ) -> None:
     """Register what a network gets wrong on recorded frames.
@@ -38,13 +43,15 @@ def errors(
     Objects and signs: missed or invented; trajectory: a final error above 2 m, at the road user's present. Each object
     counts once per scene, each sign once. `flcav place` reads the table.
     """
+    use_threads(threads)
     from flcav import progress
-    from flcav.cli.tasks import network_of, task_named
+    from flcav.cli.tasks import network_of, origin_line, origin_of, task_named
     from flcav.config import InputError
     from flcav.dataset.exchange import check_ending
     from flcav.dataset.store import Dataset
     from flcav.files import check_writable, write_bytes
-    from flcav.perception.errors import RegistersErrors, save_errors
+    from flcav.perception.agents import choose_frames
+    from flcav.perception.errors import THRESHOLD, RegistersErrors, save_errors
 
     learned = task_named(task)
     if not isinstance(learned, RegistersErrors):
@@ -60,8 +67,11 @@ def errors(
     if map_ is not None and town is None:
         raise InputError(f"{data}: its town is not known, so that there is no map of it")
     network = network_of(learned, weights, device)
+    chosen = choose_frames(learned, network.config, dataset, agents)
+    lowest = THRESHOLD if threshold is None else threshold
+    typer.echo(f"{chosen.sentence}\n{origin_line(origin_of(learned, weights))}")
     with progress.live(f"errors of {task}") as report:
-        found = learned.register_errors(network, dataset, None, 0.3 if threshold is None else threshold, report)
+        found = learned.register_errors(network, dataset, chosen.frames, lowest, report)
     save_errors(found.errors, out)
     if map_ is not None and town is not None:
         write_bytes(map_, _draw(town, found))

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import torch
 
 from flcav.experiments.pretraining import WEIGHTS
 from flcav.experiments.recording import opened
@@ -20,7 +19,6 @@ SHOWN_SCORE = 0.3
 
 def look(work: Work, town: str, arms: dict[str, str]) -> dict[str, Any]:
     """Detect with each of `arms` (name -> step) in the test frame that holds most targets, whatever they find there."""
-    torch.set_num_threads(1)
     data = opened(work, f"{town}-test")
     networks = {name: load_network(work.inputs[step] / WEIGHTS) for name, step in arms.items()}
     config = next(iter(networks.values())).config

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import torch
 
 from flcav.dataset.layout import trace_path
 from flcav.experiments.pretraining import WEIGHTS
@@ -24,7 +23,6 @@ ERRORS = "errors.parquet"
 
 def register(work: Work, town: str) -> dict[str, int]:
     """Drive the pretrained network through a town it has not seen and register what it gets wrong."""
-    torch.set_num_threads(1)
     drive = opened(work, f"{town}-registry")
     network = load_network(work.inputs["pretrain"] / WEIGHTS)
     frames = [drive.frame(i) for i in range(len(drive))]

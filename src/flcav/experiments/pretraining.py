@@ -32,7 +32,6 @@ PRECISION = 0.9  # on validation, of the detections that a vehicle may take for 
 def pretrain(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
     """Upload the planned samples, train on them, and fix the threshold of own labels."""
     setting = Protocol.model_validate(protocol)
-    torch.set_num_threads(1)
     pool, validation = opened(work, "suburb-pool"), opened(work, "suburb-validation")
     samples = int(work.result("plan")["tasks"][0]["samples"])
     chosen = np.sort(stream(setting.seed, "upload").permutation(len(pool))[:samples])

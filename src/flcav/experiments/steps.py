@@ -7,7 +7,6 @@ is written last, so a killed run goes on from its last finished step; a step may
 import hashlib
 import json
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, FIRST_EXCEPTION, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -21,6 +20,7 @@ from flcav.config import InputError
 from flcav.dataset.workers import end_with_parent
 from flcav.files import write_json
 from flcav.progress import Report
+from flcav.threads import use_threads
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
 DONE = "done.json"
@@ -153,8 +153,7 @@ def _start(queue: Any) -> None:
     global _queue
     _queue = queue
     end_with_parent()
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = "1"
+    use_threads(1)
 
 
 def _perform(step: Step, folder: Path, fingerprint: str) -> Any:

@@ -18,6 +18,7 @@ from flcav.progress import Report, silent
 
 SAME_PLACE_M = 2.0  # false positives of one scene within this of one another are one
 
+THRESHOLD = 0.3  # lowest score of a detection, unless one is told otherwise
 MISS, FALSE_POSITIVE, FINAL_ERROR = "miss", "false_positive", "final_error"
 CLASS = "class"  # the column of `PerceptionError.label`
 

@@ -143,8 +143,18 @@ def test_interval_holds_the_value_and_shrinks_with_scenes():
 
 def test_frames_of_one_scene_are_redrawn_together():
     matches = random_matches(np.random.default_rng(0))
-    low, high = bootstrap_interval(matches, ["only"] * 12, 50, rng=np.random.default_rng(1))
-    assert low == high == pytest.approx(average_precision(matches))
+    halves = np.repeat(["one", "other"], 6)
+    low, high = bootstrap_interval(matches, halves, 300, rng=np.random.default_rng(1))
+    ends = sorted(average_precision(matches, np.flatnonzero(halves == name)) for name in ("one", "other"))
+    assert (low, high) == pytest.approx(ends)  # one of four draws holds one scene twice
+
+
+def test_one_scene_says_nothing_of_others():
+    matches = random_matches(np.random.default_rng(0))
+    assert np.isnan(bootstrap_interval(matches, ["only"] * 12, 50, rng=np.random.default_rng(1))).all()
+    empty = replace(matches, targets=np.where(np.arange(12) < 3, matches.targets, 0))
+    scenes = ["full"] * 3 + ["empty"] * 9
+    assert np.isnan(bootstrap_interval(empty, scenes, 50, rng=np.random.default_rng(1))).all()
 
 
 def test_difference_is_paired():

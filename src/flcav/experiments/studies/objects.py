@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch
 
 from flcav.dataset.store import Dataset
 from flcav.experiments.task_study import RecipeFields, Result, Study
@@ -33,7 +32,6 @@ TRACKS = "tracks"
 
 def followed(network: Second, data: Dataset) -> dict[str, Any]:
     """Return the evaluation of the network's tracks."""
-    torch.set_num_threads(1)
     return {TRACKS: evaluate_tracks(network, data)}
 
 

@@ -37,7 +37,12 @@ def right_headings(matches: Matches) -> float:
 def bootstrap_interval(
     matches: Matches, scene_of_frame: ArrayLike, n: int = 1000, *, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Return the 95 % percentile interval of AP under redrawing of scenes; `scene_of_frame` (F,) names each's scene."""
+    """Return the 95 % percentile interval of AP under redrawing of scenes; `scene_of_frame` (F,) names each's scene.
+
+    NaN where fewer than two scenes hold something to find: nothing then says how much scenes differ.
+    """
+    if len(np.unique(np.asarray(scene_of_frame)[matches.targets > 0])) < 2:
+        return float("nan"), float("nan")
     draws = np.array([_weighted(matches, times) for times in _redrawn(scene_of_frame, n, rng)])
     return _interval(draws)
 
@@ -48,6 +53,11 @@ def bootstrap_difference(
     """Return the 95 % percentile interval of AP(after) - AP(before), both on the same redrawn frames."""
     draws = [_weighted(after, times) - _weighted(before, times) for times in _redrawn(scene_of_frame, n, rng)]
     return _interval(np.array(draws))
+
+
+def interval_words(low: float | None, high: float | None) -> str:
+    """Return an interval over scenes in brackets; None is one that a single scene leaves unknown."""
+    return "(no interval: one scene)" if low is None or high is None else f"[{low:.3f}, {high:.3f}]"
 
 
 def _times(matches: Matches, frames: ArrayLike | None) -> NDArray[np.int64]:

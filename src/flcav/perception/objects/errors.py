@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
-from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, keep_first
+from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError, keep_first
 from flcav.perception.metrics.matching import assign_targets, on_neutral
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import detection_labels, only_lidar
@@ -17,7 +17,6 @@ from flcav.perception.objects.targets import in_range
 from flcav.sensors.frame import Frame
 
 OVERLAP = 0.5  # 3D IoU that counts as found
-THRESHOLD = 0.3  # lowest score of a detection
 
 
 def register_errors(

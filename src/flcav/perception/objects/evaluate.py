@@ -52,7 +52,7 @@ class Score:
     kind: Kind
     overlap: float  # IoU that makes a detection a hit
     ap: float  # [0, 1]; NaN where there was nothing to find
-    low: float  # 95 % interval over scenes
+    low: float  # 95 % interval over scenes; NaN where one scene holds all targets
     high: float
     aos: float  # average orientation similarity, [0, ap]
     right: float  # share of found objects whose heading is off by less than 90 degrees; NaN where none was found
@@ -77,7 +77,7 @@ class Evaluation:
         raise KeyError((name, kind, overlap))
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers as JSON knows them; AP is null where there was nothing to find."""
+        """Return the numbers as JSON knows them; AP, or its interval, is null where it is NaN."""
         rows = [
             {
                 "class": score.name,
@@ -126,14 +126,23 @@ def evaluate(
 
 
 def detections_and_truths(
-    network: Second, frames: Iterable[Frame], *, total: int = 0, progress: Report = silent
+    network: Second,
+    frames: Iterable[Frame],
+    asked: SecondConfig | None = None,
+    *,
+    total: int = 0,
+    progress: Report = silent,
 ) -> tuple[list[Boxes], list[Truth]]:
-    """Return what `network` finds in each frame, from `LOWEST_SCORE` on, and what there is to find."""
+    """Return what `network` finds in each frame, from `LOWEST_SCORE` on, and what there is to find.
+
+    `asked`: a configuration of smaller range, beyond which no object is asked for and no detection counts.
+    """
     truths: list[Truth] = []
     detections: list[Boxes] = []
     for done, frame in enumerate(frames, start=1):
-        truths.append(truth_of(frame, network.config))
-        detections += detect_all(network, [frame.lidar[only_lidar(frame)]], score_threshold=LOWEST_SCORE)
+        truths.append(truth_of(frame, asked or network.config))
+        (found,) = detect_all(network, [frame.lidar[only_lidar(frame)]], score_threshold=LOWEST_SCORE)
+        detections.append(found if asked is None else found[in_range(found, asked)])
         progress(done, max(total, done), "")
     return detections, truths
 

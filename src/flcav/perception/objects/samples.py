@@ -23,6 +23,7 @@ DETECTION_CLASS = {
     "motorcycle": "Cyclist",
 }
 LOOKALIKE = {"truck": "Car", "bus": "Car"}  # neutral: neither to be found nor to be kept apart
+HEIGHT_SLACK_M = 0.5  # between a LiDAR's height and the one that a network expects
 MIN_RETURNS = 5  # LiDAR returns that make an object a target; with fewer it is neutral
 
 
@@ -72,6 +73,31 @@ class RecordedSweeps(Sequence[Sample]):
 
     def __getitem__(self, index: Any) -> Any:
         return sample_from_frame(self._data.frame(self._frames[index]), self._config)
+
+
+def fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
+    """Return the frames whose LiDAR is mounted within `HEIGHT_SLACK_M` of the height that `config` expects.
+
+    Heights are those of the calibration, above the agent's origin: a vehicle's is on the ground, a pole's where its
+    sensors are, so that a pole's LiDAR does not fit. All frames where none has a LiDAR: who reads them says so.
+
+    Raises `InputError` where LiDARs are there but none fits.
+    """
+    height_m: dict[int, float] = {}
+    for number, key in enumerate(data.keys):
+        if lidars := data.lidars(number):
+            mounts = data.calibrations[key.agent].true.agent_from_sensor
+            height_m[number] = float(mounts[lidars[0]][2, 3])
+    expected_m = -config.ground_z_m
+    fitting = [number for number, height in height_m.items() if abs(height - expected_m) <= HEIGHT_SLACK_M]
+    if height_m and not fitting:
+        found = {data.keys[number].agent: height for number, height in height_m.items()}
+        heights = ", ".join(f"{agent}: {height:g} m" for agent, height in found.items())
+        raise InputError(
+            f"{data.folder}: no LiDAR is mounted {expected_m:g} m above its agent's origin, as the network expects "
+            f"({heights}); --agents all takes them as they are"
+        )
+    return fitting or range(len(data))
 
 
 def detection_labels(category: NDArray[np.str_], classes: tuple[str, ...]) -> NDArray[np.str_]:

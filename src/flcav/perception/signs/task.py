@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
-from flcav.perception.errors import Registry
+from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.images import pictures
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
@@ -68,9 +68,11 @@ class SignsTask:
         """Return mAP at IoU 0.5; 0 where there was nothing to find."""
         return result["map50"] or 0.0
 
-    def infer(self, network: SignDetector, path: Path, threshold: float = 0.3) -> Iterator[Finding]:
+    def infer(
+        self, network: SignDetector, path: Path, threshold: float = 0.3, frames: Sequence[int] | None = None
+    ) -> Iterator[Finding]:
         """Yield {"boxes": [...]} for each picture of `path`, best first."""
-        for origin, rgb in pictures(path):
+        for origin, rgb in pictures(path, frames):
             found = detect(network, rgb, threshold=threshold)
             yield Finding(origin, rgb, {"boxes": box_rows(found, network.config.classes)})
 
@@ -79,7 +81,7 @@ class SignsTask:
         network: SignDetector,
         data: Dataset,
         frames: Sequence[int] | None = None,
-        threshold: float = 0.3,
+        threshold: float = THRESHOLD,
         progress: Report = silent,
     ) -> Registry:
         """Return the signs that are missed and invented, see `errors.register_errors`."""
