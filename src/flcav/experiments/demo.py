@@ -22,7 +22,7 @@ from flcav.files import write_bytes, write_json
 from flcav.geometry import Boxes
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.errors import load_errors
-from flcav.perception.objects.samples import only_lidar
+from flcav.perception.objects.truth import only_lidar
 from flcav.report import figures, html, maps, style, sweeps
 from flcav.world.town import load_town
 

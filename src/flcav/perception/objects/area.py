@@ -8,7 +8,7 @@ from typing import Any
 from flcav.config import InputError
 from flcav.perception.metrics import CONFIDENCE
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.samples import MIN_RETURNS
+from flcav.perception.objects.truth import MIN_RETURNS
 
 
 def narrowed(config: SecondConfig, text: str) -> SecondConfig:

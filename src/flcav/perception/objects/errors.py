@@ -1,6 +1,6 @@
 """What a detector of objects misses and invents.
 
-A mistake is an object with at least one LiDAR return that was missed, or a detection, with a return in it, of nothing:
+A mistake is a target or a faint object (see `truth`) that was missed, or a detection, with a return in it, of nothing:
 both within the detector's range.
 """
 
@@ -8,12 +8,11 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
+from flcav.geometry import Boxes, points_in_boxes, transform_points
 from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError, keep_first
 from flcav.perception.metrics.matching import assign_targets, on_neutral
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.samples import detection_labels, only_lidar
-from flcav.perception.objects.targets import in_range
+from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
 from flcav.sensors.frame import Frame
 
 OVERLAP = 0.5  # 3D IoU that counts as found
@@ -41,27 +40,25 @@ def _all_errors(
 
 def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[PerceptionError]:
     """Return the objects not found, and mark in `matched` the detections that found something or lie on something."""
-    truth = frame.annotations
-    boxes = truth.boxes.transformed(inverse(frame.world_from_sensor(only_lidar(frame))))
-    label = detection_labels(truth.boxes.label, config.classes)
-    asked = (label != "") & (truth.returns >= 1) & in_range(boxes, config)
+    truth, annotations = ground_truth(frame, config), frame.annotations
+    label, asked = truth.boxes.label, truth.target | truth.faint
     missed = asked.copy()
     for name in config.classes:
         own, objects = np.flatnonzero(found.label == name), np.flatnonzero(asked & (label == name))
-        target = assign_targets(found[own], boxes[objects], OVERLAP)
+        target = assign_targets(found[own], truth.boxes[objects], OVERLAP)
         matched[own[target >= 0]] = True
         missed[objects[target[target >= 0]]] = False
-    matched |= on_neutral(found, boxes)
+    matched |= on_neutral(found, truth.boxes)
     return [
         PerceptionError(
-            *(float(value) for value in truth.boxes.center[i]),
+            *(float(value) for value in annotations.boxes.center[i]),
             weight=1.0,
             kind=MISS,
             label=str(label[i]),
             returns=int(truth.returns[i]),
-            occlusion=float(truth.occlusion[i]),
+            occlusion=float(annotations.occlusion[i]),
             scene=frame.scene,
-            track=str(truth.track[i]),
+            track=str(annotations.track[i]),
         )
         for i in np.flatnonzero(missed)
     ]

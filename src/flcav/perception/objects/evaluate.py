@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.geometry import Boxes, inverse
+from flcav.geometry import Boxes
 from flcav.perception.metrics import (
     Matches,
     average_precision,
@@ -20,8 +20,7 @@ from flcav.perception.metrics import (
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect_all
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.samples import MIN_RETURNS, detection_labels, is_lookalike, only_lidar
-from flcav.perception.objects.targets import in_range
+from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
 from flcav.perception.ops.rotated import Kind
 from flcav.progress import Report, silent
 from flcav.seeds import stream
@@ -33,11 +32,11 @@ LOWEST_SCORE = 0.05  # detections below add nothing that the intervals would sho
 
 
 @dataclass(frozen=True)
-class Truth:
+class Asked:
     """What one frame holds for a network to find, LiDAR frame, detection classes."""
 
     scene: str
-    targets: Boxes  # in range, with at least `MIN_RETURNS` returns
+    targets: Boxes  # see `flcav.perception.objects.truth`
     neutral: Boxes  # finding them is neither right nor wrong; label = the class they are neutral for
     hidden: Boxes  # in range without a return: counted, not asked for
     occlusion: NDArray[np.float64] | None = None  # (targets,) share that is hidden, in [0, 1]; None: not known
@@ -96,25 +95,17 @@ class Evaluation:
         return {"frames": self.frames, "scenes": len(set(self.scenes)), "scores": rows}
 
 
-def truth_of(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Truth:
-    """Return what `frame` holds for a network of `config`, by the rules of evaluation.
+def asked_of(frame: Frame, config: SecondConfig) -> Asked:
+    """Return what `frame` holds for a network of `config` to find: its targets.
 
-    Targets are objects of its classes whose centre is in range, with enough returns. Objects with fewer, objects out of
-    range, and trucks and buses beside cars are neutral.
+    Faint and hidden objects, objects out of range and lookalikes are neutral.
     """
-    annotations = frame.annotations
-    boxes = annotations.boxes.transformed(inverse(frame.world_from_sensor(only_lidar(frame, lidar))))
-    label = detection_labels(annotations.boxes.label, config.classes)
-    lookalike = is_lookalike(annotations.boxes.label, config.classes)
-    inside = in_range(boxes, config)
-    target = (label != "") & inside & (annotations.returns >= MIN_RETURNS)
-    hidden = (label != "") & inside & (annotations.returns == 0)
-    neutral = ((label != "") & ~target) | lookalike
-    boxes = Boxes(boxes.center, boxes.size, boxes.yaw, np.where(lookalike, "Car", label))
+    truth = ground_truth(frame, config)
+    neutral = (truth.known & ~truth.target) | truth.lookalike
     weather = None if frame.weather is None else weather_class(frame.weather)
-    return Truth(
-        frame.scene, boxes[target], boxes[neutral], boxes[hidden], annotations.occlusion[target].astype(float), weather
-    )
+    occlusion = frame.annotations.occlusion[truth.target].astype(float)
+    boxes = truth.boxes
+    return Asked(frame.scene, boxes[truth.target], boxes[neutral], boxes[truth.hidden], occlusion, weather)
 
 
 def evaluate(
@@ -132,15 +123,15 @@ def detections_and_truths(
     *,
     total: int = 0,
     progress: Report = silent,
-) -> tuple[list[Boxes], list[Truth]]:
+) -> tuple[list[Boxes], list[Asked]]:
     """Return what `network` finds in each frame, from `LOWEST_SCORE` on, and what there is to find.
 
     `asked`: a configuration of smaller range, beyond which no object is asked for and no detection counts.
     """
-    truths: list[Truth] = []
+    truths: list[Asked] = []
     detections: list[Boxes] = []
     for done, frame in enumerate(frames, start=1):
-        truths.append(truth_of(frame, asked or network.config))
+        truths.append(asked_of(frame, asked or network.config))
         (found,) = detect_all(network, [frame.lidar[only_lidar(frame)]], score_threshold=LOWEST_SCORE)
         detections.append(found if asked is None else found[in_range(found, asked)])
         progress(done, max(total, done), "")
@@ -148,7 +139,7 @@ def detections_and_truths(
 
 
 def score_detections(
-    detections: Sequence[Boxes], truths: Sequence[Truth], classes: tuple[str, ...], *, seed: int = 0
+    detections: Sequence[Boxes], truths: Sequence[Asked], classes: tuple[str, ...], *, seed: int = 0
 ) -> Evaluation:
     """Return the evaluation of `detections` (LiDAR frame) against `truths`, frame by frame."""
     if not truths:

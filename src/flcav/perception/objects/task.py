@@ -22,8 +22,9 @@ from flcav.perception.objects.evaluate import detections_and_truths, score_detec
 from flcav.perception.objects.infer import box_rows, point_clouds
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.paste import Cutouts, cut, pasted
-from flcav.perception.objects.samples import RecordedSweeps, Sample, fitting_frames, only_lidar
+from flcav.perception.objects.samples import RecordedSweeps, Sample, fitting_frames
 from flcav.perception.objects.slices import slice_lines, sliced
+from flcav.perception.objects.truth import only_lidar
 from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
 

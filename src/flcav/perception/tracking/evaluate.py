@@ -15,8 +15,7 @@ from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import number_or_none
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.samples import MIN_RETURNS, detection_labels, is_lookalike, only_lidar
-from flcav.perception.objects.targets import in_range
+from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
 from flcav.perception.task import of_frames
 from flcav.perception.tracking.tracker import Tracked, Tracker
 from flcav.progress import Report, silent
@@ -122,30 +121,28 @@ def _moment(
     frame: Frame, tracked: Tracked, final: Mapping[int, float], config: SecondConfig, name: str
 ) -> tuple[Moment, list[float]]:
     """Return one class's moment, and by how much the velocity of each pair of an object and its track differ [m/s]."""
-    truth = frame.annotations
+    truth, annotations = ground_truth(frame, config), frame.annotations
+    of_class = truth.boxes.label == name
+    wanted = of_class & truth.target
     sensor_from_world = inverse(frame.world_from_sensor(only_lidar(frame)))
-    label = detection_labels(truth.boxes.label, config.classes)
-    known = (label == name) | (is_lookalike(truth.boxes.label, config.classes) & (name == "Car"))
-    wanted = (label == name) & (truth.returns >= MIN_RETURNS)
-    wanted &= in_range(truth.boxes.transformed(sensor_from_world), config)
     own = np.flatnonzero(tracked.boxes.label == name)
     own = own[in_range(tracked.boxes[own].transformed(sensor_from_world), config)]
     boxes: Boxes = tracked.boxes[own]
     objects = np.flatnonzero(wanted)
-    places, found = truth.boxes.center[objects, :2], boxes.center[:, :2]
+    places, found = annotations.boxes.center[objects, :2], boxes.center[:, :2]
     moment = Moment(
-        objects=truth.track[objects],
+        objects=annotations.track[objects],
         places=places,
         tracks=tracked.track[own],
         found=found,
         score=np.array([final[int(track)] for track in tracked.track[own]]),
-        neutral=on_neutral(boxes, truth.boxes[known & ~wanted]),
+        neutral=on_neutral(boxes, annotations.boxes[of_class & ~wanted]),
     )
     errors = []
     if len(objects) and len(own):
         apart = np.linalg.norm(places[:, None] - found[None], axis=2)
         nearest = apart.argmin(0)
         for number in np.flatnonzero(apart.min(0) <= 1.0):
-            true = truth.velocity[objects[nearest[number]]][:2]
+            true = annotations.velocity[objects[nearest[number]]][:2]
             errors.append(float(np.linalg.norm(true - tracked.velocity[own[number]])))
     return moment, errors
