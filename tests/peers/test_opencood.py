@@ -43,9 +43,8 @@ def test_its_datasets_find_what_was_recorded(together: Dataset, peer: Callable[[
             frames = {together.keys[i].agent: together.frame(i) for i in together.select(scenes=[scene], spins=[spin])}
             for agent, seen in sample.items():
                 own = frames[ego if agent == "ego" else name[int(agent)]]
-                shared = (
-                    [own] if fusion == "late" else [frame for frame in frames.values() if _apart(frame, own) < HEARD_M]
-                )
+                heard = [frame for frame in frames.values() if _apart(frame, own) < HEARD_M]
+                shared = [own] if fusion == "late" else heard
                 lidar_from_world = inverse(own.world_from_sensor("lidar"))
                 truth = {
                     str(frame.annotations.track[i]): frame.annotations.boxes.transformed(lidar_from_world)[[i]]

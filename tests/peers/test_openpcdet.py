@@ -33,7 +33,7 @@ def _keys(out: Path) -> dict[str, str]:
 def test_its_tables_training_and_evaluation_find_what_was_recorded(
     streets: Dataset, peer: Callable[[str], Peer], tmp_path: Path
 ):
-    """Detections are the recorded boxes, by the recorded calibration: they score full marks, reversed none in AOS."""
+    """Detections are the recorded boxes, by the recorded calibration: they score full marks; reversed, none in AOS."""
     out = tmp_path / "out"
     export(streets, "kitti", out, ExportOptions(validation=0.5))
     keys, detections = _keys(out), {}
@@ -45,11 +45,9 @@ def test_its_tables_training_and_evaluation_find_what_was_recorded(
         for i in np.flatnonzero((points_in(frame) > 0) & ~np.isnan(views.amodal_box[:, 0])):
             if (name := CLASSES[str(frame.annotations.boxes.label[i])]) in SCORED:
                 found[name].append(rows[i].tolist())
-    seen_in_training = {name for found in list(detections.values())[: len(keys) // 2] for name in found if found[name]}
-    detections = {
-        number: {name: boxes for name, boxes in found.items() if name in seen_in_training}
-        for number, found in detections.items()
-    }
+    train = (out / "ImageSets" / "train.txt").read_text().split()
+    classes = [name for name in SCORED if any(detections[number][name] for number in train)]  # it needs one to paste
+    detections = {number: {name: found[name] for name in classes} for number, found in detections.items()}
     (tmp_path / "detections.json").write_text(json.dumps(detections))
     read = peer("openpcdet").read(OPENPCDET, out, tmp_path / "detections.json", NUMBA_ENABLE_CUDASIM="1")
 
@@ -59,9 +57,7 @@ def test_its_tables_training_and_evaluation_find_what_was_recorded(
         boxes, truth, points = np.array(theirs["boxes"]).reshape(-1, 7), in_lidar(frame), points_in(frame)
         away = np.abs(boxes[:, None, :3] - truth.center[None]).max(axis=2)
         row = away.argmin(axis=1)
-        assert (
-            away.min(axis=1, initial=0).max(initial=0) < 0.01
-        )  # its centre is half the height above, in the LiDAR frame
+        assert away.min(axis=1, initial=0).max(initial=0) < 0.01  # it lifts boxes along the LiDAR's axis
         np.testing.assert_allclose(boxes[:, 3:6], truth.size[row], atol=1e-4)
         np.testing.assert_allclose(wrap_angle(boxes[:, 6] - truth.yaw[row]), 0, atol=2e-4)
         whole = np.array(theirs["truncated"]) == 0  # it counts within the image alone
@@ -69,15 +65,15 @@ def test_its_tables_training_and_evaluation_find_what_was_recorded(
         labels, counted = labels + len(boxes), counted + int(whole.sum())
     assert labels > counted > 50
 
-    assert len(read["boxes"]) == len(keys) // 2
+    assert len(read["boxes"]) == len(train)
     assert read["voxels"][1:] == [5, 4]
-    for name in sorted(seen_in_training):
+    for name in classes:
         found, turned = read["as they are"], read["reversed"]
         assert turned[f"{name}_3d/hard_R40"] == found[f"{name}_3d/hard_R40"]
         assert turned[f"{name}_aos/hard_R40"] < 0.01 < found[f"{name}_aos/hard_R40"]
         assert found[f"{name}_aos/hard_R40"] == pytest.approx(found[f"{name}_image/hard_R40"], abs=0.01)
-    for measure in ("3d", "bev", "image", "aos"):
-        assert read["as they are"][f"Car_{measure}/hard_R40"] > 99
+    for measure, least in {"3d": 99.9, "bev": 99.9, "image": 95, "aos": 95}.items():  # an image cuts boxes off
+        assert read["as they are"][f"Car_{measure}/hard_R40"] > least
 
 
 def test_it_reads_frames_without_labels(deserted: Dataset, peer: Callable[[str], Peer], tmp_path: Path):
