@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import torch
 
+from flcav.experiments.demo import demo_protocol, demo_steps
 from flcav.experiments.steps import Step
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import Schedule, federate
-from flcav.federation.strategies import STRATEGIES, Strategy
+from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
 
@@ -45,6 +46,10 @@ def of_the_example() -> type[Strategy]:
     module = sys.modules[EXAMPLE.stem] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.LossWeighted
+
+
+class Other(FedAvg):
+    """Does the same, and is another."""
 
 
 KINDS: dict[str, type[Strategy]] = {**STRATEGIES, "example": of_the_example()}
@@ -128,3 +133,16 @@ def test_it_travels_to_the_step_that_federates_and_is_in_its_fingerprint(strateg
     numbers = [name for name, value in settings.items() if isinstance(value, int | float)]
     changed = [replace(strategy, **{name: settings[name] + 1}) for name in numbers]
     assert len({print_of(each) for each in (strategy, *changed)}) == 1 + len(numbers)
+
+
+def test_another_strategy_leaves_what_comes_before_it_as_it_is(strategy):
+    def prints(of: Strategy) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for step in demo_steps(demo_protocol(1), of):
+            found[step.name] = step.fingerprint(found)
+        return found
+
+    one, other = prints(strategy), prints(Other())
+    changed = {name for name in one if one[name] != other[name]}
+    assert {"grid-edge-chosen", "grid-edge-densest", "ring-edge-chosen", "cloud", "test-cloud-grid"} <= changed
+    assert {"plan", "pretrain", "grid-place", "grid-edge", "test-pretrain-grid"}.isdisjoint(changed)
