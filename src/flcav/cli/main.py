@@ -22,6 +22,7 @@ from flcav.cli import (
     validate,
     view,
 )
+from flcav.cli.literal import literal
 from flcav.config import InputError
 
 INTERRUPTED = 130
@@ -70,14 +71,14 @@ for command in (
 def run(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its code: the only place where exceptions become exit codes."""
     try:
-        code = app(args=arguments, standalone_mode=False)
+        code = literal(typer.main.get_command(app))(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # what typer makes of Ctrl-C
             raise KeyboardInterrupt
     except (click.exceptions.Abort, KeyboardInterrupt):
         print("flcav: interrupted; the same command goes on where it stopped", file=sys.stderr)
         code = INTERRUPTED
     except click.ClickException as error:
-        if message := error.format_message():  # empty where the help was asked for, and shown
+        if message := " ".join(error.format_message().split()):  # empty where the help was asked for, and shown
             print(f"flcav: {message}", file=sys.stderr)
         code = 2
     except InputError as error:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.choices import Method
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to `app`."""
@@ -16,21 +18,18 @@ def place(
     poles: Path = typer.Option(..., help="CSV or Parquet of candidate poles: id, x, y, z [m]."),
     range_m: float = typer.Option(..., "--range", help="How far a sensor covers errors [m]."),
     count: int = typer.Option(..., help="How many sensors to place."),
-    method: str = typer.Option("exact", help="exact or greedy."),
+    method: Method = typer.Option(Method.exact, help="exact proves that no poles cover more; greedy is faster."),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
 ) -> None:
     """Choose the poles whose sensors cover most of the errors."""
     from flcav.cli.tables import numbers, read_table
-    from flcav.config import InputError
     from flcav.optimization import placement
 
-    if method not in ("exact", "greedy"):
-        raise InputError(f"--method = {method!r}: must be exact or greedy")
     axes = ("x", "y", "z")
     mistakes, sites = read_table(errors, axes), read_table(poles, ("id", *axes))
     weight = numbers(mistakes, ("weight",), errors)[:, 0] if "weight" in mistakes.column_names else None
     result = placement.place(
-        numbers(mistakes, axes, errors), numbers(sites, axes, poles), range_m, count, weight=weight, method=method
+        numbers(mistakes, axes, errors), numbers(sites, axes, poles), range_m, count, weight=weight, method=method.value
     )
     ids = sites["id"].to_pylist()
     chosen = [ids[pole] for pole in result.chosen]
