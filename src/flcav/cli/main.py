@@ -9,6 +9,7 @@ from flcav import __version__
 from flcav.cli import (
     allocate,
     birdseye,
+    camera,
     demo,
     evaluate,
     export,
@@ -55,6 +56,7 @@ for command in (
     record,
     validate,
     birdseye,
+    camera,
     view,
     export,
     train,
