@@ -1,4 +1,4 @@
-"""The `flcav` command. Exit 0 done; 2 invalid input, one sentence on stderr; 1 anything else."""
+"""The `flcav` command. Exit 0 done; 2 invalid input, one sentence on stderr; 130 interrupted; 1 anything else."""
 
 import sys
 
@@ -11,6 +11,7 @@ from flcav.cli import (
     birdseye,
     camera,
     demo,
+    errors,
     evaluate,
     export,
     fit,
@@ -23,6 +24,7 @@ from flcav.cli import (
     validate,
     view,
 )
+from flcav.cli.interruption import Interrupted
 from flcav.cli.literal import literal
 from flcav.config import InputError
 
@@ -30,7 +32,8 @@ INTERRUPTED = 130
 
 app = typer.Typer(
     name="flcav",
-    help="Design and verify federated learning for connected autonomous vehicle perception.",
+    help="Design and verify federated learning for connected autonomous vehicle perception.\n\n"
+    "Exit codes: 0 done, 2 bad input (one sentence on stderr), 130 interrupted (Ctrl-C), 1 anything else.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -62,6 +65,7 @@ for command in (
     train,
     evaluate,
     infer,
+    errors,
     allocate,
     place,
     fit,
@@ -76,8 +80,11 @@ def run(arguments: list[str] | None = None) -> None:
         code = literal(typer.main.get_command(app))(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # what typer makes of Ctrl-C
             raise KeyboardInterrupt
+    except Interrupted as kept:
+        print(f"flcav: interrupted; {kept}", file=sys.stderr)
+        code = INTERRUPTED
     except (click.exceptions.Abort, KeyboardInterrupt):
-        print("flcav: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        print("flcav: interrupted", file=sys.stderr)
         code = INTERRUPTED
     except click.ClickException as error:
         if message := " ".join(error.format_message().split()):  # empty where the help was asked for, and shown

@@ -5,6 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.choices import Engine
+from flcav.cli.interruption import when_interrupted
 
 
 def register(app: typer.Typer) -> None:
@@ -12,6 +13,7 @@ def register(app: typer.Typer) -> None:
     app.command()(record)
 
 
+@when_interrupted()
 def record(
     recipe: Path = typer.Argument(help="Recipe (YAML): town, traffic, vehicles, poles, sensors."),
     out: Path = typer.Option(..., "--out", help="Folder of the dataset; an interrupted recording goes on."),

@@ -6,6 +6,8 @@ from pathlib import Path
 import typer
 
 from flcav.cli.choices import listed
+from flcav.cli.interruption import when_interrupted
+from flcav.threads import use_threads
 
 
 class Target(StrEnum):
@@ -52,6 +54,7 @@ def reproduce(
     ),
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
+    use_threads(1)
     if target in (Target.fig1b, Target.fig3a):
         draw = _fig1b if target == Target.fig1b else _fig3a
         draw(out)
@@ -70,6 +73,7 @@ def reproduce(
     typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
 
 
+@when_interrupted()
 def _fig1b(out: Path) -> None:
     from flcav import progress
     from flcav.experiments.fig1b import fig1b
@@ -92,6 +96,7 @@ def _fig3a(out: Path) -> None:
         typer.echo(sentence)
 
 
+@when_interrupted()
 def _demo_arms(out: Path, seeds: range, scale: str, jobs: int) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.demo_arms import arms_protocol, draw_arms, run_arms
@@ -105,6 +110,7 @@ def _demo_arms(out: Path, seeds: range, scale: str, jobs: int) -> None:
         typer.echo(f"{arm}: closes {closed['mean']:.2f} of the gap ({closed['low']:.2f} to {closed['high']:.2f})")
 
 
+@when_interrupted()
 def _fig6a_allocation(out: Path, seeds: range, scale: str, jobs: int) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.fig6a_allocation import allocation_protocol, draw_allocation, run_allocation
@@ -118,9 +124,8 @@ def _fig6a_allocation(out: Path, seeds: range, scale: str, jobs: int) -> None:
         typer.echo(f"{finding['question']} {finding['verdict']}. {finding['sentence']}")
 
 
+@when_interrupted()
 def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int) -> None:
-    import torch
-
     from flcav.cli.steps import live_steps
     from flcav.cli.tasks import network_of
     from flcav.config import InputError
@@ -132,7 +137,6 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int)
 
     if kitti is None:
         raise InputError("--kitti is missing: sim-to-real needs a folder of real frames in KITTI's layout")
-    torch.set_num_threads(1)
     with live_steps(Target.sim_to_real.value) as notify:
         results = run_sim_to_real(network_of(OBJECTS, weights), kitti, out, jobs=jobs, notify=notify)
     write_json(out / "result.json", results)
@@ -145,6 +149,7 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int)
             typer.echo(f"{row['class']} {row['kind']} at IoU {row['iou']}: {found}, AP {row['ap']:.3f}")
 
 
+@when_interrupted()
 def _task(target: str, out: Path, seeds: range, scale: str, jobs: int) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.studies import STUDIES

@@ -22,8 +22,8 @@ from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.files import write_bytes, write_json
 from flcav.geometry import Boxes
 from flcav.network.ledger import LINKS, Ledger
-from flcav.perception.errors import MISS, load_errors
-from flcav.perception.objects.samples import only_lidar
+from flcav.perception.errors import load_errors
+from flcav.perception.objects.truth import only_lidar
 from flcav.report import figures, html, maps, style, sweeps
 from flcav.world.town import load_town
 
@@ -152,7 +152,7 @@ def _stages(values: dict[str, Any], book: Ledger, town: str) -> list[dict[str, A
             {
                 "name": STAGE_NAMES[key],
                 "town": town,
-                **{name: test[name] for name in ("ap50", "ap50_low", "ap50_high", "ap70")},
+                **{name: test[name] for name in ("ap50", "ap50_low", "ap50_high", "ap70", "aos50", "right_headings")},
                 "samples": samples,
                 "rounds": rounds,
                 **{f"{link}_mb": book.used_mb(link, stage=key) for link in LINKS},
@@ -178,14 +178,15 @@ def _difference(work: Path, protocol: Protocol, before: str, after: str) -> dict
 
 def draw(work: Path, values: dict[str, Any], results: dict[str, Any]) -> dict[str, bytes]:
     """Return the report's pictures as PNG files by name."""
-    errors = load_errors(work / "grid-errors" / ERRORS)
+    town, errors = load_town("grid"), load_errors(work / "grid-errors" / ERRORS)
     placed = results["placement"]
     scene = maps.ErrorMap(
-        load_town("grid"),
+        town,
         np.array([(error.x, error.y, error.z) for error in errors]).reshape(-1, 3),
-        np.array([error.kind == MISS for error in errors], dtype=bool),
-        (placed["chosen"],),
-        placed["densest"],
+        np.array([error.kind for error in errors], dtype=np.str_),
+        maps.poles_of(town),
+        (str(placed["chosen"]),),
+        str(placed["densest"]),
         placed["range_m"],
     )
     sweep = _sweep(work, values["sweep"])

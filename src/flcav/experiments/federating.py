@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors.numpy import load_file, save
 
 from flcav.experiments.pretraining import LEDGER, WEIGHTS, train_on
@@ -32,7 +31,6 @@ ROUND = "round.json"
 def edge_fl(work: Work, town: str, sensor: str, protocol: dict[str, Any], strategy: Strategy) -> dict[str, Any]:
     """Stage II in one region; `sensor`: the pole that helps label, "chosen" | "densest" | "none"."""
     setting = Protocol.model_validate(protocol)
-    torch.set_num_threads(1)
     rounds = int(work.result("plan")["tasks"][0]["edge_rounds"])
     book = _share_of(Ledger.load(work.inputs["pretrain"] / LEDGER), setting, town)
     pole = None if sensor == "none" else int(work.result(f"{town}-place")[sensor])
@@ -49,7 +47,6 @@ def edge_fl(work: Work, town: str, sensor: str, protocol: dict[str, Any], strate
 def cloud_fl(work: Work, protocol: dict[str, Any], strategy: Strategy) -> dict[str, Any]:
     """Stage III: the edge servers of all regions federate with the cloud, vehicles with their edge servers."""
     setting = Protocol.model_validate(protocol)
-    torch.set_num_threads(1)
     rounds, k = int(work.result("plan")["tasks"][0]["cloud_rounds"]), setting.edge_rounds_per_cloud_round
     book = Ledger(Budget(setting.wireless_mb, setting.wireline_mb), _spent(work))
     wireless, wireline = (Account(book, "cloud", TASK, link) for link in ("wireless", "wireline"))
@@ -74,7 +71,6 @@ def more_training(work: Work, source: str, protocol: dict[str, Any]) -> dict[str
     `source` "suburb": more pretraining on the uploaded samples. "grid": the oracle, on the frames of stage II.
     """
     setting = Protocol.model_validate(protocol)
-    torch.set_num_threads(1)
     network = load_network(work.inputs["pretrain"] / WEIGHTS)
     if source == "suburb":
         data, chosen = opened(work, "suburb-pool"), work.result("pretrain")["uploaded"]

@@ -8,7 +8,6 @@ Its fingerprint stands in `started.json` before that, so that it is not gone on 
 import hashlib
 import json
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, FIRST_EXCEPTION, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -22,6 +21,7 @@ from flcav.config import InputError
 from flcav.dataset.workers import end_with_parent
 from flcav.files import write_json
 from flcav.progress import Report
+from flcav.threads import use_threads
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
 DONE, STARTED = "done.json", "started.json"
@@ -161,8 +161,7 @@ def _start(queue: Any) -> None:
     global _queue
     _queue = queue
     end_with_parent()
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = "1"
+    use_threads(1)
 
 
 def _perform(step: Step, folder: Path, fingerprint: str) -> Any:

@@ -75,7 +75,7 @@ def unproject(lens: Lens, pixels: ArrayLike) -> Array:
 
     NaN where the distortion lets no direction fall there.
     """
-    return _unproject(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
+    return unprojected(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
 
 
 def directions(lens: Lens) -> NDArray[np.float32]:
@@ -90,14 +90,15 @@ def _directions(
 ) -> NDArray[np.float32]:
     v, u = np.mgrid[:height, :width]
     pixels = np.stack((u.ravel(), v.ravel()), axis=1).astype(np.float64)
-    plane = _unproject(np.reshape(intrinsics, (3, 3)), np.array(distortion), pixels)
+    plane = unprojected(np.reshape(intrinsics, (3, 3)), np.array(distortion), pixels)
     rays = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
     rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
     rays.flags.writeable = False
     return rays
 
 
-def _unproject(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
+def unprojected(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
+    """Return `unproject` of a lens of which the matrix (3, 3) and the coefficients (5,) are known."""
     fx, fy, cx, cy = _focus(intrinsics)
     wanted = (pixels - (cx, cy)) / (fx, fy)
     if not distortion.any():

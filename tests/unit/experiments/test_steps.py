@@ -27,6 +27,12 @@ def fail(work: Work) -> None:
     raise ValueError("broken step")
 
 
+def count_threads(work: Work) -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
 def sleep(work: Work) -> int:
     (work.folder / "started").touch()
     time.sleep(60)
@@ -68,6 +74,11 @@ def test_steps_run_once_and_hand_their_values_on(tmp_path):
     assert run_steps(STEPS, tmp_path, jobs=2, notify=quiet) == {"a": 1, "b": 2, "sum": 3}
     assert run_steps(STEPS, tmp_path, jobs=2, notify=quiet)["sum"] == 3
     assert (tmp_path / "a" / "calls").read_text() == "x"
+
+
+def test_a_step_computes_on_one_thread(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    assert run_steps([Step("threads", count_threads, {})], tmp_path, jobs=1, notify=quiet) == {"threads": 1}
 
 
 def test_a_folder_of_another_configuration_is_refused(tmp_path):
