@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from flcav.cli.choices import listed
+
 if TYPE_CHECKING:
     from flcav.optimization.allocation import Allocation
     from flcav.optimization.baselines import Baseline
@@ -40,7 +42,9 @@ def allocate(
         ..., help="YAML: budgets, sizes, limits and learning curves of every task; or a three-layer graph."
     ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
-    baseline: Compared | None = typer.Option(None, "--baseline", help="A plan to compare with, in the same call."),
+    baseline: Compared | None = typer.Option(
+        None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {listed(Compared)}."
+    ),
     progress: Path | None = typer.Option(
         None, "--progress", help="YAML: what is spent and observed so far; the plan goes on from there."
     ),

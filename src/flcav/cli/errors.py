@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from flcav.cli.choices import Device, TaskName, listed
 from flcav.cli.options import AGENTS, THREADS
 from flcav.threads import use_threads
 
@@ -23,7 +24,9 @@ def register(app: typer.Typer) -> None:
 
 
 def errors(
-    task: str = typer.Argument(help="Whose errors: objects, signs or trajectory."),
+    task: TaskName = typer.Argument(
+        metavar="TASK", help=f"Whose errors: {listed(TaskName)}, of which weather's have no place in a town."
+    ),
     data: Path = typer.Option(..., "--data", help="Dataset folder: where the network drives."),
     out: Path = typer.Option(..., "--out", help="The table to write: .csv or .parquet."),
     weights: Path | None = typer.Option(
@@ -35,7 +38,7 @@ def errors(
     map_: Path | None = typer.Option(None, "--map", help="PNG file: the errors in the dataset's town."),
     agents: str | None = AGENTS,
     threads: int = THREADS,
-    device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
+    device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
 ) -> None:
     """Register what a network gets wrong on recorded frames.
 

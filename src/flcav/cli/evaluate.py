@@ -5,6 +5,7 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.choices import Device, TaskName, listed
 from flcav.cli.options import AGENTS, THREADS
 from flcav.threads import use_threads
 
@@ -15,12 +16,12 @@ def register(app: typer.Typer) -> None:
 
 
 def evaluate(
-    task: str = typer.Argument(help="What was learned: weather, signs, objects or trajectory."),
+    task: TaskName = typer.Argument(metavar="TASK", help=f"What was learned: {listed(TaskName)}."),
     data: Path = typer.Option(..., "--data", help="Dataset folder."),
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
-    device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
+    device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
     tracks: bool = typer.Option(False, "--tracks", help="objects: also MOTA, AMOTA and id switches of their tracks."),
     agents: str | None = AGENTS,
     within: str | None = typer.Option(

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.choices import Format, listed
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -12,7 +14,7 @@ def register(app: typer.Typer) -> None:
 
 
 def export(
-    format: str = typer.Argument(metavar="FORMAT", help="kitti, yolo, coco, nuscenes, opv2v or mcap."),
+    format: Format = typer.Argument(metavar="FORMAT", help=f"What to write: {listed(Format)}."),
     folder: Path = typer.Argument(metavar="DIR", help="A dataset."),
     out: Path = typer.Option(..., "--out", help="New or empty folder."),
     labels: str | None = typer.Option(

@@ -32,12 +32,15 @@ def fit(
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
     model: Model = typer.Option(Model.additive, "--model", help="How the stages add up."),
     at: list[str] = typer.Option(
-        [], "--at", help="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]] to predict the error at; may be given several times."
+        [], "--at", metavar="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]]", help="Where to predict the error; may be given "
+        "several times."
     ),
     group_samples: float = typer.Option(0.0, "--group-samples", min=0, help="effective: samples that vehicles hold."),
     alpha: float = typer.Option(0.1, "--alpha", min=1e-9, help="effective: worth of a pretraining sample."),
     beta: float | None = typer.Option(None, "--beta", min=0, help="effective: worth of a held sample; else fitted."),
-    k: int = typer.Option(1, "--edge-rounds-per-cloud-round", min=0, help="effective: edge rounds in a cloud round."),
+    k: int = typer.Option(
+        1, "--edge-rounds-per-cloud-round", "-k", min=0, help="effective: edge rounds in a cloud round."
+    ),
     level: float = typer.Option(0.9, "--level", min=0.01, max=0.999, help="Share of repeats between the bands."),
     repeats: int = typer.Option(200, "--repeats", min=20, help="Bootstrap repeats of the bands."),
     seed: int = typer.Option(0, "--seed", min=0, help="Seed of the bootstrap."),

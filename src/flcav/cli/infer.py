@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from flcav.cli.choices import Device, TaskName, listed
 from flcav.cli.options import AGENTS, THREADS
 from flcav.threads import use_threads
 
@@ -20,7 +21,7 @@ def register(app: typer.Typer) -> None:
 
 
 def infer(
-    task: str = typer.Argument(help="What to find: weather, signs, objects or trajectory."),
+    task: TaskName = typer.Argument(metavar="TASK", help=f"What to find: {listed(TaskName)}."),
     inputs: list[Path] = typer.Argument(
         help="KITTI .bin files (objects) or PNG, JPEG and WebP files, folders of them, or dataset folders."
     ),
@@ -28,7 +29,7 @@ def infer(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
     threshold: float = typer.Option(0.3, "--threshold", min=0.0, max=1.0, help="Lowest score shown."),
-    device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
+    device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
     pictures: Path | None = typer.Option(None, "--pictures", help="Folder for a picture of each input with findings."),
     agents: str | None = AGENTS,
     threads: int = THREADS,

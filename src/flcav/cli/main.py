@@ -9,6 +9,7 @@ from flcav import __version__
 from flcav.cli import (
     allocate,
     birdseye,
+    camera,
     demo,
     errors,
     evaluate,
@@ -24,6 +25,7 @@ from flcav.cli import (
     view,
 )
 from flcav.cli.interruption import Interrupted
+from flcav.cli.literal import literal
 from flcav.config import InputError
 
 INTERRUPTED = 130
@@ -57,6 +59,7 @@ for command in (
     record,
     validate,
     birdseye,
+    camera,
     view,
     export,
     train,
@@ -74,7 +77,7 @@ for command in (
 def run(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its code: the only place where exceptions become exit codes."""
     try:
-        code = app(args=arguments, standalone_mode=False)
+        code = literal(typer.main.get_command(app))(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # what typer makes of Ctrl-C
             raise KeyboardInterrupt
     except Interrupted as kept:
@@ -84,7 +87,7 @@ def run(arguments: list[str] | None = None) -> None:
         print("flcav: interrupted", file=sys.stderr)
         code = INTERRUPTED
     except click.ClickException as error:
-        if message := error.format_message():  # empty where the help was asked for, and shown
+        if message := " ".join(error.format_message().split()):  # empty where the help was asked for, and shown
             print(f"flcav: {message}", file=sys.stderr)
         code = 2
     except InputError as error:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.choices import Method
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to `app`."""
@@ -16,7 +18,7 @@ def place(
     poles: Path = typer.Option(..., help="CSV or Parquet of candidate poles: id, x, y, z [m]."),
     range_m: float = typer.Option(..., "--range", help="How far a sensor covers errors [m]."),
     count: int = typer.Option(..., help="How many sensors to place."),
-    method: str = typer.Option("exact", help="exact or greedy."),
+    method: Method = typer.Option(Method.exact, help="exact proves that no poles cover more; greedy is faster."),
     town: str | None = typer.Option(None, "--town", help="With --map: a town's name, or its folder."),
     map_: Path | None = typer.Option(None, "--map", help="With --town: PNG file of errors, poles and what they cover."),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
@@ -36,8 +38,6 @@ def place(
     from flcav.report.maps import ErrorMap
     from flcav.world.town import load_town
 
-    if method not in ("exact", "greedy"):
-        raise InputError(f"--method = {method!r}: must be exact or greedy")
     if (town is None) != (map_ is None):
         raise InputError("--town and --map: each needs the other; the map is of the town")
     if map_ is not None:
@@ -47,7 +47,7 @@ def place(
     mistakes, sites = read_table(errors, axes), read_table(poles, ("id", *axes))
     weight = numbers(mistakes, ("weight",), errors)[:, 0] if "weight" in mistakes.column_names else None
     where, mounts = numbers(mistakes, axes, errors), numbers(sites, axes, poles)
-    result = placement.place(where, mounts, range_m, count, weight=weight, method=method)
+    result = placement.place(where, mounts, range_m, count, weight=weight, method=method.value)
     ids = sites["id"].to_pylist()
     chosen = [ids[pole] for pole in result.chosen]
     if here is not None and map_ is not None:

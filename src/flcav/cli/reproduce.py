@@ -5,6 +5,7 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.choices import listed
 from flcav.cli.interruption import when_interrupted
 from flcav.threads import use_threads
 
@@ -38,7 +39,7 @@ TASK = "task-"  # before a task's name: its study
 
 
 def reproduce(
-    target: Target = typer.Argument(..., help="What to reproduce."),
+    target: Target = typer.Argument(..., metavar="TARGET", help=f"What to reproduce: {listed(Target)}."),
     out: Path = typer.Option(..., "--out", help="Folder of the runs; the same command goes on after a stop."),
     seeds: int | None = typer.Option(
         None, "--seeds", min=1, help="Number of seeds, from 1: 5 of demo-arms, 3 of the others if not given."

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.choices import Device, TaskName, listed
 from flcav.cli.interruption import when_interrupted
 from flcav.cli.options import AGENTS, THREADS
 from flcav.threads import use_threads
@@ -15,7 +16,7 @@ def register(app: typer.Typer) -> None:
 
 
 def train(
-    task: str = typer.Argument(help="What to learn: weather, signs, objects or trajectory."),
+    task: TaskName = typer.Argument(metavar="TASK", help=f"What to learn: {listed(TaskName)}."),
     data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
     out: Path = typer.Option(
         ..., "--out", help="Folder of the weights; an interrupted training goes on, a finished one is left alone."
@@ -34,7 +35,7 @@ def train(
     epochs: int = typer.Option(10, "--epochs", min=1, help="Passes through the data."),
     patience: int = typer.Option(5, "--patience", min=1, help="Epochs without a better validation before it stops."),
     seed: int = typer.Option(0, "--seed", min=0, help="Initial weights, order and augmentation."),
-    device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
+    device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
     agents: str | None = AGENTS,
     threads: int = THREADS,
 ) -> None:

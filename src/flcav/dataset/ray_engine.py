@@ -14,6 +14,7 @@ from typing import Any
 from flcav.config import InputError
 from flcav.dataset.schedule import Engine
 from flcav.dataset.tasks import Part, Task, perform
+from flcav.extras import installation
 from flcav.sources.source import Source
 from flcav.threads import VARIABLES
 
@@ -31,7 +32,7 @@ def ray_cluster(source: Source, work: Path, jobs: int, wrote: Callable[[int], No
     try:
         import ray  # pyright: ignore[reportMissingImports]: an extra
     except ImportError:
-        raise InputError("engine 'ray' is not installed; install flcav with the extra 'ray'") from None
+        raise InputError(f"--engine ray needs Ray, which is not installed: {installation('ray')}") from None
     local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
     ray.init(
         **({} if "RAY_ADDRESS" in os.environ else local),

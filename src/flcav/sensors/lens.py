@@ -24,18 +24,18 @@ NEWTON_STEPS = 12
 class Lens(Config):
     """The geometry of an image."""
 
-    width: int = Field(default=640, ge=16, le=8192)  # [px]
-    height: int = Field(default=384, ge=16, le=8192)  # [px]
-    fov_deg: float = Field(default=90.0, gt=1, lt=170)  # horizontal; without effect where fx is given
-    fx: float | None = Field(default=None, gt=0)  # focal lengths [px]; fy is fx where it is not given
-    fy: float | None = Field(default=None, gt=0)
-    cx: float | None = None  # principal point [px]; the image's centre where it is not given
-    cy: float | None = None
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
+    width: int = Field(default=640, ge=16, le=8192)  # columns [px]
+    height: int = Field(default=384, ge=16, le=8192)  # rows [px]
+    fov_deg: float = Field(default=90.0, gt=1, lt=170)  # horizontal field of view; without effect where fx is given
+    fx: float | None = Field(default=None, gt=0)  # horizontal focal length [px]
+    fy: float | None = Field(default=None, gt=0)  # vertical focal length [px]; fx where it is not given
+    cx: float | None = None  # column of the principal point [px]; the image's centre where it is not given
+    cy: float | None = None  # row of the principal point [px], likewise
+    k1: float = 0.0  # radial distortion (Brown-Conrady, coefficients as OpenCV's), of r^2
+    k2: float = 0.0  # radial distortion, of r^4
+    p1: float = 0.0  # tangential distortion
+    p2: float = 0.0  # tangential distortion
+    k3: float = 0.0  # radial distortion, of r^6
 
     @model_validator(mode="after")
     def _check_distortion(self) -> "Lens":
