@@ -105,9 +105,9 @@ def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
 
 
 def _show(problem: "Problem", plan: "Allocation") -> None:
-    from rich.console import Console
+    from flcav.cli.console import plain_console
 
-    console = Console(highlight=False)
+    console = plain_console()
     console.print(_table(plan))
     proven = "no certificate" if plan.gap is None else f"proven within {plan.gap:.2%}"
     console.print(f"{MEASURES[problem.objective]} {plan.objective:.6g}, {plan.status} ({proven})")
@@ -122,9 +122,9 @@ def _show(problem: "Problem", plan: "Allocation") -> None:
 
 
 def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
-    from rich.console import Console
+    from flcav.cli.console import plain_console
 
-    console = Console(highlight=False)
+    console = plain_console()
     console.print(_table(beside))
     console.print(f"{beside.name}: {beside.objective:.6g}; the plan above: {plan.objective:.6g}")
 
@@ -143,8 +143,9 @@ def _table(plan: "Allocation | Baseline") -> Any:
 
 
 def _show_vehicles(shares: "Shares") -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from flcav.cli.console import plain_console
 
     if not shares:
         return
@@ -153,4 +154,4 @@ def _show_vehicles(shares: "Shares") -> None:
         for share in own:
             cells = (str(share.samples), str(len(share.rounds)), f"{share.wireless_mb:.1f}")
             table.add_row(task, share.vehicle, *cells)
-    Console().print(table)
+    plain_console().print(table)

@@ -117,10 +117,11 @@ def _answer(
 
 
 def _show(answers: list[dict[str, Any]], fits: list["Fit[Any]"]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    from flcav.cli.console import plain_console
+
+    console = plain_console()
     table = Table("task", "error", "rmse", "R²", "points")
     for answer, fit in zip(answers, fits):
         table.add_row(answer["task"], str(fit.curve), f"{fit.rmse:.4f}", f"{fit.r_squared:.3f}", str(fit.points))
@@ -133,6 +134,6 @@ def _show(answers: list[dict[str, Any]], fits: list["Fit[Any]"]) -> None:
                 else f", {answer['band']['level']:.0%} band {row['low']:.4f} to {row['high']:.4f}"
             )
             counts = f"{row['samples']:g} samples, {row['edge_rounds']:g} edge, {row['cloud_rounds']:g} cloud rounds"
-            console.print(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}", highlight=False)
+            console.print(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}")
         for warning in answer["warnings"]:
-            console.print(f"{answer['task']}: {warning}", highlight=False)
+            console.print(f"{answer['task']}: {warning}")
