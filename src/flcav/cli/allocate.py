@@ -131,7 +131,8 @@ def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
 
     console = Console(highlight=False)
     console.print(_table(beside))
-    console.print(f"{beside.name}: {beside.objective:.6g}; the plan above: {plan.objective:.6g}")
+    note = f" ({beside.note})" if beside.note else ""
+    console.print(f"{beside.name}: {beside.objective:.6g}{note}; the plan above: {plan.objective:.6g}")
 
 
 def _table(plan: "Allocation | Baseline") -> Any:

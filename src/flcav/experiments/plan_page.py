@@ -82,9 +82,10 @@ def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Seque
         "warnings": plan.warnings,
         "words": {"steps": STEPS, "curve": CURVE, "terms": _terms(problem, plan)},
         "others": [
-            {"name": name, "objective": baseline(problem, key).objective}
+            {"name": name, "objective": other.objective, "note": other.note}
             for key, name in OTHERS.items()
             if len(tasks) > 1 or key != "equal-tasks"
+            for other in [baseline(problem, key)]
         ],
     }
     return values | {"sentences": _sentences(values, sweep["both links"])}
@@ -92,10 +93,11 @@ def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Seque
 
 def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
     """Return the words that the page has to define."""
-    measure = MEASURES[problem.objective]
-    used = ["error", measure, "budget", "saved"]
-    used += ["up to"] * problem.robust + ["proven"] * (plan.lower_bound is not None)
-    return {name: TERMS[name] for name in used} | {measure: meaning(problem, plan.objective)}
+    measure, saved = MEASURES[problem.objective], "gained" if problem.objective == "area" else "saved"
+    terms = {"error": TERMS["error"], measure: meaning(problem, plan.objective), "budget": TERMS["budget"]}
+    terms[saved] = TERMS["saved"]
+    used = ["up to"] * problem.robust + ["proven"] * (plan.lower_bound is not None)
+    return terms | {name: TERMS[name] for name in used}
 
 
 def _parts(problem: Problem, plan: Allocation) -> list[dict[str, Any]]:
@@ -164,9 +166,12 @@ def _link(name: str, link: Mapping[str, Any], verb: str) -> str:
 
 
 def _others(values: Mapping[str, Any]) -> str:
-    """Return how the plan compares with the best of the simpler ones."""
+    """Return how the plan compares with the best of the simpler ones that can be carried out."""
     larger = values["measure"]["kind"] == "area"
-    best = (max if larger else min)(values["others"], key=lambda other: other["objective"])
+    carried = [other for other in values["others"] if other["note"] is None]
+    if not carried:
+        return "None of the simpler plans can be carried out: they know the budgets alone, not what each vehicle sends."
+    best = (max if larger else min)(carried, key=lambda other: other["objective"])
     behind = (values["objective"] - best["objective"]) * (1 if larger else -1)
     name = f"The best of the simpler plans is “{best['name']}”"
     if behind > 0:

@@ -20,8 +20,8 @@ TERMS = {
     "is left behind.",
     "budget": "what may go up over one type of link, from all vehicles together, during the whole training. What comes "
     "down is not counted.",
-    "saved": "how much less a plan errs that is solved anew with more of one budget and the other as it is. Plans are "
-    "in whole samples and rounds, so more megabytes help in steps.",
+    "saved": "what a plan that is solved anew with more of one budget, the other as it is, does better than this one. "
+    "Plans are in whole samples and rounds, so more megabytes help in steps.",
     "up to": "the upper band of a curve, which this plan makes least; the predicted error is the curve's own.",
     "proven": "the solver also finds a bound that no plan can be below, so how far this one could still be improved is "
     "known.",

@@ -135,3 +135,13 @@ def test_weights_are_those_that_the_plan_is_made_by() -> None:
     )
     results = results_of(ONE.model_copy(update={"tasks": tasks, "performance": 0.8}))
     assert [task["weight"] for task in results["tasks"]] == pytest.approx([0.75, 0.25])
+
+
+def test_simpler_plans_that_links_do_not_carry_are_no_match() -> None:
+    few = {"edge_groups": (1, 1), "uplink_mbps": {"a": Uplink(wireless=9), "b": Uplink(wireless=3)}}
+    limits = Limits(samples=(100, 101), edge_rounds=(0, 2), cloud_rounds=(0, 0))
+    tasks = (ONE.tasks[0].model_copy(update={**few, "limits": limits}),)
+    results = results_of(ONE.model_copy(update={"tasks": tasks, "horizon_s": 250.0}))
+    assert "own links" in results["note"]
+    assert all(other["note"] is not None for other in results["others"])
+    assert results["sentences"]["others"].startswith("None of the simpler plans can be carried out")
