@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 
 LONG = ("task", "stage", "resource", "accuracy")
 JOINT = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
-ROUNDED = 1.01e-3  # what accuracy and error, both rounded to three digits, may sum to beside 1
 ARTICLE = resources.files("flcav.optimization") / "data" / "article_history.csv"
+ROUNDED = 1.01e-3  # what accuracy and error, both rounded to three digits, may sum to beside 1
 
 
 @dataclass(frozen=True)
@@ -70,14 +70,6 @@ def histories(columns: Mapping[str, Sequence[object]], origin: str, unnamed: str
     return found
 
 
-def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
-    """Return (n, 3) samples, edge rounds and cloud rounds of rows that give only their own stage's resource (n,)."""
-    amounts, number = np.asarray(resource, dtype=np.float64), np.array([STAGES.index(name) for name in stage])
-    largest = [amounts[number == s].max(initial=0.0) for s in range(3)]
-    own = np.where(number[:, None] == np.arange(3), amounts[:, None], 0.0)
-    return np.where(np.arange(3) < number[:, None], largest, own)
-
-
 def _with_accuracy(columns: Mapping[str, Sequence[object]], origin: str) -> Mapping[str, Sequence[object]]:
     """Return `columns` with accuracies, from errors where there are none; raises `InputError` if both disagree."""
     if "error" not in columns:
@@ -91,6 +83,14 @@ def _with_accuracy(columns: Mapping[str, Sequence[object]], origin: str) -> Mapp
             f"{origin}: row {row + 1}: accuracy = {accuracy[row]:g} and error = {error[row]:g} do not sum to 1"
         )
     return columns
+
+
+def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
+    """Return (n, 3) samples, edge rounds and cloud rounds of rows that give only their own stage's resource (n,)."""
+    amounts, number = np.asarray(resource, dtype=np.float64), np.array([STAGES.index(name) for name in stage])
+    largest = [amounts[number == s].max(initial=0.0) for s in range(3)]
+    own = np.where(number[:, None] == np.arange(3), amounts[:, None], 0.0)
+    return np.where(np.arange(3) < number[:, None], largest, own)
 
 
 def _numbers(columns: Mapping[str, Sequence[object]], name: str, origin: str, most: float = np.inf) -> Array:

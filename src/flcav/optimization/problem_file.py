@@ -117,17 +117,17 @@ def _tasks(text: str, origin: str) -> tuple[dict[str, Any], dict[str, tuple[dict
     values, root = yaml.safe_load(text), yaml.compose(text)
     tasks = values.get("tasks") if isinstance(values, dict) else None
     node = _entries(root).get("tasks")
+    own: list[tuple[Any, Any, yaml.Node]]
     if isinstance(tasks, dict):
         own = [(name, tasks.get(name), each) for name, each in _entries(node).items()]
     elif isinstance(tasks, list) and isinstance(node, yaml.SequenceNode):
         own = [(task.get("name"), task, each) for task, each in zip(tasks, node.value) if isinstance(task, dict)]
     else:
         raise InputError(f"{origin}: not an allocation problem: it has no tasks")
-    named = [each for each in own if isinstance(each[0], str)]
     return values, {
         name: (task, each)
-        for name, task, each in named
-        if isinstance(task, dict) and isinstance(each, yaml.MappingNode)
+        for name, task, each in own
+        if isinstance(name, str) and isinstance(task, dict) and isinstance(each, yaml.MappingNode)
     }
 
 
@@ -156,7 +156,7 @@ def _edits(text: str, node: yaml.MappingNode, fields: Mapping[str, Any]) -> list
 
 def _end(node: yaml.Node) -> int:
     """Return where the text of `node` ends: a block's own mark lies behind the blank lines and comments after it."""
-    if isinstance(node, yaml.ScalarNode) or node.flow_style or not node.value:
+    if not isinstance(node, yaml.CollectionNode) or node.flow_style or not node.value:
         return node.end_mark.index
     last = node.value[-1]
     return _end(last[1] if isinstance(last, tuple) else last)
