@@ -27,10 +27,10 @@ class Lens(Config):
     width: int = Field(default=640, ge=16, le=8192)  # [px]
     height: int = Field(default=384, ge=16, le=8192)  # [px]
     fov_deg: float = Field(default=90.0, gt=1, lt=170)  # horizontal; without effect where fx is given
-    fx: float | None = Field(default=None, gt=0)  # focal lengths [px]; fy is fx where it is not given
-    fy: float | None = Field(default=None, gt=0)
-    cx: float | None = None  # principal point [px]; the image's centre where it is not given
-    cy: float | None = None
+    fx: float | None = Field(default=None, ge=1, le=1e6)  # focal lengths [px]; fy is fx where it is not given
+    fy: float | None = Field(default=None, ge=1, le=1e6)
+    cx: float | None = Field(default=None, ge=-1e6, le=1e6)  # principal point [px]; else the image's centre
+    cy: float | None = Field(default=None, ge=-1e6, le=1e6)
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +26,19 @@ RESERVED = ("traces", "town")  # folders of a dataset
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
+Reach = Annotated[float, Field(ge=-100, le=100)]  # [m]
+Turn = Annotated[float, Field(ge=-360, le=360)]
+
+
 class Mount(Config):
     """A sensor's pose on its agent: x forward, y left, z up; a camera looks along x. A positive pitch is downwards."""
 
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-    yaw_deg: float = 0.0
-    pitch_deg: float = 0.0
-    roll_deg: float = 0.0
+    x: Reach = 0.0
+    y: Reach = 0.0
+    z: Reach = 0.0
+    yaw_deg: Turn = 0.0
+    pitch_deg: Turn = 0.0
+    roll_deg: Turn = 0.0
 
     def agent_from_sensor(self) -> NDArray[np.float64]:
         """Return the (4, 4) transform; of a camera, with its body axes, not the optical ones."""

@@ -9,11 +9,11 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from flcav.config import Config
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
-from flcav.world.scenarios.scenario import Scenario
+from flcav.world.scenarios.scenario import LONGEST_S, Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
 STEP_S = 0.1  # of the traffic
-LONGEST_S = 36_000.0
+MOST = 10**6  # scenes, frames, spins
 
 
 def _multiple_of_step(value: float) -> float:
@@ -59,21 +59,30 @@ class Recipe(Config):
     `spins_per_scene` spins, `every_s` apart, after `warmup_s` in which the town fills.
     """
 
-    town: str  # one of TOWNS, or the folder of a town
+    town: str  # one of TOWNS, or the folder of a town: beside the recipe, or in the working directory
     seed: int = Field(default=0, ge=0, lt=2**63)
     split: str = Field(default="train", pattern=r"^[A-Za-z0-9_-]+$")
-    scenes: int = Field(default=1, ge=1)
-    frames: int | None = Field(default=None, ge=1)  # exactly the first so many, by as many scenes as they take
+    scenes: int = Field(default=1, ge=1, le=MOST)
+    frames: int | None = Field(default=None, ge=1, le=MOST)  # exactly the first so many, by as many scenes as they take
     warmup_s: Warmup = 60.0  # or from, to: each scene draws its own, so that scenes differ in what lights show
-    spins_per_scene: int = Field(default=10, ge=1)
+    spins_per_scene: int = Field(default=10, ge=1, le=MOST)
     every_s: Duration = 1.0
-    cavs: int = Field(default=1, ge=0)
+    cavs: int = Field(default=1, ge=0, le=1000)
     poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()
     vehicle_rig: NamedRig = RIGS["lidar32"]
     pole_rig: NamedRig = RIGS["lidar_pole"]
     weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])
     calibration_error: CalibrationError = CalibrationError()
     scenarios: tuple[Scenario, ...] = ()  # corner cases that happen in every scene
+
+    @model_validator(mode="after")
+    def _ends(self) -> "Recipe":
+        last_s = self.warmup_steps[1] * STEP_S + (self.spins_per_scene - 1) * self.every_s
+        if last_s > LONGEST_S:
+            raise ValueError(
+                f"warmup_s, spins_per_scene and every_s put the last spin at {last_s:g} s, after {LONGEST_S:g} s"
+            )
+        return self
 
     @model_validator(mode="after")
     def _scenarios_can_happen(self) -> "Recipe":
