@@ -34,10 +34,16 @@ def fit(
     at: list[str] = typer.Option(
         [], "--at", help="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]] to predict the error at; may be given several times."
     ),
-    group_samples: float = typer.Option(0.0, "--group-samples", min=0, max=1e9, help="effective: samples that vehicles hold."),
+    group_samples: float = typer.Option(
+        0.0, "--group-samples", min=0, max=1e9, help="effective: samples that vehicles hold."
+    ),
     alpha: float = typer.Option(0.1, "--alpha", min=1e-9, max=1e9, help="effective: worth of a pretraining sample."),
-    beta: float | None = typer.Option(None, "--beta", min=0, max=1e9, help="effective: worth of a held sample; else fitted."),
-    k: int = typer.Option(1, "--edge-rounds-per-cloud-round", min=0, max=10**9, help="effective: edge rounds in a cloud round."),
+    beta: float | None = typer.Option(
+        None, "--beta", min=0, max=1e9, help="effective: worth of a held sample; else fitted."
+    ),
+    k: int = typer.Option(
+        1, "--edge-rounds-per-cloud-round", min=0, max=10**9, help="effective: edge rounds in a cloud round."
+    ),
     level: float = typer.Option(0.9, "--level", min=0.01, max=0.999, help="Share of repeats between the bands."),
     repeats: int = typer.Option(200, "--repeats", min=20, max=10**5, help="Bootstrap repeats of the bands."),
     seed: int = typer.Option(0, "--seed", min=0, help="Seed of the bootstrap."),
