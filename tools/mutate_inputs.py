@@ -21,6 +21,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "contract"))
 
 MEMORY_B = 12 << 30  # that a worker may map
+HANGS_S = 1800.0  # without an outcome
 BATCH = 1000  # cases of one worker's life
 
 
@@ -30,7 +31,9 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--limit-s", type=float, default=20.0, help="a case that takes longer is left, and counted")
+    parser.add_argument(
+        "--limit-s", type=float, default=20.0, help="of computing; a case that takes longer is left, and counted"
+    )
     parser.add_argument("--command", default="", help="only commands that begin so")
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
     asked = parser.parse_args()
@@ -94,11 +97,11 @@ def supervise(batches: list[range], tally: Tally, asked: argparse.Namespace, fol
                 assert worker.stdout is not None
                 assert worker.stderr is not None
                 done = 0
-                hangs = threading.Timer(600.0, worker.kill)
+                hangs = threading.Timer(HANGS_S, worker.kill)
                 hangs.start()
                 for line in worker.stdout:
                     hangs.cancel()
-                    hangs = threading.Timer(10 * asked.limit_s + 60, worker.kill)
+                    hangs = threading.Timer(HANGS_S, worker.kill)
                     hangs.start()
                     tally.add(json.loads(line))
                     done += 1

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from flcav.cli.refusals import finite, refuse_unused
+
 if TYPE_CHECKING:
     from flcav.optimization.history import History
     from flcav.optimization.learning_curve import Fit
@@ -35,16 +37,20 @@ def fit(
         [], "--at", help="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]] to predict the error at; may be given several times."
     ),
     group_samples: float = typer.Option(
-        0.0, "--group-samples", min=0, max=1e9, help="effective: samples that vehicles hold."
+        0.0, "--group-samples", min=0, max=1e9, callback=finite, help="effective: samples that vehicles hold."
     ),
-    alpha: float = typer.Option(0.1, "--alpha", min=1e-9, max=1e9, help="effective: worth of a pretraining sample."),
+    alpha: float = typer.Option(
+        0.1, "--alpha", min=1e-9, max=1e9, callback=finite, help="effective: worth of a pretraining sample."
+    ),
     beta: float | None = typer.Option(
-        None, "--beta", min=0, max=1e9, help="effective: worth of a held sample; else fitted."
+        None, "--beta", min=0, max=1e9, callback=finite, help="effective: worth of a held sample; else fitted."
     ),
     k: int = typer.Option(
         1, "--edge-rounds-per-cloud-round", min=0, max=10**9, help="effective: edge rounds in a cloud round."
     ),
-    level: float = typer.Option(0.9, "--level", min=0.01, max=0.999, help="Share of repeats between the bands."),
+    level: float = typer.Option(
+        0.9, "--level", min=0.01, max=0.999, callback=finite, help="Share of repeats between the bands."
+    ),
     repeats: int = typer.Option(200, "--repeats", min=20, max=10**5, help="Bootstrap repeats of the bands."),
     seed: int = typer.Option(0, "--seed", min=0, help="Seed of the bootstrap."),
 ) -> None:  # fmt: skip
@@ -54,6 +60,9 @@ def fit(
     from flcav.optimization.bands import bands
     from flcav.optimization.history import histories
     from flcav.optimization.learning_curve import fit_additive, fit_effective
+
+    if model is Model.additive:
+        refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
 
     def fitted(points: "History") -> "Fit[Any]":
         samples, edge_rounds, cloud_rounds = points.resources.T

@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from flcav.perception.task import Finding
 
 
+SCORED = ("signs", "objects")  # tasks whose findings have a score each
+
+
 def register(app: typer.Typer) -> None:
     """Add the command."""
     app.command()(infer)
@@ -24,7 +27,7 @@ def infer(
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
-    threshold: float = typer.Option(0.3, "--threshold", min=0.0, max=1.0, help="Lowest score shown."),
+    threshold: float = typer.Option(0.3, "--threshold", min=0.0, max=1.0, help="signs, objects: lowest score shown."),
     device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
     pictures: Path | None = typer.Option(None, "--pictures", help="Folder for a picture of each input with findings."),
     as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
@@ -35,6 +38,7 @@ def infer(
     from the upper left corner of the picture. Paths are in the world's frame, all modes with their probabilities,
     with "constant_velocity" beside them and "truth" where the recording goes on for long enough.
     """
+    from flcav.cli.refusals import refuse_unused
     from flcav.cli.tasks import network_of, task_named
     from flcav.config import InputError
     from flcav.files import check_writable
@@ -44,6 +48,8 @@ def infer(
     if pictures is not None:
         check_writable(pictures)
     learned = task_named(task)
+    if task not in SCORED:
+        refuse_unused(f"infer {task}", "threshold")
     network = network_of(learned, weights, device)
     results = []
     for number, finding in enumerate(found for path in inputs for found in learned.infer(network, path, threshold)):

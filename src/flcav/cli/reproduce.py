@@ -1,9 +1,12 @@
 """`flcav reproduce`: the figures and comparisons of the article, from commands anyone can run again."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 
 import typer
+
+from flcav.cli.refusals import refuse_unused
 
 
 class Target(StrEnum):
@@ -29,6 +32,12 @@ class Scale(StrEnum):
     full = "full"
 
 
+STUDY = ("seeds", "scale", "jobs")  # options of what is run over seeds
+TAKEN: Mapping[Target, tuple[str, ...]] = dict.fromkeys(Target, STUDY) | {
+    Target.fig1b: (),
+    Target.fig3a: (),
+    Target.sim_to_real: ("jobs", "kitti", "weights"),
+}
 SEEDS = {Target.demo_arms: 5}
 COMMON_SEEDS = 3
 TASK = "task-"  # before a task's name: its study
@@ -50,6 +59,7 @@ def reproduce(
     ),
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
+    refuse_unused(f"reproduce {target.value}", *{*STUDY, "kitti", "weights"}.difference(TAKEN[target]))
     if target in (Target.fig1b, Target.fig3a):
         draw = _fig1b if target == Target.fig1b else _fig3a
         draw(out)
