@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from flcav.cli.refusals import finite, refuse_unused
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -42,14 +44,22 @@ def fit(
         [], "--at", metavar="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]]", help="Where to predict the error; may be given "
         "several times."
     ),
-    group_samples: float = typer.Option(0.0, "--group-samples", min=0, help="effective: samples that vehicles hold."),
-    alpha: float = typer.Option(0.1, "--alpha", min=1e-9, help="effective: worth of a pretraining sample."),
-    beta: float | None = typer.Option(None, "--beta", min=0, help="effective: worth of a held sample; else fitted."),
-    k: int = typer.Option(
-        1, "--edge-rounds-per-cloud-round", "-k", min=0, help="effective: edge rounds in a cloud round."
+    group_samples: float = typer.Option(
+        0.0, "--group-samples", min=0, max=1e9, callback=finite, help="effective: samples that vehicles hold."
     ),
-    level: float = typer.Option(0.9, "--level", min=0.01, max=0.999, help="Share of repeats between the bands."),
-    repeats: int = typer.Option(200, "--repeats", min=20, help="Bootstrap repeats of the bands."),
+    alpha: float = typer.Option(
+        0.1, "--alpha", min=1e-9, max=1e9, callback=finite, help="effective: worth of a pretraining sample."
+    ),
+    beta: float | None = typer.Option(
+        None, "--beta", min=0, max=1e9, callback=finite, help="effective: worth of a held sample; else fitted."
+    ),
+    k: int = typer.Option(
+        1, "--edge-rounds-per-cloud-round", "-k", min=0, max=10**9, help="effective: edge rounds in a cloud round."
+    ),
+    level: float = typer.Option(
+        0.9, "--level", min=0.01, max=0.999, callback=finite, help="Share of repeats between the bands."
+    ),
+    repeats: int = typer.Option(200, "--repeats", min=20, max=10**5, help="Bootstrap repeats of the bands."),
     seed: int = typer.Option(0, "--seed", min=0, help="Seed of the bootstrap."),
 ) -> None:  # fmt: skip
     """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
@@ -59,6 +69,9 @@ def fit(
     from flcav.optimization.history import histories
     from flcav.optimization.learning_curve import fit_additive, fit_effective
     from flcav.optimization.problem_file import learned
+
+    if model is Model.additive:
+        refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
 
     def fitted(points: "History") -> "Fit[Any]":
         samples, edge_rounds, cloud_rounds = points.resources.T
@@ -138,8 +151,8 @@ def _counts(text: str) -> list[float]:
         counts = [float(part) for part in text.split(",")]
     except ValueError:
         counts = []
-    if not 1 <= len(counts) <= 3 or not all(0 <= count < float("inf") for count in counts):
-        raise InputError(f"--at {text!r} must be SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]], each 0 or more")
+    if not 1 <= len(counts) <= 3 or not all(0 <= count <= 1e9 for count in counts):
+        raise InputError(f"--at {text!r} must be SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]], each from 0 to 1e+09")
     return counts + [0.0] * (3 - len(counts))
 
 

@@ -14,13 +14,14 @@ import numpy as np
 import pyarrow.csv
 from numpy.typing import ArrayLike, NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.optimization.curves import STAGES
 
 Array = NDArray[np.float64]
 
 LONG = ("task", "stage", "resource", "accuracy")
 JOINT = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
+LEAST, MOST = 1e-9, 1e9  # of a number that is not 0
 ARTICLE = resources.files("flcav.optimization") / "data" / "article_history.csv"
 ROUNDED = 1.01e-3  # what accuracy and error, both rounded to three digits, may sum to beside 1
 
@@ -93,15 +94,14 @@ def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
     return np.where(np.arange(3) < number[:, None], largest, own)
 
 
-def _numbers(columns: Mapping[str, Sequence[object]], name: str, origin: str, most: float = np.inf) -> Array:
+def _numbers(columns: Mapping[str, Sequence[object]], name: str, origin: str, most: float = MOST) -> Array:
     """Return column `name` as (n,) numbers from 0 to `most`."""
     values = np.empty(len(columns[name]))
     for row, value in enumerate(columns[name]):
         try:
             values[row] = np.nan if value is None else float(value)  # pyright: ignore[reportArgumentType]
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             values[row] = np.nan
-        if not (np.isfinite(values[row]) and 0 <= values[row] <= most):
-            allowed = "0 or more" if most == np.inf else f"from 0 to {most:g}"
-            raise InputError(f"{origin}: row {row + 1}: {name} = {value} must be a number {allowed}")
+        if not (values[row] == 0 or LEAST <= values[row] <= most):
+            raise InputError(f"{origin}: row {row + 1}: {name} = {shorten(value)} must be a number from 0 to {most:g}")
     return values
