@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.geometry import pose
+from flcav.report.camera import thermal_grey
 from flcav.sensors.camera import Camera, photograph
 from flcav.sensors.infrared import Infrared, thermal_image
 from flcav.sensors.lens import BODY_FROM_OPTICAL
@@ -108,10 +109,7 @@ def infrared() -> Picture:
         image = thermal_image(
             scene, at @ BODY_FROM_OPTICAL, Infrared(), WEATHERS[name], np.random.default_rng(0), hidden=own
         )
-        rank = np.searchsorted(np.sort(image.ravel()), image) / image.size  # as thermal cameras do: equalised in part
-        low, high = np.percentile(image, (30, 99.8))
-        grey = (255 * (0.45 * rank + 0.55 * np.clip((image - low) / (high - low), 0, 1))).astype(np.uint8)
-        out.append(np.repeat(grey[..., None], 3, axis=2))
+        out.append(thermal_grey(image))
     return sheet(out, 2)
 
 

@@ -88,6 +88,8 @@ def tell(error: ValidationError, model: type[BaseModel]) -> str:
     if first["type"] == "extra_forbidden":
         known = sorted({name for owner in _models_at(model, first["loc"][:-1]) for name in owner.model_fields})
         return f"unknown field '{field}'; known fields: {', '.join(known)}{more}"
+    if first["input"] is None:
+        return f"field '{field}' is empty{more}"
     if first["type"] == "missing":
         return f"field '{field}' is missing{more}"
     message = first["msg"].removeprefix("Value error, ")

@@ -13,36 +13,40 @@ from flcav.cli.main import app, run
 from flcav.cli.reproduce import Target
 from flcav.cli.tasks import TASKS
 from flcav.config import InputError
-from flcav.dataset.formats.export import EXPORTERS
+from flcav.dataset.formats.export import FORMATS
 
 ALWAYS = "always"
 STUDIES = tuple(target.value for target in Target if target.value not in ("fig1b", "fig3a", "sim-to-real"))
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
-    "export": {name: f"{name} none --out out" for name in EXPORTERS},
+    "export": {name: f"{name} none --out out" for name in FORMATS},
     "train": {
         **{task: f"{task} --data none --validation none --out out" for task in TASKS},
         "unvalidated": "weather --data none --out out",
     },
     "evaluate": {task: f"{task} --data none" for task in TASKS},
     "infer": {task: f"{task} none" for task in TASKS},
+    "errors": {task: f"{task} --data none --out errors.csv" for task in ("signs", "objects", "trajectory")},
     "fit": {model: f"none --model {model}" for model in ("additive", "effective")},
     "reproduce": {target.value: f"{target.value} --out out" for target in Target},
 }
+RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads", "--device"), ALWAYS)
 # command -> option -> what of CHOICES takes it; `--out` and `--json` are always taken
 TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "demo": {"--seed": ALWAYS, "--jobs": ALWAYS},
     "towns list": {},
-    "towns show": {},
+    "towns show": {"--poles": ALWAYS},
     "towns import": {},
     "record": {"--frames": ALWAYS, "--seed": ALWAYS, "--jobs": ALWAYS, "--engine": ALWAYS},
     "validate": {},
     "birdseye": {"--frame": ALWAYS, "--range": ALWAYS},
+    "camera": {"--frame": ALWAYS, "--camera": ALWAYS, "--boxes": ALWAYS},
     "view": {"--scene": ALWAYS, "--save": ALWAYS},
     "export": {  # which format takes which is said beside the formats
         "--labels": ALWAYS,
         "--validation": ALWAYS,
         "--min-pixels": ALWAYS,
+        "--min-points": ALWAYS,
         "--calibration": ALWAYS,
     },
     "train": {
@@ -52,14 +56,29 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--epochs": ALWAYS,
         "--patience": tuple(TASKS),
         "--seed": ALWAYS,
-        "--device": ALWAYS,
+        **RUNS,
     },
-    "evaluate": {"--data": ALWAYS, "--weights": ALWAYS, "--device": ALWAYS, "--tracks": ("objects",)},
-    "infer": {"--weights": ALWAYS, "--threshold": ("signs", "objects"), "--device": ALWAYS, "--pictures": ALWAYS},
+    "evaluate": {"--data": ALWAYS, "--weights": ALWAYS, "--tracks": ("objects",), "--range": ("objects",), **RUNS},
+    "infer": {"--weights": ALWAYS, "--threshold": ("signs", "objects"), "--pictures": ALWAYS, **RUNS},
+    "errors": {
+        "--data": ALWAYS,
+        "--weights": ALWAYS,
+        "--threshold": ("signs", "objects"),
+        "--map": ALWAYS,
+        **RUNS,
+    },
     "allocate": {"--baseline": ALWAYS, "--progress": ALWAYS},
-    "place": {"--errors": ALWAYS, "--poles": ALWAYS, "--range": ALWAYS, "--count": ALWAYS, "--method": ALWAYS},
+    "place": {
+        "--errors": ALWAYS,
+        "--poles": ALWAYS,
+        "--range": ALWAYS,
+        "--count": ALWAYS,
+        "--method": ALWAYS,
+        "--town": ALWAYS,
+        "--map": ALWAYS,
+    },
     "fit": {
-        **dict.fromkeys(("--model", "--at", "--level", "--repeats", "--seed"), ALWAYS),
+        **dict.fromkeys(("--model", "--at", "--problem", "--level", "--repeats", "--seed"), ALWAYS),
         **dict.fromkeys(("--group-samples", "--alpha", "--beta", "--edge-rounds-per-cloud-round"), ("effective",)),
     },
     "reproduce": {

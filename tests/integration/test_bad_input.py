@@ -69,12 +69,12 @@ def weights(tmp_path: Path) -> Path:
 def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """Run a command that is to fail; return its sentence."""
 
-    def call(*arguments: object, code: int = 2) -> str:
+    def call(*arguments: object, code: int = 2, out: str = "") -> str:
         capsys.readouterr()
         with pytest.raises(SystemExit) as ended:
             run([str(argument) for argument in arguments])
         told = capsys.readouterr()
-        assert (ended.value.code, told.out) == (code, "")
+        assert (ended.value.code, told.out) == (code, out)
         return one_sentence(told.err)
 
     return call
@@ -130,7 +130,9 @@ def test_a_truncated_point_cloud_in_a_dataset(
     os.truncate(cloud, cloud.stat().st_size - 6)
     out = tmp_path / "out"
     sentence = {
-        "train": lambda: refused("train", "objects", "--data", data, "--out", out, "--epochs", 1),
+        "train": lambda: refused(
+            *("train", "objects", "--data", data, "--out", out, "--epochs", 1), out=f"{data}: 2 vehicle frames\n"
+        ),
         "evaluate": lambda: refused("evaluate", "objects", "--data", data, "--weights", weights),
         "infer": lambda: refused("infer", "objects", data, "--weights", weights),
         "birdseye": lambda: refused("birdseye", data, "--out", out / "frame.png"),

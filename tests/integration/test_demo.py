@@ -52,6 +52,24 @@ from flcav.experiments.steps import run_steps
 steps = demo_steps(Protocol.model_validate_json(sys.argv[1]))
 run_steps(steps, Path(sys.argv[2]), jobs=1, notify=lambda *told: None)
 """
+OWN = """
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from flcav.experiments.demo import demo_steps
+from flcav.experiments.protocol import Protocol
+from flcav.experiments.steps import run_steps
+
+@dataclass(frozen=True)
+class Last:
+    def combine(self, start, updates):
+        return updates[-1].weights
+
+if __name__ == "__main__":
+    steps = demo_steps(Protocol.model_validate_json(sys.argv[1]), Last())
+    upto = [step.name for step in steps].index("grid-edge-chosen") + 1
+    run_steps(steps[:upto], Path(sys.argv[2]), jobs=1, notify=lambda *told: None)
+"""
 AFTER_EDGE = (
     "cloud",
     *(f"{what}-{arm}" for what in ("test", "rounds") for arm in ("grid-edge-chosen-grid", "cloud-grid", "cloud-ring")),
@@ -201,6 +219,18 @@ def test_a_demo_killed_in_edge_fl_ends_the_same(finished: Path, tmp_path: Path) 
     assert timeless(tmp_path) == timeless(finished)
     for path in (f"{step}/{name}" for step in redone[:2] for name in ("weights.safetensors", "ledger.parquet")):
         assert (work / path).read_bytes() == (finished / "work" / path).read_bytes(), path
+
+
+def test_a_strategy_of_ones_own_federates_and_is_not_gone_on_with_as_another(finished: Path, tmp_path: Path) -> None:
+    edge = "grid-edge-chosen"
+    work = without(finished, tmp_path, (edge, "grid-edge-densest", "ring-edge-chosen", *AFTER_EDGE))
+    (tmp_path / "own.py").write_text(OWN)
+    subprocess.run([sys.executable, tmp_path / "own.py", TOY.model_dump_json(), work], check=True)
+    weights = f"{edge}/weights.safetensors"
+    assert (work / weights).read_bytes() != (finished / "work" / weights).read_bytes()
+    (work / edge / "done.json").unlink()  # killed at its end
+    with pytest.raises(InputError, match="another configuration"):
+        run(tmp_path)
 
 
 def test_a_demo_killed_in_pretraining_ends_the_same(finished: Path, tmp_path: Path) -> None:

@@ -59,3 +59,15 @@ def test_bring_your_own_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     found = re.fullmatch(r"a third vehicle's 6 pictures of 1 scenes: accuracy (\S+) .*\n", capsys.readouterr().out)
     assert found is not None
     assert float(found[1]) > 0.6  # 1/3 by chance
+
+
+@pytest.mark.slow
+def test_bring_your_own_strategy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    name = "06_bring_your_own_strategy.py"
+    assert len((EXAMPLES / name).read_text().splitlines()) <= 60
+    run(name, tmp_path, monkeypatch=monkeypatch)
+    fedavg, own = capsys.readouterr().out.splitlines()
+    assert fedavg.startswith("FedAvg()")
+    assert own.startswith("LossWeighted(power=2.0)")
+    nights = [float(line.rsplit(" ", 1)[1]) for line in (fedavg, own)]
+    assert nights[1] > nights[0]  # what few have seen

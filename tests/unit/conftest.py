@@ -1,5 +1,5 @@
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +8,9 @@ import pytest
 
 import flcav.world
 from flcav.config import read_config
+from flcav.dataset.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.sensors.frame import Frame
 from flcav.world.parameters import TownParameters
 from flcav.world.shapes import SHAPES
 from flcav.world.town import Poles, Signs, Town
@@ -15,6 +18,39 @@ from flcav.world.trace import Trace
 
 Actor = tuple[str, str, int, float, float, float]  # id, category, shape, x, y, yaw
 NONE = np.zeros((0, 6))
+
+
+@dataclass(frozen=True)
+class Once:
+    """A source of one frame."""
+
+    seen: Frame
+
+    def describe(self) -> dict[str, Any]:
+        return {"town": "none", "split": "test", "seed": 0}
+
+    def scenes(self) -> list[str]:
+        return [self.seen.scene]
+
+    def frame_count(self, scene: str) -> int:
+        return 1
+
+    def frames(self, scene: str) -> Iterator[Frame]:
+        yield self.seen
+
+    def trace(self, scene: str) -> None:
+        return None
+
+
+@pytest.fixture(scope="session")
+def recorded() -> Callable[[Frame, Path], Dataset]:
+    """Record a frame into a folder, and open it."""
+
+    def write(frame: Frame, out: Path) -> Dataset:
+        record(Once(frame), out)
+        return Dataset.open(out)
+
+    return write
 
 
 @pytest.fixture(scope="session")

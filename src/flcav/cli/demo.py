@@ -4,7 +4,11 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.interruption import when_interrupted
+from flcav.threads import use_threads
 
+
+@when_interrupted()
 def demo(
     out: Path = typer.Option(
         Path("out/demo"), "--out", help="Folder of the run; the same command goes on after a stop."
@@ -13,6 +17,7 @@ def demo(
     jobs: int = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each."),
 ) -> None:
     """Run plan, pretraining, placement, edge FL and cloud FL on three towns; write report.html and results.json."""
+    use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.experiments.demo import demo_protocol, run_demo
     from flcav.experiments.steps import stopwatch

@@ -10,8 +10,11 @@ import typer
 from flcav.cli.refusals import finite, refuse_unused
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from flcav.optimization.history import History
     from flcav.optimization.learning_curve import Fit
+    from flcav.optimization.problem_file import Learned
 
 
 class Model(StrEnum):
@@ -29,12 +32,17 @@ def register(app: typer.Typer) -> None:
 def fit(
     history: Path = typer.Argument(
         ..., help="CSV: task, stage (pretrain, edge, cloud), resource, accuracy[, weight]; or [task,] samples, "
-        "edge_rounds, cloud_rounds, accuracy[, weight]."
+        "edge_rounds, cloud_rounds, accuracy[, weight]. error = 1 - accuracy may stand for accuracy."
+    ),
+    problem: Path | None = typer.Option(
+        None, "--problem", help="YAML: put the curves into this problem for `flcav allocate`; where there is no such "
+        "file, write one with the rest to fill in."
     ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
     model: Model = typer.Option(Model.additive, "--model", help="How the stages add up."),
     at: list[str] = typer.Option(
-        [], "--at", help="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]] to predict the error at; may be given several times."
+        [], "--at", metavar="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]]", help="Where to predict the error; may be given "
+        "several times."
     ),
     group_samples: float = typer.Option(
         0.0, "--group-samples", min=0, max=1e9, callback=finite, help="effective: samples that vehicles hold."
@@ -46,7 +54,7 @@ def fit(
         None, "--beta", min=0, max=1e9, callback=finite, help="effective: worth of a held sample; else fitted."
     ),
     k: int = typer.Option(
-        1, "--edge-rounds-per-cloud-round", min=0, max=10**9, help="effective: edge rounds in a cloud round."
+        1, "--edge-rounds-per-cloud-round", "-k", min=0, max=10**9, help="effective: edge rounds in a cloud round."
     ),
     level: float = typer.Option(
         0.9, "--level", min=0.01, max=0.999, callback=finite, help="Share of repeats between the bands."
@@ -57,9 +65,10 @@ def fit(
     """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
     from flcav.cli.tables import read_table
     from flcav.config import InputError
-    from flcav.optimization.bands import bands
+    from flcav.optimization.bands import bands, upper_curve
     from flcav.optimization.history import histories
     from flcav.optimization.learning_curve import fit_additive, fit_effective
+    from flcav.optimization.problem_file import learned
 
     if model is Model.additive:
         refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
@@ -74,19 +83,65 @@ def fit(
         return fit_effective(*columns, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
 
     asked = [_counts(text) for text in at]
-    answers, shown = [], []
-    for task, points in histories(read_table(history, ("accuracy",)).to_pydict(), str(history), history.stem).items():
+    held, unnamed = _held(problem, history.stem)
+    answers, shown, found_of = [], [], {}
+    for task, points in histories(read_table(history, ()).to_pydict(), str(history), unnamed).items():
         try:
             found = fitted(points)
         except InputError as error:
             raise InputError(f"{history}: task {task!r}: {error}") from None
         band = bands(found, level=level, repeats=repeats, seed=seed, k=k)
-        answers.append(_answer(task, found, band, points.resources, asked, k))
+        upper = None if band is None else upper_curve(found, band)
+        answers.append(_answer(task, found, band, upper, points.resources, asked, k))
         shown.append(found)
+        found_of[task] = learned(found, points.resources, upper)
+    if problem is not None:
+        _write(problem, held, found_of, k, history.name)
     if as_json:
         typer.echo(json.dumps({"curves": answers}))
-    else:
-        _show(answers, shown)
+        return
+    _show(answers, shown)
+    if problem is not None:
+        typer.echo(_next(problem, list(found_of)))
+
+
+def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
+    """Return the text of the problem, if there is one, and what a history is of that does not name its task.
+
+    That is the only task of the problem, or what the history's file is called.
+    """
+    from flcav.config import InputError, read_yaml
+    from flcav.optimization.problem_file import task_names
+
+    if problem is None or not problem.exists():
+        return None, stem
+    if problem.suffix == ".json":
+        raise InputError(f"{problem}: --problem writes YAML")
+    read_yaml(problem)  # refuses what is none
+    text = problem.read_bytes().decode("utf-8")
+    names = task_names(text, str(problem))
+    return text, names[0] if len(names) == 1 else stem
+
+
+def _write(problem: Path, held: str | None, found: "Mapping[str, Learned]", k: int, history: str) -> None:
+    from flcav.files import write_bytes
+    from flcav.optimization.problem_file import new_problem, with_curves
+
+    text = new_problem(found, k, history) if held is None else with_curves(held, found, k, str(problem))
+    write_bytes(problem, text.encode())
+
+
+def _next(problem: Path, tasks: list[str]) -> str:
+    """Return what was written, and whether a plan can be made of it."""
+    from flcav.config import InputError
+    from flcav.optimization.graph import read_problem
+
+    told = f"{problem}: now has the curve{'s' if len(tasks) > 1 else ''} of {', '.join(tasks)}"
+    try:
+        read_problem(problem)
+    except InputError as error:
+        return f"{told}; not yet what `flcav allocate` takes: {str(error).removeprefix(f'{problem}: ')}"
+    return f"{told}; next: flcav allocate {problem}"
 
 
 def _counts(text: str) -> list[float]:
@@ -102,11 +157,11 @@ def _counts(text: str) -> list[float]:
 
 
 def _answer(
-    task: str, fit: "Fit[Any]", found: Any, measured: Any, asked: list[list[float]], k: int
+    task: str, fit: "Fit[Any]", found: Any, upper: Any, measured: Any, asked: list[list[float]], k: int
 ) -> dict[str, Any]:  # fmt: skip
     import numpy as np
 
-    from flcav.optimization.bands import METHOD, pointwise, upper_curve
+    from flcav.optimization.bands import METHOD, pointwise
 
     band = None
     if found is not None:
@@ -122,18 +177,21 @@ def _answer(
         **{"rmse": fit.rmse, "points": fit.points, "r_squared": fit.r_squared, "aicc": fit.aicc},
         "measured": fit.measured,
         "band": band,
-        "upper": None if found is None else upper_curve(fit, found).model_dump(),
+        "upper": None if upper is None else upper.model_dump(),
         "asked": [{**row, "warning": warning} for row, warning in zip(predicted, extrapolated)],
         "warnings": [*fit.warnings, *filter(None, extrapolated)],
     }
 
 
 def _show(answers: list[dict[str, Any]], fits: list["Fit[Any]"]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
-    table = Table("task", "error", "rmse", "R²", "points")
+    from flcav.cli.console import plain_console
+    from flcav.optimization.curves import Effective
+
+    console = plain_console()
+    rounds = "t rounds" if isinstance(fits[0].curve, Effective) else "y edge, z cloud rounds"
+    table = Table("task", f"error after x samples, {rounds}", "rmse", "R²", "points")
     for answer, fit in zip(answers, fits):
         table.add_row(answer["task"], str(fit.curve), f"{fit.rmse:.4f}", f"{fit.r_squared:.3f}", str(fit.points))
     console.print(table)
@@ -145,6 +203,6 @@ def _show(answers: list[dict[str, Any]], fits: list["Fit[Any]"]) -> None:
                 else f", {answer['band']['level']:.0%} band {row['low']:.4f} to {row['high']:.4f}"
             )
             counts = f"{row['samples']:g} samples, {row['edge_rounds']:g} edge, {row['cloud_rounds']:g} cloud rounds"
-            console.print(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}", highlight=False)
+            console.print(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}")
         for warning in answer["warnings"]:
-            console.print(f"{answer['task']}: {warning}", highlight=False)
+            console.print(f"{answer['task']}: {warning}")

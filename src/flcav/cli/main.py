@@ -1,4 +1,4 @@
-"""The `flcav` command. Exit 0 done; 2 invalid input, one sentence on stderr; 1 anything else."""
+"""The `flcav` command. Exit 0 done; 2 invalid input, one sentence on stderr; 130 interrupted; 1 anything else."""
 
 import sys
 
@@ -9,7 +9,9 @@ from flcav import __version__
 from flcav.cli import (
     allocate,
     birdseye,
+    camera,
     demo,
+    errors,
     evaluate,
     export,
     fit,
@@ -22,6 +24,8 @@ from flcav.cli import (
     validate,
     view,
 )
+from flcav.cli.interruption import Interrupted
+from flcav.cli.literal import literal
 from flcav.config import InputError
 
 INTERRUPTED = 130
@@ -29,7 +33,8 @@ LONGEST = 1000  # characters of a sentence
 
 app = typer.Typer(
     name="flcav",
-    help="Design and verify federated learning for connected autonomous vehicle perception.",
+    help="Design and verify federated learning for connected autonomous vehicle perception.\n\n"
+    "Exit codes: 0 done, 2 bad input (one sentence on stderr), 130 interrupted (Ctrl-C), 1 anything else.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -55,11 +60,13 @@ for command in (
     record,
     validate,
     birdseye,
+    camera,
     view,
     export,
     train,
     evaluate,
     infer,
+    errors,
     allocate,
     place,
     fit,
@@ -71,11 +78,14 @@ for command in (
 def run(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its code: the only place where exceptions become exit codes."""
     try:
-        code = app(args=arguments, standalone_mode=False)
+        code = literal(typer.main.get_command(app))(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # what typer makes of Ctrl-C
             raise KeyboardInterrupt
+    except Interrupted as kept:
+        print(f"flcav: interrupted; {kept}", file=sys.stderr)
+        code = INTERRUPTED
     except (click.exceptions.Abort, KeyboardInterrupt):
-        _say("interrupted; the same command goes on where it stopped")
+        _say("interrupted")
         code = INTERRUPTED
     except click.ClickException as error:
         _say(error.format_message())

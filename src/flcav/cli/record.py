@@ -4,19 +4,23 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.choices import Engine
+from flcav.cli.interruption import when_interrupted
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
     app.command()(record)
 
 
+@when_interrupted()
 def record(
     recipe: Path = typer.Argument(help="Recipe (YAML): town, traffic, vehicles, poles, sensors."),
     out: Path = typer.Option(..., "--out", help="Folder of the dataset; an interrupted recording goes on."),
     frames: int | None = typer.Option(None, "--frames", help="Record exactly this many frames instead."),
     seed: int | None = typer.Option(None, "--seed", help="Seed instead of the recipe's."),
     jobs: int = typer.Option(1, "--jobs", help="Workers; the dataset is the same whatever their number."),
-    engine: str = typer.Option("processes", "--engine", help="Who works: processes here, or a cluster by ray."),
+    engine: Engine = typer.Option(Engine.processes, "--engine", help="Who works: processes here, or a cluster by Ray."),
 ) -> None:
     """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
     from flcav import progress

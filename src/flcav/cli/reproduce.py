@@ -6,7 +6,10 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.choices import listed
+from flcav.cli.interruption import when_interrupted
 from flcav.cli.refusals import refuse_unused
+from flcav.threads import use_threads
 
 
 class Target(StrEnum):
@@ -44,7 +47,7 @@ TASK = "task-"  # before a task's name: its study
 
 
 def reproduce(
-    target: Target = typer.Argument(..., help="What to reproduce."),
+    target: Target = typer.Argument(..., metavar="TARGET", help=f"What to reproduce: {listed(Target)}."),
     out: Path = typer.Option(..., "--out", help="Folder of the runs; the same command goes on after a stop."),
     seeds: int | None = typer.Option(
         None, "--seeds", min=1, help="Number of seeds, from 1: 5 of demo-arms, 3 of the others if not given."
@@ -59,6 +62,7 @@ def reproduce(
     ),
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
+    use_threads(1)
     refuse_unused(f"reproduce {target.value}", *{*STUDY, "kitti", "weights"}.difference(TAKEN[target]))
     if target in (Target.fig1b, Target.fig3a):
         draw = _fig1b if target == Target.fig1b else _fig3a
@@ -78,6 +82,7 @@ def reproduce(
     typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
 
 
+@when_interrupted()
 def _fig1b(out: Path) -> None:
     from flcav import progress
     from flcav.experiments.fig1b import fig1b
@@ -100,6 +105,7 @@ def _fig3a(out: Path) -> None:
         typer.echo(sentence)
 
 
+@when_interrupted()
 def _demo_arms(out: Path, seeds: range, scale: str, jobs: int) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.demo_arms import arms_protocol, draw_arms, run_arms
@@ -113,6 +119,7 @@ def _demo_arms(out: Path, seeds: range, scale: str, jobs: int) -> None:
         typer.echo(f"{arm}: closes {closed['mean']:.2f} of the gap ({closed['low']:.2f} to {closed['high']:.2f})")
 
 
+@when_interrupted()
 def _fig6a_allocation(out: Path, seeds: range, scale: str, jobs: int) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.fig6a_allocation import allocation_protocol, draw_allocation, run_allocation
@@ -126,9 +133,8 @@ def _fig6a_allocation(out: Path, seeds: range, scale: str, jobs: int) -> None:
         typer.echo(f"{finding['question']} {finding['verdict']}. {finding['sentence']}")
 
 
+@when_interrupted()
 def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int) -> None:
-    import torch
-
     from flcav.cli.steps import live_steps
     from flcav.cli.tasks import network_of
     from flcav.config import InputError
@@ -140,7 +146,6 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int)
 
     if kitti is None:
         raise InputError("--kitti is missing: sim-to-real needs a folder of real frames in KITTI's layout")
-    torch.set_num_threads(1)
     with live_steps(Target.sim_to_real.value) as notify:
         results = run_sim_to_real(network_of(OBJECTS, weights), kitti, out, jobs=jobs, notify=notify)
     write_json(out / "result.json", results)
@@ -153,6 +158,7 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int)
             typer.echo(f"{row['class']} {row['kind']} at IoU {row['iou']}: {found}, AP {row['ap']:.3f}")
 
 
+@when_interrupted()
 def _task(target: str, out: Path, seeds: range, scale: str, jobs: int) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.studies import STUDIES

@@ -1,8 +1,14 @@
 """flcav towns: what towns there are, their maps, and new ones from OpenDRIVE."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from flcav.world.town import Town
 
 towns = typer.Typer(help="Towns: list them, draw their maps, import new ones from OpenDRIVE.", no_args_is_help=True)
 
@@ -34,17 +40,28 @@ def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSO
 @towns.command()
 def show(
     town: str = typer.Argument(help="A town's name, or its folder."),
-    out: Path = typer.Option(..., "--out", help="PNG file to write."),
+    out: Path | None = typer.Option(None, "--out", help="PNG file: the map."),
+    poles: Path | None = typer.Option(None, "--poles", help="Table (.csv or .parquet) of its candidate poles."),
 ) -> None:
-    """Draw a town's map: roads, lanes, markings, buildings, trees, signs, lights, and the numbered candidate poles."""
+    """Show a town.
+
+    As a map: roads, lanes, markings, buildings, trees, signs, lights, and the numbered candidate poles. As a table: the
+    poles' id, x, y, z [m, world], yaw_deg and kind, which `flcav place` reads; recipes take the same ids.
+    """
+    from flcav.dataset.exchange import write_table
     from flcav.files import write_bytes
     from flcav.report.town_map import town_map
     from flcav.world.census import census
     from flcav.world.town import load_town
 
     loaded = load_town(town)
-    write_bytes(out, town_map(loaded))
-    typer.echo(f"{out}: map of {loaded.name}: {summary(census(loaded))}")
+    if poles is not None:
+        write_table(_poles_table(loaded), poles)
+        typer.echo(f"{poles}: {len(loaded.poles.id)} candidate poles of {loaded.name}")
+    if out is not None:
+        write_bytes(out, town_map(loaded))
+        typer.echo(f"{out}: map of {loaded.name}")
+    typer.echo(f"{loaded.name}: {summary(census(loaded))}")
 
 
 @towns.command("import")
@@ -60,6 +77,14 @@ def import_(
     typer.echo(f"{out}: {summary(census(imported.town))}")
     for note in imported.notes:
         typer.echo(f"    {note}")
+
+
+def _poles_table(town: "Town") -> "pa.Table":
+    import numpy as np
+    import pyarrow as pa
+
+    columns = {"id": town.poles.id, **dict(zip("xyz", town.poles.position.T, strict=True))}
+    return pa.table(columns | {"yaw_deg": np.degrees(town.poles.yaw), "kind": list(town.poles.kind)})
 
 
 def summary(counts: dict[str, float]) -> str:

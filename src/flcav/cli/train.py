@@ -4,6 +4,11 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.choices import Device, TaskName, listed
+from flcav.cli.interruption import when_interrupted
+from flcav.cli.options import AGENTS, THREADS
+from flcav.threads import use_threads
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -11,9 +16,11 @@ def register(app: typer.Typer) -> None:
 
 
 def train(
-    task: str = typer.Argument(help="What to learn: weather, signs, objects or trajectory."),
+    task: TaskName = typer.Argument(metavar="TASK", help=f"What to learn: {listed(TaskName)}."),
     data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
-    out: Path = typer.Option(..., "--out", help="Folder of the weights; an interrupted training goes on."),
+    out: Path = typer.Option(
+        ..., "--out", help="Folder of the weights; an interrupted training goes on, a finished one is left alone."
+    ),
     validation: Path | None = typer.Option(
         None,
         "--validation",
@@ -28,27 +35,41 @@ def train(
     epochs: int = typer.Option(10, "--epochs", min=1, help="Passes through the data."),
     patience: int = typer.Option(5, "--patience", min=1, help="Epochs without a better validation before it stops."),
     seed: int = typer.Option(0, "--seed", min=0, help="Initial weights, order and augmentation."),
-    device: str = typer.Option("auto", "--device", help="cpu, cuda, or auto: a GPU where there is one."),
+    device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
+    agents: str | None = AGENTS,
+    threads: int = THREADS,
 ) -> None:
     """Train a network on recorded frames with their ground truth; writes OUT/weights.safetensors and its card.
 
     Curves for TensorBoard go to OUT/events.
     """
+    use_threads(threads)
     from flcav import progress
     from flcav.cli.refusals import refuse_unused
     from flcav.cli.tasks import task_named
     from flcav.dataset.store import Dataset
     from flcav.perception.device import device_named
-    from flcav.perception.training.run import Request, train_network
+    from flcav.perception.training.run import CHECKPOINT, WEIGHTS, Request, prepare, train_prepared
 
     if validation is None:
         refuse_unused("a training without --validation", "patience")
     learner, place = task_named(task), device_named(device)
     held = Dataset.open(validation) if validation else None
-    request = Request([Dataset.open(folder) for folder in data], held, network, epochs, patience, seed, place)
-    with progress.live(f"train {task}") as report:
-        card = train_network(learner, request, out, report)
-    told = f"{out / 'weights.safetensors'}: trained on {card.samples} samples, {card.training['steps']} steps"
+    request = Request([Dataset.open(folder) for folder in data], held, network, epochs, patience, seed, place, agents)
+
+    def kept() -> str:
+        saved = out / CHECKPOINT
+        return f"the same command goes on from {saved}" if saved.exists() else "nothing saved yet"
+
+    with when_interrupted(kept):
+        prepared = prepare(learner, request, out)
+        if prepared.finished is not None:
+            typer.echo(f"{out / WEIGHTS}: trained with these settings before, nothing to do")
+            return
+        typer.echo("\n".join(prepared.lines()))
+        with progress.live(f"train {task}") as report:
+            card = train_prepared(prepared, report)
+    told = f"{out / WEIGHTS}: trained on {card.samples} samples, {card.training['steps']} steps"
     typer.echo(f"{told}, mean loss of the last epoch {card.training['loss']:.3f}")
     if card.metrics:
         typer.echo("\n".join(["on the validation data:", *learner.evaluation_lines(card.metrics)]))

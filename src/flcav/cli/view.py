@@ -22,11 +22,12 @@ def view(
     from flcav import progress
     from flcav.config import InputError
     from flcav.dataset.store import Dataset
+    from flcav.extras import installation
     from flcav.files import atomic_path
     from flcav.world.lanes import map_layers
 
     if find_spec("rerun") is None:
-        raise InputError("flcav view needs Rerun, which is not installed: pip install 'flcav[view]'")
+        raise InputError(f"flcav view needs Rerun, which is not installed: {installation('view')}")
     if save is not None and save.suffix != ".rrd":
         raise InputError(f"--save {save}: must be the name of an .rrd file")
     if save is None and sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):

@@ -14,10 +14,11 @@ from typing import Any
 from flcav.config import InputError
 from flcav.dataset.schedule import Engine
 from flcav.dataset.tasks import Part, Task, perform
+from flcav.extras import installation
 from flcav.sources.source import Source
+from flcav.threads import VARIABLES
 
 STORE_BYTES = 128_000_000  # of a Ray started here; only tasks pass through it
-THREADS = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 
 @contextlib.contextmanager
@@ -31,11 +32,11 @@ def ray_cluster(source: Source, work: Path, jobs: int, wrote: Callable[[int], No
     try:
         import ray  # pyright: ignore[reportMissingImports]: an extra
     except ImportError:
-        raise InputError("engine 'ray' is not installed; install flcav with the extra 'ray'") from None
+        raise InputError(f"--engine ray needs Ray, which is not installed: {installation('ray')}") from None
     local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
     ray.init(
         **({} if "RAY_ADDRESS" in os.environ else local),
-        runtime_env={"env_vars": THREADS},
+        runtime_env={"env_vars": dict.fromkeys(VARIABLES, "1")},
         log_to_driver=False,
         logging_level=logging.ERROR,
     )

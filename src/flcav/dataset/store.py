@@ -186,6 +186,10 @@ class Dataset:
         """Return the names of the cameras of frame `i`, without the infrared ones."""
         return list(self._cameras[i])
 
+    def infrareds(self, i: int) -> list[str]:
+        """Return the names of the infrared cameras of frame `i`."""
+        return list(self._infrared[i])
+
     def number(self, name: str) -> int:
         """Return the number of the frame with this key; raises `InputError` where there is none."""
         try:

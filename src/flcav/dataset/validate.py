@@ -11,6 +11,7 @@ from flcav.dataset.calibration_checks import check_calibrations
 from flcav.dataset.frame_checks import check_measurements, check_points, check_sweeps, check_traffic, check_values
 from flcav.dataset.image_checks import check_images
 from flcav.dataset.layout import FILES, MANIFEST, FrameKey, read_manifest, table_path, trace_path
+from flcav.dataset.scene_checks import Sight, check_motion
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import read_table
 from flcav.files import sha256
@@ -39,16 +40,21 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
     problems += check_calibrations(dataset.calibrations, manifest["recipe"])
 
     traces: dict[str, Trace | None] = {}
+    sight = Sight()
     for i, key in enumerate(dataset.keys):
         if key.scene not in traces:
-            traces = {key.scene: _trace(dataset, key.scene, damaged)}
+            trace = _trace(dataset, key.scene, damaged)
+            traces = {key.scene: trace}
+            problems += check_motion(key.scene, trace) if trace is not None else ()
         try:
-            problems += _frame_problems(dataset.frame(i), traces[key.scene])
+            frame = dataset.frame(i)
+            problems += _frame_problems(frame, traces[key.scene])
+            sight.add(frame)
         except InputError as error:  # a file that cannot be read
             if not any(str(error).startswith(str(folder / name)) for name in damaged):
                 problems.append(str(error))
         progress(i + 1, len(dataset), "")
-    return problems
+    return [*problems, *sight.problems()]
 
 
 def _frame_problems(frame: Frame, trace: Trace | None) -> Iterator[str]:

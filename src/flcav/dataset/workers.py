@@ -15,9 +15,9 @@ from typing import Any
 from flcav.dataset.schedule import Engine
 from flcav.dataset.tasks import Task, perform
 from flcav.sources.source import Source
+from flcav.threads import VARIABLES
 
 POLL_S = 0.2
-_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # read when a library is first loaded
 
 _job: Any = None  # in a worker: the source, the folder, and the count of frames that all workers share
 
@@ -133,8 +133,8 @@ def _children_end_on_error() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _threads_per_process(count: int) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, str(count)))
+    before = {name: os.environ.get(name) for name in VARIABLES}
+    os.environ.update(dict.fromkeys(VARIABLES, str(count)))
     try:
         yield
     finally:

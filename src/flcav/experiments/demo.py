@@ -18,11 +18,12 @@ from flcav.experiments.protocol import REGIONS, Protocol, Split, Training
 from flcav.experiments.recording import DATA
 from flcav.experiments.steps import Notify, Step, run_steps
 from flcav.experiments.testing import difference
+from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.files import write_bytes, write_json
 from flcav.geometry import Boxes
 from flcav.network.ledger import LINKS, Ledger
-from flcav.perception.errors import MISS, load_errors
-from flcav.perception.objects.samples import only_lidar
+from flcav.perception.errors import load_errors
+from flcav.perception.objects.truth import only_lidar
 from flcav.report import figures, html, maps, style, sweeps
 from flcav.world.town import load_town
 
@@ -44,11 +45,15 @@ def demo_protocol(seed: int) -> Protocol:
     )
 
 
-def demo_steps(protocol: Protocol) -> list[Step]:
-    """Return the steps of the run itself and of the one comparison the demo makes: the densest pole."""
+def demo_steps(protocol: Protocol, strategy: Strategy = FEDAVG) -> list[Step]:
+    """Return the steps of the run itself and of the one comparison the demo makes: the densest pole.
+
+    `strategy` is that of every federation: of both regions' vehicles, and of their edge servers with the cloud.
+    """
     steps = shared_steps(protocol, plan_step(protocol))
-    steps += [edge_step(protocol, "grid", "chosen"), edge_step(protocol, "grid", "densest")]
-    steps += [edge_step(protocol, "ring", "chosen"), cloud_step(protocol)]
+    for town, sensor in (("grid", "chosen"), ("grid", "densest"), ("ring", "chosen")):
+        steps.append(edge_step(protocol, town, sensor, strategy))
+    steps.append(cloud_step(protocol, strategy))
     for town in REGIONS:
         steps += [test_step(arm, town) for arm in ("pretrain", f"{town}-edge-chosen", CLOUD)]
         steps += [rounds_step(arm, town, ROUND_FRAMES) for arm in (f"{town}-edge-chosen", CLOUD)]
@@ -58,7 +63,15 @@ def demo_steps(protocol: Protocol) -> list[Step]:
     return [*steps, Step("sweep", look, {"town": "grid", "arms": arms}, needs=needs)]
 
 
-def run_demo(protocol: Protocol, out: Path, *, jobs: int, notify: Notify, clock: Callable[[], float]) -> dict[str, Any]:
+def run_demo(
+    protocol: Protocol,
+    out: Path,
+    *,
+    jobs: int,
+    notify: Notify,
+    clock: Callable[[], float],
+    strategy: Strategy = FEDAVG,
+) -> dict[str, Any]:
     """Run or finish the demo in the folder `out` and return its results; `clock()` gives the seconds spent so far."""
     work = out / "work"
 
@@ -67,9 +80,9 @@ def run_demo(protocol: Protocol, out: Path, *, jobs: int, notify: Notify, clock:
             clock()
         notify(step, done, total, note)
 
-    values = run_steps(demo_steps(protocol), work, jobs=jobs, notify=noted)
+    values = run_steps(demo_steps(protocol, strategy), work, jobs=jobs, notify=noted)
     append_points(out / HISTORY_FILE, points_of(values, f"seed{protocol.seed}"))
-    results = collect(protocol, work, values)
+    results = {"strategy": repr(strategy)} | collect(protocol, work, values)
     results["elapsed_s"] = round(clock(), 1)
     results["findings"] = findings(results)
     pictures = draw(work, values, results)
@@ -139,7 +152,7 @@ def _stages(values: dict[str, Any], book: Ledger, town: str) -> list[dict[str, A
             {
                 "name": STAGE_NAMES[key],
                 "town": town,
-                **{name: test[name] for name in ("ap50", "ap50_low", "ap50_high", "ap70")},
+                **{name: test[name] for name in ("ap50", "ap50_low", "ap50_high", "ap70", "aos50", "right_headings")},
                 "samples": samples,
                 "rounds": rounds,
                 **{f"{link}_mb": book.used_mb(link, stage=key) for link in LINKS},
@@ -165,14 +178,15 @@ def _difference(work: Path, protocol: Protocol, before: str, after: str) -> dict
 
 def draw(work: Path, values: dict[str, Any], results: dict[str, Any]) -> dict[str, bytes]:
     """Return the report's pictures as PNG files by name."""
-    errors = load_errors(work / "grid-errors" / ERRORS)
+    town, errors = load_town("grid"), load_errors(work / "grid-errors" / ERRORS)
     placed = results["placement"]
     scene = maps.ErrorMap(
-        load_town("grid"),
+        town,
         np.array([(error.x, error.y, error.z) for error in errors]).reshape(-1, 3),
-        np.array([error.kind == MISS for error in errors], dtype=bool),
-        (placed["chosen"],),
-        placed["densest"],
+        np.array([error.kind for error in errors], dtype=np.str_),
+        maps.poles_of(town),
+        (str(placed["chosen"]),),
+        str(placed["densest"]),
         placed["range_m"],
     )
     sweep = _sweep(work, values["sweep"])

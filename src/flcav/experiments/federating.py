@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors.numpy import load_file, save
 
 from flcav.experiments.pretraining import LEDGER, WEIGHTS, train_on
@@ -13,8 +12,10 @@ from flcav.experiments.protocol import REGIONS, TASK, Protocol
 from flcav.experiments.recording import opened
 from flcav.experiments.steps import Work
 from flcav.experiments.vehicles import grouped, held, region
+from flcav.federation.rounds import OnRound
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import EdgeServer, OnRound, Schedule, federate
+from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable, Weights
 from flcav.files import write_bytes, write_json
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
@@ -27,10 +28,9 @@ from flcav.seeds import child_seed
 ROUND = "round.json"
 
 
-def edge_fl(work: Work, town: str, sensor: str, protocol: dict[str, Any]) -> dict[str, Any]:
+def edge_fl(work: Work, town: str, sensor: str, protocol: dict[str, Any], strategy: Strategy) -> dict[str, Any]:
     """Stage II in one region; `sensor`: the pole that helps label, "chosen" | "densest" | "none"."""
     setting = Protocol.model_validate(protocol)
-    torch.set_num_threads(1)
     rounds = int(work.result("plan")["tasks"][0]["edge_rounds"])
     book = _share_of(Ledger.load(work.inputs["pretrain"] / LEDGER), setting, town)
     pole = None if sensor == "none" else int(work.result(f"{town}-place")[sensor])
@@ -39,14 +39,14 @@ def edge_fl(work: Work, town: str, sensor: str, protocol: dict[str, Any]) -> dic
     schedule = _schedule(setting, rounds, "edge", town)
     account = Account(book, "edge", TASK, "wireless")
     start, done = _resumed(work, to_arrays(network), book)
-    federate(clients, start, schedule, account, done=done, on_round=_checkpoint(work, book, schedule.rounds))
+    keep = _checkpoint(work, book, schedule.rounds)
+    federate(clients, start, schedule, account, strategy=strategy, done=done, on_round=keep)
     return _finish(work, network, book, rounds) | {"pole": pole, "samples": held(clients)}
 
 
-def cloud_fl(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
-    """Stage III: the edge servers of all regions federate with the cloud."""
+def cloud_fl(work: Work, protocol: dict[str, Any], strategy: Strategy) -> dict[str, Any]:
+    """Stage III: the edge servers of all regions federate with the cloud, vehicles with their edge servers."""
     setting = Protocol.model_validate(protocol)
-    torch.set_num_threads(1)
     rounds, k = int(work.result("plan")["tasks"][0]["cloud_rounds"]), setting.edge_rounds_per_cloud_round
     book = Ledger(Budget(setting.wireless_mb, setting.wireline_mb), _spent(work))
     wireless, wireline = (Account(book, "cloud", TASK, link) for link in ("wireless", "wireline"))
@@ -57,10 +57,11 @@ def cloud_fl(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
     for town in REGIONS:
         own = to_arrays(load_network(work.inputs[f"{town}-edge-chosen"] / WEIGHTS))
         clients = region(work, town, int(work.result(f"{town}-place")["chosen"]), setting)
-        servers[town] = EdgeServer(clients, k, wireless, own, cloud_rounds_done=done)
+        servers[town] = EdgeServer(clients, k, wireless, own, cloud_rounds_done=done, strategy=strategy)
         sweeps += held(clients)
     schedule = _schedule(setting, rounds, "cloud", "")
-    federate(servers, start, schedule, wireline, done=done, on_round=_checkpoint(work, book, rounds))
+    keep = _checkpoint(work, book, rounds)
+    federate(servers, start, schedule, wireline, strategy=strategy, done=done, on_round=keep)
     return _finish(work, network, book, rounds) | {"samples": sweeps}
 
 
@@ -70,7 +71,6 @@ def more_training(work: Work, source: str, protocol: dict[str, Any]) -> dict[str
     `source` "suburb": more pretraining on the uploaded samples. "grid": the oracle, on the frames of stage II.
     """
     setting = Protocol.model_validate(protocol)
-    torch.set_num_threads(1)
     network = load_network(work.inputs["pretrain"] / WEIGHTS)
     if source == "suburb":
         data, chosen = opened(work, "suburb-pool"), work.result("pretrain")["uploaded"]

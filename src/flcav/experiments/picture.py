@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import torch
 
 from flcav.experiments.pretraining import WEIGHTS
 from flcav.experiments.recording import opened
@@ -11,8 +10,8 @@ from flcav.experiments.steps import Work
 from flcav.geometry import Boxes
 from flcav.perception.metrics.matching import assign_targets, on_neutral
 from flcav.perception.objects.detect import detect
-from flcav.perception.objects.evaluate import Truth, truth_of
-from flcav.perception.objects.samples import only_lidar
+from flcav.perception.objects.evaluate import Asked, asked_of
+from flcav.perception.objects.truth import only_lidar
 from flcav.perception.objects.weights import load_network
 
 SHOWN_SCORE = 0.3
@@ -20,11 +19,10 @@ SHOWN_SCORE = 0.3
 
 def look(work: Work, town: str, arms: dict[str, str]) -> dict[str, Any]:
     """Detect with each of `arms` (name -> step) in the test frame that holds most targets, whatever they find there."""
-    torch.set_num_threads(1)
     data = opened(work, f"{town}-test")
     networks = {name: load_network(work.inputs[step] / WEIGHTS) for name, step in arms.items()}
     config = next(iter(networks.values())).config
-    truths = [truth_of(data.frame(i), config) for i in range(len(data))]
+    truths = [asked_of(data.frame(i), config) for i in range(len(data))]
     best = int(np.argmax([len(truth.targets) for truth in truths]))
     frame, truth = data.frame(best), truths[best]
     points = frame.lidar[only_lidar(frame)]
@@ -35,7 +33,7 @@ def look(work: Work, town: str, arms: dict[str, str]) -> dict[str, Any]:
     return {"frame": best, "key": frame.key, "targets": truth.targets.array().tolist(), "seen": seen}
 
 
-def _matched(found: Boxes, truth: Truth) -> dict[str, Any]:
+def _matched(found: Boxes, truth: Asked) -> dict[str, Any]:
     """Return the detections that count, which of them hit, and which targets were found."""
     target = assign_targets(found, truth.targets, 0.5)
     counts = (target >= 0) | ~on_neutral(found, truth.neutral)

@@ -8,6 +8,7 @@ from flcav.experiments.protocol import REGIONS, Protocol
 from flcav.experiments.recording import record_split
 from flcav.experiments.steps import Step
 from flcav.experiments.testing import test_arm, test_rounds
+from flcav.federation.strategies import FEDAVG, Strategy
 
 STAGES = ("pretrain", "grid-edge-chosen", "cloud")  # the run itself; every other arm is a comparison
 
@@ -33,19 +34,21 @@ def shared_steps(protocol: Protocol, planned: Step) -> list[Step]:
     return steps + [_recorded(protocol, town, "test") for town in REGIONS]
 
 
-def edge_step(protocol: Protocol, town: str, sensor: str) -> Step:
+def edge_step(protocol: Protocol, town: str, sensor: str, strategy: Strategy = FEDAVG) -> Step:
     """Return stage II of a region with the labels that `sensor` ("chosen", "densest" or "none") helps make."""
-    arguments = {"town": town, "sensor": sensor, "protocol": protocol.model_dump(mode="json")}
+    setting = protocol.model_dump(mode="json")
+    arguments = {"town": town, "sensor": sensor, "protocol": setting, "strategy": strategy}
     needs = ("plan", "pretrain", f"{town}-place", f"{town}-edge")
     return Step(f"{town}-edge-{sensor}", edge_fl, arguments, needs=needs)
 
 
-def cloud_step(protocol: Protocol) -> Step:
-    """Return stage III on top of both regions' stage II."""
+def cloud_step(protocol: Protocol, strategy: Strategy = FEDAVG) -> Step:
+    """Return stage III on top of both regions' stage II; `strategy` is the edge servers' and the cloud's."""
     needs = ["plan", "pretrain"]
     for town in REGIONS:
         needs += [f"{town}-place", f"{town}-edge", f"{town}-edge-chosen"]
-    return Step("cloud", cloud_fl, {"protocol": protocol.model_dump(mode="json")}, needs=tuple(needs))
+    arguments = {"protocol": protocol.model_dump(mode="json"), "strategy": strategy}
+    return Step("cloud", cloud_fl, arguments, needs=tuple(needs))
 
 
 def central_step(protocol: Protocol, name: str, source: str) -> Step:

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import torch
 
 from flcav.dataset.layout import trace_path
 from flcav.experiments.pretraining import WEIGHTS
@@ -11,8 +10,9 @@ from flcav.experiments.protocol import Protocol
 from flcav.experiments.recording import opened
 from flcav.experiments.steps import Work
 from flcav.optimization.placement import coverage, place
-from flcav.perception.errors import FALSE_POSITIVE, MISS, load_errors, register_errors, save_errors
+from flcav.perception.errors import FALSE_POSITIVE, MISS, load_errors, save_errors
 from flcav.perception.objects.detect import detect_all
+from flcav.perception.objects.errors import register_errors
 from flcav.perception.objects.weights import load_network
 from flcav.world.density import poles_density
 from flcav.world.town import load_town
@@ -23,7 +23,6 @@ ERRORS = "errors.parquet"
 
 def register(work: Work, town: str) -> dict[str, int]:
     """Drive the pretrained network through a town it has not seen and register what it gets wrong."""
-    torch.set_num_threads(1)
     drive = opened(work, f"{town}-registry")
     network = load_network(work.inputs["pretrain"] / WEIGHTS)
     frames = [drive.frame(i) for i in range(len(drive))]

@@ -16,7 +16,7 @@ from flcav.files import write_json
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.metrics import match
 from flcav.perception.objects.detect import detect_all
-from flcav.perception.objects.evaluate import Evaluation, evaluate, truth_of
+from flcav.perception.objects.evaluate import Evaluation, asked_of, evaluate
 from flcav.perception.objects.model import Second, second_tiny
 from flcav.perception.objects.samples import Sample, sample_from_frame
 from flcav.perception.objects.task import OBJECTS
@@ -32,7 +32,6 @@ PRECISION = 0.9  # on validation, of the detections that a vehicle may take for 
 def pretrain(work: Work, protocol: dict[str, Any]) -> dict[str, Any]:
     """Upload the planned samples, train on them, and fix the threshold of own labels."""
     setting = Protocol.model_validate(protocol)
-    torch.set_num_threads(1)
     pool, validation = opened(work, "suburb-pool"), opened(work, "suburb-validation")
     samples = int(work.result("plan")["tasks"][0]["samples"])
     chosen = np.sort(stream(setting.seed, "upload").permutation(len(pool))[:samples])
@@ -137,7 +136,7 @@ def train_on(
 def own_label_threshold(network: Second, validation: Dataset) -> float:
     """Return the lowest score from which on at least `PRECISION` of the detections on `validation` are right."""
     frames = [validation.frame(i) for i in range(len(validation))]
-    truths = [truth_of(frame, network.config) for frame in frames]
+    truths = [asked_of(frame, network.config) for frame in frames]
     found = detect_all(network, [frame.lidar["lidar"] for frame in frames])
     matches = match(found, [t.targets for t in truths], [t.neutral for t in truths], 0.5)
     precision = np.cumsum(matches.hit) / np.arange(1, len(matches.hit) + 1)

@@ -5,7 +5,7 @@ Every split has traffic seeds of its own, so no scene is in two of them; test fr
 
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from flcav.config import Config
 from flcav.seeds import child_seed
@@ -63,6 +63,13 @@ class Protocol(Config):
     edge: Split = Split(scenes=24, spins=5, cavs=4)  # grid; the ring drives its own number of vehicles
     test: Split = Split(scenes=40, spins=2, cavs=4)  # grid and ring each
     training: Training = Training()
+
+    @field_validator("test")
+    @classmethod
+    def _several_scenes(cls, test: Split) -> Split:
+        if test.scenes < 2:
+            raise ValueError("test frames of two scenes or more are wanted: intervals are over scenes")
+        return test
 
     @property
     def vehicles(self) -> dict[str, int]:

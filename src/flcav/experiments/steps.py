@@ -2,17 +2,17 @@
 
 A step is finished when its `done.json` is there: the value it returned, and the fingerprint of what it was asked. It
 is written last, so a killed run goes on from its last finished step; a step may keep files to go on from within itself.
+Its fingerprint stands in `started.json` before that, so that it is not gone on with as it was not begun.
 """
 
 import hashlib
 import json
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, FIRST_EXCEPTION, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from queue import Empty
 from typing import Any
@@ -21,9 +21,10 @@ from flcav.config import InputError
 from flcav.dataset.workers import end_with_parent
 from flcav.files import write_json
 from flcav.progress import Report
+from flcav.threads import use_threads
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
-DONE = "done.json"
+DONE, STARTED = "done.json", "started.json"
 
 
 @dataclass(frozen=True)
@@ -45,13 +46,13 @@ class Step:
 
     name: str
     run: Callable[..., Any]
-    arguments: Mapping[str, Any]  # JSON values
+    arguments: Mapping[str, Any]  # JSON values, and frozen dataclasses of them
     needs: tuple[str, ...] = ()
 
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
         """Return what identifies this step's work: its function, arguments and what it is built on."""
         parts = [self.run.__module__, self.run.__qualname__, self.arguments, {n: inputs[n] for n in self.needs}]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True, default=_named).encode()).hexdigest()[:16]
 
 
 def run_steps(steps: Sequence[Step], folder: Path, *, jobs: int, notify: Notify) -> dict[str, Any]:
@@ -65,12 +66,12 @@ def run_steps(steps: Sequence[Step], folder: Path, *, jobs: int, notify: Notify)
         prints[step.name] = step.fingerprint(prints)
     values: dict[str, Any] = {}
     for step in steps:
-        path = folder / step.name / DONE
-        if path.exists():
-            record = json.loads(path.read_text())
-            if record["fingerprint"] != prints[step.name]:
+        started, done = (folder / step.name / name for name in (STARTED, DONE))
+        for path in (started, done):
+            if path.exists() and json.loads(path.read_text())["fingerprint"] != prints[step.name]:
                 raise InputError(f"{folder}: holds the steps of another configuration; choose another folder")
-            values[step.name] = record["value"]
+        if done.exists():
+            values[step.name] = json.loads(done.read_text())["value"]
             notify(step.name, 1, 1, "done before")
     waiting = [step for step in steps if step.name not in values]
     if not waiting:
@@ -138,6 +139,13 @@ def stopwatch(folder: Path) -> Callable[[], float]:
     return clock
 
 
+def _named(value: Any) -> list[Any]:
+    """Return what identifies a record among a step's arguments: its class and its fields."""
+    if not is_dataclass(value):
+        raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a dataclass of them")
+    return [type(value).__module__, type(value).__qualname__, {f.name: getattr(value, f.name) for f in fields(value)}]
+
+
 def _drain(queue: Any, notify: Notify) -> None:
     while True:
         try:
@@ -153,8 +161,7 @@ def _start(queue: Any) -> None:
     global _queue
     _queue = queue
     end_with_parent()
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = "1"
+    use_threads(1)
 
 
 def _perform(step: Step, folder: Path, fingerprint: str) -> Any:
@@ -165,6 +172,7 @@ def _perform(step: Step, folder: Path, fingerprint: str) -> Any:
         _queue.put((step.name, done, total, note))
 
     report(0, 1, "")
+    write_json(own / STARTED, {"fingerprint": fingerprint})
     work = Work(own, {name: folder / name for name in step.needs}, report)
     value = step.run(work, **step.arguments)
     write_json(own / DONE, {"fingerprint": fingerprint, "value": value})

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from flcav.config import InputError
 from flcav.dataset.layout import package_versions
 from flcav.dataset.store import Dataset
@@ -45,14 +43,12 @@ class Study:
 
     def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> dict[str, Any]:
         """Train one seed, going on where an interrupted run left off; return its card."""
-        torch.set_num_threads(1)
         data = [opened(work, step) for step in _training_steps(self)]
         request = Request(data, opened(work, VALIDATION), network, epochs, patience, seed)
         return train_network(self.task, request, work.folder, work.report).model_dump(mode="json")
 
     def test(self, work: Work, *, seed: int) -> dict[str, Any]:
         """Return what the network of one seed reaches on each test."""
-        torch.set_num_threads(1)
         network = load_network(self.task, work.inputs[_seed_step(seed)] / WEIGHTS)
         return {name: self._tested(name, network, opened(work, _test_step(name)), work) for name in self.tests}
 
@@ -143,4 +139,4 @@ def _tested_step(seed: int) -> str:
 
 def _mean(results: Sequence[Result], numbers: Callable[[Result], Mapping[str, float]]) -> dict[str, dict[str, float]]:
     rows = [numbers(result) for result in results]
-    return {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
+    return {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from flcav.config import InputError
 from flcav.experiments.federating import round_network
@@ -13,7 +12,7 @@ from flcav.experiments.recording import opened
 from flcav.experiments.steps import Work
 from flcav.files import atomic_path
 from flcav.perception.metrics import Matches, average_precision, bootstrap_difference
-from flcav.perception.objects.evaluate import Evaluation, evaluate
+from flcav.perception.objects.evaluate import Evaluation, evaluate, number_or_none
 from flcav.perception.objects.weights import load_network
 from flcav.seeds import stream
 
@@ -22,7 +21,6 @@ MATCHES = "matches.npz"
 
 def test_arm(work: Work, arm: str, town: str) -> dict[str, Any]:
     """Evaluate an arm's final weights on a town's test frames."""
-    torch.set_num_threads(1)
     data = opened(work, f"{town}-test")
     network = load_network(work.inputs[arm] / WEIGHTS)
     frames = (data.frame(i) for i in range(len(data)))
@@ -33,12 +31,14 @@ def test_arm(work: Work, arm: str, town: str) -> dict[str, Any]:
     half, strict, bev = result.score("Car"), result.score("Car", "3d", 0.7), result.score("Car", "bev", 0.5)
     return {
         "ap50": half.ap,
-        "ap50_low": half.low,
-        "ap50_high": half.high,
+        "ap50_low": number_or_none(half.low),
+        "ap50_high": number_or_none(half.high),
         "ap70": strict.ap,
-        "ap70_low": strict.low,
-        "ap70_high": strict.high,
+        "ap70_low": number_or_none(strict.low),
+        "ap70_high": number_or_none(strict.high),
         "bev50": bev.ap,
+        "aos50": half.aos,
+        "right_headings": None if np.isnan(half.right) else half.right,
         "frames": result.frames,
         "scenes": len(set(result.scenes)),
         "targets": result.targets["Car"],
@@ -48,7 +48,6 @@ def test_arm(work: Work, arm: str, town: str) -> dict[str, Any]:
 
 def test_rounds(work: Work, arm: str, town: str, frames: int) -> list[dict[str, Any]]:
     """Evaluate an arm's weights after each of its rounds on the first `frames` test frames of a town."""
-    torch.set_num_threads(1)
     data = opened(work, f"{town}-test")
     chosen = np.linspace(0, len(data) - 1, min(frames, len(data))).astype(int)
     network = load_network(work.inputs[arm] / WEIGHTS)

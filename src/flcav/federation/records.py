@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 
-from flcav.federation.trainable import Update, Weights
+from flcav.federation.trainable import LocalUpdate, Update, Weights
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"
 SAMPLES, LOSS = "num-examples", "loss"
@@ -44,3 +44,10 @@ def reply(message: Message, update: Update) -> Message:
     """Return the answer to a training message."""
     metrics = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
     return Message(RecordDict({ARRAYS: to_arrays(update.weights), METRICS: metrics}), reply_to=message)
+
+
+def to_update(answer: Message) -> LocalUpdate:
+    """Read what `reply` wrote."""
+    metrics = answer.content.metric_records[METRICS]
+    weights = to_weights(answer.content.array_records[ARRAYS])
+    return LocalUpdate(weights, int(metrics[SAMPLES]), float(metrics[LOSS]))  # type: ignore[arg-type]

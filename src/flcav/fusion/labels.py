@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from flcav.fusion.road import CELL_M, GROUND_M, TOP_M, RoadView, free_cells
 from flcav.geometry import Boxes, concatenate, inverse, points_in_boxes, transform_points
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.samples import Sample, detection_labels, is_lookalike, near_range
+from flcav.perception.objects.samples import Sample, near_range
+from flcav.perception.objects.truth import detection_labels, is_lookalike
 from flcav.sensors.frame import Frame
 
 CONTRADICTED = 0.5  # a detection is dropped where the road looked at more than this share of its footprint

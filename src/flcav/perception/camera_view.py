@@ -1,4 +1,4 @@
-"""What a camera saw of the scene that a LiDAR swept, and where on its picture the sweep's points fall."""
+"""What a camera saw, and where on its picture points of the scene fall: those of a LiDAR's sweep, corners of boxes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,19 +21,19 @@ BESIDE = 0.5  # pixels are known as far beside the picture, in its widths and he
 
 @dataclass(frozen=True)
 class CameraView:
-    """One picture and how the camera stands to the LiDAR, as the agent knows it.
+    """One picture and how the camera stands to the frame of the points: a LiDAR's, or the world's.
 
     The camera's frame is optical: x right, y down, z ahead; the centre of the first pixel is at (0, 0).
     """
 
     picture: Picture  # (H, W, 3) sRGB
-    camera_from_lidar: Array  # (4, 4)
+    camera_from_points: Array  # (4, 4)
     intrinsics: Array  # (3, 3) [px]
     distortion: Array  # (5,) k1 k2 p1 p2 k3
 
     def project(self, points: NDArray) -> Array:
-        """Return the pixels (N, 2) u, v of points (N, 3), LiDAR frame; NaN behind the camera or far off its picture."""
-        seen = transform_points(self.camera_from_lidar, np.asarray(points, np.float64))
+        """Return the pixels (N, 2) u, v of points (N, 3); NaN behind the camera or far off its picture."""
+        seen = transform_points(self.camera_from_points, np.asarray(points, np.float64))
         seen[seen[:, 2] < NEAREST_M] = np.nan
         straight = projected(self.intrinsics, np.zeros(5), seen)
         size = np.array(self.picture.shape[1::-1])
@@ -41,13 +41,16 @@ class CameraView:
         return projected(self.intrinsics, self.distortion, np.where(near[:, None], seen, np.nan))
 
     def shows(self, points: NDArray) -> NDArray[np.bool_]:
-        """Return which of the points (N, 3), LiDAR frame, lie within the picture; some may be hidden by others."""
+        """Return which of the points (N, 3) lie within the picture; some may be hidden by others."""
         pixels = self.project(points) + 0.5
         return np.all((pixels >= 0) & (pixels < self.picture.shape[1::-1]), axis=1)
 
 
 def recorded_view(data: Dataset, number: int, lidar: str) -> CameraView | None:
-    """Return the view of the camera that looks most nearly where `lidar` does in a frame; None where none does."""
+    """Return the view of the camera that looks most nearly where `lidar` does in a frame; None where none does.
+
+    It stands as the agent believes it to.
+    """
     frame = data.frame(number)
     lidar_from_world = inverse(frame.assumed_world_from_sensor(lidar))
     ahead = {name: float((lidar_from_world @ frame.assumed_world_from_sensor(name))[0, 2]) for name in frame.images}

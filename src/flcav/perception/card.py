@@ -10,6 +10,7 @@ from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import sha256, write_bytes
 from flcav.markdown import bullets, table
+from flcav.perception.agents import Chosen
 from flcav.sensors.rig import RIGS
 
 CARD_KEY = "flcav.card"  # metadata entry of a file of weights
@@ -26,6 +27,7 @@ RECIPE_FIELDS = (
     "poles",
     "weather",
 )
+FACTS = ("parameters", "seed", "samples", "licence", "flcav", "torch", "threads", "processor")
 RIG_FIELDS = ("vehicle_rig", "pole_rig")
 
 
@@ -43,10 +45,13 @@ class Card(Config):
     metrics: dict[str, Any]  # on the validation data; empty where there were none
     licence: str = LICENCE
     flcav: str = __version__
+    torch: str | None = None  # its version; this and the next are None in older cards
+    threads: int | None = None  # that a process computed on
+    processor: str | None = None  # kind of, see `flcav.perception.device`
 
     def markdown(self) -> str:
         """Return the card as a page of text; its numbers are rounded, the file of weights has them whole."""
-        facts = {name: getattr(self, name) for name in ("parameters", "seed", "samples", "licence", "flcav")}
+        facts = {name: value for name in FACTS if (value := getattr(self, name)) is not None}
         held = [] if self.validation is None else [bullets([_entry(self.validation)])]
         blocks = [
             f"# {self.task}: {self.network}",
@@ -63,8 +68,8 @@ class Card(Config):
         return "\n\n".join(blocks) + "\n"
 
 
-def data_entry(data: Dataset) -> dict[str, Any]:
-    """Return what a dataset is: its name, its number of frames, its manifest's fingerprint, and its recipe.
+def data_entry(data: Dataset, chosen: Chosen) -> dict[str, Any]:
+    """Return what of a dataset was used: its name, frames and agents, its manifest's fingerprint, and its recipe.
 
     Of the recipe, what makes two datasets differ most, and the rigs that have a name; the manifest has the whole.
     """
@@ -72,7 +77,8 @@ def data_entry(data: Dataset) -> dict[str, Any]:
     rigs = {name: _rig_name(recipe[name]) for name in RIG_FIELDS if name in recipe}
     return {
         "name": "/".join(data.folder.resolve().parts[-2:]),
-        "frames": len(data),
+        "frames": len(chosen.frames),
+        "agents": list(chosen.agents),
         "manifest": sha256(data.folder / MANIFEST),
         "recipe": {name: recipe[name] for name in RECIPE_FIELDS if name in recipe}
         | {name: rig for name, rig in rigs.items() if rig is not None},
@@ -90,7 +96,8 @@ def _rig_name(rig: Any) -> str | None:
 
 def _entry(entry: Mapping[str, Any]) -> str:
     recipe = {name: value for name, value in entry["recipe"].items() if value not in ([], {}, None)}
-    return f"{entry['name']}: {entry['frames']} frames; {_text(recipe)}; SHA-256 of its manifest {entry['manifest']}"
+    frames = f"{entry['frames']} frames" + (f" of {', '.join(entry['agents'])}" if "agents" in entry else "")
+    return f"{entry['name']}: {frames}; {_text(recipe)}; SHA-256 of its manifest {entry['manifest']}"
 
 
 def _blocks(values: Mapping[str, Any]) -> list[str]:

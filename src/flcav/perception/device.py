@@ -1,8 +1,11 @@
 """Where networks run."""
 
+import platform
+
 import torch
 
 from flcav.config import InputError
+from flcav.perception.ops.precision import multiplies_bfloat16
 
 CPU = torch.device("cpu")
 
@@ -21,3 +24,11 @@ def device_named(name: str) -> torch.device:
         raise InputError("device 'cuda': torch finds no GPU it can use; choose cpu or auto")
     torch.backends.cudnn.deterministic = True
     return torch.device("cuda")
+
+
+def processor_of(device: torch.device) -> str:
+    """Return the kind of processor, as far as the last bits of a training depend on it: "x86_64 AVX512 bfloat16"."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    kind = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
+    return f"{kind} bfloat16" if multiplies_bfloat16(device) else kind

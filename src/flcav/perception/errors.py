@@ -1,129 +1,100 @@
-"""The error registry: where a detector was wrong, each mistake once, so that a sensor can be placed where it helps.
+"""The error registry: where a network was wrong in a town, each mistake once: sensors are placed by it.
 
-A mistake is an object with at least one LiDAR return that was missed, or a detection, with a return in it, of nothing:
-both within the detector's range. A missed object is registered once per track; false positives of one scene within
-`SAME_PLACE_M` of one another are one.
+What a mistake is, each task says in its own `errors.py`; here is how they are kept and handed on.
 """
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from flcav.files import atomic_path
-from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
-from flcav.perception.metrics.matching import assign_targets, on_neutral
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.samples import detection_labels, only_lidar
-from flcav.perception.objects.targets import in_range
-from flcav.sensors.frame import Frame
+from flcav.dataset.exchange import write_table
+from flcav.dataset.store import Dataset
+from flcav.progress import Report, silent
 
-SAME_PLACE_M = 2.0
-OVERLAP = 0.5  # 3D IoU that counts as found
+SAME_PLACE_M = 2.0  # false positives of one scene within this of one another are one
 
-MISS, FALSE_POSITIVE = "miss", "false_positive"
+THRESHOLD = 0.3  # lowest score of a detection, unless one is told otherwise
+MISS, FALSE_POSITIVE, FINAL_ERROR = "miss", "false_positive", "final_error"
+CLASS = "class"  # the column of `PerceptionError.label`
 
 
 @dataclass(frozen=True)
-class DetectionError:
+class PerceptionError:
     """One registered mistake."""
 
-    x: float  # geometric centre, world [m]
+    x: float  # world [m]; of an object its geometric centre
     y: float
     z: float
     weight: float  # what covering it is worth
-    kind: str  # miss | false_positive
-    label: str  # detection class
-    returns: int  # LiDAR returns in it
-    occlusion: float  # of a missed object, [0, 1]; NaN for a false positive
+    kind: str  # miss | false_positive | final_error
+    label: str  # class of what was missed or invented
+    returns: int  # LiDAR returns in it; 0 where no LiDAR is asked
+    occlusion: float  # of a missed object, [0, 1]; NaN where it is not known
     scene: str
     track: str  # the object's; false positives are numbered per scene
 
 
-def register_errors(
-    frames: Sequence[Frame], detections: Sequence[Boxes], config: SecondConfig, threshold: float = 0.3
-) -> list[DetectionError]:
-    """Return the mistakes of `detections` (LiDAR frame, one `Boxes` per frame) that score at least `threshold`.
+@dataclass(frozen=True)
+class Registry:
+    """All mistakes of a network on a dataset."""
 
-    A mistake is registered where and as it was first made; `frames` are gone through in the order they come.
+    errors: tuple[PerceptionError, ...]
+    dropped: int = 0  # false positives that point at no place of the town
+
+
+@runtime_checkable
+class RegistersErrors(Protocol):
+    """A task whose mistakes have a place in the town."""
+
+    def register_errors(
+        self, network: Any, data: Dataset, frames: Sequence[int] | None, threshold: float, progress: Report = silent
+    ) -> Registry:
+        """Return what `network` misses and invents in the frames; detections below `threshold` are none.
+
+        Raises `InputError` where the dataset lacks what that takes.
+        """
+        ...
+
+
+def keep_first(errors: Iterable[PerceptionError]) -> tuple[PerceptionError, ...]:
+    """Return each mistake where and as it was first made, false positives numbered per scene.
+
+    A missed object is one mistake per track and scene; so are false positives of a class within `SAME_PLACE_M`.
     """
-    errors: dict[tuple[str, str], DetectionError] = {}
-    for frame, found in zip(frames, detections, strict=True):
-        found = found[np.flatnonzero(found.score >= threshold)] if found.score is not None else found
-        matched = np.zeros(len(found), dtype=bool)
-        for error in _misses(frame, found, matched, config):
-            errors.setdefault((error.scene, error.track), error)
-        for error in _false_positives(frame, found[~matched], config):
-            known = [e for e in errors.values() if e.kind == FALSE_POSITIVE and e.scene == error.scene]
-            if not any(_distance(e, error) <= SAME_PLACE_M for e in known):
-                track = f"{FALSE_POSITIVE}{len(known)}"
-                errors[(error.scene, track)] = DetectionError(**{**asdict(error), "track": track})
-    return list(errors.values())
+    kept: dict[tuple[str, str], PerceptionError] = {}
+    for error in errors:
+        if error.kind != FALSE_POSITIVE:
+            kept.setdefault((error.scene, error.track), error)
+            continue
+        known = [other for other in kept.values() if other.kind == FALSE_POSITIVE and other.scene == error.scene]
+        if not any(_distance(other, error) <= SAME_PLACE_M for other in known):
+            track = f"{FALSE_POSITIVE}{len(known)}"
+            kept[error.scene, track] = replace(error, track=track)
+    return tuple(kept.values())
 
 
-def save_errors(errors: Sequence[DetectionError], path: Path) -> None:
-    """Write the registry as Parquet, one column per field of `DetectionError`, atomically."""
+def save_errors(errors: Sequence[PerceptionError], path: Path) -> None:
+    """Write the registry as Parquet or CSV, by the ending of `path`; raises `InputError` for another one.
+
+    A column per field of `PerceptionError`, its `label` called "class": what `flcav place` reads.
+    """
     kinds = {float: pa.float64(), int: pa.int64(), str: pa.string()}
-    schema = pa.schema([(name, kinds[kind]) for name, kind in DetectionError.__annotations__.items()])
-    with atomic_path(path) as temporary:
-        pq.write_table(pa.Table.from_pylist([asdict(error) for error in errors], schema=schema), temporary)
+    schema = pa.schema([(name, kinds[kind]) for name, kind in PerceptionError.__annotations__.items()])
+    table = pa.Table.from_pylist([asdict(error) for error in errors], schema=schema)
+    table = table.rename_columns([CLASS if name == "label" else name for name in table.column_names])
+    write_table(table, path)
 
 
-def load_errors(path: Path) -> list[DetectionError]:
-    """Return the registry that `save_errors` wrote."""
-    return [DetectionError(**row) for row in pq.read_table(path).to_pylist()]
+def load_errors(path: Path) -> tuple[PerceptionError, ...]:
+    """Return the registry that `save_errors` wrote as Parquet."""
+    rows = pq.read_table(path).to_pylist()
+    return tuple(PerceptionError(**{("label" if name == CLASS else name): row[name] for name in row}) for row in rows)
 
 
-def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[DetectionError]:
-    """Return the objects not found, and mark in `matched` the detections that found something or lie on something."""
-    truth = frame.annotations
-    boxes = truth.boxes.transformed(inverse(frame.world_from_sensor(only_lidar(frame))))
-    label = detection_labels(truth.boxes.label, config.classes)
-    asked = (label != "") & (truth.returns >= 1) & in_range(boxes, config)
-    missed = asked.copy()
-    for name in config.classes:
-        own, objects = np.flatnonzero(found.label == name), np.flatnonzero(asked & (label == name))
-        target = assign_targets(found[own], boxes[objects], OVERLAP)
-        matched[own[target >= 0]] = True
-        missed[objects[target[target >= 0]]] = False
-    matched |= on_neutral(found, boxes)
-    return [
-        DetectionError(
-            *(float(value) for value in truth.boxes.center[i]),
-            weight=1.0,
-            kind=MISS,
-            label=str(label[i]),
-            returns=int(truth.returns[i]),
-            occlusion=float(truth.occlusion[i]),
-            scene=frame.scene,
-            track=str(truth.track[i]),
-        )
-        for i in np.flatnonzero(missed)
-    ]
-
-
-def _false_positives(frame: Frame, found: Boxes, config: SecondConfig) -> list[DetectionError]:
-    name = only_lidar(frame)
-    found = found[in_range(found, config)]
-    returns = points_in_boxes(frame.lidar[name], found).sum(1)
-    world = transform_points(frame.world_from_sensor(name), found.center)
-    return [
-        DetectionError(
-            *(float(value) for value in world[i]),
-            weight=1.0,
-            kind=FALSE_POSITIVE,
-            label=str(found.label[i]),
-            returns=int(returns[i]),
-            occlusion=float("nan"),
-            scene=frame.scene,
-            track="",
-        )
-        for i in np.flatnonzero(returns >= 1)
-    ]
-
-
-def _distance(a: DetectionError, b: DetectionError) -> float:
+def _distance(a: PerceptionError, b: PerceptionError) -> float:
     return float(np.linalg.norm([a.x - b.x, a.y - b.y, a.z - b.z]))

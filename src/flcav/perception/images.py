@@ -19,14 +19,16 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 SMALLEST_PX, LARGEST_PX = 32, 8192  # side of a picture
 
 
-def pictures(path: Path) -> Iterator[tuple[Path, Picture]]:
-    """Yield the pictures of a PNG, JPEG or WebP file, a folder of them, or a dataset folder, each with its own path.
+def pictures(path: Path, frames: Sequence[int] | None = None) -> Iterator[tuple[Path, Picture]]:
+    """Yield the pictures of a PNG, JPEG or WebP file, a folder of them, or `frames` of a dataset folder (None: all).
+
+    Each comes with its own path.
 
     Raises `InputError` for anything else, and for a picture that is damaged, not RGB or of a size out of bounds.
     """
     if (path / MANIFEST).is_file():
         data = Dataset.open(path)
-        return ((path / f"{frame.key}/{camera}", rgb) for frame, camera, rgb in recorded(data))
+        return ((path / f"{frame.key}/{camera}", rgb) for frame, camera, rgb in recorded(data, frames))
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
         if not files:

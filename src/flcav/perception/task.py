@@ -105,8 +105,13 @@ class Task(Protocol[ConfigT, NetworkT, SampleT]):
         """Return the one number of an evaluation that training is to raise."""
         ...
 
-    def infer(self, network: NetworkT, path: Path, threshold: float) -> Iterator[Finding]:
-        """Yield what is found in each input that `path` names; raises `InputError` for a bad one."""
+    def infer(
+        self, network: NetworkT, path: Path, threshold: float, frames: Sequence[int] | None = None
+    ) -> Iterator[Finding]:
+        """Yield what is found in each input that `path` names, of a dataset in these frames (None: all).
+
+        Raises `InputError` for a bad one.
+        """
         ...
 
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
@@ -122,8 +127,17 @@ class Task(Protocol[ConfigT, NetworkT, SampleT]):
 class Calibrates(Protocol):
     """A task whose trained networks are told, by frames they did not learn from, how far to trust their scores."""
 
-    def calibrate(self, network: Any, data: Dataset) -> None:
-        """Set the calibration in the network's configuration from all frames of `data`."""
+    def calibrate(self, network: Any, data: Dataset, frames: Sequence[int] | None = None) -> None:
+        """Set the calibration in the network's configuration from frames of `data` (None: all)."""
+        ...
+
+
+@runtime_checkable
+class RigBound(Protocol):
+    """A task whose networks expect sensors to stand where not every agent carries them."""
+
+    def fitting(self, data: Dataset, config: Any) -> Sequence[int]:
+        """Return the frames whose sensors stand as a network of `config` expects; raises `InputError` for none."""
         ...
 
 

@@ -1,6 +1,6 @@
 """A town from above, with what a placement is about."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +25,13 @@ MISS: dict[str, Any] = {
     "markeredgewidth": 0.5,
 }
 FALSE_POSITIVE: dict[str, Any] = {"marker": "x", "markersize": 5, "color": style.FALSE, "markeredgewidth": 1.3}
+FINAL_ERROR: dict[str, Any] = {**MISS, "marker": "^", "color": style.ORANGE}
+OTHER: dict[str, Any] = {**MISS, "marker": "D", "markersize": 4, "color": style.INK}
+KINDS = {
+    "miss": ("missed", MISS),
+    "false_positive": ("false positive", FALSE_POSITIVE),
+    "final_error": ("final error", FINAL_ERROR),
+}
 NOTE_M = 15.0  # about where a note stands above its pole
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
@@ -35,10 +42,16 @@ class ErrorMap:
 
     town: Town
     errors: Array  # (E, 3) world [m]
-    missed: NDArray[np.bool_]  # (E,) a missed object; else a false positive
-    chosen: Sequence[int]  # ids of the poles that were placed
-    densest: int  # id of the pole with most actors within range
-    range_m: float
+    kind: NDArray[np.str_]  # (E,) a key of KINDS, or what the user calls it
+    poles: Mapping[str, Array]  # candidate sites by id: (3,) world [m]
+    chosen: Collection[str] = ()  # ids of the poles that were placed
+    densest: str | None = None  # id of the pole with most actors within range
+    range_m: float = 0.0  # of the sensors that were placed
+
+
+def poles_of(town: Town) -> dict[str, Array]:
+    """Return a town's candidate sites by id."""
+    return {str(number): xyz for number, xyz in zip(town.poles.id, town.poles.position, strict=True)}
 
 
 def draw_town(axes: Axes, town: Town) -> None:
@@ -60,24 +73,24 @@ def draw_town(axes: Axes, town: Town) -> None:
 def draw_errors(axes: Axes, scene: ErrorMap) -> None:
     """Draw the town, its registered errors, and its poles: the chosen with what they cover, the densest marked."""
     draw_town(axes, scene.town)
-    poles = scene.town.poles
-    position = {int(number): xyz for number, xyz in zip(poles.id, poles.position, strict=True)}
     for number in scene.chosen:
-        reach = np.sqrt(max(scene.range_m**2 - position[number][2] ** 2, 0.0))  # of the sphere, at ground level
-        disc = Circle(tuple(position[number][:2]), reach, facecolor=style.BLUE, alpha=0.10, linewidth=0)
-        rim = Circle(tuple(position[number][:2]), reach, fill=False, edgecolor=style.BLUE, linewidth=1.2)
-        axes.add_patch(disc)
-        axes.add_patch(rim)
-    misses, falses = scene.errors[scene.missed], scene.errors[~scene.missed]
-    for xyz, look, label in ((misses, MISS, "object missed"), (falses, FALSE_POSITIVE, "false positive")):
+        at = scene.poles[number]
+        reach = np.sqrt(max(scene.range_m**2 - at[2] ** 2, 0.0))  # of the sphere, at ground level
+        axes.add_patch(Circle(tuple(at[:2]), reach, facecolor=style.BLUE, alpha=0.10, linewidth=0))
+        axes.add_patch(Circle(tuple(at[:2]), reach, fill=False, edgecolor=style.BLUE, linewidth=1.2))
+    for kind in dict.fromkeys([*KINDS, *scene.kind.tolist()]):
+        label, look = KINDS.get(kind, (kind, OTHER))
+        xyz = scene.errors[scene.kind == kind]
+        if not len(xyz):
+            continue
         axes.plot(*xyz[:, :2].T, linestyle="none", label=f"{label} ({len(xyz)})", **look)
-    for number, (x, y, _) in position.items():
+    for number, (x, y, _) in scene.poles.items():
         chosen, densest = number in scene.chosen, number == scene.densest
         face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)
         axes.plot(x, y, "s" if densest else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
-        axes.text(x, y, str(number), ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
+        axes.text(x, y, number, ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
         if note := " and ".join(word for word, said in (("placed", chosen), ("densest traffic", densest)) if said):
-            others = np.array([xyz[:2] for other, xyz in position.items() if other != number]).reshape(-1, 2)
+            others = np.array([xyz[:2] for other, xyz in scene.poles.items() if other != number]).reshape(-1, 2)
             _write_beside(axes, note, np.array([x, y]), others)
 
 

@@ -1,4 +1,4 @@
-"""A sweep's points, and boxes in the LiDAR's frame, drawn on what a camera saw."""
+"""A sweep's points, and boxes in their frame, drawn on what a camera saw."""
 
 import numpy as np
 from matplotlib import colormaps
@@ -14,6 +14,7 @@ from flcav.perception.camera_view import CameraView
 from flcav.report import style
 
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+TICK = 1.3  # of the way from the middle of a box to its front
 ALONG = np.linspace(0, 1, 33)  # of an edge: distortion bends it, and it may end behind the camera
 DISTANCES_M = Normalize(0, 60, clip=True)
 DISTANCE_COLOURS = ListedColormap(colormaps["turbo"](np.linspace(0.08, 0.92, 64))[::-1])
@@ -39,8 +40,14 @@ def points_on_picture(axes: Axes, points: NDArray[np.float32], view: CameraView)
 
 
 def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *, width: float = 1.0) -> None:
-    """Draw the edges of boxes (LiDAR frame) as far as they are in front of the camera."""
-    ends = boxes.corners()[:, EDGES]  # (boxes, edges, 2, 3)
+    """Draw the edges of boxes (in the points' frame) as far as they are in front of the camera.
+
+    A tick on the ground through its front says which way each box heads.
+    """
+    corners = boxes.corners()
+    foot, front = corners[:, :4].mean(axis=1), corners[:, (0, 3)].mean(axis=1)
+    ticks = np.stack((foot, foot + TICK * (front - foot)), axis=1)
+    ends = np.concatenate((corners[:, EDGES], ticks[:, None]), axis=1)  # (boxes, edges, 2, 3)
     along = ends[:, :, :1] + ALONG[:, None] * (ends[:, :, 1:] - ends[:, :, :1])
     lines = LineCollection(
         list(view.project(along.reshape(-1, 3)).reshape(-1, len(ALONG), 2)),

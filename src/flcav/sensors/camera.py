@@ -19,7 +19,7 @@ from flcav.world.weather import Weather
 class Camera(Lens):
     """What a camera is built like; its pose is the rig's."""
 
-    noise: float = Field(default=0.8, ge=0, le=20)  # standard deviation of a byte
+    noise: float = Field(default=0.8, ge=0, le=20)  # standard deviation of a colour value from 0 to 255
     drops: bool = True  # whether rain leaves drops on the lens
 
 

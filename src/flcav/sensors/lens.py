@@ -24,18 +24,20 @@ NEWTON_STEPS = 12
 class Lens(Config):
     """The geometry of an image."""
 
-    width: int = Field(default=640, ge=16, le=8192)  # [px]
-    height: int = Field(default=384, ge=16, le=8192)  # [px]
-    fov_deg: float = Field(default=90.0, gt=1, lt=170)  # horizontal; without effect where fx is given
-    fx: float | None = Field(default=None, ge=1, le=1e6)  # focal lengths [px]; fy is fx where it is not given
-    fy: float | None = Field(default=None, ge=1, le=1e6)
-    cx: float | None = Field(default=None, ge=-1e6, le=1e6)  # principal point [px]; else the image's centre
-    cy: float | None = Field(default=None, ge=-1e6, le=1e6)
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
+    width: int = Field(default=640, ge=16, le=8192)  # columns [px]
+    height: int = Field(default=384, ge=16, le=8192)  # rows [px]
+    fov_deg: float = Field(default=90.0, gt=1, lt=170)  # horizontal field of view; without effect where fx is given
+    fx: float | None = Field(default=None, ge=1, le=1e6)  # horizontal focal length [px]
+    fy: float | None = Field(default=None, ge=1, le=1e6)  # vertical focal length [px]; fx where it is not given
+    cx: float | None = Field(
+        default=None, ge=-1e6, le=1e6
+    )  # column of the principal point [px]; the image's centre where it is not given
+    cy: float | None = Field(default=None, ge=-1e6, le=1e6)  # row of the principal point [px], likewise
+    k1: float = 0.0  # radial distortion (Brown-Conrady, coefficients as OpenCV's), of r^2
+    k2: float = 0.0  # radial distortion, of r^4
+    p1: float = 0.0  # tangential distortion
+    p2: float = 0.0  # tangential distortion
+    k3: float = 0.0  # radial distortion, of r^6
 
     @model_validator(mode="after")
     def _check_distortion(self) -> "Lens":
@@ -75,7 +77,7 @@ def unproject(lens: Lens, pixels: ArrayLike) -> Array:
 
     NaN where the distortion lets no direction fall there.
     """
-    return _unproject(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
+    return unprojected(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
 
 
 def directions(lens: Lens) -> NDArray[np.float32]:
@@ -90,14 +92,15 @@ def _directions(
 ) -> NDArray[np.float32]:
     v, u = np.mgrid[:height, :width]
     pixels = np.stack((u.ravel(), v.ravel()), axis=1).astype(np.float64)
-    plane = _unproject(np.reshape(intrinsics, (3, 3)), np.array(distortion), pixels)
+    plane = unprojected(np.reshape(intrinsics, (3, 3)), np.array(distortion), pixels)
     rays = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
     rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
     rays.flags.writeable = False
     return rays
 
 
-def _unproject(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
+def unprojected(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
+    """Return `unproject` of a lens of which the matrix (3, 3) and the coefficients (5,) are known."""
     fx, fy, cx, cy = _focus(intrinsics)
     wanted = (pixels - (cx, cy)) / (fx, fy)
     if not distortion.any():

@@ -33,12 +33,12 @@ Turn = Annotated[float, Field(ge=-360, le=360)]
 class Mount(Config):
     """A sensor's pose on its agent: x forward, y left, z up; a camera looks along x. A positive pitch is downwards."""
 
-    x: Reach = 0.0
-    y: Reach = 0.0
-    z: Reach = 0.0
-    yaw_deg: Turn = 0.0
-    pitch_deg: Turn = 0.0
-    roll_deg: Turn = 0.0
+    x: Reach = 0.0  # forward [m]
+    y: Reach = 0.0  # to the left [m]
+    z: Reach = 0.0  # up [m]
+    yaw_deg: Turn = 0.0  # turned to the left
+    pitch_deg: Turn = 0.0  # tilted downwards
+    roll_deg: Turn = 0.0  # leaning to the right
 
     def agent_from_sensor(self) -> NDArray[np.float64]:
         """Return the (4, 4) transform; of a camera, with its body axes, not the optical ones."""
@@ -49,56 +49,56 @@ class Mount(Config):
 class Mounted(Config):
     """A sensor's pose, and when it looks."""
 
-    mount: Mount = Mount()
-    trigger_ms: float = Field(default=0.0, ge=-TRIGGER_MS, le=TRIGGER_MS)  # after the LiDAR spin
+    mount: Mount = Mount()  # where it is
+    trigger_ms: float = Field(default=0.0, ge=-TRIGGER_MS, le=TRIGGER_MS)  # when it looks, after the LiDAR spin
 
 
 class MountedLidar(Config):
     """A LiDAR and where it is. Its spin is the frame."""
 
-    mount: Mount = Mount()
-    settings: Lidar = Lidar()
+    mount: Mount = Mount()  # where it is
+    settings: Lidar = Lidar()  # what it is built like
 
 
 class MountedCamera(Mounted):
     """A camera and where it is."""
 
-    settings: Camera = Camera()
+    settings: Camera = Camera()  # what it is built like
 
 
 class MountedInfrared(Mounted):
     """A thermal camera and where it is."""
 
-    settings: Infrared = Infrared()
+    settings: Infrared = Infrared()  # what it is built like
 
 
 class MountedRadar(Mounted):
     """A radar and where it is."""
 
-    settings: Radar = Radar()
+    settings: Radar = Radar()  # what it is built like
 
 
 class MountedGnss(Mounted):
     """The antenna of a satellite receiver and where it is."""
 
-    settings: Gnss = Gnss()
+    settings: Gnss = Gnss()  # how good it is
 
 
 class MountedImu(Mounted):
     """An inertial measurement unit and where it is."""
 
-    settings: Imu = Imu()
+    settings: Imu = Imu()  # how good it is
 
 
 class Rig(Config):
     """The sensors of one agent, by name. A car's frame is at its ground centre, a pole's at its mount."""
 
-    lidars: dict[str, MountedLidar] = Field(default_factory=dict)
-    cameras: dict[str, MountedCamera] = Field(default_factory=dict)
-    infrareds: dict[str, MountedInfrared] = Field(default_factory=dict)
-    radars: dict[str, MountedRadar] = Field(default_factory=dict)
-    gnss: dict[str, MountedGnss] = Field(default_factory=dict)
-    imus: dict[str, MountedImu] = Field(default_factory=dict)
+    lidars: dict[str, MountedLidar] = Field(default_factory=dict)  # spinning LiDARs
+    cameras: dict[str, MountedCamera] = Field(default_factory=dict)  # colour, with depth and classes of each pixel
+    infrareds: dict[str, MountedInfrared] = Field(default_factory=dict)  # thermal cameras
+    radars: dict[str, MountedRadar] = Field(default_factory=dict)  # 77 GHz radars
+    gnss: dict[str, MountedGnss] = Field(default_factory=dict)  # satellite receivers
+    imus: dict[str, MountedImu] = Field(default_factory=dict)  # accelerometers and gyroscopes
 
     @model_validator(mode="after")
     def _check_names(self) -> "Rig":

@@ -59,20 +59,20 @@ class Recipe(Config):
     `spins_per_scene` spins, `every_s` apart, after `warmup_s` in which the town fills.
     """
 
-    town: str  # one of TOWNS, or the folder of a town: beside the recipe, or in the working directory
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    split: str = Field(default="train", pattern=r"^[A-Za-z0-9_-]+$")
-    scenes: int = Field(default=1, ge=1, le=MOST)
-    frames: int | None = Field(default=None, ge=1, le=MOST)  # exactly the first so many, by as many scenes as they take
-    warmup_s: Warmup = 60.0  # or from, to: each scene draws its own, so that scenes differ in what lights show
-    spins_per_scene: int = Field(default=10, ge=1, le=MOST)
-    every_s: Duration = 1.0
-    cavs: int = Field(default=1, ge=0, le=1000)
-    poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()
-    vehicle_rig: NamedRig = RIGS["lidar32"]
-    pole_rig: NamedRig = RIGS["lidar_pole"]
-    weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])
-    calibration_error: CalibrationError = CalibrationError()
+    town: str  # the name of a town, or the folder of one
+    seed: int = Field(default=0, ge=0, lt=2**63)  # of traffic, parked cars, sensor noise: the same seed, the same bytes
+    split: str = Field(default="train", pattern=r"^[A-Za-z0-9_-]+$")  # what the dataset is for; kept with it
+    scenes: int = Field(default=1, ge=1, le=MOST)  # traffic runs
+    frames: int | None = Field(default=None, ge=1, le=MOST)  # exactly so many, by as many scenes as they take
+    warmup_s: Warmup = 60.0  # until the first spin, as the town fills; two numbers: each scene draws one between them
+    spins_per_scene: int = Field(default=10, ge=1, le=MOST)  # every agent makes one frame at each
+    every_s: Duration = 1.0  # from one spin to the next, a multiple of 0.1
+    cavs: int = Field(default=1, ge=0, le=1000)  # connected vehicles with sensors: cav0, cav1, ...
+    poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()  # those with sensors, by number
+    vehicle_rig: NamedRig = RIGS["lidar32"]  # the name of a rig, or its sensors
+    pole_rig: NamedRig = RIGS["lidar_pole"]  # the same for every pole
+    weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])  # a name, values, or over time
+    calibration_error: CalibrationError = CalibrationError()  # how far off is what agents believe of their sensors
     scenarios: tuple[Scenario, ...] = ()  # corner cases that happen in every scene
 
     @model_validator(mode="after")

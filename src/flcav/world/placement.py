@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 CORNER_M = 9.0  # how far beyond an edge's ends its frontage may go on
 STEP_M = 1.0  # how far on to try where something did not fit
 CLEARANCE_M = 0.25  # kept between solid things
+SENSOR_CLEAR_M = 2.5  # no street lamp stands nearer to a roadside sensor: it hides the view
 SIGN_HEIGHT_M = 2.2  # of the plate's centre
 SPEED_SIGNS = {30: "speed_30", 60: "speed_60", 90: "speed_90"}  # [km/h]
 
@@ -125,12 +126,18 @@ def place_trees(rows: list[Verge], ground: Surfaces, plot: Plot, random: np.rand
     return _rows(out, 4)
 
 
-def place_lamps(rows: list[Verge], random: np.random.Generator) -> Array:
-    """Return street lamps (L, 3): foot x, y at the kerb, and height."""
+def place_lamps(rows: list[Verge], sensors: Array, random: np.random.Generator) -> Array:
+    """Return street lamps (L, 3): foot x, y at the kerb, and height.
+
+    A lamp that would stand within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) stands further along.
+    """
     out = []
     for verge in rows:
         for along in _stations(verge, verge.street.lamp_spacing_m, random):
             x, y, _ = verge.at(along, 0.3 - verge.half_width)
+            while len(sensors) and np.hypot(*(sensors[:, :2] - (x, y)).T).min() < SENSOR_CLEAR_M:
+                along += STEP_M
+                x, y, _ = verge.at(along, 0.3 - verge.half_width)
             out.append((x, y, 7.0))
     return _rows(out, 3)
 

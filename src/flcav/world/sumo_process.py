@@ -6,12 +6,14 @@ libsumo holds one simulation per process, and a second start silently replaces t
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from flcav.world.scenarios.director import Director
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import State
+from flcav.world.walking import Walkers
 
 STEP_S = 0.1
 
@@ -39,6 +41,7 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
     }
     libsumo.start(["sumo", *(part for name, value in options.items() for part in (f"--{name}", str(value)))])
     director = Director(libsumo, net, scenarios) if scenarios else None
+    walkers = Walkers(STEP_S)
     index: dict[str, int] = {}
     kinds: list[str] = []
     rows: list[tuple[int, int]] = []
@@ -54,16 +57,22 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
         rows.append((instant, index[name]))
         states.append(state)
 
+    def state_of(domain: Any, name: str) -> State:
+        return (*domain.getPosition(name), domain.getAngle(name), domain.getSpeed(name))
+
     for instant, step in enumerate(steps):
         while now < step:
             libsumo.simulationStep()
             now += 1
+            walkers.follow({name: state_of(libsumo.person, name) for name in libsumo.person.getIDList()})
             if director:
                 director.direct()
-        for domain in (libsumo.vehicle, libsumo.person):
-            for name in domain.getIDList():
-                state = (*domain.getPosition(name), domain.getAngle(name), domain.getSpeed(name))
-                note(instant, name, domain.getTypeID(name), director.stage.seen(name, state) if director else state)
+        for name in libsumo.vehicle.getIDList():
+            state = state_of(libsumo.vehicle, name)
+            kind = libsumo.vehicle.getTypeID(name)
+            note(instant, name, kind, director.stage.seen(name, state) if director else state)
+        for name, state in walkers.states.items():
+            note(instant, name, libsumo.person.getTypeID(name), state)
         light_states.append([libsumo.trafficlight.getRedYellowGreenState(light) for light in lights])
     libsumo.close()
     if director:

@@ -110,6 +110,7 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
     clutter = placement.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
     trees = placement.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
     poles = placement.place_poles(net, parameters.poles)
+    mounts = np.array([row[1] for row in poles], dtype=np.float64).reshape(-1, 3)
     signs = placement.place_signs(net)
     low_x, low_y, high_x, high_y = shapely.union_all([paved, *facades]).bounds
     return Town(
@@ -126,7 +127,7 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
         clutter=clutter,
         poles=Poles(
             id=np.array([row[0] for row in poles], dtype=np.int64),
-            position=np.array([row[1] for row in poles], dtype=np.float64).reshape(-1, 3),
+            position=mounts,
             yaw=np.array([row[2] for row in poles], dtype=np.float64),
             kind=tuple(row[3] for row in poles),
         ),
@@ -135,6 +136,6 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
             yaw=np.array([row[1] for row in signs], dtype=np.float64),
             kind=tuple(row[2] for row in signs),
         ),
-        lamps=placement.place_lamps(rows, stream(parameters.seed, "lamps")),
-        signals=place_signals(net, np.array([row[1] for row in poles], np.float64).reshape(-1, 3)),
+        lamps=placement.place_lamps(rows, mounts, stream(parameters.seed, "lamps")),
+        signals=place_signals(net, mounts),
     )

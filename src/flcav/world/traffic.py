@@ -95,13 +95,15 @@ def _trace(
     parked: list[Parked],
 ) -> Trace:
     before, now, after = windows
-    state = _smooth(raw, now)
-    rates = _rates(_smooth(raw, before), state, _smooth(raw, after))
+    earlier, state, later = (_smooth(raw, window) for window in (before, now, after))
+    rates = _rates(earlier, state, later)
     seen = np.flatnonzero(~np.isnan(state[..., 0]).all(axis=0))
     order = np.array(sorted(seen, key=lambda i: _natural(str(raw["id"][i]))), dtype=np.int64)
     known = {name: (category, shape) for name, category, shape in types()}
     kinds = [known[str(raw["type"][i])] for i in order] + [(car.category, car.shape) for car in parked]
     size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], dtype=np.float64).reshape(-1, 3)
+    half_length = size[: len(order), 0] / 2  # from an actor's front, which SUMO moves, to its centre
+    walk = _walk(*(_centre(step[:, order], half_length) for step in (earlier, state, later)))
     still = np.array([(car.x, car.y, car.yaw, 0.0) for car in parked], dtype=np.float64).reshape(-1, 4)
     state = np.concatenate((state[:, order], np.broadcast_to(still, (len(time_s), *still.shape))), axis=1)
     rates = np.concatenate((rates[:, order], np.zeros((len(time_s), *still.shape))), axis=1)
@@ -109,8 +111,10 @@ def _trace(
     x, y, yaw, speed = np.moveaxis(state, 2, 0)
     forward = np.stack((np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)), axis=2)
     pedestrian = np.array([category == "pedestrian" for category, _ in kinds])
+    velocity, acceleration = speed[..., None] * forward, rates[..., :3]
+    walking = np.flatnonzero(pedestrian)  # SUMO moves people aside without turning them
+    velocity[:, walking], acceleration[:, walking] = (motion[:, walking] for motion in walk)
     z = np.where(np.isnan(x), np.nan, KERB_M * (shapely.contains_xy(_pavement(town), x, y) & pedestrian))
-    front_to_centre = np.where(np.arange(len(kinds)) < len(order), size[:, 0] / 2, 0.0)
     lights = [(light, len(letters)) for light, letters in zip(raw["light"], raw["light_state"][0])]
     letters = [list("".join(row)) for row in raw["light_state"][now[:, SMOOTHING_STEPS]]]
     return Trace(
@@ -121,10 +125,10 @@ def _trace(
         shape=np.array([shape for _, shape in kinds], dtype=np.int64),
         size=size,
         present=~np.isnan(yaw),
-        position=np.stack((x, y, z), axis=2) - front_to_centre[:, None] * forward,
+        position=np.concatenate((_centre(state, np.append(half_length, np.zeros(len(still)))), z[..., None]), axis=2),
         yaw=yaw,
-        velocity=speed[..., None] * forward,
-        acceleration=rates[..., :3],
+        velocity=velocity,
+        acceleration=acceleration,
         yaw_rate=rates[..., 3],
         light=np.array([f"{light}:{i}" for light, links in lights for i in range(links)], dtype=np.str_),
         light_state=np.array(letters, dtype="<U1").reshape(len(time_s), -1),
@@ -174,6 +178,27 @@ def _rates(before: Array, now: Array, after: Array) -> Array:
     known = ~np.isnan(changes)
     mean = np.where(known, changes, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.where(np.isnan(now), np.nan, mean / STEP_S)
+
+
+def _centre(state: Array, half_length: Array) -> Array:
+    """Return (T, A, 2) the centres of actors whose front, yaw and speed are `state` (T, A, 4)."""
+    yaw = state[..., 2]
+    return state[..., :2] - half_length[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), axis=2)
+
+
+def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
+    """Return velocities [m/s] and accelerations [m/s^2] (T, A, 3) of positions (T, A, 2) a step before, now, and after.
+
+    One-sided, without an acceleration, where an actor has just come or is about to leave; NaN where it is absent now.
+    """
+    steps = np.stack((now - before, after - now)) / STEP_S
+    known = ~np.isnan(steps)
+    velocity = np.where(known, steps, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    acceleration = np.where(known.all(axis=0), steps[1] - steps[0], 0.0) / STEP_S
+    absent = np.isnan(now[..., :1])
+    level = np.zeros_like(absent, dtype=np.float64)
+    motions = (np.where(absent, np.nan, np.concatenate((flat, level), axis=2)) for flat in (velocity, acceleration))
+    return next(motions), next(motions)
 
 
 def _beside(raw: dict[str, NDArray], parked: list[Parked]) -> list[Parked]:

@@ -16,10 +16,10 @@ NIGHT_DEG = -6.0  # end of civil twilight: street lamps and headlamps are on
 class Weather(Config):
     """The weather of one instant."""
 
-    sun_elevation_deg: float = Field(default=45.0, ge=-90, le=90)
+    sun_elevation_deg: float = Field(default=45.0, ge=-90, le=90)  # above the horizon; night below -6
     sun_azimuth_deg: float = 160.0  # clockwise from north
     cloud_cover: float = Field(default=0.1, ge=0, le=1)  # share of the sky
-    rain_mm_h: float = Field(default=0.0, ge=0, le=300)
+    rain_mm_h: float = Field(default=0.0, ge=0, le=300)  # rain rate
     visibility_m: float = Field(default=NO_FOG_M, ge=5, le=1e6)  # meteorological optical range, of haze and fog alone
     wetness: float = Field(default=0.0, ge=0, le=1)  # of the road: 0 dry, 1 under water
 
@@ -140,7 +140,7 @@ class Keyframe(Config):
     """The weather at one time."""
 
     at_s: float = Field(ge=0)  # after the scene's first spin
-    weather: Annotated[Weather, BeforeValidator(_named)]
+    weather: Annotated[Weather, BeforeValidator(_named)]  # the name of a preset, or values
 
 
 class WeatherSchedule(Config):
@@ -151,9 +151,9 @@ class WeatherSchedule(Config):
     the list of keyframes alone. A weather is its fields, the name of a preset, or a `preset` with fields given anew.
     """
 
-    keyframes: tuple[Keyframe, ...] = ()
-    classes: tuple[str, ...] = ()  # of WEATHER_CLASSES; "any": of the whole space
-    turn_s: float | None = Field(default=None, gt=0, exclude_if=lambda value: value is None)
+    keyframes: tuple[Keyframe, ...] = ()  # between them everything changes evenly
+    classes: tuple[str, ...] = ()  # one is drawn for each scene; "any": of the whole space
+    turn_s: float | None = Field(default=None, gt=0, exclude_if=lambda value: value is None)  # from class to class
 
     @model_validator(mode="before")
     @classmethod

@@ -13,6 +13,7 @@ from painted_source import CATEGORIES, PaintedSource
 from flcav.cli.main import run
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.extras import installation
 from flcav.world.lanes import map_layers
 from flcav.world.town import load_town
 
@@ -100,7 +101,7 @@ def test_a_scene_can_be_chosen(dataset: Dataset, tmp_path: Path, capsys: pytest.
 @pytest.mark.skipif(not WITHOUT_RERUN, reason="rerun-sdk is installed")
 def test_without_rerun_one_sentence_says_how_to_get_it(dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     assert _view(dataset) == 2
-    assert "pip install 'flcav[view]'" in capsys.readouterr().err
+    assert installation("view") in capsys.readouterr().err
 
 
 @needs_rerun

@@ -13,7 +13,16 @@ from flcav.report.clouds import compare, real_frame
 
 def result(ap):
     measures = [(kind, iou) for kind in ("3d", "bev") for iou in (0.5, 0.7)]
-    row = {"class": "Car", "low": ap, "high": ap, "targets": 12, "hidden": 0, "ap": ap}
+    row = {
+        "class": "Car",
+        "low": ap,
+        "high": ap,
+        "targets": 12,
+        "hidden": 0,
+        "ap": ap,
+        "aos": ap - 0.1,
+        "right_headings": 0.95,
+    }
     sliced = {"class": "Car", "by": "distance", "slice": "0-20 m", "targets": 7, "ap": ap}
     return {
         "scores": [row | {"kind": kind, "iou": iou} for kind, iou in measures],
@@ -50,7 +59,7 @@ def test_what_is_reached_is_said_with_its_interval():
 
 def test_tables_hold_classes_slices_and_tracks():
     tables = objects_tables.tables(study((0.8, 0.9)))
-    assert "| suburb | Car | 12 | 0.850 | 0.850 | 0.850 | 0.850 | 0.040 |" in tables["classes"]
+    assert "| suburb | Car | 12 | 0.850 | 0.850 | 0.850 | 0.850 | 0.750 | 0.950 | 0.040 |" in tables["classes"]
     assert "| suburb | distance 0-20 m | 7 |" in tables["slices"]
     assert "| Car | 0.700 | 0.600 | 2.000 | 0.500 |" in tables["tracks"]
     assert "| 1 | 40 | 60 | 0.25, 0.50 |" in tables["training"]

@@ -8,7 +8,7 @@ from flcav.experiments import pretraining
 from flcav.experiments.pretraining import next_factor, own_label_threshold
 from flcav.experiments.protocol import Training
 from flcav.geometry import Boxes
-from flcav.perception.objects.evaluate import Truth
+from flcav.perception.objects.evaluate import Asked
 
 TRAINING = Training(max_blocks=6, patience=2, min_gain=0.01, cooldown=(0.3, 0.05))
 
@@ -64,8 +64,8 @@ def test_own_labels_start_where_nine_of_ten_are_right(
 ):
     hits = [(10.0 * i, score) for i, score in enumerate(scores_of_hits, start=1)]
     misses = [(-10.0 * i, score) for i, score in enumerate(scores_of_misses, start=1)]
-    truth = Truth("s", cars(*hits), Boxes.empty(), Boxes.empty())
-    monkeypatch.setattr(pretraining, "truth_of", lambda frame, config: truth)
+    truth = Asked("s", cars(*hits), Boxes.empty(), Boxes.empty())
+    monkeypatch.setattr(pretraining, "asked_of", lambda frame, config: truth)
     monkeypatch.setattr(pretraining, "detect_all", lambda network, clouds: [cars(*hits, *misses)])
 
     class OneFrame:

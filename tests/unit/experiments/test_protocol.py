@@ -29,3 +29,8 @@ def test_frames_lie_at_least_two_seconds_apart():
     assert all(getattr(Protocol(), split).every_s >= 2 for split in SPLITS)
     with pytest.raises(ValidationError, match="greater than or equal to 2"):
         Split(scenes=1, spins=2, cavs=1, every_s=1.0)
+
+
+def test_intervals_need_test_frames_of_several_scenes():
+    with pytest.raises(ValidationError, match="two scenes or more are wanted: intervals are over scenes"):
+        Protocol(test=Split(scenes=1, spins=2, cavs=1))

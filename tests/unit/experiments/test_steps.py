@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -26,10 +27,36 @@ def fail(work: Work) -> None:
     raise ValueError("broken step")
 
 
+def count_threads(work: Work) -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
 def sleep(work: Work) -> int:
     (work.folder / "started").touch()
     time.sleep(60)
     return 0
+
+
+@dataclass(frozen=True)
+class Setting:
+    share: float = 0.5
+
+
+@dataclass(frozen=True)
+class Other:
+    share: float = 0.5
+
+
+@dataclass(frozen=True)
+class Around:
+    inner: Setting | Other
+
+
+def refuse(work: Work, setting: Setting | Other) -> None:
+    count(work, 0)
+    raise ValueError("broken step")
 
 
 STEPS = [
@@ -49,10 +76,36 @@ def test_steps_run_once_and_hand_their_values_on(tmp_path):
     assert (tmp_path / "a" / "calls").read_text() == "x"
 
 
+def test_a_step_computes_on_one_thread(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    assert run_steps([Step("threads", count_threads, {})], tmp_path, jobs=1, notify=quiet) == {"threads": 1}
+
+
 def test_a_folder_of_another_configuration_is_refused(tmp_path):
     run_steps(STEPS[:1], tmp_path, jobs=1, notify=quiet)
     with pytest.raises(InputError, match="another configuration"):
         run_steps([Step("a", count, {"start": 5})], tmp_path, jobs=1, notify=quiet)
+
+
+def test_a_step_that_was_begun_is_not_gone_on_with_as_another(tmp_path):
+    def begun(setting: Setting | Other) -> list[Step]:
+        return [Step("a", refuse, {"setting": setting})]
+
+    for attempt in (1, 2):
+        with pytest.raises(ValueError, match="broken step"):
+            run_steps(begun(Setting()), tmp_path, jobs=1, notify=quiet)
+        assert (tmp_path / "a" / "calls").read_text() == "x" * attempt
+    for other in (Setting(0.25), Other()):
+        with pytest.raises(InputError, match="another configuration"):
+            run_steps(begun(other), tmp_path, jobs=1, notify=quiet)
+    assert (tmp_path / "a" / "calls").read_text() == "xx"
+
+
+def test_records_among_the_arguments_are_told_apart_by_class_and_fields():
+    settings = (Setting(), Setting(0.25), Other(), Around(Setting()), Around(Other()))
+    assert len({Step("a", refuse, {"setting": setting}).fingerprint({}) for setting in settings}) == len(settings)
+    with pytest.raises(TypeError, match="neither a JSON value nor a dataclass"):
+        Step("a", refuse, {"setting": object()}).fingerprint({})
 
 
 def test_a_failing_step_ends_the_run_and_keeps_what_was_finished(tmp_path):

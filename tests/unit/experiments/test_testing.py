@@ -5,7 +5,7 @@ import pytest
 
 from flcav.experiments import testing
 from flcav.geometry import Boxes
-from flcav.perception.objects.evaluate import Evaluation, Truth, score_detections
+from flcav.perception.objects.evaluate import Asked, Evaluation, score_detections
 
 SCENES = 6
 
@@ -15,7 +15,7 @@ def evaluation(found: int) -> Evaluation:
     rows = np.array([(x, 0.0, 0.0, 4.0, 2.0, 1.6, 0.0) for x in (10.0, 20.0, 30.0)])
     cars = Boxes.from_array(rows, "Car")
     seen = Boxes.from_array(rows[:found], "Car", np.linspace(0.9, 0.5, 3)[:found])
-    truths = [Truth(f"s{i // 2}", cars, Boxes.empty(), Boxes.empty()) for i in range(2 * SCENES)]
+    truths = [Asked(f"s{i // 2}", cars, Boxes.empty(), Boxes.empty()) for i in range(2 * SCENES)]
     return score_detections([seen] * len(truths), truths, ("Car",))
 
 

@@ -1,13 +1,14 @@
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from flwr.supercore.task_identity import TaskIdentity
 from regression import START, TRUTH, ledger, vehicles
 
+from flcav.federation.rounds import ClientFailed
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, federate
-from flcav.federation.strategies.fedavg import ClientFailed, average
+from flcav.federation.strategies.fedavg import FedAvg, average
 from flcav.network.ledger import BudgetExceeded
 from flcav.network.plan import MessageSizes, StagePlan, price
 from flcav.seeds import child_seed
@@ -52,6 +53,47 @@ def test_integer_buffers_are_not_averaged():
 def test_clients_of_another_network_are_refused():
     with pytest.raises(ValueError, match="different"):
         average([{"w": np.zeros(3)}, {"w": np.zeros(4)}], [1, 1])
+
+
+@dataclass(frozen=True)
+class Only:
+    """A strategy that listens to one client alone."""
+
+    client: int = 0
+    renamed: str = "w"
+
+    def combine(self, start, updates):
+        weights = dict(updates[self.client].weights)
+        return {self.renamed: weights.pop("w"), **weights}
+
+
+def test_a_federation_does_as_its_strategy_says():
+    clients = vehicles("grid", 3)
+    alone = federate({"grid/cav1": clients["grid/cav1"]}, START, SCHEDULE, edge())
+    led = federate(clients, START, SCHEDULE, edge(), strategy=Only(1))
+    np.testing.assert_array_equal(led.weights["w"], alone.weights["w"])
+    assert led.samples == 4 + 5 + 6
+
+
+def test_an_edge_server_has_a_strategy_of_its_own():
+    clients = vehicles("grid", 3)
+    update = {"steps": 5, "learning_rate": 0.05, "seed": 1}
+    server, plain = (EdgeServer(clients, 2, edge(), START, strategy=how) for how in (Only(2), FedAvg()))
+    alone = EdgeServer({"grid/cav2": clients["grid/cav2"]}, 2, edge(), START)
+    found = [each.train(START, **update).weights["w"] for each in (server, alone, plain)]
+    np.testing.assert_array_equal(found[0], found[1])
+    assert not np.array_equal(found[0], found[2])
+
+
+def test_a_strategy_that_returns_other_arrays_is_refused():
+    with pytest.raises(ValueError, match="Only returned arrays of other names"):
+        federate(vehicles("grid", 2), START, SCHEDULE, edge(), strategy=Only(renamed="v"))
+
+
+@pytest.mark.parametrize("shares", [[0, 0], [1, -1], [1, np.nan], [np.inf, 1]])
+def test_shares_that_make_no_mean_are_refused(shares):
+    with pytest.raises(ValueError, match="they must be 0 or more"):
+        average([{"w": np.zeros(1)}] * 2, shares)
 
 
 def test_a_resumed_federation_ends_where_an_uninterrupted_one_does():

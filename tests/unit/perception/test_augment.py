@@ -13,7 +13,8 @@ from flcav.perception.objects.augment import augment, in_view, resized, sheared,
 from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.model import small_config
 from flcav.perception.objects.paste import cut, free, pasted
-from flcav.perception.objects.samples import MIN_RETURNS, Sample, near_range
+from flcav.perception.objects.samples import Sample, near_range
+from flcav.perception.objects.truth import MIN_RETURNS
 
 
 def scene(seed: int, objects: int = 12, per_object: int = 20) -> Sample:

@@ -1,8 +1,7 @@
 """Where points fall on a picture, against the renderer's own depths, KITTI's formula and what can be seen by eye."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +11,6 @@ from PIL import Image
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration
 from flcav.dataset.formats.kitti.export import calibration_lines
-from flcav.dataset.recorder import record
-from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.camera_view import CameraView, kitti_view, recorded_view, view_beside
 from flcav.perception.objects.infer import box_rows, boxes_of_rows
@@ -35,28 +32,6 @@ CAR_AHEAD = ("veh1", "car", 0, 12.0, -2.0, 0.1)
 OPTICAL = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=float)
 
 
-@dataclass(frozen=True)
-class Once:
-    """A source of one frame."""
-
-    seen: Frame
-
-    def describe(self) -> dict[str, Any]:
-        return {"town": "none", "split": "test", "seed": 0}
-
-    def scenes(self) -> list[str]:
-        return [self.seen.scene]
-
-    def frame_count(self, scene: str) -> int:
-        return 1
-
-    def frames(self, scene: str):
-        yield self.seen
-
-    def trace(self, scene: str) -> None:
-        return None
-
-
 @pytest.fixture(scope="module")
 def seen(small_town, standing):
     street = Scene(small_town(), standing([("cav0", "car", 3, 0.0, -2.0, 0.0), CAR_AHEAD]))
@@ -69,12 +44,7 @@ def seen(small_town, standing):
     return look
 
 
-def recorded(frame: Frame, out: Path) -> Dataset:
-    record(Once(frame), out)
-    return Dataset.open(out)
-
-
-def test_points_fall_where_the_renderer_has_their_depth(seen, tmp_path):
+def test_points_fall_where_the_renderer_has_their_depth(seen, recorded, tmp_path):
     frame = seen({"left": ASIDE, "front": LOW, "rear": BEHIND})
     view = recorded_view(recorded(frame, tmp_path), 0, "top")
     assert view is not None
@@ -83,22 +53,22 @@ def test_points_fall_where_the_renderer_has_their_depth(seen, tmp_path):
     points = points[view.shows(points)]
     assert len(points) > 1000
     column, row = np.rint(view.project(points)).astype(int).T
-    error = np.abs(frame.images["front"].depth_m[row, column] - transform_points(view.camera_from_lidar, points)[:, 2])
+    error = np.abs(frame.images["front"].depth_m[row, column] - transform_points(view.camera_from_points, points)[:, 2])
     assert np.median(error) < 0.05
     assert (error < 0.5).mean() > 0.9
 
 
-def test_it_is_drawn_as_the_agent_believes_its_sensors_to_be(seen, tmp_path):
+def test_it_is_drawn_as_the_agent_believes_its_sensors_to_be(seen, recorded, tmp_path):
     frame = seen({"front": LOW})
     believed = assume(frame.calibration, CalibrationError(rotation_deg=1.0), seed=1, agent="cav0")
     view = recorded_view(recorded(replace(frame, assumed=believed), tmp_path), 0, "top")
     assert view is not None
     from_top = np.linalg.inv(believed.agent_from_sensor["front"]) @ believed.agent_from_sensor["top"]
-    np.testing.assert_allclose(view.camera_from_lidar, from_top, atol=1e-9)
+    np.testing.assert_allclose(view.camera_from_points, from_top, atol=1e-9)
 
 
 @pytest.mark.parametrize("mounts", [{}, {"left": ASIDE, "rear": BEHIND}])
-def test_where_no_camera_looks_ahead_there_is_no_view(mounts, seen, tmp_path):
+def test_where_no_camera_looks_ahead_there_is_no_view(mounts, seen, recorded, tmp_path):
     assert recorded_view(recorded(seen(mounts), tmp_path), 0, "top") is None
 
 
@@ -177,8 +147,9 @@ def test_boxes_are_drawn_as_far_as_the_camera_can_see_them(folder):
         ]
         return sum(int(np.isfinite(edge).all(1).sum()) for edge in edges if len(edge))
 
-    assert drawn(12, 0) == 12 * len(ALONG)
-    assert 0 < drawn(0.5, 0) < 12 * len(ALONG)
+    lines = 13 * len(ALONG)  # twelve edges and the tick
+    assert drawn(12, 0) == lines
+    assert 0 < drawn(0.5, 0) < lines
     assert drawn(-9, 0) == 0
 
 

@@ -7,7 +7,9 @@ import pytest
 
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.perception.agents import choose_frames
 from flcav.perception.card import Card, data_entry
+from flcav.perception.weather.task import WEATHER
 from flcav.sensors.rig import RIGS
 
 from .frames import frame
@@ -79,7 +81,8 @@ class Once:
 def test_a_dataset_s_entry_names_its_rig_where_it_has_a_name(known, tmp_path):
     rig = RIGS["kitti_lidar"].model_dump(mode="json")
     record(Once(rig if known else {**rig, "cameras": {"front": {}}}), tmp_path / "run" / "data")
-    entry = data_entry(Dataset.open(tmp_path / "run" / "data"))
+    data = Dataset.open(tmp_path / "run" / "data")
+    entry = data_entry(data, choose_frames(WEATHER, None, data))
     assert entry["recipe"].get("vehicle_rig") == ("kitti_lidar" if known else None)
     assert entry["recipe"]["warmup_s"] == 5.0
-    assert (entry["name"], entry["frames"]) == ("run/data", 1)
+    assert (entry["name"], entry["frames"], entry["agents"]) == ("run/data", 1, ["cav0"])

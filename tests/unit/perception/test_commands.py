@@ -141,7 +141,7 @@ def test_other_bad_input_is_one_sentence(data, weights, tmp_path, capsys):
     (tmp_path / "broken").write_bytes(b"no weights")
     (tmp_path / "empty").mkdir()
     cases = {
-        "choose one of weather": ("train", "poetry", "--data", data, "--out", tmp_path / "o"),
+        "'poetry' is not one of 'weather'": ("train", "poetry", "--data", data, "--out", tmp_path / "o"),
         "choose one of tiny, small, paper": (
             *("train", "objects", "--data", data, "--out", tmp_path / "o", "--network", "huge"),
         ),

@@ -7,10 +7,12 @@ import pytest
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
-from flcav.perception.errors import load_errors, register_errors, save_errors
+from flcav.perception.errors import load_errors, save_errors
 from flcav.perception.objects import sample_from_frame, second_paper, second_tiny
-from flcav.perception.objects.evaluate import evaluate, score_detections, truth_of
+from flcav.perception.objects.errors import register_errors
+from flcav.perception.objects.evaluate import asked_of, evaluate, score_detections
 from flcav.perception.objects.samples import checked_points
+from flcav.perception.objects.truth import ground_truth
 
 from .frames import cloud_in, detections, frame
 
@@ -32,7 +34,7 @@ def xs(boxes):
 
 
 def test_truth_follows_the_rules():
-    truth = truth_of(frame(MIXED, at=(100, 50), yaw=1.0), CONFIG)
+    truth = asked_of(frame(MIXED, at=(100, 50), yaw=1.0), CONFIG)
     assert xs(truth.targets) == [10, 20]
     assert xs(truth.neutral) == [-10, 20, 30, 40, 49]
     assert xs(truth.hidden) == [40]
@@ -41,7 +43,7 @@ def test_truth_follows_the_rules():
 
 
 def test_other_classes_are_found_by_networks_that_know_them():
-    truth = truth_of(frame(MIXED), second_paper().config)
+    truth = asked_of(frame(MIXED), second_paper().config)
     assert set(truth.targets.label) == {"Car", "Pedestrian"}
 
 
@@ -57,16 +59,17 @@ def test_points_out_of_every_augmentation_are_left_out():
 
 
 def test_scores_count_targets_and_hidden_objects():
-    truths = [truth_of(frame(MIXED, scene=f"s{i}"), CONFIG) for i in range(3)]
+    truths = [asked_of(frame(MIXED, scene=f"s{i}"), CONFIG) for i in range(3)]
     found = [detections((10, 0, 0.9), (20, 0, 0.8), (30, 0, 0.7), (40, 0, 0.6))] * 3
     result = score_detections(found, truths, ("Car",))
     assert result.score("Car", "3d", 0.7).ap == 1
     row = result.summary()["scores"][0]
     assert row == {
-        "class": "Car", "kind": "3d", "iou": 0.5, "ap": 1.0, "low": 1.0, "high": 1.0, "targets": 6, "hidden": 3
+        "class": "Car", "kind": "3d", "iou": 0.5, "ap": 1.0, "low": 1.0, "high": 1.0, "aos": 1.0,
+        "right_headings": 1.0, "targets": 6, "hidden": 3
     }  # fmt: skip
     assert result.frames == 3
-    nothing = score_detections([Boxes.empty()], [truth_of(frame([]), CONFIG)], ("Car",))
+    nothing = score_detections([Boxes.empty()], [asked_of(frame([]), CONFIG)], ("Car",))
     assert nothing.summary()["scores"][0]["ap"] is None
 
 
@@ -103,7 +106,7 @@ def test_false_positives_need_a_return_and_are_one_per_place():
 
 def test_detections_on_a_bus_or_a_hidden_car_are_no_mistakes():
     found = detections((40, 0, 0.9), (20, 12, 0.9))
-    assert register_errors([frame(MIXED[3:5], points=cloud_in(found))], [found], CONFIG) == []
+    assert register_errors([frame(MIXED[3:5], points=cloud_in(found))], [found], CONFIG) == ()
 
 
 def test_the_registry_is_a_parquet_table(tmp_path):
@@ -112,7 +115,7 @@ def test_the_registry_is_a_parquet_table(tmp_path):
     save_errors(errors, tmp_path / "errors.parquet")
     assert repr(load_errors(tmp_path / "errors.parquet")) == repr(errors)
     save_errors([], tmp_path / "none.parquet")
-    assert load_errors(tmp_path / "none.parquet") == []
+    assert load_errors(tmp_path / "none.parquet") == ()
 
 
 @pytest.mark.parametrize(
@@ -126,3 +129,21 @@ def test_the_registry_is_a_parquet_table(tmp_path):
 def test_bad_clouds_are_refused(points, sentence):
     with pytest.raises(InputError, match=sentence):
         checked_points(points, "cloud")
+
+
+def test_one_rule_says_which_objects_count():
+    truth = ground_truth(frame(MIXED), CONFIG)
+    names = [row[0] for row in MIXED]
+    of = {name: [n for n, own in zip(names, getattr(truth, name), strict=True) if own] for name in RULES}
+    assert of == RULES
+    assert not (truth.target & truth.faint).any()
+    assert truth.boxes.label[names.index("bus")] == "Car"
+
+
+RULES = {
+    "target": ["seen", "van"],
+    "faint": ["faint"],
+    "hidden": ["hidden"],
+    "lookalike": ["bus"],
+    "enough": ["seen", "van", "behind", "far"],
+}

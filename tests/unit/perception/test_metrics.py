@@ -1,10 +1,21 @@
 """Matching and average precision against hand-made cases and a slow, separate implementation."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flcav.geometry import Boxes, concatenate
-from flcav.perception.metrics import Matches, average_precision, bootstrap_difference, bootstrap_interval, match
+from flcav.perception.metrics import (
+    Matches,
+    average_precision,
+    bootstrap_difference,
+    bootstrap_interval,
+    match,
+    orientation_similarity,
+    right_headings,
+)
 
 CAR = (0.0, 4.0, 1.8, 1.5, 0.0)  # z, length, width, height, yaw
 
@@ -13,19 +24,22 @@ def cars(*xs, scores=None):
     return Boxes.from_array([(x, 0.0, *CAR) for x in xs], "Car", scores)
 
 
-def slow_ap(matches, frames):
-    """AP|R40 by its definition: every threshold, every recall, no vectors."""
+def slow_ap(matches, frames, worth=lambda turned: 1.0):
+    """AP|R40 by its definition: every threshold, every recall, no vectors; `worth` of a hit, by its angle."""
     wanted = sum(int(matches.targets[f]) for f in frames)
     points = []
     for threshold in sorted(set(matches.score.tolist())):
-        hits = found = 0
+        hits = found = right = 0
         for f in frames:
-            for score, hit, frame in zip(matches.score, matches.hit, matches.frame, strict=True):
+            for score, hit, turned, frame in zip(
+                matches.score, matches.hit, matches.turned, matches.frame, strict=True
+            ):
                 if frame == f and score >= threshold:
                     found += 1
                     hits += bool(hit)
+                    right += worth(turned) if hit else 0.0
         if found:
-            points.append((hits / wanted, hits / found))
+            points.append((hits / wanted, right / found))
     return sum(max((p for r, p in points if r >= i / 40 - 1e-12), default=0.0) for i in range(1, 41)) / 40
 
 
@@ -38,7 +52,8 @@ def random_matches(rng, frames=12, detections=60):
         hit[own[targets[f] :]] = False
     score = np.round(rng.random(detections), 1)  # many ties
     order = np.argsort(-score, kind="stable")
-    return Matches(score[order], hit[order], frame[order], targets)
+    turned = np.where(hit, rng.choice([0.1, 3.0], detections), np.nan)
+    return Matches(score[order], hit[order], turned[order], frame[order], targets)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -48,6 +63,30 @@ def test_average_precision_is_its_definition(seed):
     assert average_precision(matches) == pytest.approx(slow_ap(matches, range(12)), abs=1e-12)
     drawn = rng.integers(0, 12, 12)
     assert average_precision(matches, drawn) == pytest.approx(slow_ap(matches, drawn.tolist()), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_orientation_similarity_is_its_definition(seed):
+    matches = random_matches(np.random.default_rng(seed))
+    wanted = slow_ap(matches, range(12), lambda turned: (1 + math.cos(turned)) / 2)
+    assert orientation_similarity(matches) == pytest.approx(wanted, abs=1e-12)
+    assert orientation_similarity(matches) < average_precision(matches)
+
+
+def test_headings_of_found_cars_are_compared_with_those_of_their_targets():
+    targets = [
+        Boxes.from_array([(x, 0.0, 0.0, 4.0, 1.8, 1.5, yaw) for x, yaw in ((0, 3.1), (20, 0.0), (40, 1.0))], "Car")
+    ]
+    turned = [
+        Boxes.from_array([(x, 0.0, 0.0, 4.0, 1.8, 1.5, yaw) for x, yaw in ((0, -3.1), (20, np.pi), (60, 0))], "Car")
+    ]
+    matches = match([replace(turned[0], score=np.array([0.9, 0.8, 0.7]))], targets, [Boxes.empty()], 0.5)
+    np.testing.assert_allclose(matches.turned, [2 * np.pi - 6.2, np.pi, np.nan])
+    assert right_headings(matches) == 0.5
+    assert orientation_similarity(matches) == pytest.approx(
+        (13 * (1 + np.cos(6.2)) / 2 + 13 * (1 + np.cos(6.2)) / 4) / 40
+    )
+    assert np.isnan(right_headings(match([Boxes.empty()], targets, [Boxes.empty()], 0.5)))
 
 
 def test_perfect_and_empty():
@@ -104,8 +143,18 @@ def test_interval_holds_the_value_and_shrinks_with_scenes():
 
 def test_frames_of_one_scene_are_redrawn_together():
     matches = random_matches(np.random.default_rng(0))
-    low, high = bootstrap_interval(matches, ["only"] * 12, 50, rng=np.random.default_rng(1))
-    assert low == high == pytest.approx(average_precision(matches))
+    halves = np.repeat(["one", "other"], 6)
+    low, high = bootstrap_interval(matches, halves, 300, rng=np.random.default_rng(1))
+    ends = sorted(average_precision(matches, np.flatnonzero(halves == name)) for name in ("one", "other"))
+    assert (low, high) == pytest.approx(ends)  # one of four draws holds one scene twice
+
+
+def test_one_scene_says_nothing_of_others():
+    matches = random_matches(np.random.default_rng(0))
+    assert np.isnan(bootstrap_interval(matches, ["only"] * 12, 50, rng=np.random.default_rng(1))).all()
+    empty = replace(matches, targets=np.where(np.arange(12) < 3, matches.targets, 0))
+    scenes = ["full"] * 3 + ["empty"] * 9
+    assert np.isnan(bootstrap_interval(empty, scenes, 50, rng=np.random.default_rng(1))).all()
 
 
 def test_difference_is_paired():

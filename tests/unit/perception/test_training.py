@@ -9,7 +9,7 @@ from flcav.geometry import Boxes
 from flcav.perception.client import TaskClient
 from flcav.perception.objects import detect_all
 from flcav.perception.objects.batch import batch_loss
-from flcav.perception.objects.evaluate import Truth, score_detections
+from flcav.perception.objects.evaluate import Asked, score_detections
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import configuration, fresh
 from flcav.perception.training import Checkpointing, Validation, batches, train, train_steps
@@ -148,7 +148,7 @@ def test_it_learns_the_toy():
     network = tiny(seed=0)
     losses = train(OBJECTS, network, [toy_sample(seed, rays) for seed in range(60)], steps=200, seed=0).losses
     test = [toy_sample(10**6 + seed, rays) for seed in range(24)]
-    truths = [Truth(f"s{i // 3}", sample.boxes, sample.ignore, Boxes.empty()) for i, sample in enumerate(test)]
+    truths = [Asked(f"s{i // 3}", sample.boxes, sample.ignore, Boxes.empty()) for i, sample in enumerate(test)]
     found = detect_all(network, [sample.points for sample in test], score_threshold=0.05)
     assert losses[-20:].mean() < 0.5 * losses[:20].mean()
     assert score_detections(found, truths, ("Car",)).score("Car", "3d", 0.5).ap > 0.6

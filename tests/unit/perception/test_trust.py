@@ -7,7 +7,7 @@ from scipy.special import expit, logit
 from flcav.geometry import Boxes
 from flcav.perception.metrics import calibration_error, fit_logistic
 from flcav.perception.objects.calibrate import trust
-from flcav.perception.objects.evaluate import Truth, score_detections
+from flcav.perception.objects.evaluate import Asked, score_detections
 from flcav.perception.objects.slices import slice_lines, sliced
 
 
@@ -38,7 +38,7 @@ def test_nothing_changes_where_there_is_nothing_to_learn():
 
 
 def truth(*xs, occlusion, weather: str | None = "clear", neutral=()):
-    return Truth("s", cars(*xs), cars(*neutral), Boxes.empty(), np.array(occlusion, dtype=float), weather)
+    return Asked("s", cars(*xs), cars(*neutral), Boxes.empty(), np.array(occlusion, dtype=float), weather)
 
 
 def row(rows, by, name, kind="3d", iou=0.5):

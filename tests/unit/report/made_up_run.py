@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from flcav.geometry import Boxes
-from flcav.report.maps import ErrorMap
+from flcav.report.maps import ErrorMap, poles_of
 from flcav.report.sweeps import Detections, Sweep
 from flcav.world.town import load_town
 
@@ -18,6 +18,8 @@ def stage(name: str, town: str, ap50: float, **more: float) -> dict[str, Any]:
         "ap50_low": ap50 - 0.041,
         "ap50_high": ap50 + 0.038,
         "ap70": ap50 - 0.19,
+        "aos50": ap50 - 0.02,
+        "right_headings": 0.96,
         "samples": 0,
         "rounds": 0,
         "wireless_mb": 0.0,
@@ -110,8 +112,9 @@ def error_map(town: str = "grid", errors: int = 61) -> ErrorMap:
     rng = np.random.default_rng(1)
     road = np.concatenate(place.roads)
     xy = road[rng.integers(len(road), size=errors)] + rng.normal(0, 4, (errors, 2))
-    missed = rng.random(errors) < 0.7
-    return ErrorMap(place, np.c_[xy, np.full(errors, 0.8)], missed, chosen=(2,), densest=8, range_m=40.0)
+    kind = np.where(rng.random(errors) < 0.7, "miss", "false_positive")
+    xyz = np.c_[xy, np.full(errors, 0.8)]
+    return ErrorMap(place, xyz, kind, poles_of(place), chosen=("2",), densest="8", range_m=40.0)
 
 
 def sweep() -> Sweep:

@@ -46,8 +46,9 @@ def test_the_map_shows_every_error_once_and_the_reach_of_the_chosen_pole() -> No
     scene = made_up_run.error_map()
     axes = figures.town_map(scene).axes[0]
     by_label = {str(line.get_label()): line for line in axes.get_lines()}
-    misses, falses = scene.missed.sum(), (~scene.missed).sum()
-    for label, own in ((f"object missed ({misses})", scene.missed), (f"false positive ({falses})", ~scene.missed)):
+    for kind, name in (("miss", "missed"), ("false_positive", "false positive")):
+        own = scene.kind == kind
+        label = f"{name} ({own.sum()})"
         np.testing.assert_allclose(np.column_stack(by_label[label].get_data()), scene.errors[own, :2])
     rim = next(patch for patch in axes.patches if isinstance(patch, Circle) and not patch.get_fill())
     x, y, z = scene.town.poles.position[list(scene.town.poles.id).index(2)]
@@ -59,7 +60,7 @@ def test_the_map_shows_every_error_once_and_the_reach_of_the_chosen_pole() -> No
 
 
 def test_a_chosen_pole_that_is_also_the_densest_says_both() -> None:
-    axes = figures.town_map(replace(made_up_run.error_map(), densest=2)).axes[0]
+    axes = figures.town_map(replace(made_up_run.error_map(), densest="2")).axes[0]
     assert "placed and densest traffic" in {text.get_text() for text in axes.texts}
 
 

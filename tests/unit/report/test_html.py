@@ -74,6 +74,12 @@ def test_the_page_tells_the_numbers() -> None:
         assert shown in text
 
 
+def test_an_interval_that_one_scene_leaves_unknown_is_said() -> None:
+    told = results()
+    told["stages"][0] = told["stages"][0] | {"ap50_low": None, "ap50_high": None}
+    assert "pretrained 0.412 no interval: one scene" in Page(render(told, PICTURES)).text
+
+
 def test_verdicts_stand_at_their_findings_and_under_the_pictures() -> None:
     text = render(results(), PICTURES)
     page = Page(text).text

@@ -92,6 +92,11 @@ def test_poles_stand_at_the_kerb_and_face_what_they_watch(town: Town) -> None:
     assert shapely.contains_xy(area(town.roads), *ahead.T).all()
 
 
+def test_no_lamp_stands_in_the_view_of_a_sensor(town: Town) -> None:
+    away = np.linalg.norm(town.lamps[:, None, :2] - town.poles.position[:, :2], axis=2)
+    assert away.min() > 2.0
+
+
 def test_kind_of_a_pole_fits_the_junction_it_watches(town: Town) -> None:
     net = read_net(town.net)
     for pole, kind in zip(sorted(town.parameters.poles, key=lambda pole: pole.id), town.poles.kind):

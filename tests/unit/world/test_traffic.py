@@ -9,12 +9,14 @@ from shapely.geometry import Polygon
 
 from flcav.config import InputError
 from flcav.geometry import wrap_angle
+from flcav.seeds import child_seed
 from flcav.world.density import poles_density
 from flcav.world.shapes import SHAPES
 from flcav.world.surfaces import footprint
 from flcav.world.town import KERB_M, TOWNS, Town, load_town
 from flcav.world.trace import CATEGORIES, Trace
 from flcav.world.traffic import simulate
+from flcav.world.walking import HURRY_MPS, Walkers
 
 TIMES_S = 60.0 + 0.1 * np.arange(300)
 ROUGHLY = {
@@ -71,6 +73,39 @@ def test_motion_agrees_with_velocity(run: tuple[Town, Trace]) -> None:
     assert np.nanmean(np.linalg.norm(mean, axis=2)) > 1.5
     turned = np.abs(wrap_angle(np.diff(trace.yaw[:, vehicle], axis=0)))
     assert np.nanmax(turned) < np.radians(15)
+
+
+def test_pedestrians_walk_as_fast_as_people_do_and_as_recorded(run: tuple[Town, Trace]) -> None:
+    _, trace = run
+    walked = trace.position[:, named(trace, "ped")]
+    velocity = trace.velocity[:, named(trace, "ped")]
+    assert np.nanmax(np.linalg.norm(np.diff(walked, axis=0), axis=2)) < (HURRY_MPS + 0.5) * 0.1  # and turns about
+    moved = (walked[5:] - walked[:-5])[..., :2]
+    expected = 0.1 * (velocity[:-5] / 2 + velocity[1:-4] + velocity[2:-3] + velocity[3:-2] + velocity[4:-1])
+    expected += 0.1 * velocity[5:] / 2
+    assert np.nanmax(np.linalg.norm(moved - expected[..., :2], axis=2)) < 0.35
+
+
+def test_a_pedestrian_who_changes_the_crossing_walks_there() -> None:
+    """Seed 5 of `grid`: ped6 waits at one end of a corner and then takes the crossing at the other, 13 m away."""
+    trace = simulate(load_town("grid"), seed=child_seed(5, "traffic", 0), cavs=5, times_s=np.array([59.5, 60.0, 60.5]))
+    ped6 = trace.actor.tolist().index("ped6")
+    distance = np.linalg.norm(np.diff(trace.position[:, ped6], axis=0), axis=1)
+    assert 0.2 < distance.max() < 0.5 * HURRY_MPS
+
+
+def test_walkers_walk_what_their_model_hops() -> None:
+    walkers = Walkers(0.1)
+    walkers.follow({"a": (0.0, 0.0, 90.0, 0.0), "b": (5.0, 5.0, 0.0, 1.0)})
+    walkers.follow({"a": (2.0, 0.0, 90.0, 1.0), "b": (5.0, 5.1, 0.0, 1.0)})
+    assert walkers.states["b"] == (5.0, 5.1, 0.0, 1.0)
+    assert walkers.states["a"] == pytest.approx((0.25, 0.0, 90.0, HURRY_MPS))
+    for _ in range(6):
+        walkers.follow({"a": (2.0, 1.0, 0.0, 0.0)})  # round a corner
+    assert walkers.states["a"][:2] == pytest.approx((1.75, 0.0))
+    for _ in range(6):
+        walkers.follow({"a": (2.0, 1.0, 0.0, 0.0)})
+    assert walkers.states == {"a": (2.0, 1.0, 0.0, 0.0)}
 
 
 def test_acceleration_and_yaw_rate_are_those_of_the_neighbouring_steps(run: tuple[Town, Trace]) -> None:

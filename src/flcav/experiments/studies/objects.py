@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch
 
 from flcav.dataset.store import Dataset
 from flcav.experiments.task_study import RecipeFields, Result, Study
@@ -33,16 +32,21 @@ TRACKS = "tracks"
 
 def followed(network: Second, data: Dataset) -> dict[str, Any]:
     """Return the evaluation of the network's tracks."""
-    torch.set_num_threads(1)
     return {TRACKS: evaluate_tracks(network, data)}
 
 
 def _numbers(result: Result) -> Mapping[str, float]:
-    """Return AP in 3D and from above of each class, the error of calibration, and MOTA where tracks were tested."""
+    """Return AP in 3D and from above of each class, AOS, headings, the error of calibration, MOTA of tracks."""
     ap = {
         f"{row['class']} AP {row['kind']} at {row['iou']}": row["ap"]
         for row in result["scores"]
         if row["ap"] is not None
+    }
+    headings = {
+        f"{row['class']} {name}": row[key]
+        for row in result["scores"]
+        for name, key in (("AOS 3d at 0.5", "aos"), ("right headings", "right_headings"))
+        if (row["kind"], row["iou"]) == ("3d", 0.5) and row[key] is not None
     }
     errors = {f"{row['class']} calibration error": row["ece"] for row in result["trust"] if row["ece"] is not None}
     rows = result[TRACKS]["scores"] if TRACKS in result else []
@@ -52,7 +56,7 @@ def _numbers(result: Result) -> Mapping[str, float]:
         for name in ("mota", "amota")
         if row[name] is not None
     }
-    return ap | errors | tracks
+    return ap | headings | errors | tracks
 
 
 def _draw(results: Mapping[str, Any]) -> bytes:
@@ -76,9 +80,9 @@ STUDY = Study(
     train=tuple({**RECIPE, "town": town, "seed": 21, "scenes": 16} for town in TOWNS),
     validation={**RECIPE, "town": "suburb", "seed": 121, "split": "validation", "scenes": 2},
     tests={
-        **{town: {**RECIPE, "town": town, "seed": 421, "split": "test", "scenes": 3} for town in TOWNS},
-        WEATHERS: {**RECIPE, "town": "suburb", "seed": 521, "split": "test", "scenes": 4, "weather": CHANGING},
-        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 621, "split": "test", "scenes": 3},
+        **{town: {**RECIPE, "town": town, "seed": 431, "split": "test", "scenes": 6} for town in TOWNS},
+        WEATHERS: {**RECIPE, "town": "suburb", "seed": 531, "split": "test", "scenes": 4, "weather": CHANGING},
+        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 631, "split": "test", "scenes": 3},
     },
     epochs=8,
     patience=8,

@@ -1,15 +1,27 @@
 """Detection metrics."""
 
-from flcav.perception.metrics.average_precision import average_precision, bootstrap_difference, bootstrap_interval
+from flcav.perception.metrics.average_precision import (
+    CONFIDENCE,
+    average_precision,
+    bootstrap_difference,
+    bootstrap_interval,
+    interval_words,
+    orientation_similarity,
+    right_headings,
+)
 from flcav.perception.metrics.calibration import calibration_error, fit_logistic
 from flcav.perception.metrics.matching import Matches, match
 
 __all__ = [
+    "CONFIDENCE",
     "Matches",
     "average_precision",
     "bootstrap_difference",
     "bootstrap_interval",
     "calibration_error",
     "fit_logistic",
+    "interval_words",
     "match",
+    "orientation_similarity",
+    "right_headings",
 ]

@@ -2,6 +2,8 @@
 
 AP|R40 is the mean over recalls 1/40, 2/40, ..., 1 of the best precision reached at that recall or a higher one
 (Simonelli et al., "Disentangling Monocular 3D Object Detection", ICCV 2019, sec. 5; KITTI's measure since then).
+Average orientation similarity is the same mean of another precision: a hit turned by t counts (1 + cos t) / 2 (Geiger
+et al., "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012, sec. 2.5, eqs. 1-2).
 Intervals are percentile bootstraps over scenes: frames of one scene share traffic, so whole scenes are redrawn.
 """
 
@@ -19,16 +21,28 @@ def average_precision(matches: Matches, frames: ArrayLike | None = None) -> floa
 
     NaN where those frames hold nothing to find.
     """
-    if frames is None:
-        return _weighted(matches, np.ones(len(matches.targets), dtype=np.int64))
-    times = np.bincount(np.asarray(frames, dtype=np.int64), minlength=len(matches.targets))
-    return _weighted(matches, times)
+    return _weighted(matches, _times(matches, frames))
+
+
+def orientation_similarity(matches: Matches, frames: ArrayLike | None = None) -> float:
+    """Return the average orientation similarity (AOS|R40) in [0, AP|R40] over `frames`, as `average_precision` does."""
+    return _weighted(matches, _times(matches, frames), (1 + np.cos(np.nan_to_num(matches.turned))) / 2)
+
+
+def right_headings(matches: Matches) -> float:
+    """Return the share of hits whose heading is off by less than a right angle; NaN without hits."""
+    return float((matches.turned[matches.hit] < np.pi / 2).mean()) if matches.hit.any() else float("nan")
 
 
 def bootstrap_interval(
     matches: Matches, scene_of_frame: ArrayLike, n: int = 1000, *, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Return the 95 % percentile interval of AP under redrawing of scenes; `scene_of_frame` (F,) names each's scene."""
+    """Return the 95 % percentile interval of AP under redrawing of scenes; `scene_of_frame` (F,) names each's scene.
+
+    NaN where fewer than two scenes hold something to find: nothing then says how much scenes differ.
+    """
+    if len(np.unique(np.asarray(scene_of_frame)[matches.targets > 0])) < 2:
+        return float("nan"), float("nan")
     draws = np.array([_weighted(matches, times) for times in _redrawn(scene_of_frame, n, rng)])
     return _interval(draws)
 
@@ -41,17 +55,30 @@ def bootstrap_difference(
     return _interval(np.array(draws))
 
 
-def _weighted(matches: Matches, times: NDArray[np.int64]) -> float:
+def interval_words(low: float | None, high: float | None) -> str:
+    """Return an interval over scenes in brackets; None is one that a single scene leaves unknown."""
+    return "(no interval: one scene)" if low is None or high is None else f"[{low:.3f}, {high:.3f}]"
+
+
+def _times(matches: Matches, frames: ArrayLike | None) -> NDArray[np.int64]:
+    """Return (F,) how often each frame counts."""
+    if frames is None:
+        return np.ones(len(matches.targets), dtype=np.int64)
+    return np.bincount(np.asarray(frames, dtype=np.int64), minlength=len(matches.targets))
+
+
+def _weighted(matches: Matches, times: NDArray[np.int64], worth: NDArray[np.float64] | float = 1.0) -> float:
+    """Return AP where each frame counts `times` (F,) and each hit `worth` (D,) towards the precision."""
     wanted = int((matches.targets * times).sum())
     if not wanted:
         return float("nan")
     weight = times[matches.frame]
     hits, all_detections = np.cumsum(weight * matches.hit), np.cumsum(weight)
+    worths = np.cumsum(weight * matches.hit * worth)
     ends = np.flatnonzero(np.diff(matches.score, append=-np.inf) != 0)  # equal scores enter together
-    hits, all_detections = hits[ends], all_detections[ends]
-    precision = hits / np.maximum(all_detections, 1)
+    precision = worths[ends] / np.maximum(all_detections[ends], 1)
     best_onwards = np.maximum.accumulate(precision[::-1])[::-1]
-    place = np.searchsorted(hits, RECALLS * wanted - 1e-9)  # first threshold that reaches the recall
+    place = np.searchsorted(hits[ends], RECALLS * wanted - 1e-9)  # first threshold that reaches the recall
     return float(np.append(best_onwards, 0.0)[place].mean())
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, wrap_angle
 from flcav.perception.ops.rotated import Kind, intersection_area, iou
 
 
@@ -17,6 +17,7 @@ class Matches:
 
     score: NDArray[np.float64]  # (D,)
     hit: NDArray[np.bool_]  # (D,) whether it found a target
+    turned: NDArray[np.float64]  # (D,) angle between its heading and its target's [rad], in [0, pi]; NaN without target
     frame: NDArray[np.int64]  # (D,)
     targets: NDArray[np.int64]  # (F,) objects to find
 
@@ -36,10 +37,10 @@ def match(
     """
     parts = [_match_frame(*one, overlap, kind) for one in zip(detections, targets, neutral, strict=True)]
     frame = np.repeat(np.arange(len(parts)), [len(scores) for scores, _ in parts])
-    score = np.concatenate([scores for scores, _ in parts]) if parts else np.zeros(0)
-    hit = np.concatenate([hits for _, hits in parts]) if parts else np.zeros(0, dtype=bool)
+    score, turned = (np.concatenate(column) for column in zip(*parts)) if parts else (np.zeros(0), np.zeros(0))
     order = np.argsort(-score, kind="stable")
-    return Matches(score[order], hit[order], frame[order], np.array([len(boxes) for boxes in targets], dtype=np.int64))
+    wanted = np.array([len(boxes) for boxes in targets], dtype=np.int64)
+    return Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], wanted)
 
 
 def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind = "3d") -> NDArray[np.int64]:
@@ -77,10 +78,14 @@ def on_neutral(detections: Boxes, neutral: Boxes) -> NDArray[np.bool_]:
 
 def _match_frame(
     detections: Boxes, targets: Boxes, neutral: Boxes, overlap: float, kind: Kind
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    hit = assign_targets(detections, targets, overlap, kind) >= 0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (D,) scores of the detections that count, and `Matches.turned` of each."""
+    found = assign_targets(detections, targets, overlap, kind)
+    hit = found >= 0
+    turned = np.full(len(found), np.nan)
+    turned[hit] = np.abs(wrap_angle(detections.yaw[hit] - targets.yaw[found[hit]]))
     counts = hit | ~on_neutral(detections, neutral)
-    return _scores(detections)[counts], hit[counts]
+    return _scores(detections)[counts], turned[counts]
 
 
 def _scores(detections: Boxes) -> NDArray[np.float64]:

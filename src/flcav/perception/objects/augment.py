@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, concatenate, points_in_boxes
 from flcav.perception.objects.config import Augmentation
-from flcav.perception.objects.samples import MIN_RETURNS, Sample
+from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.truth import MIN_RETURNS
 
 VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's view to either side, down and up: KITTI's left colour camera
 

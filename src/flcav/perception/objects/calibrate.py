@@ -9,7 +9,7 @@ import numpy as np
 from flcav.geometry import Boxes
 from flcav.perception.metrics import calibration_error, fit_logistic, match
 from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.evaluate import Truth, detections_and_truths, number_or_none, of_class
+from flcav.perception.objects.evaluate import Asked, detections_and_truths, number_or_none, of_class
 from flcav.perception.objects.model import Second
 from flcav.sensors.frame import Frame
 
@@ -27,7 +27,7 @@ def calibrate(network: Second, frames: Iterable[Frame]) -> None:
     network.config = replace(network.config, calibration=tuple(fitted))
 
 
-def trust(detections: Sequence[Boxes], truths: Sequence[Truth], classes: Sequence[str]) -> list[dict[str, Any]]:
+def trust(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> list[dict[str, Any]]:
     """Return a row per class: the scores' expected calibration error, and where detections have variances, theirs.
 
     `variance_ratio` is the mean squared error of found objects' x and y over the mean variance predicted: 1 is right,
@@ -42,13 +42,13 @@ def trust(detections: Sequence[Boxes], truths: Sequence[Truth], classes: Sequenc
     return rows
 
 
-def _matches(detections: Sequence[Boxes], truths: Sequence[Truth], name: str):
+def _matches(detections: Sequence[Boxes], truths: Sequence[Asked], name: str):
     found = [of_class(boxes, name) for boxes in detections]
     targets = [of_class(truth.targets, name) for truth in truths]
     return match(found, targets, [of_class(truth.neutral, name) for truth in truths], OVERLAP)
 
 
-def _variance_ratio(detections: Sequence[Boxes], truths: Sequence[Truth], name: str) -> float:
+def _variance_ratio(detections: Sequence[Boxes], truths: Sequence[Asked], name: str) -> float:
     error, variance = [0.0], [0.0]
     for boxes, truth in zip(detections, truths, strict=True):
         found, targets = of_class(boxes, name), of_class(truth.targets, name)

@@ -32,7 +32,7 @@ class Anchor:
 class Augmentation:
     """What training changes about its samples at random; amounts are uniform up to the one given."""
 
-    flip: bool = True  # left-right, in one of two samples
+    flip: bool = False  # left-right, in one of two samples: streets with traffic on the other side, so headings suffer
     turn_rad: Annotated[float, Field(ge=0, lt=math.pi / 2)] = 0.3  # about the sensor, to either side
     scale: Portion = 0.03  # of the whole scene, 1 -/+ scale
     shift_m: Annotated[float, Field(ge=0)] = 0.0  # of the whole scene, ahead or back and to either side

@@ -1,4 +1,4 @@
-"""How well detections agree with the truth: AP per class, in 3D and bird's-eye, at IoU 0.5 and 0.7."""
+"""How well detections agree with the truth: AP and AOS per class, in 3D and bird's-eye, at IoU 0.5 and 0.7."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -8,13 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.geometry import Boxes, inverse
-from flcav.perception.metrics import Matches, average_precision, bootstrap_interval, match
+from flcav.geometry import Boxes
+from flcav.perception.metrics import (
+    Matches,
+    average_precision,
+    bootstrap_interval,
+    match,
+    orientation_similarity,
+    right_headings,
+)
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect_all
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.samples import MIN_RETURNS, detection_labels, is_lookalike, only_lidar
-from flcav.perception.objects.targets import in_range
+from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
 from flcav.perception.ops.rotated import Kind
 from flcav.progress import Report, silent
 from flcav.seeds import stream
@@ -26,11 +32,11 @@ LOWEST_SCORE = 0.05  # detections below add nothing that the intervals would sho
 
 
 @dataclass(frozen=True)
-class Truth:
+class Asked:
     """What one frame holds for a network to find, LiDAR frame, detection classes."""
 
     scene: str
-    targets: Boxes  # in range, with at least `MIN_RETURNS` returns
+    targets: Boxes  # see `flcav.perception.objects.truth`
     neutral: Boxes  # finding them is neither right nor wrong; label = the class they are neutral for
     hidden: Boxes  # in range without a return: counted, not asked for
     occlusion: NDArray[np.float64] | None = None  # (targets,) share that is hidden, in [0, 1]; None: not known
@@ -45,8 +51,10 @@ class Score:
     kind: Kind
     overlap: float  # IoU that makes a detection a hit
     ap: float  # [0, 1]; NaN where there was nothing to find
-    low: float  # 95 % interval over scenes
+    low: float  # 95 % interval over scenes; NaN where one scene holds all targets
     high: float
+    aos: float  # average orientation similarity, [0, ap]
+    right: float  # share of found objects whose heading is off by less than 90 degrees; NaN where none was found
     matches: Matches
 
 
@@ -68,7 +76,7 @@ class Evaluation:
         raise KeyError((name, kind, overlap))
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers as JSON knows them; AP is null where there was nothing to find."""
+        """Return the numbers as JSON knows them; AP, or its interval, is null where it is NaN."""
         rows = [
             {
                 "class": score.name,
@@ -77,6 +85,8 @@ class Evaluation:
                 "ap": number_or_none(score.ap),
                 "low": number_or_none(score.low),
                 "high": number_or_none(score.high),
+                "aos": number_or_none(score.aos),
+                "right_headings": number_or_none(score.right),
                 "targets": self.targets[score.name],
                 "hidden": self.hidden[score.name],
             }
@@ -85,25 +95,17 @@ class Evaluation:
         return {"frames": self.frames, "scenes": len(set(self.scenes)), "scores": rows}
 
 
-def truth_of(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Truth:
-    """Return what `frame` holds for a network of `config`, by the rules of evaluation.
+def asked_of(frame: Frame, config: SecondConfig) -> Asked:
+    """Return what `frame` holds for a network of `config` to find: its targets.
 
-    Targets are objects of its classes whose centre is in range, with enough returns. Objects with fewer, objects out of
-    range, and trucks and buses beside cars are neutral.
+    Faint and hidden objects, objects out of range and lookalikes are neutral.
     """
-    annotations = frame.annotations
-    boxes = annotations.boxes.transformed(inverse(frame.world_from_sensor(only_lidar(frame, lidar))))
-    label = detection_labels(annotations.boxes.label, config.classes)
-    lookalike = is_lookalike(annotations.boxes.label, config.classes)
-    inside = in_range(boxes, config)
-    target = (label != "") & inside & (annotations.returns >= MIN_RETURNS)
-    hidden = (label != "") & inside & (annotations.returns == 0)
-    neutral = ((label != "") & ~target) | lookalike
-    boxes = Boxes(boxes.center, boxes.size, boxes.yaw, np.where(lookalike, "Car", label))
+    truth = ground_truth(frame, config)
+    neutral = (truth.known & ~truth.target) | truth.lookalike
     weather = None if frame.weather is None else weather_class(frame.weather)
-    return Truth(
-        frame.scene, boxes[target], boxes[neutral], boxes[hidden], annotations.occlusion[target].astype(float), weather
-    )
+    occlusion = frame.annotations.occlusion[truth.target].astype(float)
+    boxes = truth.boxes
+    return Asked(frame.scene, boxes[truth.target], boxes[neutral], boxes[truth.hidden], occlusion, weather)
 
 
 def evaluate(
@@ -115,20 +117,29 @@ def evaluate(
 
 
 def detections_and_truths(
-    network: Second, frames: Iterable[Frame], *, total: int = 0, progress: Report = silent
-) -> tuple[list[Boxes], list[Truth]]:
-    """Return what `network` finds in each frame, from `LOWEST_SCORE` on, and what there is to find."""
-    truths: list[Truth] = []
+    network: Second,
+    frames: Iterable[Frame],
+    asked: SecondConfig | None = None,
+    *,
+    total: int = 0,
+    progress: Report = silent,
+) -> tuple[list[Boxes], list[Asked]]:
+    """Return what `network` finds in each frame, from `LOWEST_SCORE` on, and what there is to find.
+
+    `asked`: a configuration of smaller range, beyond which no object is asked for and no detection counts.
+    """
+    truths: list[Asked] = []
     detections: list[Boxes] = []
     for done, frame in enumerate(frames, start=1):
-        truths.append(truth_of(frame, network.config))
-        detections += detect_all(network, [frame.lidar[only_lidar(frame)]], score_threshold=LOWEST_SCORE)
+        truths.append(asked_of(frame, asked or network.config))
+        (found,) = detect_all(network, [frame.lidar[only_lidar(frame)]], score_threshold=LOWEST_SCORE)
+        detections.append(found if asked is None else found[in_range(found, asked)])
         progress(done, max(total, done), "")
     return detections, truths
 
 
 def score_detections(
-    detections: Sequence[Boxes], truths: Sequence[Truth], classes: tuple[str, ...], *, seed: int = 0
+    detections: Sequence[Boxes], truths: Sequence[Asked], classes: tuple[str, ...], *, seed: int = 0
 ) -> Evaluation:
     """Return the evaluation of `detections` (LiDAR frame) against `truths`, frame by frame."""
     if not truths:
@@ -142,7 +153,8 @@ def score_detections(
         for kind, overlap in OVERLAPS:
             matches = match(found, targets, neutral, overlap, kind)
             low, high = bootstrap_interval(matches, scenes, rng=stream(seed, "bootstrap"))
-            scores.append(Score(name, kind, overlap, average_precision(matches), low, high, matches))
+            ap, aos = average_precision(matches), orientation_similarity(matches)
+            scores.append(Score(name, kind, overlap, ap, low, high, aos, right_headings(matches), matches))
     targets_of = {name: sum(int((truth.targets.label == name).sum()) for truth in truths) for name in classes}
     hidden_of = {name: sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes}
     return Evaluation(tuple(scores), len(truths), scenes, targets_of, hidden_of)

@@ -14,7 +14,9 @@ from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
 from flcav.perception.camera_view import CameraView, recorded_view, view_beside
-from flcav.perception.objects.samples import checked_points, only_lidar
+from flcav.perception.objects.samples import checked_points
+from flcav.perception.objects.truth import only_lidar
+from flcav.perception.task import of_frames
 
 FIELDS = ("x", "y", "z", "length", "width", "height", "yaw")
 
@@ -27,13 +29,13 @@ class Cloud(NamedTuple):
     view: Callable[[], CameraView | None]  # of a camera that looks the same way, read when asked for
 
 
-def point_clouds(path: Path) -> Iterator[Cloud]:
-    """Yield the point clouds of a KITTI .bin file, a folder of them, or a dataset folder.
+def point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterator[Cloud]:
+    """Yield the point clouds of a KITTI .bin file, a folder of them, or `frames` of a dataset folder (None: all).
 
     Raises `InputError` for anything else, and for a cloud that is empty, truncated or not of finite numbers.
     """
     if (path / MANIFEST).is_file():
-        clouds = _recorded(path)
+        clouds = _recorded(path, frames)
     elif path.is_dir():
         files = sorted(path.glob("*.bin"))
         if not files:
@@ -65,9 +67,9 @@ def _of_file(path: Path) -> Cloud:
     return Cloud(path, read_points(path), partial(view_beside, path))
 
 
-def _recorded(folder: Path) -> Iterator[Cloud]:
+def _recorded(folder: Path, frames: Sequence[int] | None) -> Iterator[Cloud]:
     dataset = Dataset.open(folder)
-    for i in range(len(dataset)):
+    for i in of_frames(dataset, frames):
         frame = dataset.frame(i)
         lidar = only_lidar(frame)
         yield Cloud(folder / frame.key, frame.lidar[lidar], partial(recorded_view, dataset, i, lidar))

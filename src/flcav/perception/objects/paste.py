@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, concatenate, points_in_boxes
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.samples import MIN_RETURNS, Sample
-from flcav.perception.objects.targets import in_range
+from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.truth import MIN_RETURNS, in_range
 from flcav.perception.ops.rotated import iou
 
 

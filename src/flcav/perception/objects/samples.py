@@ -11,19 +11,12 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.geometry import Boxes, inverse
+from flcav.geometry import Boxes
 from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.truth import ground_truth, only_lidar
 from flcav.sensors.frame import Frame
 
-DETECTION_CLASS = {
-    "car": "Car",
-    "van": "Car",
-    "pedestrian": "Pedestrian",
-    "bicycle": "Cyclist",
-    "motorcycle": "Cyclist",
-}
-LOOKALIKE = {"truck": "Car", "bus": "Car"}  # neutral: neither to be found nor to be kept apart
-MIN_RETURNS = 5  # LiDAR returns that make an object a target; with fewer it is neutral
+HEIGHT_SLACK_M = 0.5  # between a LiDAR's height and the one that a network expects
 
 
 @dataclass(frozen=True)
@@ -40,20 +33,14 @@ class Sample:
 def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Sample:
     """Return the frame's sweep with its ground truth as labels.
 
-    Objects with at least `MIN_RETURNS` returns are to be found, with fewer but some they are ignored, and so are
-    trucks and buses beside cars; objects without a return are background. Points that cannot come into `config`'s
-    range, turned and scaled as training does, are left out.
+    Objects with enough returns are to be found, with fewer but some they are ignored, and so are lookalikes; objects
+    without a return are background. Those out of range are kept, since training may turn them in. Points that cannot
+    come into `config`'s range, turned and scaled as training does, are left out.
     """
-    name = only_lidar(frame, lidar)
-    truth = frame.annotations
-    boxes = truth.boxes.transformed(inverse(frame.world_from_sensor(name)))
-    label = detection_labels(truth.boxes.label, config.classes)
-    wanted = (label != "") & (truth.returns >= MIN_RETURNS)
-    neutral = (truth.returns > 0) & ~wanted & (label != "")
-    neutral |= (truth.returns > 0) & is_lookalike(truth.boxes.label, config.classes)
-    learn = boxes[wanted]
-    learn = Boxes(learn.center, learn.size, learn.yaw, label[wanted])
-    return Sample(near_range(frame.lidar[name], config), learn, boxes[neutral])
+    truth = ground_truth(frame, config, lidar)
+    ignored = (truth.returns > 0) & ((truth.known & ~truth.enough) | truth.lookalike)
+    points = near_range(frame.lidar[only_lidar(frame, lidar)], config)
+    return Sample(points, truth.boxes[truth.enough], truth.boxes[ignored])
 
 
 class RecordedSweeps(Sequence[Sample]):
@@ -74,25 +61,29 @@ class RecordedSweeps(Sequence[Sample]):
         return sample_from_frame(self._data.frame(self._frames[index]), self._config)
 
 
-def detection_labels(category: NDArray[np.str_], classes: tuple[str, ...]) -> NDArray[np.str_]:
-    """Return the detection class of every actor category, "" where the network knows none."""
-    mapped = [DETECTION_CLASS.get(str(name), "") for name in category]
-    return np.array([name if name in classes else "" for name in mapped], dtype=np.str_)
+def fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
+    """Return the frames whose LiDAR is mounted within `HEIGHT_SLACK_M` of the height that `config` expects.
 
+    Heights are those of the calibration, above the agent's origin: a vehicle's is on the ground, a pole's where its
+    sensors are, so that a pole's LiDAR does not fit. All frames where none has a LiDAR: who reads them says so.
 
-def is_lookalike(category: NDArray[np.str_], classes: tuple[str, ...]) -> NDArray[np.bool_]:
-    """Return which actors look so much like one of `classes` that finding them is no mistake (trucks, buses)."""
-    return np.array([LOOKALIKE.get(str(name)) in classes for name in category], dtype=bool)
-
-
-def only_lidar(frame: Frame, name: str | None = None) -> str:
-    """Return `name`, or the frame's first LiDAR; raises `InputError` where it has none."""
-    if name is None and frame.lidar:
-        return next(iter(frame.lidar))
-    if name is None or name not in frame.lidar:
-        wanted = "no LiDAR in it" if name is None else f"no LiDAR '{name}' in it; it has {sorted(frame.lidar)}"
-        raise InputError(f"frame {frame.key}: {wanted}")
-    return name
+    Raises `InputError` where LiDARs are there but none fits.
+    """
+    height_m: dict[int, float] = {}
+    for number, key in enumerate(data.keys):
+        if lidars := data.lidars(number):
+            mounts = data.calibrations[key.agent].true.agent_from_sensor
+            height_m[number] = float(mounts[lidars[0]][2, 3])
+    expected_m = -config.ground_z_m
+    fitting = [number for number, height in height_m.items() if abs(height - expected_m) <= HEIGHT_SLACK_M]
+    if height_m and not fitting:
+        found = {data.keys[number].agent: height for number, height in height_m.items()}
+        heights = ", ".join(f"{agent}: {height:g} m" for agent, height in found.items())
+        raise InputError(
+            f"{data.folder}: no LiDAR is mounted {expected_m:g} m above its agent's origin, as the network expects "
+            f"({heights}); --agents all takes them as they are"
+        )
+    return fitting or range(len(data))
 
 
 def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, concatenate
 from flcav.perception.metrics import average_precision, match
-from flcav.perception.objects.evaluate import OVERLAPS, Truth, number_or_none, of_class
+from flcav.perception.objects.evaluate import OVERLAPS, Asked, number_or_none, of_class
 from flcav.world.weather import WEATHER_CLASSES
 
 DISTANCES_M = ((0, 20), (20, 40), (40, 80))
@@ -26,7 +26,7 @@ class Slice(NamedTuple):
     frames: NDArray[np.int64]
 
 
-def sliced(detections: Sequence[Boxes], truths: Sequence[Truth], classes: Sequence[str]) -> list[dict[str, Any]]:
+def sliced(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> list[dict[str, Any]]:
     """Return a row per slice that holds targets of a class, kind of overlap and IoU: its AP and number of targets."""
     rows = []
     for part in slices(detections, truths):
@@ -61,7 +61,7 @@ def slice_lines(rows: Sequence[Mapping[str, Any]], overlap: float) -> list[str]:
     ]
 
 
-def slices(detections: Sequence[Boxes], truths: Sequence[Truth]) -> Iterator[Slice]:
+def slices(detections: Sequence[Boxes], truths: Sequence[Asked]) -> Iterator[Slice]:
     """Yield the slices of frames; occlusions where they are known, weathers where there are several."""
     everything = np.arange(len(truths))
     for low, high in DISTANCES_M:

@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from flcav.geometry import Boxes
 from flcav.perception.objects.anchors import anchor_boxes, anchor_classes, cell_size
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import HEADINGS, head_shape
 from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.truth import in_range
 
 Array = NDArray[np.float64]
 
@@ -67,13 +67,6 @@ def decoded_variance(variance: Array, boxes: Array, anchors: Array) -> Array:
 def direction_of(yaw: Array) -> NDArray[np.int64]:
     """Return 0 where the heading lies in [pi/4, 5/4 pi), else 1: what a box's axis alone leaves open."""
     return (np.mod(yaw - np.pi / 4, 2 * np.pi) >= np.pi).astype(np.int64)
-
-
-def in_range(boxes: Boxes, config: SecondConfig) -> NDArray[np.bool_]:
-    """Return (N,) whether a box's centre lies within the range, seen from above."""
-    x, y = boxes.center[:, 0], boxes.center[:, 1]
-    x0, y0, _, x1, y1, _ = config.range_m
-    return (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
 
 
 def free_cells(free: NDArray[np.float32], config: SecondConfig) -> NDArray[np.bool_]:

@@ -8,17 +8,23 @@ import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.geometry import Boxes
+from flcav.perception.errors import THRESHOLD, Registry
+from flcav.perception.metrics import interval_words
+from flcav.perception.objects.area import rules, rules_lines
 from flcav.perception.objects.augment import augment
 from flcav.perception.objects.batch import batch_loss
 from flcav.perception.objects.calibrate import OVERLAP, calibrate, trust
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
+from flcav.perception.objects.errors import register_errors
 from flcav.perception.objects.evaluate import detections_and_truths, score_detections
 from flcav.perception.objects.infer import box_rows, point_clouds
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.paste import Cutouts, cut, pasted
-from flcav.perception.objects.samples import RecordedSweeps, Sample
+from flcav.perception.objects.samples import RecordedSweeps, Sample, fitting_frames
 from flcav.perception.objects.slices import slice_lines, sliced
+from flcav.perception.objects.truth import only_lidar
 from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
 
@@ -42,6 +48,10 @@ class ObjectsTask:
         """Return each frame's sweep with its ground truth as labels, read when asked for."""
         return RecordedSweeps(data, config, of_frames(data, frames))
 
+    def fitting(self, data: Dataset, config: SecondConfig) -> Sequence[int]:
+        """Return the frames whose LiDAR is about as high as the network expects, see `fitting_frames`."""
+        return fitting_frames(data, config)
+
     def draw(self, samples: Sequence[Sample], index: int, config: SecondConfig, rng: np.random.Generator) -> Sample:
         """Return the sample with objects of all pasted into it, then changed as `config.augmentation` says.
 
@@ -63,36 +73,70 @@ class ObjectsTask:
         return batch_loss(network, samples)
 
     def evaluate(
-        self, network: Second, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
+        self,
+        network: Second,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        *,
+        asked: SecondConfig | None = None,
+        progress: Report = silent,
     ) -> dict[str, Any]:
-        """Return AP per class, kind of overlap and IoU, with intervals over scenes; its slices; what to trust."""
+        """Return AP per class, kind of overlap and IoU, with intervals over scenes; its slices; what to trust.
+
+        `asked`: the network's configuration with a smaller range, see `flcav.perception.objects.area`.
+        """
         numbers, classes = of_frames(data, frames), network.config.classes
-        found, truths = detections_and_truths(network, map(data.frame, numbers), total=len(numbers), progress=progress)
-        summary = score_detections(found, truths, classes).summary()
+        found, truths = detections_and_truths(
+            network, map(data.frame, numbers), asked, total=len(numbers), progress=progress
+        )
+        summary = score_detections(found, truths, classes).summary() | {"rules": rules(asked or network.config)}
         return summary | {"slices": sliced(found, truths, classes), "trust": trust(found, truths, classes)}
 
-    def calibrate(self, network: Second, data: Dataset) -> None:
+    def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the calibration of the network's scores, see `flcav.perception.objects.calibrate`."""
-        calibrate(network, map(data.frame, range(len(data))))
+        calibrate(network, map(data.frame, of_frames(data, frames)))
 
     def score(self, result: Mapping[str, Any]) -> float:
         """Return the mean over classes of AP in 3D at IoU 0.5; 0 where there was nothing to find."""
         known = [row["ap"] for row in result["scores"] if (row["kind"], row["iou"]) == ("3d", 0.5) and row["ap"]]
         return float(np.mean(known)) if known else 0.0
 
-    def infer(self, network: Second, path: Path, threshold: float = 0.3) -> Iterator[Finding]:
+    def infer(
+        self, network: Second, path: Path, threshold: float = 0.3, frames: Sequence[int] | None = None
+    ) -> Iterator[Finding]:
         """Yield {"boxes": [...]} for each point cloud of `path`, see `infer.point_clouds`."""
-        for cloud in point_clouds(path):
+        for cloud in point_clouds(path, frames):
             found = detect(network, cloud.points, score_threshold=threshold)
             yield Finding(cloud.path, cloud.points, {"boxes": box_rows(found)}, cloud.view)
 
+    def register_errors(
+        self,
+        network: Second,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        threshold: float = THRESHOLD,
+        progress: Report = silent,
+    ) -> Registry:
+        """Return the objects that are missed and invented, see `errors.register_errors`."""
+        numbers = of_frames(data, frames)
+
+        def found() -> Iterator[Boxes]:
+            for done, number in enumerate(numbers, start=1):
+                frame = data.frame(number)
+                yield detect(network, frame.lidar[only_lidar(frame)], score_threshold=threshold)
+                progress(done, len(numbers), "")
+
+        return Registry(register_errors(map(data.frame, numbers), found(), network.config, threshold))
+
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
         """Return one line per class, kind of overlap and IoU, and one per class and slice."""
-        lines = [f"{result['frames']} frames of {result['scenes']} scenes"]
+        lines = [f"{result['frames']} frames of {result['scenes']} scenes", *rules_lines(result["rules"])]
         for row in result["scores"]:
             found = "nothing to find"
             if row["ap"] is not None:
-                found = f"AP {row['ap']:.3f} [{row['low']:.3f}, {row['high']:.3f}]"
+                found = f"AP {row['ap']:.3f} {interval_words(row['low'], row['high'])}  AOS {row['aos']:.3f}"
+            if row["right_headings"] is not None:
+                found += f", {row['right_headings']:.0%} of those found head the right way"
             counts = f"objects: {row['targets']}, and {row['hidden']} without a return"
             lines.append(f"{row['class']:<12}{row['kind']:>4} IoU {row['iou']:.1f}  {found}  ({counts})")
         lines += [f"at IoU {OVERLAP:g} by distance, occlusion and weather:", *slice_lines(result["slices"], OVERLAP)]

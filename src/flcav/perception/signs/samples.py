@@ -75,9 +75,14 @@ def sample_of(frame: Frame, camera: str, picture: Picture, config: SignsConfig) 
     label = np.array([config.classes.index(name) for name, ok in zip(names, known) if ok], dtype=np.int64)
     box = shown.box[known]
     height, width = picture.shape[:2]
-    whole = (box[:, :2] > 0).all(1) & (box[:, 2:] < (width, height)).all(1)
-    wanted = whole & (size_px(box) >= config.smallest_px)
+    wanted = wanted_boxes(box, (width, height), config)
     return Sample(picture, box[wanted], label[wanted], box[~wanted])
+
+
+def wanted_boxes(box: NDArray[np.float64], size: tuple[int, int], config: SignsConfig) -> NDArray[np.bool_]:
+    """Return which boxes (N, 4) are to be found in a picture of `size` (width, height) [px]: whole and large enough."""
+    whole = (box[:, :2] > 0).all(1) & (box[:, 2:] < size).all(1)
+    return whole & (size_px(box) >= config.smallest_px)
 
 
 def size_px(boxes: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,16 +9,18 @@ import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.images import pictures
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
 from flcav.perception.signs.detect import Detections, detect, predict
+from flcav.perception.signs.errors import register_errors
 from flcav.perception.signs.evaluate import Truth, mean_average_precision
 from flcav.perception.signs.loss import detection_loss
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.samples import RecordedPictures, Sample
 from flcav.perception.signs.targets import assign
-from flcav.perception.task import Finding, Practice
+from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
 
 LOWEST_SCORE = 0.01  # detections below hardly change the average precision
@@ -66,11 +68,24 @@ class SignsTask:
         """Return mAP at IoU 0.5; 0 where there was nothing to find."""
         return result["map50"] or 0.0
 
-    def infer(self, network: SignDetector, path: Path, threshold: float = 0.3) -> Iterator[Finding]:
+    def infer(
+        self, network: SignDetector, path: Path, threshold: float = 0.3, frames: Sequence[int] | None = None
+    ) -> Iterator[Finding]:
         """Yield {"boxes": [...]} for each picture of `path`, best first."""
-        for origin, rgb in pictures(path):
+        for origin, rgb in pictures(path, frames):
             found = detect(network, rgb, threshold=threshold)
             yield Finding(origin, rgb, {"boxes": box_rows(found, network.config.classes)})
+
+    def register_errors(
+        self,
+        network: SignDetector,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        threshold: float = THRESHOLD,
+        progress: Report = silent,
+    ) -> Registry:
+        """Return the signs that are missed and invented, see `errors.register_errors`."""
+        return register_errors(network, data, of_frames(data, frames), threshold, progress)
 
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
         """Return mAP, then AP by class and by size."""

@@ -11,11 +11,12 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse
 from flcav.perception.metrics.matching import on_neutral
 from flcav.perception.metrics.tracks import Moment, amota, clear
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import number_or_none
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.samples import MIN_RETURNS, detection_labels, is_lookalike, only_lidar
-from flcav.perception.objects.targets import in_range
+from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
+from flcav.perception.task import of_frames
 from flcav.perception.tracking.tracker import Tracked, Tracker
 from flcav.progress import Report, silent
 from flcav.sensors.frame import Frame
@@ -24,30 +25,39 @@ LONGEST_GAP_S = 1.0  # between two frames of a sequence
 SCORE = 0.3  # lowest of a detection that is followed
 
 
-def evaluate_tracks(network: Second, data: Dataset, *, progress: Report = silent) -> dict[str, Any]:
+def evaluate_tracks(
+    network: Second,
+    data: Dataset,
+    frames: Sequence[int] | None = None,
+    *,
+    asked: SecondConfig | None = None,
+    progress: Report = silent,
+) -> dict[str, Any]:
     """Return MOTA, AMOTA, switches of identity and errors of velocity per class, as JSON knows them.
 
-    A sequence is the frames of one agent in one scene. Objects to follow are those that detection asks for.
+    A sequence is the frames (None: all) of one agent in one scene. Objects to follow are those that detection asks for,
+    by the network's configuration or by `asked`, one of smaller range.
 
     Raises `InputError` where frames are further apart than a tracker can bridge.
     """
-    numbers = sequences(data)
+    numbers, config = sequences(data, frames), asked or network.config
+    total = sum(map(len, numbers.values()))
     per_class: dict[str, list[list[Moment]]] = {name: [] for name in network.config.classes}
     speed_errors: dict[str, list[float]] = {name: [] for name in network.config.classes}
     done = 0
-    for frames in numbers.values():
+    for sequence in numbers.values():
         tracker = Tracker()
         story: list[tuple[Frame, Tracked]] = []
-        for number in frames:
+        for number in sequence:
             frame = data.frame(number)
             lidar = only_lidar(frame)
             found = detect(network, frame.lidar[lidar], score_threshold=SCORE)
             story.append((frame, tracker.step(found.transformed(frame.world_from_sensor(lidar)), frame.time_s)))
             done += 1
-            progress(done, len(data), "")
+            progress(done, total, "")
         final = _final_scores([tracked for _, tracked in story])
         for name in per_class:
-            moments = [_moment(frame, tracked, final, network, name) for frame, tracked in story]
+            moments = [_moment(frame, tracked, final, config, name) for frame, tracked in story]
             per_class[name].append([moment for moment, _ in moments])
             speed_errors[name] += [error for _, errors in moments for error in errors]
     rows = []
@@ -66,7 +76,7 @@ def evaluate_tracks(network: Second, data: Dataset, *, progress: Report = silent
                 "velocity_error_mps": number_or_none(float(np.mean(speed_errors[name] or [np.nan]))),
             }
         )
-    return {"sequences": len(numbers), "frames": len(data), "scores": rows}
+    return {"sequences": len(numbers), "frames": total, "scores": rows}
 
 
 def tracks_lines(result: Mapping[str, Any]) -> list[str]:
@@ -82,10 +92,13 @@ def tracks_lines(result: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def sequences(data: Dataset) -> dict[tuple[str, str], list[int]]:
-    """Return the frames of each scene and agent, in time order; raises `InputError` where they are too far apart."""
+def sequences(data: Dataset, frames: Sequence[int] | None = None) -> dict[tuple[str, str], list[int]]:
+    """Return the frames (None: all) by scene and agent, in time order.
+
+    Raises `InputError` where they are too far apart.
+    """
     found: dict[tuple[str, str], list[int]] = defaultdict(list)
-    for number in sorted(range(len(data)), key=lambda i: data.keys[i].time_s):
+    for number in sorted(of_frames(data, frames), key=lambda i: data.keys[i].time_s):
         found[data.keys[number].scene, data.keys[number].agent].append(number)
     for (scene, agent), numbers in found.items():
         gap = max(np.diff([data.keys[i].time_s for i in numbers]), default=0.0)
@@ -105,33 +118,31 @@ def _final_scores(story: Sequence[Tracked]) -> dict[int, float]:
 
 
 def _moment(
-    frame: Frame, tracked: Tracked, final: Mapping[int, float], network: Second, name: str
+    frame: Frame, tracked: Tracked, final: Mapping[int, float], config: SecondConfig, name: str
 ) -> tuple[Moment, list[float]]:
     """Return one class's moment, and by how much the velocity of each pair of an object and its track differ [m/s]."""
-    config, truth = network.config, frame.annotations
+    truth, annotations = ground_truth(frame, config), frame.annotations
+    of_class = truth.boxes.label == name
+    wanted = of_class & truth.target
     sensor_from_world = inverse(frame.world_from_sensor(only_lidar(frame)))
-    label = detection_labels(truth.boxes.label, config.classes)
-    known = (label == name) | (is_lookalike(truth.boxes.label, config.classes) & (name == "Car"))
-    wanted = (label == name) & (truth.returns >= MIN_RETURNS)
-    wanted &= in_range(truth.boxes.transformed(sensor_from_world), config)
     own = np.flatnonzero(tracked.boxes.label == name)
     own = own[in_range(tracked.boxes[own].transformed(sensor_from_world), config)]
     boxes: Boxes = tracked.boxes[own]
     objects = np.flatnonzero(wanted)
-    places, found = truth.boxes.center[objects, :2], boxes.center[:, :2]
+    places, found = annotations.boxes.center[objects, :2], boxes.center[:, :2]
     moment = Moment(
-        objects=truth.track[objects],
+        objects=annotations.track[objects],
         places=places,
         tracks=tracked.track[own],
         found=found,
         score=np.array([final[int(track)] for track in tracked.track[own]]),
-        neutral=on_neutral(boxes, truth.boxes[known & ~wanted]),
+        neutral=on_neutral(boxes, annotations.boxes[of_class & ~wanted]),
     )
     errors = []
     if len(objects) and len(own):
         apart = np.linalg.norm(places[:, None] - found[None], axis=2)
         nearest = apart.argmin(0)
         for number in np.flatnonzero(apart.min(0) <= 1.0):
-            true = truth.velocity[objects[nearest[number]]][:2]
+            true = annotations.velocity[objects[nearest[number]]][:2]
             errors.append(float(np.linalg.norm(true - tracked.velocity[own[number]])))
     return moment, errors

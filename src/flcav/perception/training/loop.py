@@ -33,6 +33,7 @@ class Checkpointing:
 
     path: Path
     every: int = 50  # steps
+    of: str = ""  # what else tells one run from another, beside what `train` is given
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def train(
     optimizer = adamw(network, learning_rate)
     waits = None if validation is None else (validation.every, validation.patience)
     settings = [task.name, repr(network.config), steps, batch, learning_rate, schedule, seed, waits]
-    identity = f"{json.dumps(settings)} on {len(samples)} samples"
+    identity = f"{json.dumps(settings)} on {len(samples)} samples {checkpointing.of if checkpointing else ''}"
     done = load_checkpoint(checkpointing.path, identity, network, optimizer) if checkpointing else Progress()
     order = batches(len(samples), batch, steps, seed)
     for number in range(len(done.losses), steps):

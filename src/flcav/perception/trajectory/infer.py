@@ -1,6 +1,6 @@
 """Predictions for the frames of a dataset, as JSON knows them, on the map around who observes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose, yaw_of
-from flcav.perception.task import Finding
+from flcav.perception.task import Finding, of_frames
 from flcav.perception.trajectory.config import FUTURE, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import predict, single
@@ -28,8 +28,8 @@ PIXEL_M = 0.2  # of the map that is shown
 TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())
 
 
-def findings(network: TrajectoryNetwork, path: Path) -> Iterator[Finding]:
-    """Yield what is predicted in each frame of the dataset `path`; raises `InputError` for anything else.
+def findings(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | None = None) -> Iterator[Finding]:
+    """Yield what is predicted in `frames` of the dataset `path` (None: all); raises `InputError` for anything else.
 
     The result is in the world's frame: {"time_s": [...], "observer": {"x", "y", "yaw"}, "lights": [{"x", "y",
     "open"}], "agents": [{"track", "class", "x", "y", "yaw", "speed", "length", "width", "modes": [{"probability",
@@ -40,7 +40,8 @@ def findings(network: TrajectoryNetwork, path: Path) -> Iterator[Finding]:
     read_manifest(path)
     data = Dataset.open(path)
     traces: dict[str, Trace] = {}
-    for number, key in enumerate(data.keys):
+    for number in of_frames(data, frames):
+        key = data.keys[number]
         if key.scene not in traces:
             traces = {key.scene: traffic(data, key.scene)}
         trace = traces[key.scene]

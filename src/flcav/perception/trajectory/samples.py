@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
+from flcav.perception.agents import POLE, kind_of
 from flcav.perception.task import of_frames
 from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.rasters import rasters
@@ -107,6 +108,15 @@ def _parts(
         rows = present_at(trace, key.time_s, roads_of(data), patch, wanted)
         count = len(rows["past"])
         yield rows | {"scene": np.full(count, key.scene), "frame": np.full(count, number)}
+
+
+def watching_frames(data: Dataset, cameras: bool) -> Sequence[int]:
+    """Return the frames that samples can be of: all, or with `cameras` those of vehicles, if there are any.
+
+    Through cameras the ways of those around the observing vehicle are predicted; a pole is none.
+    """
+    driving = [number for number, key in enumerate(data.keys) if kind_of(key.agent) != POLE]
+    return driving if cameras and driving else range(len(data))
 
 
 def traffic(data: Dataset, scene: str) -> Trace:

@@ -9,15 +9,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.perception.errors import Registry
 from flcav.perception.task import Finding, Practice
 from flcav.perception.trajectory.batch import futures_of, inputs_of, rasters_of
 from flcav.perception.trajectory.config import CONFIGURATIONS, TrajectoryConfig
+from flcav.perception.trajectory.errors import register_errors
 from flcav.perception.trajectory.evaluate import metrics
 from flcav.perception.trajectory.infer import findings
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import predict
-from flcav.perception.trajectory.samples import Sample, samples_of
+from flcav.perception.trajectory.samples import Sample, samples_of, watching_frames
 from flcav.progress import Report, silent
 
 Array = NDArray[np.float64]
@@ -38,6 +40,10 @@ class TrajectoryTask:
     def samples(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
         """Return the road users of the frames with a past and a future, see `samples_of`."""
         return samples_of(data, config, frames)
+
+    def fitting(self, data: Dataset, config: TrajectoryConfig) -> Sequence[int]:
+        """Return the frames that can hold samples, see `watching_frames`."""
+        return watching_frames(data, config.cameras is not None)
 
     def draw(self, samples: Sequence[Sample], index: int, config: TrajectoryConfig, rng: np.random.Generator) -> Sample:
         """Return the sample as it is: the frame of the present leaves nothing to turn or to move."""
@@ -71,9 +77,22 @@ class TrajectoryTask:
         every = result["slices"]["all"]
         return 1 / (1 + (every["minFDE_1"] + every["minFDE_K"]) / 2)
 
-    def infer(self, network: TrajectoryNetwork, path: Path, threshold: float = 0.0) -> Iterator[Finding]:
+    def infer(
+        self, network: TrajectoryNetwork, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None
+    ) -> Iterator[Finding]:
         """Yield the predicted paths of each frame of a dataset, see `findings`; all modes, however unlikely."""
-        yield from findings(network, path)
+        yield from findings(network, path, frames)
+
+    def register_errors(
+        self,
+        network: TrajectoryNetwork,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        threshold: float = 0.0,
+        progress: Report = silent,
+    ) -> Registry:
+        """Return who went elsewhere than predicted, see `errors.register_errors`; a path has no score."""
+        return register_errors(network, data, samples_of(data, network.config, frames), progress)
 
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
         """Return a line per slice."""

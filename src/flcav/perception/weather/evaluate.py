@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.perception.metrics import CONFIDENCE
 from flcav.seeds import stream
 
 REDRAWS = 1000
@@ -17,7 +18,8 @@ def classification(
     """Return accuracy with its 95 % interval over scenes, recall per class, and the confusion matrix.
 
     `truth` and `found` are (N,) class numbers. Rows of the matrix are the truth, columns what was found. Scenes are
-    redrawn whole, since their pictures are alike. The recall of a class without pictures is None.
+    redrawn whole, since their pictures are alike; of a single one the interval is None. So is the recall of a class
+    without pictures.
     """
     confusion = np.zeros((len(classes), len(classes)), np.int64)
     np.add.at(confusion, (truth, found), 1)
@@ -29,6 +31,7 @@ def classification(
         "accuracy": float((truth == found).mean()),
         "low": low,
         "high": high,
+        "confidence": CONFIDENCE,
         "recall": recall,
         "classes": list(classes),
         "confusion": confusion.tolist(),
@@ -37,10 +40,12 @@ def classification(
     }
 
 
-def _interval(right: NDArray[np.bool_], scenes: Sequence[str], seed: int) -> tuple[float, float]:
+def _interval(right: NDArray[np.bool_], scenes: Sequence[str], seed: int) -> tuple[float, float] | tuple[None, None]:
     _, scene = np.unique(np.asarray(scenes), return_inverse=True)
     count = int(scene.max()) + 1
+    if count < 2:
+        return None, None
     hits, sizes = np.bincount(scene, right), np.bincount(scene)
     times = stream(seed, "bootstrap").multinomial(count, np.full(count, 1 / count), size=REDRAWS)
-    low, high = np.quantile(times @ hits / (times @ sizes), (0.025, 0.975))
+    low, high = np.quantile(times @ hits / (times @ sizes), ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
     return float(low), float(high)

@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from flcav.dataset.store import Dataset
 from flcav.perception.images import Picture, pictures
+from flcav.perception.metrics import interval_words
 from flcav.perception.task import Finding, Practice
 from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
 from flcav.perception.weather.evaluate import classification
@@ -57,17 +58,21 @@ class WeatherTask:
         """Return the accuracy."""
         return float(result["accuracy"])
 
-    def infer(self, network: Classifier, path: Path, threshold: float = 0.0) -> Iterator[Finding]:
+    def infer(
+        self, network: Classifier, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None
+    ) -> Iterator[Finding]:
         """Yield {"class", "probabilities"} for each picture; the likeliest class, however unlikely."""
         classes = network.config.classes
-        for origin, rgb in pictures(path):
+        for origin, rgb in pictures(path, frames):
             shares = probabilities(network, [small(rgb)])[0]
             rows = {name: float(share) for name, share in zip(classes, shares, strict=True)}
             yield Finding(origin, rgb, {"class": classes[int(shares.argmax())], "probabilities": rows})
 
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
         """Return accuracy, then recall and confusions class by class."""
-        interval = f"[{result['low']:.3f}, {result['high']:.3f}]"
+        interval = interval_words(result["low"], result["high"])
+        if result["low"] is not None:
+            interval += f" ({100 * result['confidence']:g} %, over scenes)"
         seen = f"{result['pictures']} pictures of {result['scenes']} scenes"
         lines = [f"{seen}: accuracy {result['accuracy']:.3f} {interval}"]
         for name, row in zip(result["classes"], result["confusion"], strict=True):

@@ -6,6 +6,7 @@ import subprocess
 from pathlib import Path
 
 from flcav.config import InputError
+from flcav.extras import installation
 
 PARTS = ("nod", "edg", "con")
 OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
@@ -54,7 +55,7 @@ def join(prefix: Path, net: Path, origin: Path) -> None:
 def _run(options: dict[str, str], origin: Path) -> None:
     found = importlib.util.find_spec("sumo")
     if found is None or not found.submodule_search_locations:
-        raise InputError("importing towns needs SUMO's netconvert: pip install 'flcav[towns]'")
+        raise InputError(f"importing towns needs SUMO's netconvert, which is not installed: {installation('towns')}")
     binary = Path(next(iter(found.submodule_search_locations))) / "bin" / "netconvert"
     command = [str(binary), *(word for name, value in options.items() for word in (f"--{name}", value))]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

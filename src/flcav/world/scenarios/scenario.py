@@ -27,14 +27,14 @@ NEAR_M = 50.0  # of a position
 class Scenario(Config):
     """One corner case of a recipe: as soon after `at_s` as the traffic around `near` lends itself to it."""
 
-    kind: Kind
+    kind: Kind  # what happens
     at_s: Annotated[float, Field(gt=0, le=LONGEST_S)]  # of the traffic's clock, as `warmup_s`; not before
-    near: Annotated[str, Field(pattern=r"^cav[0-9]{1,4}$")] | None = None  # None: whichever vehicle under test is first
-    position: tuple[float, float] | None = None  # only while that vehicle is within NEAR_M of it [m]
+    near: Annotated[str, Field(pattern=r"^cav[0-9]{1,4}$")] | None = None  # that vehicle (cav0); without it, the first
+    position: tuple[float, float] | None = None  # only while that vehicle is within 50 m of x, y [m]
     lasts_s: Annotated[float, Field(ge=0.1, le=LONGEST_S)] | None = (
-        None  # a stalled vehicle drives on then; None: never
+        None  # a stalled vehicle drives on then; without it, never
     )
-    actors: dict[str, str] = Field(default={})  # role -> "category.shape", e.g. van: van.high_van
+    actors: dict[str, str] = Field(default={})  # who takes part, by role: "category.shape", e.g. van: van.high_van
 
     @model_validator(mode="after")
     def _known_actors(self) -> "Scenario":

@@ -1,0 +1,59 @@
+"""Bring your own strategy: the vehicle that errs most counts for most, so that what few have seen is learned too.
+
+One vehicle has pictures of the day alone, another fewer of the night. Weighting by a power of the loss is the idea of
+q-fair federated learning (Li et al., ICLR 2020).
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from flcav.dataset.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.stages import Schedule, federate
+from flcav.federation.strategies.fedavg import FedAvg, average
+from flcav.federation.trainable import Update, Weights
+from flcav.network.ledger import Budget, Ledger
+from flcav.perception.client import TaskClient
+from flcav.perception.task import fresh
+from flcav.perception.weather.config import LeNetConfig
+from flcav.perception.weather.task import WEATHER
+from flcav.perception.weights import from_arrays, to_arrays
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+
+CONFIG = LeNetConfig(classes=("clear", "fog", "night"))
+RIG = {"cameras": {"front": {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 160, "height": 96}}}}
+SKY = {"classes": CONFIG.classes * 2, "turn_s": 2.0}
+RECIPE = {"town": "grid", "cavs": 3, "spins_per_scene": 6, "every_s": 2.0, "vehicle_rig": RIG, "weather": SKY}
+SCHEDULE = Schedule(rounds=10, steps=5, learning_rate=4e-3, final_learning_rate=1e-3, seed=1)
+
+
+@dataclass(frozen=True)
+class LossWeighted:
+    power: float = 2.0
+
+    def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
+        return average([u.weights for u in updates], [u.samples * u.loss**self.power for u in updates])
+
+
+def main(out: Path) -> None:
+    record(EmbeddedSource(Recipe.model_validate(RECIPE)), out)
+    data, clients = Dataset.open(out), {}
+    for vehicle, weathers in (("cav0", ("clear", "fog")), ("cav1", ("night",))):
+        samples = WEATHER.samples(data, CONFIG, data.select(agents=[vehicle]))
+        seen = [sample for sample in samples if CONFIG.classes[sample.label] in weathers]
+        clients[vehicle] = TaskClient(WEATHER, CONFIG, seen)
+    for strategy in (FedAvg(), LossWeighted()):
+        network = fresh(WEATHER, CONFIG, seed=1)
+        account = Account(Ledger(Budget(wireless_mb=10.0, wireline_mb=0.0)), "edge", WEATHER.name, "wireless")
+        update = federate(clients, to_arrays(network), SCHEDULE, account, strategy=strategy)
+        from_arrays(network, update.weights)
+        recall = WEATHER.evaluate(network, data, data.select(agents=["cav2"]))["recall"]
+        print(f"{strategy}: a third vehicle's pictures, recall", ", ".join(f"{k} {v:.2f}" for k, v in recall.items()))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "out/own_strategy"))

@@ -1,0 +1,51 @@
+"""What commands let one choose from: the help lists it without loading what is chosen."""
+
+from enum import StrEnum
+
+
+class TaskName(StrEnum):
+    """The tasks, see `flcav.cli.tasks`."""
+
+    weather = "weather"
+    signs = "signs"
+    objects = "objects"
+    trajectory = "trajectory"
+
+
+class Device(StrEnum):
+    """Where networks run."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+class Format(StrEnum):
+    """What datasets are exported to, see `flcav.dataset.formats.export`."""
+
+    kitti = "kitti"
+    yolo = "yolo"
+    coco = "coco"
+    nuscenes = "nuscenes"
+    opv2v = "opv2v"
+    mcap = "mcap"
+
+
+class Engine(StrEnum):
+    """Who records, see `flcav.dataset.recorder`."""
+
+    processes = "processes"
+    ray = "ray"
+
+
+class Method(StrEnum):
+    """How sensors are placed, see `flcav.optimization.placement`."""
+
+    exact = "exact"
+    greedy = "greedy"
+
+
+def listed(choices: type[StrEnum]) -> str:
+    """Return the choices in words."""
+    *others, last = choices
+    return f"{', '.join(others)} or {last}"

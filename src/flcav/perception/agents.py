@@ -1,0 +1,69 @@
+"""Whose frames of a dataset a network learns from, is tested on, or looks at: vehicles', poles', or some by name."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.perception.task import RigBound, Task
+
+POLE = "pole"  # begins the names of roadside agents; all others are vehicles
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Frames of a dataset, and what is left out."""
+
+    frames: tuple[int, ...]  # numbers, in order
+    agents: tuple[str, ...]  # whose they are, in the dataset's order
+    used: Mapping[str, int]  # kind of agent, vehicle or pole -> frames
+    left_out: Mapping[str, int]
+
+    @property
+    def sentence(self) -> str:
+        """Return the counts in words: "24 vehicle frames (8 pole frames left out)"."""
+        left = f" ({_frames(self.left_out)} left out)" if self.left_out else ""
+        return _frames(self.used) + left
+
+    def summary(self) -> dict[str, Any]:
+        """Return agents and counts as JSON knows them."""
+        return {"agents": list(self.agents), "used": dict(self.used), "left_out": dict(self.left_out)}
+
+
+def choose_frames(task: Task[Any, Any, Any], config: Any, data: Dataset, wanted: str | None = None) -> Chosen:
+    """Return the frames of the agents `wanted`: "all", "vehicles", "poles" or names, with commas between several.
+
+    None stands for the frames whose sensors stand as a network of `config` expects them, all where the task does not
+    mind. Raises `InputError` for an agent that the dataset lacks, and where no frame is left.
+    """
+    if wanted is not None:
+        frames = data.select(agents=_agents(data, wanted))
+    else:
+        frames = task.fitting(data, config) if isinstance(task, RigBound) else range(len(data))
+    every, own = ([data.keys[i].agent for i in numbers] for numbers in (range(len(data)), frames))
+    used = Counter(map(kind_of, own))
+    return Chosen(tuple(frames), tuple(dict.fromkeys(own)), used, Counter(map(kind_of, every)) - used)
+
+
+def kind_of(agent: str) -> str:
+    """Return "vehicle" or "pole"."""
+    return POLE if agent.startswith(POLE) else "vehicle"
+
+
+def _agents(data: Dataset, wanted: str) -> set[str]:
+    known = list(dict.fromkeys(key.agent for key in data.keys))
+    groups = {"all": known} | {f"{kind}s": [a for a in known if kind_of(a) == kind] for kind in ("vehicle", POLE)}
+    found: set[str] = set()
+    for name in wanted.split(","):
+        own = groups.get(name, [name] if name in known else [])
+        if not own:
+            raise InputError(f"agents '{wanted}': {data.folder} has none called '{name}', but {', '.join(known)}")
+        found.update(own)
+    return found
+
+
+def _frames(counts: Mapping[str, int]) -> str:
+    noun = "frame" if sum(counts.values()) == 1 else "frames"
+    return f"{' and '.join(f'{count} {kind}' for kind, count in counts.items())} {noun}"

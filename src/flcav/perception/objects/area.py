@@ -1,0 +1,49 @@
+"""What an evaluation asks for: where objects have to lie, and with how many returns, said beside its numbers."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from flcav.config import InputError
+from flcav.perception.metrics import CONFIDENCE
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.truth import MIN_RETURNS
+
+
+def narrowed(config: SecondConfig, text: str) -> SecondConfig:
+    """Return `config` with the range `text`: metres ahead, a comma, metres to either side, as in "48,24".
+
+    Networks of different ranges are asked for the same objects within it. Raises `InputError` for anything else, and
+    where the network does not see so far.
+    """
+    try:
+        ahead, side = map(float, text.split(","))
+    except ValueError:
+        ahead = side = math.nan
+    if not (0 < ahead < math.inf and 0 < side < math.inf):
+        raise InputError(f"range '{text}': metres ahead and metres to either side are wanted, as in 48,24")
+    x0, y0, z0, x1, y1, z1 = config.range_m
+    if x0 > 0 or x1 < ahead or y0 > -side or y1 < side:
+        raise InputError(f"range '{text}': the network sees no further than {_extent(config.range_m)}")
+    return replace(config, range_m=(0.0, -side, z0, ahead, side, z1))
+
+
+def rules(config: SecondConfig) -> dict[str, Any]:
+    """Return what makes an object a target, and the level of intervals, as JSON knows them."""
+    return {"range_m": list(config.range_m), "min_returns": MIN_RETURNS, "confidence": CONFIDENCE}
+
+
+def rules_lines(rules: Mapping[str, Any]) -> list[str]:
+    """Return `rules` in words."""
+    return [
+        f"targets: centre {_extent(rules['range_m'])}, {rules['min_returns']} LiDAR returns or more; "
+        "others are neutral, and so are trucks and buses beside cars",
+        f"intervals: {100 * rules['confidence']:g} %, over scenes",
+    ]
+
+
+def _extent(range_m: tuple[float, ...]) -> str:
+    x0, y0, _, x1, y1, _ = range_m
+    sides = f"{y1:g} m to either side" if y0 == -y1 else f"{-y0:g} m to the right and {y1:g} m to the left"
+    return f"{x0:g} to {x1:g} m ahead and {sides}"

@@ -1,0 +1,124 @@
+"""Which signs and traffic lights a detector misses, and where it sees some that are none."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.formats.rectangles import CLASSES, HALF_PX, rectangles
+from flcav.dataset.store import Dataset
+from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry, keep_first
+from flcav.perception.images import checked_picture
+from flcav.perception.ops.rectangles import iou
+from flcav.perception.signs.config import SignsConfig
+from flcav.perception.signs.detect import Detections, detect
+from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.samples import size_px, wanted_boxes
+from flcav.progress import Report, silent
+from flcav.sensors.frame import Frame
+from flcav.sensors.lens import unprojected
+from flcav.world.rays.embree import Embree, Solid
+from flcav.world.static import Things, static_world, town_things
+
+OVERLAP = 0.5  # IoU that counts as found
+WITHIN = 0.5  # share of a detection that lies on something too small or cut off, which is then no mistake
+
+
+def register_errors(
+    network: SignDetector,
+    data: Dataset,
+    frames: Sequence[int],
+    threshold: float,
+    progress: Report = silent,
+) -> Registry:
+    """Return each sign or light of the town that was missed, once, and false positives by scene.
+
+    A miss stands at the sign's place in the town, a false positive where the ray through its middle meets what stands
+    still in the town; where it meets nothing it is dropped, and counted. Raises `InputError` where the dataset's town
+    is not known, or none of the frames has a camera.
+    """
+    town = data.town()
+    if town is None:
+        raise InputError(f"{data.folder}: its town is not known, so that signs have no place in it")
+    things, mesh = town_things(town), static_world(town).mesh
+    solid = Embree().solid(mesh.vertices, mesh.faces)
+    pairs = [(number, camera) for number in frames for camera in data.cameras(number)]
+    if not pairs:
+        raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
+    missed: dict[str, PerceptionError] = {}
+    invented: list[PerceptionError] = []
+    dropped = 0
+    for done, (number, camera) in enumerate(pairs, start=1):
+        frame = data.frame(number)
+        picture = checked_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}")
+        found = detect(network, picture, threshold=threshold)
+        height, width = picture.shape[:2]
+        misses, false = _mistakes(frame, camera, found, (width, height), network.config)
+        for error in _misses(frame, camera, misses, things):
+            missed.setdefault(error.track, error)
+        meets = list(_meets(frame, camera, found, false, solid, network.config))
+        dropped += sum(error is None for error in meets)
+        invented += [error for error in meets if error is not None]
+        progress(done, len(pairs), "")
+    return Registry(keep_first([*missed.values(), *invented]), dropped)
+
+
+def _mistakes(
+    frame: Frame, camera: str, found: Detections, size: tuple[int, int], config: SignsConfig
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows of the picture's signs that were missed, and the numbers of the detections of nothing."""
+    shown = rectangles(frame, camera, "signs", min_pixels=1)
+    names = [CLASSES["signs"][number] for number in shown.label]
+    wanted = wanted_boxes(shown.box, size, config) & np.array([name in config.classes for name in names], dtype=bool)
+    overlap = iou(torch.from_numpy(found.box), torch.from_numpy(shown.box)).numpy()
+    same = np.array([[config.classes[label] == name for name in names] for label in found.label], dtype=bool)
+    overlap = np.where(same.reshape(overlap.shape), overlap, 0.0)
+    free = wanted.copy()
+    false = []
+    for number in range(len(found)):
+        gain = np.where(free, overlap[number], 0.0)
+        if len(gain) and gain.max() >= OVERLAP:
+            free[gain.argmax()] = False
+        elif size_px(found.box[[number]])[0] >= config.smallest_px and not _on(found.box[number], shown.box[~wanted]):
+            false.append(number)
+    return shown.row[free], np.array(false, dtype=np.int64)
+
+
+def _on(box: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+    """Return whether at least `WITHIN` of a box (4,) lies on one of the others (K, 4)."""
+    low, high = np.maximum(box[:2], others[:, :2]), np.minimum(box[2:], others[:, 2:])
+    return bool(((high - low).clip(min=0).prod(1) >= WITHIN * (box[2:] - box[:2]).prod()).any())
+
+
+def _misses(frame: Frame, camera: str, rows: NDArray[np.int64], things: Things) -> Iterator[PerceptionError]:
+    signs, shown = frame.annotations.signs[camera], rectangles(frame, camera, "signs", min_pixels=1)
+    for row in rows.tolist():
+        thing = int(signs.thing[row])
+        label = CLASSES["signs"][shown.label[int(np.flatnonzero(shown.row == row)[0])]]
+        x, y, z = things.position[thing].tolist()
+        track = f"{signs.kind[row]}{thing}"
+        yield PerceptionError(x, y, z, 1.0, MISS, label, 0, float("nan"), frame.scene, track)
+
+
+def _meets(
+    frame: Frame, camera: str, found: Detections, numbers: NDArray[np.int64], solid: Solid, config: SignsConfig
+) -> Iterator[PerceptionError | None]:
+    """Yield a false positive where its ray meets the town, None where it meets nothing."""
+    if not len(numbers):
+        return
+    calibration = frame.calibration
+    middle = (found.box[numbers, :2] + found.box[numbers, 2:]) / 2 - HALF_PX
+    plane = unprojected(calibration.intrinsics[camera], calibration.distortion.get(camera, np.zeros(5)), middle)
+    rays = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    world_from_camera = frame.world_from_sensor(camera)
+    distance = solid.trace(world_from_camera, np.nan_to_num(rays).astype(np.float32)).distance
+    for number, ray, metres in zip(numbers, rays, distance, strict=True):
+        if not (np.isfinite(ray).all() and np.isfinite(metres)):
+            yield None
+            continue
+        x, y, z = (world_from_camera[:3, :3] @ ray * metres + world_from_camera[:3, 3]).tolist()
+        label = config.classes[found.label[number]]
+        yield PerceptionError(x, y, z, 1.0, FALSE_POSITIVE, label, 0, float("nan"), frame.scene, "")

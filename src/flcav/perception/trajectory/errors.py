@@ -1,0 +1,47 @@
+"""Where road users went elsewhere than a predictor said: final errors above `MISS_M`, at the vehicle's present."""
+
+from typing import Any
+
+import numpy as np
+
+from flcav.dataset.store import Dataset
+from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry, keep_first
+from flcav.perception.trajectory.evaluate import MISS_M
+from flcav.perception.trajectory.model import TrajectoryNetwork
+from flcav.perception.trajectory.predict import predict, single
+from flcav.perception.trajectory.samples import Samples
+from flcav.progress import Report, silent
+from flcav.world.trace import Trace
+
+
+def register_errors(network: TrajectoryNetwork, data: Dataset, samples: Samples, progress: Report = silent) -> Registry:
+    """Return a mistake per road user and scene whose single path ends more than `MISS_M` from where it went: the first.
+
+    It stands at the road user's present, on the ground.
+    """
+    columns: dict[str, Any] = samples.columns
+    paths, probabilities = predict(network, samples, progress)
+    said = paths[np.arange(len(paths)), single(paths, probabilities), -1]
+    wrong = np.linalg.norm(said - columns["future"][:, -1], axis=1) > MISS_M
+    traces: dict[str, Trace | None] = {scene: data.trace(scene) for scene in np.unique(columns["scene"]).tolist()}
+    errors = []
+    for row in np.flatnonzero(wrong):
+        scene, actor = str(columns["scene"][row]), int(columns["actor"][row])
+        trace = traces[scene]
+        assert trace is not None  # the samples come from it
+        x, y, _ = columns["pose"][row]
+        errors.append(
+            PerceptionError(
+                x=float(x),
+                y=float(y),
+                z=0.0,
+                weight=1.0,
+                kind=FINAL_ERROR,
+                label=str(trace.category[actor]),
+                returns=0,
+                occlusion=float("nan"),
+                scene=scene,
+                track=str(trace.actor[actor]),
+            )
+        )
+    return Registry(keep_first(errors))

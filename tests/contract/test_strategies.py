@@ -1,0 +1,148 @@
+"""What every strategy keeps to: those of the package, and the one that the example brings."""
+
+import importlib.util
+import json
+import pickle
+import random
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from flcav.experiments.demo import demo_protocol, demo_steps
+from flcav.experiments.steps import Step
+from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.stages import Schedule, federate
+from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy
+from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.network.ledger import Budget, Ledger
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "06_bring_your_own_strategy.py"
+SCHEDULE = Schedule(rounds=3, steps=2, learning_rate=0.1, final_learning_rate=0.05, seed=3)
+START = {"layer.weight": np.ones((5, 3), np.float32), "norm.count": np.array([7])}
+
+
+class Client:
+    """Walks at random, by a stride and a number of samples of its own."""
+
+    def __init__(self, samples: int) -> None:
+        self.samples = samples
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        rng = np.random.default_rng(seed)
+        moved = weights["layer.weight"] + (learning_rate * self.samples * rng.normal(size=(5, 3))).astype(np.float32)
+        count = weights["norm.count"] + self.samples
+        return LocalUpdate({"layer.weight": moved, "norm.count": count}, self.samples, float(rng.uniform(0.1, 2.0)))
+
+
+def of_the_example() -> type[Strategy]:
+    spec = importlib.util.spec_from_file_location(EXAMPLE.stem, EXAMPLE)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[EXAMPLE.stem] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.LossWeighted
+
+
+class Other(FedAvg):
+    """Does the same, and is another."""
+
+
+KINDS: dict[str, type[Strategy]] = {**STRATEGIES, "example": of_the_example()}
+CLIENTS = {f"cav{i}": Client(samples) for i, samples in enumerate((3, 40, 1, 17, 8))}
+
+
+@pytest.fixture(params=KINDS.values(), ids=[*KINDS])
+def strategy(request: pytest.FixtureRequest) -> Strategy:
+    return request.param()
+
+
+def federated(strategy: Strategy, start: Weights = START, **how: Any) -> Weights:
+    account = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless")
+    return federate(CLIENTS, start, SCHEDULE, account, strategy=strategy, **how).weights
+
+
+def updates() -> list[LocalUpdate]:
+    return [client.train(START, steps=2, learning_rate=0.1, seed=seed) for seed, client in enumerate(CLIENTS.values())]
+
+
+def same(one: Weights, other: Weights) -> bool:
+    return all(one[name].tobytes() == other[name].tobytes() for name in (*START, *one, *other))
+
+
+def test_it_is_deterministic_and_changes_nothing_it_is_given(strategy):
+    given, start = updates(), {name: array.copy() for name, array in START.items()}
+    once = strategy.combine(start, given)
+    for seed in (1, 2):
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002 - what a strategy must not draw from
+        torch.manual_seed(seed)
+        assert same(strategy.combine(start, given), once)
+    assert same(start, START)
+    assert all(same(update.weights, fresh.weights) for update, fresh in zip(given, updates(), strict=True))
+
+
+def test_it_returns_arrays_as_it_was_given_them(strategy):
+    combined = strategy.combine(START, updates())
+    assert {name: (a.shape, a.dtype) for name, a in combined.items()} == {
+        name: (a.shape, a.dtype) for name, a in START.items()
+    }
+    assert all(np.isfinite(array).all() for array in combined.values())
+    assert not np.array_equal(combined["layer.weight"], START["layer.weight"])
+
+
+def test_replies_are_combined_in_node_order_however_they_come_in(strategy, monkeypatch: pytest.MonkeyPatch):
+    in_order = federated(strategy)
+    receive, arrived = MeteredGrid.send_and_receive, []
+
+    def shuffled(grid, messages, **options):
+        replies = list(receive(grid, messages, **options))
+        arrived.append(len(replies))
+        return [replies[i] for i in (3, 0, 4, 2, 1)] if replies else replies
+
+    monkeypatch.setattr(MeteredGrid, "send_and_receive", shuffled)
+    assert same(federated(strategy), in_order)
+    assert arrived.count(len(CLIENTS)) == SCHEDULE.rounds
+
+
+def test_no_client_is_special(strategy):
+    given = updates()
+    one, other = (strategy.combine(START, order)["layer.weight"] for order in (given, given[::-1]))
+    np.testing.assert_allclose(one, other, rtol=1e-5)
+
+
+def test_it_keeps_nothing_between_rounds(strategy):
+    kept: list[Weights] = []
+    whole = federated(strategy, on_round=lambda number, weights, loss: kept.append(weights))
+    for done in (1, 2):
+        assert same(federated(type(strategy)(), kept[done - 1], done=done), whole)
+
+
+def test_it_travels_to_the_step_that_federates_and_is_in_its_fingerprint(strategy):
+    def print_of(arguments: Any) -> str:
+        return Step("edge", federated, {"strategy": arguments}).fingerprint({})
+
+    settings: dict[str, Any] = {field.name: getattr(strategy, field.name) for field in fields(strategy)}
+    assert json.loads(json.dumps(settings)) == settings
+    assert pickle.loads(pickle.dumps(strategy)) == strategy
+    assert len({print_of(kind()) for kind in KINDS.values()}) == len(KINDS)
+    numbers = [name for name, value in settings.items() if isinstance(value, int | float)]
+    changed = [replace(strategy, **{name: settings[name] + 1}) for name in numbers]
+    assert len({print_of(each) for each in (strategy, *changed)}) == 1 + len(numbers)
+
+
+def test_another_strategy_leaves_what_comes_before_it_as_it_is(strategy):
+    def prints(of: Strategy) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for step in demo_steps(demo_protocol(1), of):
+            found[step.name] = step.fingerprint(found)
+        return found
+
+    one, other = prints(strategy), prints(Other())
+    changed = {name for name in one if one[name] != other[name]}
+    assert {"grid-edge-chosen", "grid-edge-densest", "ring-edge-chosen", "cloud", "test-cloud-grid"} <= changed
+    assert {"plan", "pretrain", "grid-place", "grid-edge", "test-pretrain-grid"}.isdisjoint(changed)

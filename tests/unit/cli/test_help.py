@@ -1,0 +1,119 @@
+"""The help of every command, as it is shown."""
+
+import inspect
+import re
+from collections.abc import Iterator
+from enum import StrEnum
+
+import click
+import pytest
+import typer
+
+from flcav.cli.choices import Device, Engine, Format, Method, TaskName
+from flcav.cli.main import app, run
+from flcav.cli.tasks import TASKS
+from flcav.dataset.formats.export import FORMATS
+from flcav.dataset.recorder import ENGINES
+from flcav.perception.device import device_named
+from flcav.report.inference import DRAWINGS
+
+Commands = Iterator[tuple[tuple[str, ...], click.Command]]
+
+
+def commands(command: click.Command, path: tuple[str, ...] = ()) -> Commands:
+    """Yield every command as it was written, with the words that call it."""
+    yield path, command
+    for name, each in getattr(command, "commands", {}).items():
+        yield from commands(each, (*path, name))
+
+
+EVERY = dict(commands(typer.main.get_command(app)))
+each_command = pytest.mark.parametrize("path", EVERY, ids=lambda path: " ".join(path) or "flcav")
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    def show(path: tuple[str, ...], width: int) -> str:
+        monkeypatch.setenv("COLUMNS", str(width))
+        with pytest.raises(SystemExit) as ended:
+            run([*path, "--help"])
+        assert ended.value.code == 0
+        return capsys.readouterr().out
+
+    return show
+
+
+def words(text: str) -> str:
+    return " ".join(text.split())
+
+
+@each_command
+def test_help_is_shown_as_it_was_written(path, shown):
+    command, told = EVERY[path], words(shown(path, 400))
+    assert "…" not in told
+    for paragraph in inspect.cleandoc(command.help or "").split("\n\n"):
+        assert words(paragraph) in told
+    for parameter in command.params:
+        text = getattr(parameter, "help", None)
+        assert text, f"{parameter.name} has no help"
+        assert words(text) in told
+    for subcommand in getattr(command, "commands", {}).values():
+        assert words(inspect.cleandoc(subcommand.help).split("\n\n")[0]) in told
+
+
+@each_command
+def test_in_a_narrow_terminal_help_is_wrapped_and_only_names_of_options_are_cut(path, shown):
+    told = shown(path, 80)
+    for paragraph in inspect.cleandoc(EVERY[path].help or "").split("\n\n"):
+        assert words(paragraph) in words(told)
+    for cut in re.findall(r"\S*…", told):
+        (option,) = [each for each in EVERY[path].params if any(name.startswith(cut[:-1]) for name in each.opts)]
+        assert any(not name.startswith("--") and name in told for name in option.opts), cut
+
+
+@each_command
+def test_what_can_be_chosen_is_listed(path, shown):
+    told = words(shown(path, 400))
+    for parameter in EVERY[path].params:
+        if isinstance(parameter.type, click.Choice):
+            names = [str(choice) for choice in parameter.type.choices]
+            in_words = f"{', '.join(names[:-1])} or {names[-1]}"
+            assert in_words in told or f"[{'|'.join(names)}]" in told, parameter.name
+
+
+def test_choices_are_those_that_there_are():
+    for listed, known in ((TaskName, TASKS), (TaskName, DRAWINGS), (Format, FORMATS), (Engine, ENGINES)):
+        assert [*listed] == [*known]
+    for device in Device:
+        if device != Device.cuda:
+            device_named(device)
+
+
+def test_every_network_is_named(shown):
+    told = shown(("train",), 400)
+    for task in TASKS.values():
+        for name in task.configurations:
+            assert re.search(rf"\b{name}\b", told), name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wrong", "choices"),
+    [
+        (("train", "poetry", "--data", "d", "--out", "o"), "'TASK'", TaskName),
+        (("evaluate", "poetry", "--data", "d"), "'TASK'", TaskName),
+        (("infer", "poetry", "d"), "'TASK'", TaskName),
+        (("export", "poetry", "d", "--out", "o"), "'FORMAT'", Format),
+        (("record", "r", "--out", "o", "--engine", "steam"), "'--engine'", Engine),
+        (("infer", "weather", "d", "--device", "steam"), "'--device'", Device),
+        (("place", "--method", "steam"), "'--method'", Method),
+        (("export",), "'FORMAT'", Format),
+    ],
+)
+def test_a_wrong_choice_is_one_sentence(arguments, wrong, choices: type[StrEnum], capsys):
+    with pytest.raises(SystemExit) as ended:
+        run(list(arguments))
+    told = capsys.readouterr()
+    assert (ended.value.code, told.out) == (2, "")
+    (line,) = told.err.splitlines()
+    assert wrong in line
+    assert all(choice in line for choice in choices)

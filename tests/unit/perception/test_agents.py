@@ -1,0 +1,238 @@
+"""Whose frames are used: vehicles' and poles' sweeps in one dataset, and what is said of those left out."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flcav.cli.main import run
+from flcav.config import InputError
+from flcav.dataset.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.geometry import concatenate, pose
+from flcav.perception.agents import choose_frames
+from flcav.perception.objects import evaluate as evaluation
+from flcav.perception.objects.area import narrowed
+from flcav.perception.objects.model import second_small, second_tiny, small_config, tiny_config
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.weights import save_network
+from flcav.perception.trajectory.config import CONFIGURATIONS as TRAJECTORIES
+from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.perception.weather.task import WEATHER
+from flcav.perception.weights import read_card
+from flcav.sensors.frame import Calibration, Frame
+
+from .frames import cloud_in, detections, frame
+
+CARS = [("near", "car", 10.0, 3.0, 40), ("aside", "car", 20.0, 26.0, 40), ("far", "car", 50.0, 0.0, 40)]
+CLOUD = cloud_in(detections(*((x, y, 1.0) for _, _, x, y, _ in CARS)), each=40)
+
+
+@dataclass(frozen=True)
+class Street:
+    """A source of one frame per scene and agent: vehicles with a LiDAR at `height_m`, poles with theirs at 6 m."""
+
+    agents: tuple[str, ...] = ("cav0", "cav1", "pole3")
+    scene: tuple[str, ...] = ("a", "b")
+    height_m: float = 1.8
+
+    def describe(self) -> dict[str, Any]:
+        return {"town": "none", "split": "train", "seed": 0, "agents": self.agents}
+
+    def scenes(self) -> list[str]:
+        return list(self.scene)
+
+    def frame_count(self, scene: str) -> int:
+        return len(self.agents)
+
+    def frames(self, scene: str):
+        return (self.frame(scene, agent) for agent in self.agents)
+
+    def frame(self, scene: str, agent: str) -> Frame:
+        seen = frame(CARS, points=CLOUD, scene=scene, agent=agent)
+        mounted = Calibration({"top": pose(0, 0, 0.0 if agent.startswith("pole") else self.height_m)})
+        raised = pose(0, 0, 6.0) if agent.startswith("pole") else np.eye(4)
+        return replace(seen, calibration=mounted, assumed=mounted, world_from_agent=raised)
+
+    def trace(self, scene: str) -> None:
+        return None
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Callable[..., Dataset]:
+    def make(**fields: Any) -> Dataset:
+        out = tmp_path_factory.mktemp("street")
+        record(Street(**fields), out)
+        return Dataset.open(out)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def street(recorded) -> Dataset:
+    return recorded()
+
+
+@pytest.fixture
+def said(capsys) -> Callable[..., str]:
+    """Run a command that is to succeed; return what it prints."""
+
+    def call(*arguments: object) -> str:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stopped:
+            run([str(argument) for argument in arguments])
+        told = capsys.readouterr()
+        assert not stopped.value.code, told.err
+        return told.out
+
+    return call
+
+
+def agents_of(data: Dataset, frames: Any) -> list[str]:
+    return [data.keys[number].agent for number in frames]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "agents", "sentence"),
+    [
+        (None, ["cav0", "cav1"], "4 vehicle frames (2 pole frames left out)"),
+        ("vehicles", ["cav0", "cav1"], "4 vehicle frames (2 pole frames left out)"),
+        ("poles", ["pole3"], "2 pole frames (4 vehicle frames left out)"),
+        ("all", ["cav0", "cav1", "pole3"], "4 vehicle and 2 pole frames"),
+        ("pole3,cav1", ["cav1", "pole3"], "2 vehicle and 2 pole frames (2 vehicle frames left out)"),
+        ("poles,cav0", ["cav0", "pole3"], "2 vehicle and 2 pole frames (2 vehicle frames left out)"),
+    ],
+)
+def test_agents_are_chosen_by_kind_and_name(street, wanted, agents, sentence):
+    chosen = choose_frames(OBJECTS, tiny_config(), street, wanted)
+    assert agents_of(street, chosen.frames) == 2 * agents
+    assert list(chosen.agents) == agents
+    assert chosen.sentence == sentence
+
+
+def test_one_frame_is_one(recorded):
+    assert choose_frames(WEATHER, None, recorded(agents=("cav0",), scene=("a",))).sentence == "1 vehicle frame"
+
+
+@pytest.mark.parametrize("wanted", ["cav7", "vehicles,cav7", "", "cav0,", "pole"])
+def test_agents_that_are_not_there_are_refused(street, wanted):
+    with pytest.raises(InputError, match=r"has none called '.*', but cav0, cav1, pole3$"):
+        choose_frames(OBJECTS, tiny_config(), street, wanted)
+
+
+def test_a_kind_that_is_not_there_is_refused(recorded):
+    with pytest.raises(InputError, match="has none called 'poles', but cav0"):
+        choose_frames(OBJECTS, tiny_config(), recorded(agents=("cav0",)), "poles")
+
+
+def test_a_lidar_fits_by_its_height_and_not_by_its_carrier(recorded):
+    truck = recorded(height_m=2.9)
+    with pytest.raises(InputError, match=r"no LiDAR is mounted 1.8 m .* \(cav0: 2.9 m, cav1: 2.9 m, pole3: 0 m\)"):
+        choose_frames(OBJECTS, tiny_config(), truck)
+    assert len(choose_frames(OBJECTS, tiny_config(), truck, "vehicles").frames) == 4
+    assert choose_frames(OBJECTS, tiny_config(ground_z_m=-3.0), truck).sentence.startswith("4 vehicle frames (2 pole")
+
+
+def test_cameras_of_vehicles_and_poles_are_used_alike_and_paths_are_those_of_vehicles(street):
+    assert choose_frames(WEATHER, None, street).left_out == {}
+    assert choose_frames(TRAJECTORY, TRAJECTORIES["tiny"], street).left_out == {}
+    assert choose_frames(TRAJECTORY, TRAJECTORIES["tiny-cameras"], street).left_out == {"pole": 2}
+
+
+def test_every_command_says_whose_frames_it_uses(street, tmp_path, said):
+    out = tmp_path / "out"
+    learned = said(
+        "train", "objects", "--data", street.folder, "--validation", street.folder, "--out", out, "--epochs", 1
+    )
+    counts = "4 vehicle frames (2 pole frames left out)"
+    assert learned.splitlines()[:2] == [f"{street.folder}: {counts}", f"{street.folder}: {counts}, for validation"]
+    weights = out / "weights.safetensors"
+    card = read_card(weights)
+    assert card.samples == 4
+    assert [entry["agents"] for entry in (*card.data, card.validation or {})] == 2 * [["cav0", "cav1"]]
+    assert "4 frames of cav0, cav1;" in card.markdown()
+    evaluated = said("evaluate", "objects", "--data", street.folder, "--weights", weights).splitlines()
+    assert evaluated[:2] == [counts, f"network: tiny, seed 0, {weights}"]
+    assert any("0 to 48 m ahead and 24 m to either side, 5 LiDAR returns or more" in line for line in evaluated[:5])
+    assert "intervals: 95 %, over scenes" in evaluated[:5]
+    assert said("infer", "objects", street.folder, "--weights", weights).startswith(f"{street.folder}: {counts}\n")
+
+
+def test_what_is_left_out_is_neither_tested_nor_looked_at(street, tmp_path, said):
+    weights = tmp_path / "weights.safetensors"
+    save_network(second_tiny(), weights)
+    for wanted, agents in (((), ["cav0", "cav1"]), (("--agents", "pole3"), ["pole3"])):
+        result = json.loads(
+            said("evaluate", "objects", "--data", street.folder, "--weights", weights, "--json", *wanted)
+        )
+        asked_for = OBJECTS.evaluate(second_tiny(), street, street.select(agents=agents))
+        assert result["frames"] == 2 * len(agents)
+        assert [row["targets"] for row in result["scores"]] == [row["targets"] for row in asked_for["scores"]]
+        found = json.loads(said("infer", "objects", street.folder, "--weights", weights, "--json", *wanted))
+        assert [one["path"].rsplit("_", 1)[1] for one in found["inputs"]] == 2 * agents
+        assert result["agents"] == found["datasets"][0]["agents"] == agents
+        assert sum(result["used"].values()) + sum(result["left_out"].values()) == 6
+
+
+def test_files_have_no_agents(street, tmp_path, capsys):
+    cloud = next(iter(sorted(street.folder.glob("top/*.bin"))))
+    with pytest.raises(SystemExit, match="2"):
+        run(["infer", "objects", str(cloud), "--agents", "all"])
+    assert "--agents all: only datasets have agents" in capsys.readouterr().err
+
+
+def test_networks_of_different_ranges_are_asked_for_the_same_objects(street):
+    tiny, small = second_tiny(), second_small(classes=("Car",))
+    own, same = [], []
+    for network in (tiny, small):
+        asked = narrowed(network.config, "48,24")
+        own.append(OBJECTS.evaluate(network, street)["scores"][0]["targets"])
+        same.append(OBJECTS.evaluate(network, street, asked=asked)["scores"][0]["targets"])
+    assert own == [6, 18]
+    assert same == [6, 6]
+
+
+def test_beyond_the_range_nothing_is_wrong(street, monkeypatch):
+    hit, beyond = detections((10, 3, 0.8)), detections((44, 10, 0.9), (30, -26, 0.9))
+    monkeypatch.setattr(evaluation, "detect_all", lambda *_, **__: [concatenate([beyond, hit])])
+    network = second_small(classes=("Car",))
+    ap = [
+        OBJECTS.evaluate(network, street, street.select(agents=["cav0"]), asked=asked)["scores"][0]["ap"]
+        for asked in (narrowed(network.config, "40,24"), narrowed(network.config, "51,28"))
+    ]
+    assert ap[0] == 1
+    assert ap[1] < 0.5
+
+
+@pytest.mark.parametrize("text", ["48", "48,24,1", "48;24", "nan,24", "48,inf", "0,24", "-48,24", "48,-24", ""])
+def test_a_range_that_is_none_is_refused(text):
+    with pytest.raises(InputError, match="metres ahead and metres to either side are wanted, as in 48,24"):
+        narrowed(small_config(), text)
+
+
+@pytest.mark.parametrize("text", ["52,24", "48,29"])
+def test_a_range_beyond_the_network_s_is_refused(text):
+    with pytest.raises(InputError, match=r"sees no further than 0 to 51\.2 m ahead and 28\.8 m to either side"):
+        narrowed(small_config(), text)
+
+
+def test_only_objects_lie_in_a_range(street, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        run(["evaluate", "weather", "--data", str(street.folder), "--range", "48,24"])
+    assert "--range: only objects" in capsys.readouterr().err
+
+
+def test_one_scene_has_no_interval(recorded, tmp_path, said, monkeypatch):
+    hits = detections((10, 3, 0.8))
+    monkeypatch.setattr(evaluation, "detect_all", lambda *_, **__: [hits])
+    weights = tmp_path / "weights.safetensors"
+    save_network(second_tiny(), weights)
+    for scenes, words in ((("a",), "AP 1.000 (no interval: one scene)"), (("a", "b"), "AP 1.000 [1.000, 1.000]")):
+        data = recorded(scene=scenes)
+        options = ("evaluate", "objects", "--data", data.folder, "--weights", weights)
+        assert words in said(*options)
+        row = json.loads(said(*options, "--json"))["scores"][0]
+        assert (row["low"], row["high"]) == ((None, None) if len(scenes) == 1 else (1, 1))

@@ -1,0 +1,40 @@
+"""Hints about what is not installed work where flcav is on no index: they name the packages, as the project does."""
+
+import importlib.util
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from flcav.config import InputError
+from flcav.dataset import ray_engine
+from flcav.extras import installation
+from flcav.world.opendrive import netconvert
+
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+
+
+@pytest.mark.parametrize("extra", ["ray", "view", "towns"])
+def test_it_names_the_packages_that_the_project_asks_for(extra):
+    command = shlex.split(installation(extra))
+    assert command[:4] == [sys.executable, "-m", "pip", "install"]
+    asked = {Requirement(line) for line in PROJECT["optional-dependencies"][extra]}
+    assert {Requirement(word) for word in command[4:]} == asked
+    assert not any("flcav" in word for word in command[4:])
+
+
+def test_ray_says_how_to_get_it(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError) as told, ray_engine.ray_cluster(None, tmp_path, 1, lambda count: None):  # type: ignore
+        pass
+    assert str(told.value).endswith(installation("ray"))
+
+
+def test_importing_towns_says_how_to_get_netconvert(monkeypatch, tmp_path):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError) as told:
+        netconvert.take_apart(tmp_path / "map.xodr", tmp_path / "parts")
+    assert str(told.value).endswith(installation("towns"))

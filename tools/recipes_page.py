@@ -1,0 +1,220 @@
+"""Write docs/recipes.md from the models of recipes, their fields' comments among them: python tools/recipes_page.py."""
+
+import ast
+import inspect
+import io
+import re
+import tokenize
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import annotated_types
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from pydantic.fields import FieldInfo
+
+from flcav.config import Config
+from flcav.markdown import table
+from flcav.sensors.beams import BEAMS
+from flcav.sensors.calibration import CalibrationError
+from flcav.sensors.camera import Camera
+from flcav.sensors.carla import CarlaReturns
+from flcav.sensors.gnss import Gnss
+from flcav.sensors.imu import Imu
+from flcav.sensors.infrared import Infrared
+from flcav.sensors.lens import Lens
+from flcav.sensors.lidar import Lidar
+from flcav.sensors.radar_detector import Radar
+from flcav.sensors.rig import (
+    RIGS,
+    Mount,
+    Mounted,
+    MountedCamera,
+    MountedGnss,
+    MountedImu,
+    MountedInfrared,
+    MountedLidar,
+    MountedRadar,
+    Rig,
+)
+from flcav.sources.recipe import Recipe
+from flcav.world.scenarios.scenario import Scenario
+from flcav.world.town import TOWNS
+from flcav.world.weather import WEATHER_CLASSES, WEATHERS, Keyframe, Weather, WeatherSchedule
+
+PAGE = Path(__file__).parents[1] / "docs" / "recipes.md"
+TEMPLATE = Path(__file__).with_name("recipes.md.j2")
+HEADER = ("field", "unit", "value", "default", "what it is")
+UNITS = {
+    **{"mm_h": "mm/h", "m_s": "m/s", "ms": "ms", "m": "m", "s": "s"},
+    **{"deg": "°", "rad": "rad", "px": "px", "hz": "Hz", "k": "K"},
+}  # by the end of a field's name
+WORDS = {int: "whole number", float: "number", bool: "true, false", str: "text"}
+LISTS = {int: "whole numbers", float: "numbers", str: "names"}
+LINKS: Mapping[type[Config], str] = {  # to where a model is explained
+    Rig: "[rig](#rigs)",
+    Mount: "[pose](#rigs)",
+    MountedLidar: "[LiDARs](#lidar)",
+    MountedCamera: "[cameras](#cameras)",
+    MountedInfrared: "[thermal cameras](#cameras)",
+    MountedRadar: "[radars](#radar)",
+    MountedGnss: "[receivers](#gnss)",
+    MountedImu: "[units](#imu)",
+    CarlaReturns: "[values](#lidar)",
+    WeatherSchedule: "[weather](#weather)",
+    Weather: "[weather](#weather)",
+    Keyframe: "[keyframes](#weather)",
+    CalibrationError: "[errors](#errors-of-calibration)",
+    Scenario: "[corner cases](#corner-cases)",
+}
+EXPLAINED = (
+    *(Recipe, Rig, Mounted, Mount, Lidar, CarlaReturns, Lens, Camera, Infrared, Radar, Gnss, Imu),
+    *(Weather, WeatherSchedule, Keyframe, CalibrationError, Scenario),
+)
+
+
+def page() -> str:
+    """Return the page."""
+    jinja = Environment(loader=FileSystemLoader(TEMPLATE.parent), undefined=StrictUndefined, keep_trailing_newline=True)
+    weathers, values = WEATHERS.items(), Weather.model_fields
+    return jinja.get_template(TEMPLATE.name).render(
+        {model.__name__: model for model in EXPLAINED},
+        fields=fields_of,
+        towns=", ".join(f"`{name}`" for name in TOWNS),
+        rigs=table(("rig", "its sensors"), ((f"`{name}`", "; ".join(sensors_of(rig))) for name, rig in RIGS.items())),
+        beams=table(("`beams`", "beams", "elevations", "`azimuth_steps`", "`range_m`"), beams()),
+        presets=WEATHERS,
+        preset_table=table(
+            ("preset", *(f"`{name}`" for name in values)),
+            ((f"`{preset}`", *(number(getattr(weather, name)) for name in values)) for preset, weather in weathers),
+        ),
+        class_table=table(("class", "region"), ((f"`{name}`", "; ".join(region(name))) for name in WEATHER_CLASSES)),
+    )
+
+
+def fields_of(model: type[Config], without: type[Config] = Config) -> str:
+    """Return a table of the model's fields but those of `without`."""
+    said = comments(model)
+    rows = []
+    for name, field in model.model_fields.items():
+        if name not in without.model_fields:
+            text, unit = said_and_unit(name, said[name])
+            rows.append((f"`{name}`", unit, value_of(field), default_of(field), text))
+    return table(HEADER, rows)
+
+
+def comments(model: type[Config]) -> dict[str, str]:
+    """Return the comment beside each field of a model, those it inherits included."""
+    found = {}
+    for owner in reversed(model.__mro__):
+        if not issubclass(owner, Config) or owner is Config:
+            continue
+        source = inspect.getsource(owner)
+        tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+        lines = {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
+        for node in ast.parse(source).body[0].body:  # type: ignore[attr-defined]
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                around = range(node.lineno, (node.end_lineno or node.lineno) + 1)
+                found[node.target.id] = " ".join(lines[line] for line in around if line in lines)
+    return found
+
+
+def said_and_unit(name: str, comment: str) -> tuple[str, str]:
+    """Return a field's comment without its unit, and the unit: in brackets in the comment, or the end of its name."""
+    if bracket := re.search(r" *\[([^\]]*[a-z][^\]]*)\]", comment):
+        return comment.replace(bracket[0], ""), bracket[1]
+    return comment, next((unit for ending, unit in UNITS.items() if name.endswith(f"_{ending}")), "")
+
+
+def value_of(field: FieldInfo) -> str:
+    """Return what may be given, in words."""
+    limits = {type(each): each for each in field.metadata}
+    low = limits.get(annotated_types.Ge) or limits.get(annotated_types.Gt)
+    high = limits.get(annotated_types.Le) or limits.get(annotated_types.Lt)
+    words = kind_of(field.annotation)
+    if isinstance(low, annotated_types.Ge) and isinstance(high, annotated_types.Le):
+        return f"{words}, {number(low.ge)} to {number(high.le)}"
+    for each, sign, name in ((low, "≥", "ge"), (low, ">", "gt"), (high, "≤", "le"), (high, "<", "lt")):
+        if hasattr(each, name) and getattr(each, name) != 2**63:
+            words += f", {sign} {number(getattr(each, name))}"
+    return words
+
+
+def kind_of(annotation: Any) -> str:
+    """Return a type in words; of a model, a link to where it is explained."""
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        limits = [f", > {each.gt:g}" for each in inner[1].metadata if isinstance(each, annotated_types.Gt)]
+        return kind_of(inner[0]) + "".join(limits)
+    if origin in (Union, UnionType):
+        return " or ".join(kind_of(each) for each in inner if each is not NoneType)
+    if origin is Literal:
+        return ", ".join(f"`{each}`" for each in inner)
+    if origin is dict:
+        return f"by name: {kind_of(inner[1])}"
+    if origin is tuple and inner[-1] is not Ellipsis:
+        return f"{len(inner)} numbers"
+    if origin is tuple:
+        return f"list of {LISTS.get(inner[0]) or kind_of(inner[0])}"
+    if annotation in WORDS:
+        return WORDS[annotation]
+    return LINKS[annotation]
+
+
+def default_of(field: FieldInfo) -> str:
+    """Return the default as YAML has it."""
+    if field.is_required():
+        return "**required**"
+    value = field.get_default(call_default_factory=True)
+    names = {rig.model_dump_json(): name for name, rig in RIGS.items()}
+    if isinstance(value, WeatherSchedule):
+        return f"`{next(name for name, each in WEATHERS.items() if WeatherSchedule.model_validate(each) == value)}`"
+    if isinstance(value, Rig):
+        return f"`{names[value.model_dump_json()]}`"
+    if isinstance(value, Config) or value is None or value in ((), {}):
+        return ""
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
+    return f"`{value if isinstance(value, str) else number(value)}`"
+
+
+def sensors_of(rig: Rig) -> Iterator[str]:
+    """Yield the sensors of a rig, in words."""
+    for name, lidar in rig.lidars.items():
+        settings = lidar.settings
+        beams = settings.beams or f"{settings.channels} channels from {settings.up_deg:g}° to {settings.down_deg:g}°"
+        yield f"LiDAR `{name}` ({beams}, {settings.azimuth_steps} steps, {settings.range_m:g} m)"
+    for name, camera in rig.cameras.items():
+        lens = camera.settings
+        wide = 2 * np.degrees(np.arctan(lens.width / 2 / lens.intrinsics()[0, 0]))
+        yield f"camera `{name}` ({lens.width} × {lens.height}, {wide:.0f}°)"
+    yield from (f"thermal camera `{name}`" for name in rig.infrareds)
+    yield from (f"radar `{name}`" for name in rig.radars)
+    yield from (f"GNSS `{name}`" for name in rig.gnss)
+    yield from (f"IMU `{name}`" for name in rig.imus)
+
+
+def beams() -> Iterator[tuple[Any, ...]]:
+    """Yield a row for each LiDAR that has a name."""
+    for name, known in BEAMS.items():
+        high, low = max(known.elevations_deg), min(known.elevations_deg)
+        limits = f"{high:g}° to {low:g}°"
+        yield f"`{name}`", len(known.elevations_deg), limits, known.azimuth_steps, number(known.range_m)
+
+
+def region(name: str) -> Iterator[str]:
+    """Yield the limits of a class of weather."""
+    for field, (low, high) in WEATHER_CLASSES[name].items():
+        yield f"`{field}` {low:g}" + (f" to {high:g}" if high > low else "")
+
+
+def number(value: Any) -> str:
+    """Return a number as one writes it."""
+    return f"{value:.12g}"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
+    print(PAGE)
