@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -25,6 +26,7 @@ from flcav.perception.objects.weights import save_network
 from flcav.perception.weights import config_key
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.world.town import load_town
 
 COMMAND = (sys.executable, "-c", "from flcav.cli.main import run; run()")
 COARSE = {"lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 16, "azimuth_steps": 360}}}}
@@ -158,6 +160,116 @@ def test_an_empty_dataset(data: Path, weights: Path, tmp_path: Path, refused: Ca
     for command, options in commands.items():
         assert "the dataset is empty, it holds no frames" in refused(command, "objects", *options)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("table", "column"), [("annotations", "track"), ("annotations", "category"), ("frames", "agent"), ("files", "path")]
+)
+def test_names_that_are_no_utf8(
+    table: str, column: str, data: Path, tmp_path: Path, refused: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = data / f"{table}.parquet"
+    rows = pq.read_table(path)
+    raw = [b"\xff\xfe" + name.encode() for name in rows[column].to_pylist()]
+    names = pa.array(raw, pa.binary()).view(pa.string())
+    pq.write_table(rows.set_column(rows.column_names.index(column), rows.schema.field(column), names), path)
+    with pytest.raises(SystemExit) as ended:
+        run(["validate", str(data)])
+    told = capsys.readouterr()
+    assert (ended.value.code, told.err) == (1, "")
+    if table == "files":  # read by `validate` alone
+        assert f"{path}: truncated or grown" in told.out
+        return
+    assert f"{path}: not a readable Parquet file" in told.out
+    assert "UTF8" in refused("birdseye", data, "--out", tmp_path / "frame.png")
+    assert "UTF8" in refused("infer", "objects", data)
+    assert not (tmp_path / "frame.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value", "said"),
+    [
+        ("frames", "scene", "../../scene", "'../../scene' is no name"),
+        ("frames", "points", [1, 2], "needs one number of points for each of its lidars"),
+        ("frames", "index", 7, "is not spin 7 of cav0"),
+        ("poses", "world_from_agent_then", [1.0], "needs 16 numbers for each pose"),
+        ("poses", "world_from_agent", [float("nan")] * 16, "is not a rigid transform"),
+        ("points", "row", -1, "sees an actor that is not annotated"),
+        ("points", "row", 10_000, "sees an actor that is not annotated"),
+        ("annotations", "x", float("nan"), "not finite"),
+        ("annotations", "category", "tank", "unknown class 'tank'"),
+        ("annotations", "track", None, "has empty cells"),
+    ],
+)
+def test_what_nobody_can_have_measured(
+    table: str, column: str, value: object, said: str, data: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    path = data / f"{table}.parquet"
+    rows = pq.read_table(path)
+    cells = [value, *rows[column].to_pylist()[1:]]
+    field = rows.schema.field(column)
+    pq.write_table(rows.set_column(rows.column_names.index(column), field, pa.array(cells, field.type)), path)
+    assert said in refused("birdseye", data, "--out", tmp_path / "frame.png")
+    assert said in refused("export", "opv2v", data, "--out", tmp_path / "out")
+    assert left_in(tmp_path) == left_in(data.parent)
+    with pytest.raises(SystemExit) as ended:
+        run(["validate", str(data)])
+    assert ended.value.code == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"scenarios": [{"kind": "stalled_vehicle", "at_s": 20, "lasts_s": "1e309"}]}, "lasts_s' = '1e309': "),
+        ({"spins_per_scene": 10**400}, "spins_per_scene"),
+        ({"spins_per_scene": 50_000}, "put the last spin at 50029 s, after 36000 s"),
+        ({"weather": {"sun_azimuth_deg": 1e300}}, "sun_azimuth_deg' = 1e+300: "),
+        ({"vehicle_rig": {"radars": {"radar": {"settings": {"range_cell_m": 1e-320}}}}}, "range_cell_m' = "),
+    ],
+)
+def test_numbers_that_nobody_can_mean_in_a_recipe(
+    change: dict[str, object], said: str, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(RECIPE | change))
+    assert said in refused("record", tmp_path / "recipe.yaml", "--out", tmp_path / "data")
+    assert left_in(tmp_path) == ["recipe.yaml"]
+
+
+def test_numbers_that_nobody_can_mean_in_a_history_and_a_graph(tmp_path: Path, refused: Callable[..., str]) -> None:
+    history = tmp_path / "history.csv"
+    history.write_text("samples,edge_rounds,cloud_rounds,accuracy\n1e-310,0,0,0.1\n100,0,0,0.5\n1000,0,0,0.7\n")
+    for model in ("additive", "effective"):
+        assert "samples = 1e-310 must be a number from 0 to 1e+09" in refused("fit", history, "--model", model)
+    text = (Path(__file__).parents[2] / "recipes" / "graphs" / "three_layers.yaml").read_text()
+    (tmp_path / "graph.yaml").write_text(text.replace("b: 0.10, alpha: 0.1", "b: 0.10, alpha: 1e-320"))
+    assert "alpha' = '1e-320': " in refused("allocate", tmp_path / "graph.yaml")
+    steep = PROBLEM["tasks"][0] | {"curve": {"model": "additive", "pretrain": {"a": 1.0, "b": 200.0, "x0": 1e-9}}}
+    steep["limits"] = steep["limits"] | {"samples": [0, 400]}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(PROBLEM | {"tasks": [steep]}))
+    assert "curve of task 'objects' predicts an error of inf" in refused("allocate", tmp_path / "problem.yaml")
+
+
+@pytest.mark.parametrize("text", ["a: " + "[" * 2000 + "]" * 2000, "a: 2020-13-45", "{[1]: 2}", "a: &b [*b]"])
+def test_yaml_that_the_parser_trips_over(text: str, tmp_path: Path, refused: Callable[..., str]) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    for command in (("record", tmp_path / "a.yaml", "--out", tmp_path / "data"), ("allocate", tmp_path / "a.yaml")):
+        assert str(tmp_path / "a.yaml") in refused(*command)
+
+
+def test_a_town_is_looked_for_beside_the_recipe_too(
+    tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = tmp_path / "recipes" / "recipe.yaml"
+    recipe.parent.mkdir()
+    recipe.write_text(yaml.safe_dump(RECIPE | {"town": "town02", "poles": [99]}))
+    monkeypatch.chdir(tmp_path)
+    sentence = refused("record", recipe, "--out", tmp_path / "data")
+    assert "unknown town 'town02'; known towns: suburb, grid, ring, arterial, or a folder" in sentence
+    assert f"there is no {recipe.parent / 'town02'} nor {tmp_path / 'town02'}" in sentence
+    shutil.copytree(load_town("suburb").net.parent, recipe.parent / "town02")
+    assert "field 'poles' = 99: no pole of town02" in refused("record", recipe, "--out", tmp_path / "data")
+    (recipe.parent / "town02").rename(tmp_path / "town02")
+    assert "field 'poles' = 99: no pole of town02" in refused("record", recipe, "--out", tmp_path / "data")
 
 
 def test_weights_of_another_network(data: Path, weights: Path, tmp_path: Path, refused: Callable[..., str]) -> None:

@@ -1,10 +1,11 @@
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import Field
 
-from flcav.config import Config, InputError, parse_config
+from flcav.config import Config, InputError, parse_config, read_json
 
 
 class Circle(Config):
@@ -47,6 +48,25 @@ class Picture(Config):
 def test_a_fault_is_one_sentence_with_field_value_and_rule(values: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         parse_config(Picture, values, "p.yaml")
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), "1e309", 1e300, 10**400])
+def test_numbers_that_nobody_can_mean_are_refused(number: float) -> None:
+    with pytest.raises(InputError, match=r"^p.yaml: field 'radius_m' = .{1,90}: ") as caught:
+        parse_config(Circle, {"radius_m": number}, "p.yaml")
+    assert len(str(caught.value)) < 250
+
+
+def test_a_record_in_the_place_of_which_something_else_stands() -> None:
+    with pytest.raises(InputError, match=r"'frame' = 3: must be a mapping of the fields kind, side_m$"):
+        parse_config(Picture, {"shapes": [{"kind": "square", "side_m": 1}], "frame": 3}, "p.yaml")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "{", "\xff", '{"a": 1' + "0" * 5000 + "}"])
+def test_json_that_the_parser_trips_over(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"a\.json: not JSON"):
+        read_json(tmp_path / "a.json")
 
 
 def test_what_is_no_mapping_is_refused() -> None:

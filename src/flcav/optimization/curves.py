@@ -78,7 +78,7 @@ class Effective(Fitted):
     floor: NonNegative = 0.0
     a: Positive
     b: Positive
-    alpha: Positive
+    alpha: Annotated[float, Field(ge=1e-9)]
     beta: NonNegative
     group_samples: NonNegative
 

@@ -119,11 +119,15 @@ class Task(Quantities):
                     raise ValueError(
                         f"limits.samples of task {self.name!r} must start at 1 or more: its error at 0 is infinite"
                     )
-                for stage, decay, (_, most) in zip(STAGES, each.decays(), ranges) if isinstance(each, Additive) else ():
+                decays = each.decays() if isinstance(each, Additive) else ()
+                for stage, decay, (_, most) in zip(STAGES, decays, ranges):
                     if most == 0 and decay.infinite_at_0:
                         raise ValueError(f"{field}.{stage}.x0 of task {self.name!r} is 0: its error at 0 is infinite")
+                least = [float(low) for low, _ in ranges]
+                for stage, decay in enumerate(decays):
+                    least[stage] = max(least[stage], decay.infinite_at_0)
                 with np.errstate(over="ignore"):
-                    error = float(each.error(*(max(least, 1) for least, _ in ranges), k=0))
+                    error = float(each.error(*least, k=0))
                 if not error <= WORST:
                     raise ValueError(
                         f"{field} of task {self.name!r} predicts an error of {error:g} at its least limits: at most "

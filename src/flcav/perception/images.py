@@ -55,7 +55,7 @@ def recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterator[tup
 def read_picture(path: Path) -> Picture:
     """Return an RGB picture file; raises `InputError` for anything else."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=("PNG", "JPEG", "WEBP")) as image:
             channels, mode = len(image.getbands()), image.mode
             if mode not in ("RGB", "P"):
                 raise InputError(f"{path}: a picture of {channels} channels ({mode}); 3 are wanted: red, green, blue")

@@ -2,6 +2,7 @@ import io
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -55,6 +56,16 @@ def test_what_is_no_payload_is_named(tmp_path: Path):
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="not a readable image"):
         read_image(path, np.uint8)
+
+
+def test_an_image_of_other_channels_is_named(tmp_path: Path):
+    for plane, pixels in (("rgb", PLANES["semantic"]), ("semantic", PLANES["rgb"]), ("instance", PLANES["rgb"])):
+        Image.fromarray(pixels(np.random.default_rng(0))).save(tmp_path / "x", "png")
+        with pytest.raises(InputError, match=r"x: not a readable image \(it has \d channels, not \d\)"):
+            read_plane(tmp_path / "x", plane)
+    (tmp_path / "x").write_bytes(pa.Codec("zstd").compress(b"\x93NUMPY\x01\x00\x0a\x00{'descr':((\n", asbytes=True))
+    with pytest.raises(InputError, match="not a readable depth image"):
+        read_plane(tmp_path / "x", "depth_m")
 
 
 def test_rows_are_counted(tmp_path: Path):

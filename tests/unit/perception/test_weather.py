@@ -105,3 +105,6 @@ def test_accuracy_recall_and_confusion_by_hand():
 def test_the_classes_are_those_of_the_world():
     assert LeNetConfig().classes == tuple(WEATHER_CLASSES)
     assert len(WEATHER_CLASSES) == 8
+    for classes, odd in ((("clear", "rainy_night"), "rainy_night"), (("clear", "fog", "clear"), "clear")):
+        with pytest.raises(ValueError, match=f"'{odd}' is none of the classes, or there twice; they are clear, cloudy"):
+            LeNetConfig(classes=classes)

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flcav.config import InputError
-from flcav.world.trace import Trace
+from flcav.world.trace import METADATA, Trace
 
 
 def make_trace(instants: int = 7, actors: int = 5, lights: int = 3) -> Trace:
@@ -63,6 +63,19 @@ def test_files_that_are_no_trace_are_named(tmp_path: Path) -> None:
     pq.write_table(older, tmp_path / "older.parquet")
     with pytest.raises(InputError, match=r"another version.*'yaw_rate'"):
         Trace.load(tmp_path / "older.parquet")
+    for column, value, said in (("actor", -1, "no actor"), ("instant", 99, "out of bounds"), ("x", np.nan, "finite")):
+        whole = pq.read_table(tmp_path / "whole.parquet")
+        cells = pa.array([value, *whole[column].to_pylist()[1:]], whole.schema.field(column).type)
+        pq.write_table(whole.set_column(whole.column_names.index(column), column, cells), tmp_path / "odd.parquet")
+        with pytest.raises(InputError, match=rf"odd\.parquet: not a trace .*{said}"):
+            Trace.load(tmp_path / "odd.parquet")
+    for old, new in (("car", "tank"), ("60.0", "NaN"), ("veh1", "veh0"), ('"shape": [', '"shape": [99, ')):
+        whole = pq.read_table(tmp_path / "whole.parquet")
+        rest = {METADATA: whole.schema.metadata[METADATA].replace(old.encode(), new.encode(), 1)}
+        assert rest[METADATA] != whole.schema.metadata[METADATA]
+        pq.write_table(whole.replace_schema_metadata(rest), tmp_path / "odd.parquet")
+        with pytest.raises(InputError, match=r"odd\.parquet: not a trace"):
+            Trace.load(tmp_path / "odd.parquet")
     cut = (tmp_path / "whole.parquet").read_bytes()[:-100]
     (tmp_path / "cut.parquet").write_bytes(cut)
     with pytest.raises(InputError, match=r"cut\.parquet"):

@@ -138,9 +138,11 @@ def test_between_two_weathers_nothing_leaves_their_limits(share: float, names: t
         assert low - 1e-6 * abs(low) <= getattr(mixed, parameter) <= high + 1e-6 * abs(high)
 
 
-def test_a_schedule_in_its_four_forms():
+def test_a_schedule_in_its_forms():
     assert schedule("fog").at(7.0) == WEATHERS["fog"]
     assert schedule({"rain_mm_h": 4.0}).at(0.0) == Weather(rain_mm_h=4.0)
+    changed = schedule({"preset": "rainy_night", "rain_mm_h": 8}).at(0.0)
+    assert changed == WEATHERS["rainy_night"].model_copy(update={"rain_mm_h": 8.0})
     frames = [{"at_s": 2.0, "weather": "clear"}, {"at_s": 4.0, "weather": {"rain_mm_h": 8.0}}]
     changing = schedule(frames)
     assert [changing.at(t).rain_mm_h for t in (0.0, 2.0, 2.5, 3.0, 4.0, 99.0)] == pytest.approx([0, 0, 2, 4, 8, 8])
@@ -179,7 +181,15 @@ def test_a_schedule_survives_its_own_dump(value: Any):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("drizzle", "unknown weather; known weathers: clear, cloudy"),
+        ("drizzle", "'weather' = 'drizzle': unknown weather; known weathers: clear, cloudy"),
+        ({"preset": "drizzle"}, "'weather' = .*: unknown weather; known weathers: clear, cloudy"),
+        ({"preset": "night", "rain_mm_h": -1}, r"rain_mm_h' = -1"),
+        (
+            ["night", "heavy_rain"],
+            r"a list is of keyframes, such as {at_s: 0, weather: night}; .* {classes: \[night",
+        ),
+        (None, "'weather' = None: must be the name of a weather, its fields, or a list of keyframes"),
+        ({"sun_azimuth_deg": float("inf")}, "sun_azimuth_deg' = inf: Input should be a finite number"),
         ({"rain_mm_h": -1}, r"rain_mm_h' = -1"),
         ({"colour": 1}, "unknown field"),
         ({"classes": ["snow"]}, "no weather class 'snow'"),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti.frame import Calibration, Objects, read_calibration, read_objects, read_points
@@ -93,5 +93,5 @@ def _read_image(path: Path) -> NDArray[np.uint8]:
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
-    except UnidentifiedImageError:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         raise InputError(f"{path}: not an image") from None
