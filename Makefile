@@ -6,12 +6,16 @@ export OMP_NUM_THREADS := 1
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: demo test check bench format clean
+.PHONY: demo test test-peers check bench format clean
 demo: $(STAMP)
 	$(BIN)/flcav demo --out out/demo
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+# Exports read by other software, in environments of their own below out/peers: docs/formats.md.
+test-peers: $(STAMP)
+	$(BIN)/python -m pytest -n 0 -rs tests/peers
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from flcav.cli.main import run
+from flcav.optimization.definitions import TERMS
 from flcav.optimization.history import ARTICLE
 
 RECIPES = sorted((Path(__file__).parents[2] / "recipes" / "allocation").glob("*.yaml"))
@@ -24,7 +25,7 @@ def test_every_recipe_gives_a_plan_within_its_budgets(recipe, capsys):
     assert called("allocate", recipe, "--json") == 0
     plan = json.loads(capsys.readouterr().out)
     assert set(plan) == {
-        "status", "objective", "lower_bound", "gap", "tasks", "used_mb", "marginal_error_per_gb",
+        "status", "objective", "lower_bound", "gap", "tasks", "used_mb", "marginal_error_per_gb", "savings",
     }  # fmt: skip
     assert all(set(task) == TASK_KEYS for task in plan["tasks"])
     budgets = yaml.safe_load(recipe.read_text())["budgets_mb"]
@@ -34,6 +35,17 @@ def test_every_recipe_gives_a_plan_within_its_budgets(recipe, capsys):
         assert plan["marginal_error_per_gb"][link] >= 0
     assert called("allocate", recipe) == 0
     assert plan["tasks"][0]["name"] in capsys.readouterr().out
+
+
+def test_a_weighted_error_is_told_with_its_mean(tmp_path, capsys):
+    values = yaml.safe_load(RECIPES[-1].read_text())
+    for task in values["tasks"]:
+        task["weight"] = 1
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))
+    assert called("allocate", tmp_path / "problem.yaml") == 0
+    told = " ".join(capsys.readouterr().out.split())
+    total = float(told.split("weighted error ")[1].split(",")[0])
+    assert f"Weighted error: {TERMS['weighted error']} Here they sum to 3, and the mean is {total / 3:.4g}." in told
 
 
 def test_a_graph_is_planned_down_to_its_vehicles(capsys):

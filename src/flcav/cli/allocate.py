@@ -14,13 +14,11 @@ from flcav.cli.choices import listed
 if TYPE_CHECKING:
     from flcav.optimization.allocation import Allocation
     from flcav.optimization.baselines import Baseline
+    from flcav.optimization.budget_sweep import Saving
     from flcav.optimization.problem import Problem
     from flcav.optimization.vehicles import VehicleShare
 
     Shares = Mapping[str, Sequence[VehicleShare]]
-
-
-MEASURES = {"weighted": "weighted error", "max-min": "largest error", "area": "area"}
 
 
 class Compared(StrEnum):
@@ -54,6 +52,7 @@ def allocate(
     from flcav.config import read_config
     from flcav.optimization.allocation import Infeasible
     from flcav.optimization.baselines import baseline as compared
+    from flcav.optimization.budget_sweep import savings
     from flcav.optimization.fleet import allocate_fleet
     from flcav.optimization.graph import read_graph, read_problem
     from flcav.optimization.replanning import Progress, going_on
@@ -67,23 +66,25 @@ def allocate(
         if as_json:
             typer.echo(json.dumps({"status": "infeasible", "message": str(error)}))
         raise
+    more = savings(asked, plan)
     if out is not None:
         from flcav.experiments.plan_page import plan_page
         from flcav.files import write_bytes
 
-        write_bytes(out, plan_page(asked, plan, shares, read_graph(problem)).encode())
+        write_bytes(out, plan_page(asked, plan, shares, more, read_graph(problem)).encode())
     beside = None if baseline is None else compared(asked, baseline.value)
     if as_json:
-        typer.echo(json.dumps(_as_json(plan, shares) | ({} if beside is None else {"baseline": _plain(beside)})))
+        beside_it = {} if beside is None else {"baseline": _plain(beside)}
+        typer.echo(json.dumps(_as_json(plan, shares, more) | beside_it))
         return
-    _show(asked, plan)
+    _show(asked, plan, more)
     _show_vehicles(shares)
     if beside is not None:
         _show_baseline(beside, plan)
 
 
-def _as_json(plan: "Allocation", shares: "Shares") -> dict:
-    values = _plain(plan)
+def _as_json(plan: "Allocation", shares: "Shares", more: "Sequence[Saving]") -> dict[str, Any]:
+    values = _plain(plan) | {"savings": [dataclasses.asdict(each) for each in more]}
     for task in values["tasks"]:
         if task["name"] in shares:
             task["vehicles"] = [dataclasses.asdict(share) for share in shares[task["name"]]]
@@ -104,21 +105,28 @@ def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name not in optional or value}
 
 
-def _show(problem: "Problem", plan: "Allocation") -> None:
+def _show(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> None:
     from flcav.cli.console import plain_console
+    from flcav.optimization.definitions import MEASURES, meaning
 
-    console = plain_console()
+    console, measure = plain_console(), MEASURES[problem.objective]
     console.print(_table(plan))
-    proven = "no certificate" if plan.gap is None else f"proven within {plan.gap:.2%}"
-    console.print(f"{MEASURES[problem.objective]} {plan.objective:.6g}, {plan.status} ({proven})")
-    budgets, gained = problem.budgets_mb, "save" if plan.gap is not None else "add"
-    for link, used, budget, rate in (
-        ("wireless", plan.used_mb.wireless_mb, budgets.wireless, plan.marginal_error_per_gb.wireless_mb),
-        ("wireline", plan.used_mb.wireline_mb, budgets.wireline, plan.marginal_error_per_gb.wireline_mb),
-    ):
-        console.print(f"{link}: {used:.1f} of {budget:.6g} MB; 1000 MB more would {gained} about {rate:.4f}")
+    console.print(f"{measure} {plan.objective:.6g}, {plan.status} ({_proven(plan.gap)})")
+    console.print(f"{measure.capitalize()}: {meaning(problem, plan.objective)}")
+    verb = "adds" if problem.objective == "area" else "saves"
+    for link in ("wireless", "wireline"):
+        used, budget = getattr(plan.used_mb, f"{link}_mb"), getattr(problem.budgets_mb, link)
+        console.print(f"{link}: {used:.1f} of {budget:.6g} MB")
+        for each in (each for each in more if each.link == link):
+            saved = f"{each.saved:.3g}" if each.saved else "nothing"
+            budget = f"{each.added:.0%} more ({each.added_mb:.6g} MB)"
+            console.print(f"  {budget}, solved anew: {verb} {saved} ({_proven(each.gap)})")
     for sentence in filter(None, (plan.note, *plan.warnings)):
         console.print(sentence)
+
+
+def _proven(gap: float | None) -> str:
+    return "no certificate" if gap is None else f"proven within {gap:.2%}"
 
 
 def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
@@ -126,7 +134,8 @@ def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
 
     console = plain_console()
     console.print(_table(beside))
-    console.print(f"{beside.name}: {beside.objective:.6g}; the plan above: {plan.objective:.6g}")
+    note = f" ({beside.note})" if beside.note else ""
+    console.print(f"{beside.name}: {beside.objective:.6g}{note}; the plan above: {plan.objective:.6g}")
 
 
 def _table(plan: "Allocation | Baseline") -> Any:

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.refusals import finite
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -16,7 +18,9 @@ def birdseye(
     frame: str | None = typer.Option(
         None, "--frame", help="Key of the frame, as the point clouds are named; else the first."
     ),
-    range_m: float = typer.Option(50.0, "--range", min=5.0, max=500.0, help="How far from the agent to show [m]."),
+    range_m: float = typer.Option(
+        50.0, "--range", min=5.0, max=500.0, callback=finite, help="How far from the agent to show [m]."
+    ),
 ) -> None:
     """Draw a frame of a dataset from above: its points by height, its boxes, its agent."""
     import numpy as np

@@ -8,6 +8,7 @@ import typer
 
 from flcav.cli.choices import Device, TaskName, listed
 from flcav.cli.options import AGENTS, THREADS
+from flcav.cli.refusals import finite, refuse_unused
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
@@ -32,8 +33,8 @@ def errors(
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
-    threshold: float | None = typer.Option(
-        None, "--threshold", min=0.0, max=1.0, help="objects, signs: lowest score of a detection; 0.3 if not given."
+    threshold: float = typer.Option(
+        0.3, "--threshold", min=0.0, max=1.0, callback=finite, help="objects, signs: lowest score of a detection."
     ),
     map_: Path | None = typer.Option(None, "--map", help="PNG file: the errors in the dataset's town."),
     agents: str | None = AGENTS,
@@ -54,13 +55,13 @@ def errors(
     from flcav.dataset.store import Dataset
     from flcav.files import check_writable, write_bytes
     from flcav.perception.agents import choose_frames
-    from flcav.perception.errors import THRESHOLD, RegistersErrors, save_errors
+    from flcav.perception.errors import RegistersErrors, save_errors
 
     learned = task_named(task)
     if not isinstance(learned, RegistersErrors):
         raise InputError(f"task '{task}': its mistakes have no place in a town; choose objects, signs or trajectory")
-    if threshold is not None and task == "trajectory":
-        raise InputError("--threshold: predicted paths have no score; objects and signs have")
+    if task == TaskName.trajectory:
+        refuse_unused(f"errors {task}", "threshold")
     check_ending(out)
     for path in (out, map_):
         if path is not None:
@@ -71,10 +72,9 @@ def errors(
         raise InputError(f"{data}: its town is not known, so that there is no map of it")
     network = network_of(learned, weights, device)
     chosen = choose_frames(learned, network.config, dataset, agents)
-    lowest = THRESHOLD if threshold is None else threshold
     typer.echo(f"{chosen.sentence}\n{origin_line(origin_of(learned, weights))}")
     with progress.live(f"errors of {task}") as report:
-        found = learned.register_errors(network, dataset, chosen.frames, lowest, report)
+        found = learned.register_errors(network, dataset, chosen.frames, threshold, report)
     save_errors(found.errors, out)
     if map_ is not None and town is not None:
         write_bytes(map_, _draw(town, found))

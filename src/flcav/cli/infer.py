@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from flcav.perception.task import Finding
 
 
+SCORED = ("signs", "objects")  # tasks whose findings have a score each
+
+
 def register(app: typer.Typer) -> None:
     """Add the command."""
     app.command()(infer)
@@ -28,7 +31,7 @@ def infer(
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
-    threshold: float = typer.Option(0.3, "--threshold", min=0.0, max=1.0, help="Lowest score shown."),
+    threshold: float = typer.Option(0.3, "--threshold", min=0.0, max=1.0, help="signs, objects: lowest score shown."),
     device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
     pictures: Path | None = typer.Option(None, "--pictures", help="Folder for a picture of each input with findings."),
     agents: str | None = AGENTS,
@@ -42,6 +45,7 @@ def infer(
     with "constant_velocity" beside them and "truth" where the recording goes on for long enough.
     """
     use_threads(threads)
+    from flcav.cli.refusals import refuse_unused
     from flcav.cli.tasks import network_of, task_named
     from flcav.config import InputError
     from flcav.dataset.layout import MANIFEST
@@ -54,6 +58,8 @@ def infer(
     if pictures is not None:
         check_writable(pictures)
     learned = task_named(task)
+    if task not in SCORED:
+        refuse_unused(f"infer {task}", "threshold")
     network = network_of(learned, weights, device)
     recorded = [path for path in inputs if (path / MANIFEST).is_file()]
     if agents is not None and not recorded:

@@ -29,6 +29,7 @@ from flcav.cli.literal import literal
 from flcav.config import InputError
 
 INTERRUPTED = 130
+LONGEST = 1000  # characters of a sentence
 
 app = typer.Typer(
     name="flcav",
@@ -84,17 +85,22 @@ def run(arguments: list[str] | None = None) -> None:
         print(f"flcav: interrupted; {kept}", file=sys.stderr)
         code = INTERRUPTED
     except (click.exceptions.Abort, KeyboardInterrupt):
-        print("flcav: interrupted", file=sys.stderr)
+        _say("interrupted")
         code = INTERRUPTED
     except click.ClickException as error:
-        if message := " ".join(error.format_message().split()):  # empty where the help was asked for, and shown
-            print(f"flcav: {message}", file=sys.stderr)
+        _say(error.format_message())
         code = 2
     except InputError as error:
-        print(f"flcav: {error}", file=sys.stderr)
+        _say(str(error))
         code = 2
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        print(f"flcav: {where}{error.strerror or error}", file=sys.stderr)
-        code = 1
+        _say(f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error))
+        code = 2 if isinstance(error, FileNotFoundError | IsADirectoryError) else 1  # what was named is not there
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _say(message: str) -> None:
+    """Print one line on stderr, whatever the names and reasons in it; none where the help was asked for, and shown."""
+    line = " ".join(message.split())
+    if line:
+        print(f"flcav: {line if len(line) <= LONGEST else f'{line[:LONGEST]} ...'}", file=sys.stderr)

@@ -1,5 +1,6 @@
 """`flcav reproduce`: the figures and comparisons of the article, from commands anyone can run again."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import typer
 
 from flcav.cli.choices import listed
 from flcav.cli.interruption import when_interrupted
+from flcav.cli.refusals import refuse_unused
 from flcav.threads import use_threads
 
 
@@ -33,6 +35,12 @@ class Scale(StrEnum):
     full = "full"
 
 
+STUDY = ("seeds", "scale", "jobs")  # options of what is run over seeds
+TAKEN: Mapping[Target, tuple[str, ...]] = dict.fromkeys(Target, STUDY) | {
+    Target.fig1b: (),
+    Target.fig3a: (),
+    Target.sim_to_real: ("jobs", "kitti", "weights"),
+}
 SEEDS = {Target.demo_arms: 5}
 COMMON_SEEDS = 3
 TASK = "task-"  # before a task's name: its study
@@ -55,6 +63,7 @@ def reproduce(
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
     use_threads(1)
+    refuse_unused(f"reproduce {target.value}", *{*STUDY, "kitti", "weights"}.difference(TAKEN[target]))
     if target in (Target.fig1b, Target.fig3a):
         draw = _fig1b if target == Target.fig1b else _fig3a
         draw(out)

@@ -6,24 +6,31 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
-import pyarrow.parquet as pq
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
+from flcav.parquet import read_parquet
 
 
 def read_table(path: Path, columns: Sequence[str]) -> pa.Table:
     """Return the CSV or Parquet table at `path`; raises `InputError` if it is none or lacks one of `columns`."""
-    try:
-        table = pq.read_table(path) if path.suffix == ".parquet" else pyarrow.csv.read_csv(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (pa.ArrowInvalid, pa.ArrowKeyError) as error:
-        raise InputError(f"{path}: not a table ({' '.join(str(error).split())})") from None
+    table = read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     for column in columns:
-        if column not in table.column_names:
-            raise InputError(f"{path}: column '{column}' is missing; found {', '.join(table.column_names)}")
+        if table.column_names.count(column) != 1:
+            found = "is missing" if column not in table.column_names else "is there twice"
+            raise InputError(f"{path}: column '{column}' {found}; found {', '.join(table.column_names)}")
     if not table.num_rows:
         raise InputError(f"{path}: has no rows")
+    return table
+
+
+def _read_csv(path: Path) -> pa.Table:
+    try:
+        table = pyarrow.csv.read_csv(path)
+        _ = table.column_names  # decodes them
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a table ({error})") from None
     return table
 
 
@@ -34,10 +41,9 @@ def numbers(table: pa.Table, columns: Sequence[str], path: Path) -> np.ndarray:
         for row, value in enumerate(table[column].to_pylist()):
             try:
                 out[row, i] = np.nan if value is None else float(value)
-            except ValueError:
+            except (TypeError, ValueError, OverflowError):
                 out[row, i] = np.nan
             if not np.isfinite(out[row, i]):
-                raise InputError(
-                    f"{path}: row {row + 1}: {column} = {'nan' if value is None else value} is not a finite number"
-                )
+                told = "nan" if value is None else shorten(value)
+                raise InputError(f"{path}: row {row + 1}: {column} = {told} is not a finite number")
     return out

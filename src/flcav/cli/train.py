@@ -45,11 +45,14 @@ def train(
     """
     use_threads(threads)
     from flcav import progress
+    from flcav.cli.refusals import refuse_unused
     from flcav.cli.tasks import task_named
     from flcav.dataset.store import Dataset
     from flcav.perception.device import device_named
     from flcav.perception.training.run import CHECKPOINT, WEIGHTS, Request, prepare, train_prepared
 
+    if validation is None:
+        refuse_unused("a training without --validation", "patience")
     learner, place = task_named(task), device_named(device)
     held = Dataset.open(validation) if validation else None
     request = Request([Dataset.open(folder) for folder in data], held, network, epochs, patience, seed, place, agents)

@@ -4,14 +4,13 @@ agent -> "true" | "assumed" -> sensor -> {"agent_from_sensor": 16 numbers row by
 "intrinsics": 9 numbers row by row, "distortion": 5}.
 """
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from flcav.config import InputError
+from flcav.config import InputError, read_json
 from flcav.sensors.frame import Calibration, Frame
 
 SHAPES = {"agent_from_sensor": (4, 4), "intrinsics": (3, 3), "distortion": (5,)}
@@ -31,17 +30,12 @@ def to_json(frame: Frame) -> dict[str, Any]:
 
 def read_calibrations(path: Path, sensors: Mapping[str, set[str]]) -> dict[str, Calibrations]:
     """Return the calibrations by agent; raises `InputError` where one of its `sensors` is missing or malformed."""
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing from the dataset") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON ({error})") from None
+    values = read_json(path)
     found = {}
     for agent, names in sensors.items():
         try:
             both = Calibrations(*(_calibration(values[agent][which]) for which in ("true", "assumed")))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(f"{path}: the calibration of '{agent}' is missing or malformed ({error})") from None
         for name in sorted(names):
             if name not in both.true.agent_from_sensor or name not in both.assumed.agent_from_sensor:

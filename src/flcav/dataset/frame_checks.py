@@ -52,8 +52,10 @@ def check_values(frame: Frame) -> Iterator[str]:
 
 
 def check_sweeps(frame: Frame) -> Iterator[str]:
-    """Check that each LiDAR has seen all round."""
+    """Check that each LiDAR whose points are finite has seen all round."""
     for name, points in frame.lidar.items():
+        if not np.isfinite(points).all():
+            continue
         azimuth = np.sort(np.degrees(np.arctan2(points[:, 1], points[:, 0])))
         gap = np.diff(azimuth, append=azimuth[:1] + 360.0).max(initial=0.0) if len(points) else 360.0
         if gap > GAP_DEG:

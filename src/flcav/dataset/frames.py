@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from flcav.config import parse_config
+from flcav.config import InputError, parse_config
 from flcav.dataset.tables import (
     ACCELERATION_COLUMNS,
     AMODAL_COLUMNS,
@@ -24,7 +24,10 @@ from flcav.world.weather import Weather
 def annotations_of(
     rows: pa.Table, points: pa.Table, views: pa.Table, signs: pa.Table, ranging: Iterable[str], cameras: Iterable[str]
 ) -> Annotations:
-    """Return the annotations of a frame from its rows in four tables, for its LiDARs and radars and its cameras."""
+    """Return the annotations of a frame from its rows in four tables, for its LiDARs and radars and its cameras.
+
+    Raises `InputError` where a row speaks of an actor that is not annotated.
+    """
     count, cameras = len(rows), list(cameras)
     return Annotations(
         track=_text(rows, "track"),
@@ -54,12 +57,22 @@ def weather_of(rows: pa.Table) -> Weather | None:
 
 def _points(rows: pa.Table, count: int) -> NDArray[np.int64]:
     points = np.zeros(count, np.int64)
-    points[rows["row"].to_numpy()] = rows["points"].to_numpy()
+    points[_actors(rows, count)] = rows["points"].to_numpy()
     return points
 
 
-def _view(rows: pa.Table, count: int) -> Views:
+def _actors(rows: pa.Table, count: int) -> NDArray[np.int64]:
+    """Return (R,) the rows of the frame's `count` annotations that the rows of another table speak of."""
     at = rows["row"].to_numpy()
+    if ((at < 0) | (at >= count)).any():
+        raise InputError(
+            f"{rows['frame'][0].as_py()}: '{rows['sensor'][0].as_py()}' sees an actor that is not annotated"
+        )
+    return at
+
+
+def _view(rows: pa.Table, count: int) -> Views:
+    at = _actors(rows, count)
 
     def filled(values: NDArray, missing: float) -> NDArray:
         column = np.full((count, *values.shape[1:]), missing, values.dtype)

@@ -23,8 +23,10 @@ def check_images(frame: Frame) -> Iterator[str]:
     for name in (*frame.images, *frame.infrared):
         yield from check_views(frame.key, name, frame.annotations.views[name])
     for name, image in frame.images.items():
-        lens = _lens(frame, name, image)
         yield from check_planes(frame.key, name, image, len(frame.annotations))
+        if not _fit(image):
+            continue
+        lens = _lens(frame, name, image)
         yield from check_visibility(frame, name, image)
         yield from check_projection(frame, name, image, lens)
         yield from check_signs(frame.key, name, frame.annotations.signs[name], lens)
@@ -43,16 +45,20 @@ def check_views(key: str, name: str, views: Views) -> Iterator[str]:
 
 def check_planes(key: str, name: str, image: CameraImage, actors: int) -> Iterator[str]:
     """Check that the planes of an image go together."""
-    shape = image.rgb.shape[:2]
-    if image.rgb.shape[2:] != (3,) or any(
-        plane.shape != shape for plane in (image.depth_m, image.semantic, image.instance)
-    ):
+    if not _fit(image):
         yield f"{key}: the planes of '{name}' differ in shape"
         return
     if np.isnan(image.depth_m).any() or (image.depth_m <= 0).any():
         yield f"{key}: '{name}' has a depth that is not above 0"
     if image.instance.max(initial=0) > actors:
         yield f"{key}: '{name}' shows actor {image.instance.max()} of {actors}"
+
+
+def _fit(image: CameraImage) -> bool:
+    """Return whether the planes of an image are of one shape."""
+    shape = image.rgb.shape[:2]
+    others = (image.depth_m, image.semantic, image.instance)
+    return image.rgb.shape[2:] == (3,) and all(plane.shape == shape for plane in others)
 
 
 def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[str]:

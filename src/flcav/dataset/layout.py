@@ -1,12 +1,13 @@
 """Where things lie in a dataset folder, and its manifest."""
 
-import json
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from flcav.config import InputError
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from flcav.config import InputError, read_json, tell
 
 FORMAT = 2
 MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
@@ -16,6 +17,41 @@ TRACES = "traces"
 TOWN = "town"  # holds the folder of a town that does not come with flcav
 WORK = ".recording"  # what a recording under way keeps; gone when it is done
 PACKAGES = ("flcav", "embreex", "libsumo", "numba", "numpy", "pillow", "pyarrow")  # those that decide the bytes
+
+
+class Strict(BaseModel):
+    """Base of what must be in a manifest; nothing is taken for something else, and more may be there."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+
+class TableFile(Strict):
+    """A table's file."""
+
+    bytes: int
+    sha256: str
+
+
+class Counts(Strict):
+    """How much a dataset holds."""
+
+    frames: int
+    scenes: int
+    annotations: int
+    points: int
+    images: int
+    payload_bytes: int
+
+
+class Manifest(Strict):
+    """What every manifest holds."""
+
+    format: int
+    recipe: dict[str, Any]
+    versions: dict[str, str]
+    counts: Counts
+    scenes: list[str]
+    tables: dict[str, TableFile]
 
 
 @dataclass(frozen=True)
@@ -61,15 +97,13 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         reason = "an unfinished recording; record it again to finish it" if (folder / WORK).exists() else "no dataset"
         raise InputError(f"{path}: missing, so {folder} is {reason}")
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON ({error})") from None
+    manifest = read_json(path)
     found = manifest.get("format") if isinstance(manifest, dict) else None
     if isinstance(found, int) and found != FORMAT:
         advice = "update flcav to read it" if found > FORMAT else "record it again from its recipe"
         raise InputError(f"{path}: dataset format {found}, this version of flcav reads format {FORMAT}; {advice}")
-    expected = {"format", "recipe", "versions", "counts", "scenes", "tables"}
-    if found is None or not expected <= manifest.keys():
-        raise InputError(f"{path}: not a dataset manifest; it must hold {', '.join(sorted(expected))}")
+    try:
+        Manifest.model_validate(manifest)
+    except ValidationError as error:
+        raise InputError(f"{path}: not a dataset manifest: {tell(error, Manifest)}") from None
     return manifest

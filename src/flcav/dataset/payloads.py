@@ -79,7 +79,7 @@ def read_rows(path: Path, suffix: str, expected: int) -> NDArray[np.float32]:
     try:
         found = path.stat().st_size
         rows = np.fromfile(path, dtype="<f4")
-    except FileNotFoundError:
+    except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
     if found != expected * row_bytes:
         raise InputError(f"{path}: {found} bytes where {expected} points take {expected * row_bytes}")
@@ -88,28 +88,36 @@ def read_rows(path: Path, suffix: str, expected: int) -> NDArray[np.float32]:
 
 def read_plane(path: Path, plane: str) -> NDArray:
     """Return one of PLANES of a `CameraImage`; raises `InputError` where the file is missing or no such image."""
-    return _read_depth(path) if plane == "depth_m" else read_image(path, np.uint16 if plane == "instance" else np.uint8)
+    if plane == "depth_m":
+        return _read_depth(path)
+    return read_image(path, np.uint16 if plane == "instance" else np.uint8, channels=3 if plane == "rgb" else 1)
 
 
-def read_image(path: Path, dtype: type[np.generic]) -> NDArray:
-    """Return the pixels of an image file; raises `InputError` where it is missing or none."""
+def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArray:
+    """Return the pixels (H, W) of an image file, or (H, W, 3); raises `InputError` where it is missing or none."""
     try:
-        with Image.open(path) as image:
-            return np.asarray(image).astype(dtype)
-    except FileNotFoundError:
+        with Image.open(path, formats=("PNG", "WEBP")) as image:
+            found = len(image.getbands())
+            pixels = np.asarray(image)
+    except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
-    except (OSError, ValueError, SyntaxError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: not a readable image ({error})") from None
+    if found != channels:
+        raise InputError(f"{path}: not a readable image (it has {found} channels, not {channels})")
+    return pixels.astype(dtype)
 
 
 def _read_depth(path: Path) -> NDArray[np.float32]:
     try:
         with pa.CompressedInputStream(pa.OSFile(str(path)), "zstd") as stream:
             planes = np.load(io.BytesIO(stream.read()), allow_pickle=False)
+        if planes.dtype != np.uint8:
+            raise ValueError(f"it holds {planes.dtype}")
         return np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f4")[..., 0]
-    except FileNotFoundError:
+    except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # NumPy parses an array's header as Python, and raises whatever that trips over
         raise InputError(f"{path}: not a readable depth image ({error})") from None
 
 

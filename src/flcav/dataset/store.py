@@ -1,7 +1,8 @@
 """A recorded dataset, read frame by frame in any order."""
 
+import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -10,9 +11,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.dataset.calibration import Calibrations, read_calibrations
+from flcav.dataset.calibration_checks import check_calibration
+from flcav.dataset.frame_checks import check_measurements, check_values
 from flcav.dataset.frames import annotations_of, vectors_of, weather_of
+from flcav.dataset.image_checks import check_planes, check_views
 from flcav.dataset.layout import CALIBRATION, FrameKey, payload_path, read_manifest, table_path, town_path, trace_path
 from flcav.dataset.payloads import INFRARED, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, read_table
@@ -21,6 +25,8 @@ from flcav.world.town import Town, load_town
 from flcav.world.trace import Trace
 
 POINT_BYTES = 16  # four float32
+KINDS = ("lidar", "radar", "cameras", "infrared")  # of sensors, columns of `frames`
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")  # of a frame, scene, agent or sensor: they are files' names
 NOT_IN_SAMPLE = ("ax", "ay", "az")  # columns of `annotations` that nobody learns from
 
 Value = TypeVar("Value")
@@ -36,6 +42,8 @@ class Dataset:
         calibrations: dict[str, Calibrations],
         tables: dict[str, pa.Table],
         first: dict[str, NDArray[np.int64]],
+        *,
+        checked: bool = True,
     ) -> None:
         self.folder = folder
         self.manifest = manifest
@@ -49,10 +57,14 @@ class Dataset:
         self._infrared: list[list[str]] = frames["infrared"]
         self._tables = tables
         self._first = first
+        self._checked = checked
 
     @classmethod
-    def open(cls, path: Path | str) -> "Dataset":
-        """Return the dataset in the folder `path`; raises `InputError` naming the file that is not as it should be."""
+    def open(cls, path: Path | str, *, checked: bool = True) -> "Dataset":
+        """Return the dataset in the folder `path`; raises `InputError` naming the file that is not as it should be.
+
+        Unless `checked` is false, what nobody can have measured is refused too, here and where frames are read.
+        """
         folder = Path(path)
         manifest = read_manifest(folder)
         tables = {name: read_table(folder / table_path(name), name) for name in SCHEMAS}
@@ -69,7 +81,13 @@ class Dataset:
         if not np.array_equal(np.diff(first["annotations"]), frames["annotations"].to_numpy()):
             raise InputError(f"{folder / table_path('annotations')}: its rows are not those of the frames")
         calibrations = read_calibrations(folder / CALIBRATION, _sensors(frames))
-        return cls(folder, manifest, calibrations, tables, first)
+        _check_frames(frames, folder / table_path("frames"))
+        if checked:
+            _refuse(folder / table_path("frames"), _other_names(frames))
+            for agent, both in calibrations.items():
+                for calibration in both:
+                    _refuse(folder / CALIBRATION, check_calibration(f"the calibration of {agent}", calibration))
+        return cls(folder, manifest, calibrations, tables, first, checked=checked)
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -81,8 +99,10 @@ class Dataset:
         """
         key, calibration = self.keys[i], self.calibrations[self.keys[i].agent]
         poses = self._tables["poses"].slice(i, 1).to_pylist()[0]
-        then = np.array(poses["world_from_agent_then"]).reshape(-1, 4, 4)
-        return Frame(
+        if len(poses["world_from_agent_then"]) != 16 * len(poses["triggered"]):
+            raise InputError(f"{self.folder / table_path('poses')}: '{self._name[i]}' needs 16 numbers for each pose")
+        then = np.array(poses["world_from_agent_then"], np.float64).reshape(-1, 4, 4)
+        frame = Frame(
             scene=key.scene,
             index=key.index,
             time_s=key.time_s,
@@ -105,6 +125,12 @@ class Dataset:
             weather=weather_of(self._rows("weather", i)),
             agent_at_trigger=dict(zip(poses["triggered"], then)),
         )
+        if self._checked:
+            _refuse(self.folder, check_values(frame))
+            _refuse(self.folder, check_measurements(frame))
+            for camera, views in frame.annotations.views.items():
+                _refuse(self.folder, check_views(frame.key, camera, views))
+        return frame
 
     def plane(self, i: int, camera: str, plane: str) -> NDArray:
         """Return one plane ("rgb", "depth_m", "semantic", "instance") of one image of frame `i`: see `CameraImage`."""
@@ -188,7 +214,11 @@ class Dataset:
         return {sensor: times[:, 0] for sensor, times in self._rows_of(i, timed, TIMES).items()}
 
     def _image(self, i: int, camera: str) -> CameraImage:
-        return CameraImage(**{plane: self.plane(i, camera, plane) for plane in PLANES})
+        image = CameraImage(**{plane: self.plane(i, camera, plane) for plane in PLANES})
+        if self._checked:
+            actors = int(np.diff(self._first["annotations"])[i])
+            _refuse(self.folder, check_planes(self._name[i], camera, image, actors))
+        return image
 
     def _thermal(self, i: int, camera: str) -> NDArray[np.uint16]:
         return read_image(self.folder / payload_path(camera, self._name[i], INFRARED), np.uint16)
@@ -215,6 +245,32 @@ class ReadWhenAsked(Mapping[str, Value], Generic[Value]):
         return len(self._names)
 
 
+def _refuse(where: Path, problems: Iterable[str]) -> None:
+    """Raise `InputError` with the first of the problems where there is one."""
+    for problem in problems:
+        raise InputError(f"{where}: {problem}")
+
+
+def _check_frames(frames: pa.Table, path: Path) -> None:
+    """Raise `InputError` where the names in the rows can be no files, or sensors do not go with their counts."""
+    for row in frames.to_pylist():
+        names = [row["key"], row["scene"], row["agent"], *(name for kind in KINDS for name in row[kind])]
+        if odd := [name for name in names if not NAME.fullmatch(name)]:
+            raise InputError(f"{path}: {shorten(odd[0])} is no name: letters, digits, dots, - and _ are")
+        for sensors, counts in (("lidar", "points"), ("radar", "detections")):
+            if len(row[sensors]) != len(row[counts]) or min(row[counts], default=0) < 0:
+                raise InputError(f"{path}: '{row['key']}' needs one number of {counts} for each of its {sensors}s")
+
+
+def _other_names(frames: pa.Table) -> Iterator[str]:
+    """Yield the frames that are not called as their rows say, or whose time is none."""
+    for row in frames.to_pylist():
+        if row["key"] != f"{row['scene']}_{row['index']:04d}_{row['agent']}":
+            yield f"'{row['key']}' is not spin {row['index']} of {row['agent']} in '{row['scene']}'"
+        if not np.isfinite(row["time_s"]):
+            yield f"'{row['key']}' is at no time"
+
+
 def _first_rows(table: pa.Table, frames: pa.Table, path: Path) -> NDArray[np.int64]:
     """Return (F + 1,) the first row of each frame; raises `InputError` where rows are of no frame, or out of order."""
     number = pc.call_function(
@@ -228,7 +284,7 @@ def _first_rows(table: pa.Table, frames: pa.Table, path: Path) -> NDArray[np.int
 def _sensors(frames: pa.Table) -> dict[str, set[str]]:
     """Return the names of each agent's LiDARs, radars and cameras."""
     found: dict[str, set[str]] = defaultdict(set)
-    for kind in ("lidar", "radar", "cameras", "infrared"):
+    for kind in KINDS:
         for agent, names in zip(frames["agent"].to_pylist(), frames[kind].to_pylist()):
             found[agent].update(names)
     return found

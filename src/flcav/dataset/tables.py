@@ -7,9 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from flcav.config import InputError
+from flcav.parquet import read_parquet
 from flcav.world.weather import Weather
 
 ROWS_PER_GROUP = 65_536
@@ -129,16 +131,15 @@ def join_tables(parts: Iterable[Path], schema: pa.Schema, path: Path) -> int:
 
 def read_table(path: Path, name: str) -> pa.Table:
     """Return the table `name` that a file holds; raises `InputError` naming the file where it does not."""
-    try:
-        table = pq.ParquetFile(path).read()
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing from the dataset") from None
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).partition("\n")[0]
-        raise InputError(f"{path}: not a readable Parquet file ({reason})") from None
+    table = read_parquet(path)
     schema = SCHEMAS.get(name, FILES_SCHEMA)
     if not table.schema.equals(schema):
         raise InputError(f"{path}: its columns are not those of the table '{name}' ({', '.join(schema.names)})")
-    if any(column.null_count for column in table.columns):
+    if any(column.null_count or _null_elements(column) for column in table.columns):
         raise InputError(f"{path}: has empty cells")
     return table.combine_chunks()
+
+
+def _null_elements(column: pa.ChunkedArray) -> int:
+    lists = pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
+    return pc.call_function("list_flatten", [column]).null_count if lists else 0

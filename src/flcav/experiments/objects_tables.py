@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from flcav.experiments.aims import aim_sentence
 from flcav.experiments.task_study import training_rows
-from flcav.markdown import bullets, interval, table
+from flcav.markdown import bullets, table
 
 WANTED = {  # of cars on other scenes of the towns that were learned from
     "Car AP 3d at 0.5": (0.85, "Car AP3D@0.5 of 0.85"),
@@ -35,10 +36,7 @@ def _findings(results: Mapping[str, Any]) -> list[str]:
     seeds, said = len(results["seeds"]), []
     for test in dict.fromkeys(recipe["town"] for recipe in results["recipes"]["train"]):
         for name, (wanted, claim) in WANTED.items():
-            mean = results["summary"][test][name]
-            verdict = "reached" if mean["low"] >= wanted else "not reached" if mean["high"] < wanted else "undecided"
-            over = f"{interval(mean)} over {seeds} seeds" if seeds > 1 else f"{mean['mean']:.3f} of one seed"
-            said.append(f"*{claim} on {test}*: **{verdict}**, {over}.")
+            said.append(aim_sentence(f"{claim} on {test}", wanted, results["summary"][test][name], seeds) + ".")
     return said
 
 

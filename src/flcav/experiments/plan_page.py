@@ -7,35 +7,21 @@ from typing import Any
 import networkx as nx
 
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
-from flcav.optimization.allocation import Allocation, TaskPlan
+from flcav.optimization.allocation import Allocation, TaskPlan, resolved
 from flcav.optimization.baselines import baseline
-from flcav.optimization.budget_sweep import FACTORS, LINKS, BudgetPoint, budget_sweep
+from flcav.optimization.budget_sweep import FACTORS, LINKS, BudgetPoint, Saving, budget_sweep
+from flcav.optimization.definitions import CURVE, MEASURES, STEPS, TERMS, meaning
 from flcav.optimization.problem import Problem, Task
 from flcav.optimization.vehicles import VehicleShare
 from flcav.report import html, layers_chart, plan_charts, style
 
 STAGES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
 SHOWN = 6  # tasks with a colour of their own; the others are drawn as one
-COARSE = (0.5, 1.0, 2.0)  # budgets that are tried where a plan takes seconds
-MEASURES = {  # what the objective is called, and what more megabytes do to it
-    "weighted": {
-        "short": "error",
-        "title": "predicted error",
-        "better": "lower the error",
-        "gain": "error saved",
-    },
-    "max-min": {
-        "short": "largest error",
-        "title": "largest predicted error",
-        "better": "lower the largest error",
-        "gain": "largest error saved",
-    },
-    "area": {
-        "short": "area",
-        "title": "area of the predicted accuracies",
-        "better": "raise the area",
-        "gain": "area gained",
-    },
+COARSE = (0.5, 1.0, 2.0)  # budgets that are tried where a plan takes seconds: one without a certificate, or by links
+BETTER = {  # what more megabytes do to the objective
+    "weighted": {"verb": "lower the weighted error", "gain": "weighted error saved"},
+    "max-min": {"verb": "lower the largest error", "gain": "largest error saved"},
+    "area": {"verb": "raise the area", "gain": "area gained"},
 }
 OTHERS = {
     "equal-stages": "equal shares for every stage",
@@ -46,46 +32,44 @@ OTHERS = {
 Shares = Mapping[str, Sequence[VehicleShare]]
 
 
-def plan_page(problem: Problem, plan: Allocation, shares: Shares, graph: nx.Graph | None = None) -> str:
+def plan_page(
+    problem: Problem, plan: Allocation, shares: Shares, more: Sequence[Saving], graph: nx.Graph | None = None
+) -> str:
     """Return the page as HTML that needs nothing but itself; `graph`: what the problem was made from, if it was."""
-    results = plan_results(problem, plan, shares)
-    measure = results["measure"]
+    results = plan_results(problem, plan, shares, more)
     pictures = {
         "megabytes": plan_charts.megabytes(results["parts"], results["links"]),
-        "budgets": plan_charts.best_by_budget(results["sweep"], measure["short"]),
-        "marginal": plan_charts.marginal_values(results["sweep"]["both links"], results["links"], measure["gain"]),
+        "budgets": plan_charts.best_by_budget(results["sweep"], results["measure"]["name"]),
     }
     if graph is not None:
         pictures["layers"] = layers_chart.three_layers(graph)
     return html.render(results, {name: style.png(figure) for name, figure in pictures.items()}, "plan.html.j2")
 
 
-def plan_results(problem: Problem, plan: Allocation, shares: Shares) -> dict[str, Any]:
+def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Sequence[Saving]) -> dict[str, Any]:
     """Return what the page shows: numbers and sentences."""
     scaled = {"both links": LINKS, "wireless alone": ("wireless",), "wireline alone": ("wireline",)}
-    factors = COARSE if problem.objective == "area" else FACTORS
-    sweep = {name: budget_sweep(problem, links, factors) for name, links in scaled.items()}
+    factors = FACTORS if plan.note is None else COARSE
+    sweep = {name: budget_sweep(problem, plan, links, factors) for name, links in scaled.items()}
     links = {
         link: {
             "budget_mb": getattr(problem.budgets_mb, link),
             "used_mb": getattr(plan.used_mb, f"{link}_mb"),
             "share": getattr(plan.used_mb, f"{link}_mb") / getattr(problem.budgets_mb, link),
-            "marginal": getattr(plan.marginal_error_per_gb, f"{link}_mb"),
+            "more": [asdict(each) for each in more if each.link == link],
         }
         for link in LINKS
     }
-    weights = sum(task.weight for task in problem.tasks)
     tasks = [
         {**asdict(row), "weight": task.weight, "vehicles": sum(task.edge_groups)}
-        for task, row in zip(problem.tasks, plan.tasks, strict=True)
+        for task, row in zip(resolved(problem).tasks, plan.tasks, strict=True)
     ]
     values = {
-        "measure": MEASURES[problem.objective] | {"kind": problem.objective},
+        "measure": {"name": MEASURES[problem.objective], "kind": problem.objective, **BETTER[problem.objective]},
         "objective": plan.objective,
         "lower_bound": plan.lower_bound,
         "gap": plan.gap,
         "status": plan.status,
-        "weights": weights,
         "k": problem.edge_rounds_per_cloud_round,
         "tasks": tasks,
         "links": links,
@@ -96,13 +80,24 @@ def plan_results(problem: Problem, plan: Allocation, shares: Shares) -> dict[str
         "robust": problem.robust,
         "note": plan.note,
         "warnings": plan.warnings,
+        "words": {"steps": STEPS, "curve": CURVE, "terms": _terms(problem, plan)},
         "others": [
-            {"name": name, "objective": baseline(problem, key).objective}
+            {"name": name, "objective": other.objective, "note": other.note}
             for key, name in OTHERS.items()
             if len(tasks) > 1 or key != "equal-tasks"
+            for other in [baseline(problem, key)]
         ],
     }
     return values | {"sentences": _sentences(values, sweep["both links"])}
+
+
+def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
+    """Return the words that the page has to define."""
+    measure, saved = MEASURES[problem.objective], "gained" if problem.objective == "area" else "saved"
+    terms = {"error": TERMS["error"], measure: meaning(problem, plan.objective), "budget": TERMS["budget"]}
+    terms[saved] = TERMS["saved"]
+    used = ["up to"] * problem.robust + ["proven"] * (plan.lower_bound is not None)
+    return terms | {name: TERMS[name] for name in used}
 
 
 def _parts(problem: Problem, plan: Allocation) -> list[dict[str, Any]]:
@@ -144,9 +139,9 @@ def _vehicles(problem: Problem, shares: Shares) -> list[dict[str, Any]]:
 def _sentences(values: Mapping[str, Any], both: Sequence[BudgetPoint]) -> dict[str, str]:
     return {
         "proof": _proof(values),
-        "links": " ".join(_link(name, link, values["measure"]["better"]) for name, link in values["links"].items()),
+        "links": " ".join(_link(name, link, values["measure"]["verb"]) for name, link in values["links"].items()),
         "stages": _stages(values["parts"]),
-        "budgets": _budgets(values["measure"]["short"], values["objective"], both),
+        "budgets": _budgets(values["measure"]["name"], values["objective"], both),
         "others": _others(values),
         "vehicles": _stragglers(values["vehicles"], values["horizon_s"]),
     }
@@ -156,21 +151,27 @@ def _proof(values: Mapping[str, Any]) -> str:
     if values["lower_bound"] is None:
         return "Nothing is proven of it: it is the best of several local optima."
     bound = f"no plan within these budgets has less than {values['lower_bound']:.6g}"
-    near = f", and this one has at most {100 * values['gap']:.2g} % more" if values["gap"] > 0 else ""
+    near = f", and this one has at most {100 * values['gap']:.2g} % more" if values["gap"] > 1e-9 else ""
     return f"This is proven: {bound}{near}."
 
 
-def _link(name: str, link: Mapping[str, Any], better: str) -> str:
+def _link(name: str, link: Mapping[str, Any], verb: str) -> str:
+    """Return how much of a budget is used, and what more of it would bring."""
     used = f"{link['used_mb']:,.0f} of {link['budget_mb']:,.0f} MB of the {name} budget are used"
-    if link["marginal"] > 0:
-        return f"{used}; 1,000 MB more would {better} by about {link['marginal']:.2g}."
-    return f"{used}; more of it would not {better}."
+    if not any(each["saved"] for each in link["more"]):
+        most = max(each["added"] for each in link["more"])
+        return f"{used}; up to {most:.0%} more of it would not {verb}."
+    by = " or ".join(f"{each['saved']:.2g} ({each['added']:.0%} more)" for each in link["more"])
+    return f"{used}; more of it would {verb} by {by}."
 
 
 def _others(values: Mapping[str, Any]) -> str:
-    """Return how the plan compares with the best of the simpler ones."""
+    """Return how the plan compares with the best of the simpler ones that can be carried out."""
     larger = values["measure"]["kind"] == "area"
-    best = (max if larger else min)(values["others"], key=lambda other: other["objective"])
+    carried = [other for other in values["others"] if other["note"] is None]
+    if not carried:
+        return "None of the simpler plans can be carried out: they know the budgets alone, not what each vehicle sends."
+    best = (max if larger else min)(carried, key=lambda other: other["objective"])
     behind = (values["objective"] - best["objective"]) * (1 if larger else -1)
     name = f"The best of the simpler plans is “{best['name']}”"
     if behind > 0:

@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+from flcav.experiments.aims import aim_sentence
 from flcav.experiments.task_study import training_rows
-from flcav.markdown import bullets, interval, table
+from flcav.markdown import bullets, table
 
 WANTED = 0.75  # mAP50 on scenes that were not learned from
 
@@ -33,10 +34,8 @@ def _findings(results: Mapping[str, Any]) -> list[str]:
     seeds = len(results["seeds"])
     said = []
     for test, means in results["summary"].items():
-        mean = means["mAP50"]
-        verdict = "reached" if mean["low"] >= WANTED else "not reached" if mean["high"] < WANTED else "undecided"
-        over = f"{interval(mean)} over {seeds} seeds" if seeds > 1 else f"{mean['mean']:.3f} of one seed"
-        said.append(f"*mAP50 of {WANTED} on {test}*: **{verdict}**, {over}; mAP50-95 {means['mAP50-95']['mean']:.3f}.")
+        aim = aim_sentence(f"mAP50 of {WANTED} on {test}", WANTED, means["mAP50"], seeds)
+        said.append(f"{aim}; mAP50-95 {means['mAP50-95']['mean']:.3f}.")
     return said
 
 

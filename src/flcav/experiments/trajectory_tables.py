@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from flcav.experiments.aims import aim_sentence
 from flcav.markdown import bullets, interval, table
 
 WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # of constant velocity's final error at junctions, at most
@@ -50,13 +51,10 @@ def tables(results: Mapping[str, Any]) -> dict[str, str]:
 
 def _finding(wanted: float, test: str, means: Mapping[str, Any], seeds: int) -> str:
     ratio = means[f"{SLICE}, ratio_single"]
-    verdict = "reached" if ratio["high"] <= wanted else "not reached" if ratio["low"] > wanted else "undecided"
-    over = f"{interval(ratio)} over {seeds} seeds" if seeds > 1 else f"{ratio['mean']:.3f} of one seed"
+    aim = f"A final error of {wanted} times constant velocity's at junctions, {test}"
+    said = aim_sentence(aim, wanted, ratio, seeds, at_most=True)
     best, plain = (means[f"{SLICE}, {key}"]["mean"] for key in ("minFDE_K", "constant_velocity_FDE"))
-    return (
-        f"*A final error of {wanted} times constant velocity's at junctions, {test}*: **{verdict}**, {over}. Of six "
-        f"modes the best ends {best:.2f} m off, constant velocity {plain:.2f} m."
-    )
+    return f"{said}. Of six modes the best ends {best:.2f} m off, constant velocity {plain:.2f} m."
 
 
 def _errors(test: str, means: Mapping[str, Any]) -> list[list[str]]:

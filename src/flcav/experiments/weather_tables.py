@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from flcav.experiments.aims import aim_sentence
 from flcav.markdown import bullets, interval, table
 
 WANTED = 0.95  # accuracy
@@ -25,9 +26,8 @@ def _findings(results: Mapping[str, Any]) -> list[str]:
     for test, numbers in results["summary"].items():
         for name, mean in numbers.items():
             where = "within the classes' regions" if name == "accuracy" else "by the nearest class, everywhere"
-            verdict = "reached" if mean["low"] >= WANTED else "not reached" if mean["high"] < WANTED else "undecided"
-            over = f"{interval(mean)} over {len(results['seeds'])} seeds"
-            said.append(f"*Accuracy of {WANTED} on {test}, {where}*: **{verdict}**, {over}.")
+            aim = f"Accuracy of {WANTED} on {test}, {where}"
+            said.append(aim_sentence(aim, WANTED, mean, len(results["seeds"])) + ".")
     return said
 
 

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 
 from flcav.config import InputError
 from flcav.files import atomic_path
+from flcav.parquet import read_parquet
 
 Link = Literal["wireless", "wireline"]
 Direction = Literal["up", "down"]
@@ -128,14 +129,12 @@ class Ledger:
     @classmethod
     def load(cls, path: Path) -> "Ledger":
         """Read a ledger that `save` wrote; raises `InputError` where `path` is not one."""
+        table = read_parquet(path)
         try:
-            table = pq.read_table(path)
             budget = Budget(**json.loads((table.schema.metadata or {})[b"budget"]))
             return cls(budget, (LedgerEntry(**row) for row in table.to_pylist()))
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such ledger") from None
-        except (pa.ArrowInvalid, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path}: not a ledger ({' '.join(str(error).split())})") from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path}: not a ledger ({error})") from None
 
 
 _SCHEMA = pa.schema(

@@ -64,7 +64,7 @@ class Allocation:
     gap: float | None  # (objective - lower_bound) / lower_bound
     tasks: tuple[TaskPlan, ...]
     used_mb: Price
-    marginal_error_per_gb: Price  # rate at which 1000 MB more on a link would better the relaxed objective
+    marginal_error_per_gb: Price  # derivative by each budget, per 1000 MB: see `allocate`
     note: str | None = None
     warnings: tuple[str, ...] = ()
 
@@ -80,17 +80,17 @@ class _Best:
 def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
     """Return the best plan within both budgets, proven to a relative `gap` (few tasks: to 1e-9).
 
-    Robust plans minimise the upper bands of the curves. Raises `Infeasible`, naming the budget, the least that the
-    limits allow, and by how much that is over.
+    Robust plans minimise the upper bands of the curves. `marginal_error_per_gb` is the derivative of the optimum over
+    quantities that need not be whole, times 1000 MB: a price at these budgets, no forecast of what 1000 MB more bring,
+    for which see `budget_sweep.savings`. Raises `Infeasible`, naming the budget, the least that the limits allow, and
+    by how much that is over.
     """
     asked = resolved(problem)
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
     best = _METHODS[problem.objective](asked, instance(asked), sought)
     plans = described(problem, best.x)
     lower = None if best.lower is None else min(best.lower, best.objective)
-    achieved = None
-    if lower is not None:
-        achieved = (best.objective - lower) / lower if lower > 0 else float(best.objective > 0)
+    achieved = None if lower is None else relative_gap(best.objective, lower)
     return Allocation(
         status="optimal" if achieved is not None and achieved <= gap else "feasible",
         objective=best.objective,
@@ -102,6 +102,11 @@ def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
         note=NO_CERTIFICATE if lower is None else None,
         warnings=_beyond(problem, plans),
     )
+
+
+def relative_gap(objective: float, lower: float) -> float:
+    """Return by what share `objective` is above the bound `lower`; above one of 0, by all of it."""
+    return (objective - lower) / lower if lower > 0 else float(objective > 0)
 
 
 def resolved(problem: Problem) -> Problem:

@@ -8,19 +8,21 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 from flcav.network.plan import Price
-from flcav.optimization.allocation import TaskPlan, described, resolved, score, used
+from flcav.optimization.allocation import Infeasible, TaskPlan, described, resolved, score, used
 from flcav.optimization.cutting_planes import Program, continuous_optimum
 from flcav.optimization.instance import Instance, instance
 from flcav.optimization.problem import Problem
 from flcav.optimization.rounding import trim
 from flcav.optimization.separable import relax
 from flcav.optimization.terms import terms_of
+from flcav.optimization.vehicles import vehicle_shares
 from flcav.optimization.weighted import least_weighted
 
 Array = NDArray[np.float64]
 
 GAP = 1e-4
 LONGEST_S = 5.0  # of the search for most messages
+NOT_CARRIED = "its vehicles do not hold the samples for it, or their links do not carry it within horizon_s"
 
 
 @dataclass(frozen=True)
@@ -31,12 +33,20 @@ class Baseline:
     objective: float
     tasks: tuple[TaskPlan, ...]
     used_mb: Price
+    note: str | None = None  # why it cannot be carried out, if it cannot
 
 
 def baseline(problem: Problem, name: str) -> Baseline:
-    """Return the plan of `BASELINES[name]`; raises `Infeasible` as `allocate` does."""
+    """Return the plan of `BASELINES[name]`; it knows the budgets alone, not what each vehicle holds and sends.
+
+    Raises `Infeasible` as `allocate` does.
+    """
     asked = resolved(problem)
     plans = described(problem, BASELINES[name](asked, instance(asked)))
+    try:
+        vehicle_shares(problem, plans)
+    except Infeasible:
+        return Baseline(name, score(asked, plans), plans, used(plans), NOT_CARRIED)
     return Baseline(name, score(asked, plans), plans, used(plans))
 
 

@@ -1,6 +1,6 @@
 """Learning curves: the error that is left after so many samples, edge rounds and cloud rounds."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,11 +10,17 @@ from flcav.config import Config
 
 STAGES = ("pretrain", "edge", "cloud")  # measured in samples, edge rounds, cloud rounds
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
 
 
-class Decay(Config):
+class Fitted(Config):
+    """Base of curves: their parameters are fitted, and of steep ones any size."""
+
+    magnitudes: ClassVar[tuple[float, float]] = (0.0, 1e100)
+
+
+class Decay(Fitted):
     """The error a * (x + x0)^(-b) that is left after x samples or rounds. The default is none at all."""
 
     a: NonNegative = 0.0
@@ -37,7 +43,7 @@ class Decay(Config):
             return self.a * shifted**-self.b if self.a > 0 else np.zeros_like(shifted)
 
 
-class Additive(Config):
+class Additive(Fitted):
     """error = floor + the decay of each stage."""
 
     model: Literal["additive"] = "additive"
@@ -62,7 +68,7 @@ class Additive(Config):
         return self.floor + self.pretrain.at(samples) + self.edge.at(edge_rounds) + self.cloud.at(cloud_rounds)
 
 
-class Effective(Config):
+class Effective(Fitted):
     """error = floor + a * n^(-b) at n = alpha * samples + beta * group_samples * (1 - 1 / (t + 1)) effective samples.
 
     t = edge_rounds + k * cloud_rounds; group_samples are those that the vehicles of all groups hold.

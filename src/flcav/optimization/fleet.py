@@ -17,14 +17,23 @@ from dataclasses import replace
 import numpy as np
 
 from flcav.network.plan import Price
-from flcav.optimization.allocation import Allocation, Infeasible, allocate, described, resolved, score, used
+from flcav.optimization.allocation import (
+    Allocation,
+    Infeasible,
+    allocate,
+    described,
+    relative_gap,
+    resolved,
+    score,
+    used,
+)
 from flcav.optimization.problem import Problem, Task
 from flcav.optimization.vehicles import BITS_PER_BYTE, Shares, TooSlow, vehicle_shares
 
 HALVINGS = 9  # of the interval in which what is made smaller is sought
 ROUNDING = 1e-9  # relative
 OPTIMAL = 1e-4  # gap
-CARRIED = "the vehicles' own links, within horizon_s, limit this plan, not the wireless budget"
+CARRIED = "the vehicles' own links, within horizon_s, limit this plan"
 
 Carried = tuple[Allocation, Shares]
 Relaxed = Callable[[float], Problem]  # by the share that is left of what is made smaller
@@ -40,14 +49,20 @@ def allocate_fleet(problem: Problem) -> Carried:
     try:
         return plan, vehicle_shares(asked, plan.tasks)
     except TooSlow as error:
-        relaxations = [_all_join(asked, plan)]
+        relaxations, bounds = [_all_join(asked, plan)], [plan.lower_bound]
         if all(task.uplink_mbps for task in asked.tasks):
-            relaxations.append(_one_joins(asked))
-        found = [carried for relaxed in relaxations if (carried := _largest(asked, relaxed))]
+            relaxations.insert(0, _one_joins(asked))
+            bounds.append(_bound(relaxations[0]))
+        lower = max((bound for bound in bounds if bound is not None), default=None)
+        found: list[Carried] = []
+        for relaxed in relaxations:
+            if carried := _largest(asked, relaxed):
+                found.append(carried)
+                if lower is not None and carried[0].objective <= lower * (1 + ROUNDING):
+                    break  # no plan is better
         if not found:
             raise error
-        bounds = [plan.lower_bound, *(_bound(relaxed) for relaxed in relaxations[1:])]
-        return _certified(asked, found, bounds)
+        return _certified(asked, found, lower)
 
 
 def _within_held(task: Task) -> Task:
@@ -116,13 +131,12 @@ def _bound(relaxed: Relaxed) -> float | None:
         return None
 
 
-def _certified(asked: Problem, found: Sequence[Carried], bounds: Sequence[float | None]) -> Carried:
-    """Return the best plan with what is proven of it; more of the wireless budget would bring it nothing."""
+def _certified(asked: Problem, found: Sequence[Carried], bound: float | None) -> Carried:
+    """Return the best plan with what is proven of it; its derivative by the wireless budget is not known: 0."""
     larger = asked.objective == "area"
     plan, shares = (max if larger else min)(found, key=lambda carried: carried[0].objective)
-    known = [bound for bound in bounds if bound is not None]
-    lower = None if larger else min(max(known), plan.objective)
-    gap = None if lower is None else (plan.objective - lower) / lower if lower > 0 else float(plan.objective > 0)
+    lower = None if bound is None else min(bound, plan.objective)
+    gap = None if lower is None else relative_gap(plan.objective, lower)
     rates = Price(0.0, plan.marginal_error_per_gb.wireline_mb)
     notes = (plan.note, CARRIED)
     certified = replace(

@@ -14,16 +14,16 @@ from typing import Annotated, Any, Self
 import networkx as nx
 from pydantic import Field, model_validator
 
-from flcav.config import Config, InputError, parse_config, read_yaml
+from flcav.config import InputError, parse_config, read_yaml
 from flcav.files import write_json
 from flcav.optimization.curves import Additive, Effective, Positive
-from flcav.optimization.problem import Budgets, Count, Limits, Problem, Uplink
+from flcav.optimization.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
 
 OwnCurve = Annotated[Additive | Effective, Field(discriminator="model")]
 KINDS = ("task", "network", "modality", "vehicle")  # a layer joins neighbours
 
 
-class TaskNode(Config):
+class TaskNode(Quantities):
     """A task, and the network it shares."""
 
     network: str
@@ -31,7 +31,7 @@ class TaskNode(Config):
     curve: OwnCurve | None = None  # None: its network's
 
 
-class NetworkNode(Config):
+class NetworkNode(Quantities):
     """A network: its size, what it reads, and the curve of its tasks that have none of their own."""
 
     model_mb: Positive
@@ -40,20 +40,20 @@ class NetworkNode(Config):
     curve: OwnCurve | None = None
 
 
-class ModalityNode(Config):
+class ModalityNode(Quantities):
     """A kind of sensor data."""
 
     sample_mb: Positive
 
 
-class Held(Config):
+class Held(Quantities):
     """What a vehicle holds of a modality."""
 
     samples: Count | None = None  # None: as many as are asked for
     quality: Positive = 1.0
 
 
-class VehicleNode(Config):
+class VehicleNode(Quantities):
     """A vehicle: its edge server, its own link, and what it holds."""
 
     edge: str
@@ -61,7 +61,7 @@ class VehicleNode(Config):
     holds: Annotated[Mapping[str, Held], Field(min_length=1)]
 
 
-class Layers(Config):
+class Layers(Quantities):
     """The graph as one writes it, in YAML or code, by name."""
 
     budgets_mb: Budgets
@@ -170,8 +170,10 @@ def load(path: Path) -> nx.Graph:
         return build(parse_config(Layers, values, str(path)))
     try:
         return build(describe(nx.node_link_graph(values, edges="links")))
-    except (KeyError, TypeError, nx.NetworkXError) as error:
-        raise InputError(f"{path}: not a graph in node-link JSON ({' '.join(str(error).split())})") from None
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, nx.NetworkXError) as error:
+        raise InputError(f"{path}: not a graph in node-link JSON ({error})") from None
 
 
 def read_problem(path: Path) -> Problem:

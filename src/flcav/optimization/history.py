@@ -2,7 +2,8 @@
 
 Two forms of table are read. Long: `task, stage, resource, accuracy[, weight]`, each row giving its own stage's
 resource; stages follow each other, so a row stands at the largest of the earlier stages and at 0 of the later ones.
-Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight]`, as our own runs write it.
+Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight]`, as our own runs write it. Either may say
+`error`, which is 1 - accuracy, in place of `accuracy`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,14 +14,16 @@ import numpy as np
 import pyarrow.csv
 from numpy.typing import ArrayLike, NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.optimization.curves import STAGES
 
 Array = NDArray[np.float64]
 
 LONG = ("task", "stage", "resource", "accuracy")
 JOINT = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
+LEAST, MOST = 1e-9, 1e9  # of a number that is not 0
 ARTICLE = resources.files("flcav.optimization") / "data" / "article_history.csv"
+ROUNDED = 1.01e-3  # what accuracy and error, both rounded to three digits, may sum to beside 1
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,13 @@ def histories(columns: Mapping[str, Sequence[object]], origin: str, unnamed: str
 
     Raises `InputError` naming `origin`, the row (from 1), the field and the value.
     """
+    columns = _with_accuracy(columns, origin)
     joint = "stage" not in columns
     for name in JOINT if joint else LONG:
         if name not in columns:
             raise InputError(
-                f"{origin}: column '{name}' is missing; a history has {', '.join(LONG)}, or {', '.join(JOINT)}"
+                f"{origin}: column '{name}' is missing; a history has {', '.join(LONG)}, or {', '.join(JOINT)}; "
+                "error may stand for accuracy"
             )
     accuracy = _numbers(columns, "accuracy", origin, most=1.0)
     weight = _numbers(columns, "weight", origin) if "weight" in columns else np.ones(len(accuracy))
@@ -66,6 +71,21 @@ def histories(columns: Mapping[str, Sequence[object]], origin: str, unnamed: str
     return found
 
 
+def _with_accuracy(columns: Mapping[str, Sequence[object]], origin: str) -> Mapping[str, Sequence[object]]:
+    """Return `columns` with accuracies, from errors where there are none; raises `InputError` if both disagree."""
+    if "error" not in columns:
+        return columns
+    error = _numbers(columns, "error", origin, most=1.0)
+    if "accuracy" not in columns:
+        return {**columns, "accuracy": (1 - error).tolist()}
+    accuracy = _numbers(columns, "accuracy", origin, most=1.0)
+    for row in np.flatnonzero(np.abs(accuracy + error - 1) > ROUNDED):
+        raise InputError(
+            f"{origin}: row {row + 1}: accuracy = {accuracy[row]:g} and error = {error[row]:g} do not sum to 1"
+        )
+    return columns
+
+
 def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
     """Return (n, 3) samples, edge rounds and cloud rounds of rows that give only their own stage's resource (n,)."""
     amounts, number = np.asarray(resource, dtype=np.float64), np.array([STAGES.index(name) for name in stage])
@@ -74,15 +94,14 @@ def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
     return np.where(np.arange(3) < number[:, None], largest, own)
 
 
-def _numbers(columns: Mapping[str, Sequence[object]], name: str, origin: str, most: float = np.inf) -> Array:
+def _numbers(columns: Mapping[str, Sequence[object]], name: str, origin: str, most: float = MOST) -> Array:
     """Return column `name` as (n,) numbers from 0 to `most`."""
     values = np.empty(len(columns[name]))
     for row, value in enumerate(columns[name]):
         try:
             values[row] = np.nan if value is None else float(value)  # pyright: ignore[reportArgumentType]
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             values[row] = np.nan
-        if not (np.isfinite(values[row]) and 0 <= values[row] <= most):
-            allowed = "0 or more" if most == np.inf else f"from 0 to {most:g}"
-            raise InputError(f"{origin}: row {row + 1}: {name} = {value} must be a number {allowed}")
+        if not (values[row] == 0 or LEAST <= values[row] <= most):
+            raise InputError(f"{origin}: row {row + 1}: {name} = {shorten(value)} must be a number from 0 to {most:g}")
     return values

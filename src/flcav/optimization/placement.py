@@ -18,6 +18,7 @@ from flcav.config import InputError
 Array = NDArray[np.float64]
 Method = Literal["exact", "greedy"]
 
+FARTHEST_M = 1e9
 TIE = 1e-9  # relative: covered weights closer than this are equal
 
 
@@ -53,10 +54,10 @@ def place(
     """
     places, sites = _points(errors, "errors"), _points(poles, "poles")
     weights = np.ones(len(places)) if weight is None else np.asarray(weight, dtype=np.float64)
-    if weights.shape != (len(places),) or not np.all(np.isfinite(weights) & (weights >= 0)):
-        raise InputError("errors: every weight must be a finite number of at least 0")
-    if not (np.isfinite(range_m) and range_m > 0):
-        raise InputError(f"range = {range_m}: must be a positive number of metres")
+    if weights.shape != (len(places),) or not np.all((weights == 0) | (weights >= 1e-9) & (weights <= 1e9)):
+        raise InputError("errors: every weight must be 0, or a number from 1e-09 to 1e+09")
+    if not 0 < range_m <= FARTHEST_M:
+        raise InputError(f"range = {range_m}: must be a positive number of metres, at most {FARTHEST_M:g}")
     if not 1 <= count <= len(sites):
         raise InputError(f"count = {count}: must be from 1 to the number of poles, {len(sites)}")
     if method not in ("exact", "greedy"):
@@ -83,8 +84,9 @@ def _points(values: ArrayLike, name: str) -> Array:
         raise InputError(f"{name}: there are none")
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{name}: expected rows of x, y, z, found an array of shape {points.shape}")
-    if not np.isfinite(points).all():
-        raise InputError(f"{name}: row {int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0]) + 1} is not finite")
+    odd = np.flatnonzero(~(np.abs(points) <= FARTHEST_M).all(axis=1))
+    if len(odd):
+        raise InputError(f"{name}: row {int(odd[0]) + 1} is not finite, or farther than {FARTHEST_M:g} m")
     return points
 
 

@@ -2,18 +2,28 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from flcav.config import Config
 from flcav.optimization.curves import STAGES, Additive, Curve, Effective, NonNegative, Positive, Shared
 
-Count = Annotated[int, Field(ge=0)]
+MOST = 10**9  # of anything that is counted
+WORST = 1e6  # error that a curve may predict anywhere within the limits; of one that was fitted it is about 1
+Count = Annotated[int, Field(ge=0, le=MOST)]
+Vehicles = Annotated[int, Field(ge=1, le=MOST)]
 Range = tuple[Count, Count]  # least and most, both allowed
 Share = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(min_length=1)]
 Objective = Literal["weighted", "max-min", "area"]
+
+
+class Quantities(Config):
+    """Base of what an allocation problem is made of."""
+
+    magnitudes: ClassVar[tuple[float, float]] = (1e-9, 1e9)
 
 
 class Limits(Config):
@@ -32,7 +42,7 @@ class Limits(Config):
         return self
 
 
-class Uplink(Config):
+class Uplink(Quantities):
     """What one vehicle can send [Mbit/s]."""
 
     wireless: Positive
@@ -55,7 +65,7 @@ class Measured(Config):
     cloud_rounds: NonNegative | None = None
 
 
-class Task(Config):
+class Task(Quantities):
     """One task, or a cluster of them: what its messages weigh, who takes part, and what its training brings.
 
     Tasks that share a network and its data are one task here, with a `shared` curve: the mean of theirs by weight.
@@ -65,7 +75,7 @@ class Task(Config):
     weight: Positive = 1.0
     sample_mb: Positive
     model_mb: Positive
-    edge_groups: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]  # vehicles per edge server
+    edge_groups: Annotated[tuple[Vehicles, ...], Field(min_length=1)]  # per edge server
     uplink_mbps: Mapping[str, Uplink] | None = None  # by vehicle, in the order of the edge groups
     samples_held: Mapping[str, Count] = {}  # by vehicle; one that is not named holds as many as are asked for
     data_quality: Mapping[str, Positive] = {}  # by vehicle: what a sample of its is worth; 1 if not named
@@ -103,7 +113,7 @@ class Task(Config):
     def _finite(self) -> Self:
         limits = self.limits
         ranges = (limits.samples, limits.edge_rounds, limits.cloud_rounds)
-        for field, curve in (("curve", self.curve), ("upper", self.upper)):
+        for field, curve in (("curve", self.curve), ("upper", self.upper or self.curve)):
             for each in (member.curve for member in curve.members) if isinstance(curve, Shared) else (curve,):
                 if isinstance(each, Effective) and limits.samples[0] == 0:
                     raise ValueError(
@@ -112,6 +122,13 @@ class Task(Config):
                 for stage, decay, (_, most) in zip(STAGES, each.decays(), ranges) if isinstance(each, Additive) else ():
                     if most == 0 and decay.infinite_at_0:
                         raise ValueError(f"{field}.{stage}.x0 of task {self.name!r} is 0: its error at 0 is infinite")
+                with np.errstate(over="ignore"):
+                    error = float(each.error(*(max(least, 1) for least, _ in ranges), k=0))
+                if not error <= WORST:
+                    raise ValueError(
+                        f"{field} of task {self.name!r} predicts an error of {error:g} at its least limits: at most "
+                        f"{WORST:g} is taken for one"
+                    )
         return self
 
     @model_validator(mode="after")
@@ -125,14 +142,14 @@ def _members(curve: Curve) -> list[tuple[str, float]]:
     return [(member.name, member.weight) for member in curve.members] if isinstance(curve, Shared) else []
 
 
-class Budgets(Config):
+class Budgets(Quantities):
     """Uplink budgets [MB]."""
 
     wireless: Positive
     wireline: Positive
 
 
-class Problem(Config):
+class Problem(Quantities):
     """How to split the budgets of both links over tasks and stages."""
 
     budgets_mb: Budgets

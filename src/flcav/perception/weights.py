@@ -19,6 +19,7 @@ from flcav.perception.card import CARD_KEY, Card
 from flcav.perception.task import ConfigT, NetworkT, Task
 
 PREFIX = "flcav."
+LARGEST = 1e9  # of a weight: larger ones overflow in a few layers
 SHIPPED = "shipped/weights.safetensors"  # in a task's folder; its card lies beside it
 COUNTER = "num_batches_tracked"  # of batch normalisation with a fixed momentum, which does not use it
 
@@ -48,8 +49,11 @@ def save_network(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path, 
 def load_network(task: Task[ConfigT, NetworkT, Any], path: Path) -> NetworkT:
     """Return the network that `save_network` wrote, in evaluation mode; raises `InputError` for any other file."""
     config, tensors = _read(task, path)
-    with torch.random.fork_rng(devices=[]):
-        network = task.build(config)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            network = task.build(config)
+    except (ValueError, TypeError, ArithmeticError, RuntimeError, AssertionError, MemoryError) as error:
+        raise InputError(f"{path}: weights of an impossible network ({error})") from None
     _fill(network, tensors, path)
     return network.eval()
 
@@ -134,12 +138,12 @@ def _read(task: Task[ConfigT, Any, Any], path: Path) -> tuple[ConfigT, dict[str,
 
 
 def _fill(network: nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
-    if odd := [name for name, tensor in tensors.items() if not torch.isfinite(tensor).all()]:
-        raise InputError(f"{path}: weights that are not finite numbers, in '{odd[0]}'")
+    if odd := [name for name, tensor in tensors.items() if not (tensor.abs() <= LARGEST).all()]:
+        raise InputError(f"{path}: weights that are not finite numbers, in '{odd[0]}', or above {LARGEST:g}")
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = str(error)[:200]
         raise InputError(f"{path}: weights of another network ({reason})") from None
 
 

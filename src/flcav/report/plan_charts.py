@@ -1,4 +1,4 @@
-"""A plan in pictures: megabytes per link, error against budget, and what more megabytes are worth."""
+"""A plan in pictures: megabytes per link, and error against budget."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -67,21 +67,5 @@ def best_by_budget(sweep: Mapping[str, Sequence[Row]], measure: str) -> Figure:
         columnspacing=1.0,
     )
     axes.set(xlabel="budget, as a multiple of this one", ylabel=measure)
-    axes.grid(axis="y")
-    return figure
-
-
-@style.styled
-def marginal_values(both: Sequence[Row], links: Mapping[str, Row], gain: str) -> Figure:
-    """Return what 1,000 MB more of each link bring, called `gain`, at multiples of both budgets."""
-    figure = style.canvas(WIDTH, 0.8 * WIDTH)
-    axes = figure.add_subplot()
-    handles = []
-    for name, colour in zip(links, (style.BLUE, style.VERMILLION), strict=True):
-        saved = [point["marginal_error_per_gb"][f"{name}_mb"] for point in both]
-        handles += axes.plot([point["factor"] for point in both], saved, color=colour, marker="o", ms=3, label=name)
-    axes.axvline(1, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
-    style.key(figure, handles)
-    axes.set(xlabel="both budgets, as a multiple of these", ylabel=f"{gain} by 1,000 MB more", ylim=(0, None))
     axes.grid(axis="y")
     return figure

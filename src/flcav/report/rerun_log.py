@@ -22,6 +22,7 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import inverse
 from flcav.progress import Report, silent
 from flcav.sensors.frame import Frame
+from flcav.sensors.radar import echo_directions
 from flcav.world.layers import MapLayers
 
 Array = NDArray[np.float64]
@@ -125,11 +126,8 @@ def _log_pose(recording: Any, path: str, parent_from_child: Array) -> None:
 
 
 def _log_radar(recording: Any, path: str, echoes: NDArray[np.float32]) -> None:
-    distance, azimuth, elevation, doppler, _ = echoes.T
-    level = np.cos(elevation)
-    ray = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
-    colours = RADAR_COLOURS(0.5 + doppler / (2 * RADAR_M_S), bytes=True)
-    recording.log(path, rr.Points3D(distance[:, None] * ray, colors=colours, radii=0.12))
+    colours = RADAR_COLOURS(0.5 + echoes[:, 3] / (2 * RADAR_M_S), bytes=True)
+    recording.log(path, rr.Points3D(echoes[:, :1] * echo_directions(echoes), colors=colours, radii=0.12))
 
 
 def _log_pinhole(recording: Any, path: str, intrinsics: Array, picture: NDArray) -> None:

@@ -15,9 +15,9 @@ from flcav.config import Config
 class CarlaReturns(Config):
     """CARLA's sensor attributes and their defaults."""
 
-    atmosphere_attenuation_rate: float = Field(default=0.004, ge=0)  # a of exp(-a distance) [1/m]
+    atmosphere_attenuation_rate: float = Field(default=0.004, ge=0, le=10)  # a of exp(-a distance) [1/m]
     dropoff_general_rate: float = Field(default=0.45, ge=0, le=1)  # share of all rays that is lost
-    dropoff_intensity_limit: float = Field(default=0.8, gt=0, le=1)  # weaker returns may be lost besides
+    dropoff_intensity_limit: float = Field(default=0.8, ge=1e-6, le=1)  # weaker returns may be lost besides
     dropoff_zero_intensity: float = Field(default=0.4, ge=0, le=1)  # share lost of returns of intensity 0
 
 

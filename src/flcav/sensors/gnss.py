@@ -15,11 +15,13 @@ Array = NDArray[np.float64]
 class Gnss(Config):
     """How good a receiver is; the defaults are those of a single-frequency receiver under open sky."""
 
-    noise_m: float = Field(default=0.3, ge=0)  # standard deviation of the white noise, east and north
-    noise_up_m: float = Field(default=0.6, ge=0)  # the same of the altitude
-    bias_m: float = Field(default=1.2, ge=0)  # standard deviation of what wanders (satellites, ionosphere), east, north
-    bias_up_m: float = Field(default=2.4, ge=0)  # the same of the altitude
-    bias_s: float = Field(default=60.0, gt=0)  # time in which the bias is forgotten
+    noise_m: float = Field(default=0.3, ge=0, le=1000)  # standard deviation of the white noise, east and north
+    noise_up_m: float = Field(default=0.6, ge=0, le=1000)  # the same of the altitude
+    bias_m: float = Field(
+        default=1.2, ge=0, le=1000
+    )  # standard deviation of what wanders (satellites, ionosphere), east, north
+    bias_up_m: float = Field(default=2.4, ge=0, le=1000)  # the same of the altitude
+    bias_s: float = Field(default=60.0, ge=0.001, le=1e6)  # time in which the bias is forgotten
 
 
 def fix(

@@ -20,13 +20,13 @@ GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
 class Imu(Config):
     """How good a unit is; the defaults are those of an automotive MEMS unit."""
 
-    rate_hz: float = Field(default=100.0, gt=0)  # samples a second: how much of the noise passes
-    force_noise: float = Field(default=1.5e-3, ge=0)  # white noise of the specific force [m/s^2 / sqrt(Hz)]
-    rate_noise: float = Field(default=1.0e-4, ge=0)  # the same of the angular rate [rad/s / sqrt(Hz)]
-    force_bias: float = Field(default=0.05, ge=0)  # standard deviation when switched on [m/s^2]
-    rate_bias: float = Field(default=2.0e-3, ge=0)  # the same of the angular rate [rad/s]
-    force_walk: float = Field(default=1.0e-4, ge=0)  # growth of this bias [m/s^2 / sqrt(s)]
-    rate_walk: float = Field(default=5.0e-6, ge=0)  # the same of the angular rate [rad/s / sqrt(s)]
+    rate_hz: float = Field(default=100.0, ge=0.1, le=10_000)  # samples a second: how much of the noise passes
+    force_noise: float = Field(default=1.5e-3, ge=0, le=1000)  # white noise of the specific force [m/s^2 / sqrt(Hz)]
+    rate_noise: float = Field(default=1.0e-4, ge=0, le=1000)  # the same of the angular rate [rad/s / sqrt(Hz)]
+    force_bias: float = Field(default=0.05, ge=0, le=1000)  # standard deviation when switched on [m/s^2]
+    rate_bias: float = Field(default=2.0e-3, ge=0, le=1000)  # the same of the angular rate [rad/s]
+    force_walk: float = Field(default=1.0e-4, ge=0, le=1000)  # growth of this bias [m/s^2 / sqrt(s)]
+    rate_walk: float = Field(default=5.0e-6, ge=0, le=1000)  # the same of the angular rate [rad/s / sqrt(s)]
 
 
 def reading(

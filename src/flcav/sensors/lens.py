@@ -27,10 +27,12 @@ class Lens(Config):
     width: int = Field(default=640, ge=16, le=8192)  # columns [px]
     height: int = Field(default=384, ge=16, le=8192)  # rows [px]
     fov_deg: float = Field(default=90.0, gt=1, lt=170)  # horizontal field of view; without effect where fx is given
-    fx: float | None = Field(default=None, gt=0)  # horizontal focal length [px]
-    fy: float | None = Field(default=None, gt=0)  # vertical focal length [px]; fx where it is not given
-    cx: float | None = None  # column of the principal point [px]; the image's centre where it is not given
-    cy: float | None = None  # row of the principal point [px], likewise
+    fx: float | None = Field(default=None, ge=1, le=1e6)  # horizontal focal length [px]
+    fy: float | None = Field(default=None, ge=1, le=1e6)  # vertical focal length [px]; fx where it is not given
+    cx: float | None = Field(
+        default=None, ge=-1e6, le=1e6
+    )  # column of the principal point [px]; the image's centre where it is not given
+    cy: float | None = Field(default=None, ge=-1e6, le=1e6)  # row of the principal point [px], likewise
     k1: float = 0.0  # radial distortion (Brown-Conrady, coefficients as OpenCV's), of r^2
     k2: float = 0.0  # radial distortion, of r^4
     p1: float = 0.0  # tangential distortion

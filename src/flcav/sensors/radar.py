@@ -51,6 +51,13 @@ def radar_sweep(
     return everything[order], owner[order]
 
 
+def echo_directions(echoes: NDArray[np.float32]) -> Array:
+    """Return (N, 3) unit vectors from the radar, in its frame, to the (N, 5) detections of a sweep."""
+    azimuth, elevation = echoes[:, 1:3].T.astype(np.float64)
+    level = np.cos(elevation)
+    return np.column_stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)))
+
+
 def rays_of(radar: Radar, rng: np.random.Generator) -> tuple[NDArray[np.float32], Array]:
     """Return (N, 3) directions, one at random in each cell of a grid over the field of view, and (N,) their [sr]."""
     _, (left, right), (low, high), _ = radar.extent()

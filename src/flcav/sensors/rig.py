@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +26,19 @@ RESERVED = ("traces", "town")  # folders of a dataset
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
+Reach = Annotated[float, Field(ge=-100, le=100)]  # [m]
+Turn = Annotated[float, Field(ge=-360, le=360)]
+
+
 class Mount(Config):
     """A sensor's pose on its agent: x forward, y left, z up; a camera looks along x. A positive pitch is downwards."""
 
-    x: float = 0.0  # forward [m]
-    y: float = 0.0  # to the left [m]
-    z: float = 0.0  # up [m]
-    yaw_deg: float = 0.0  # turned to the left
-    pitch_deg: float = 0.0  # tilted downwards
-    roll_deg: float = 0.0  # leaning to the right
+    x: Reach = 0.0  # forward [m]
+    y: Reach = 0.0  # to the left [m]
+    z: Reach = 0.0  # up [m]
+    yaw_deg: Turn = 0.0  # turned to the left
+    pitch_deg: Turn = 0.0  # tilted downwards
+    roll_deg: Turn = 0.0  # leaning to the right
 
     def agent_from_sensor(self) -> NDArray[np.float64]:
         """Return the (4, 4) transform; of a camera, with its body axes, not the optical ones."""

@@ -23,10 +23,13 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")  # it begins the names of 
 class EmbeddedSource:
     """The frames of a recipe. Scene i has the same traffic whatever the number of scenes, agents apart."""
 
-    def __init__(self, recipe: Recipe) -> None:
-        """Load the town; raises `InputError` where it, a pole or an observer is missing, or a mount below ground."""
+    def __init__(self, recipe: Recipe, beside: Path | None = None) -> None:
+        """Load the town, a folder's from `beside` too: the recipe's own folder.
+
+        Raises `InputError` where the town, a pole or an observer is missing, or a mount below ground.
+        """
         self.recipe = recipe
-        self.town = load_town(recipe.town)
+        self.town = load_town(recipe.town, beside)
         if not _SAFE_NAME.fullmatch(self.town.name):
             raise InputError(f"field 'town' = {recipe.town!r}: the folder's name must be letters, digits, - and _")
         known = self.town.poles.id.tolist()

@@ -9,11 +9,11 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from flcav.config import Config
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
-from flcav.world.scenarios.scenario import Scenario
+from flcav.world.scenarios.scenario import LONGEST_S, Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
 STEP_S = 0.1  # of the traffic
-LONGEST_S = 36_000.0
+MOST = 10**6  # scenes, frames, spins
 
 
 def _multiple_of_step(value: float) -> float:
@@ -62,18 +62,27 @@ class Recipe(Config):
     town: str  # the name of a town, or the folder of one
     seed: int = Field(default=0, ge=0, lt=2**63)  # of traffic, parked cars, sensor noise: the same seed, the same bytes
     split: str = Field(default="train", pattern=r"^[A-Za-z0-9_-]+$")  # what the dataset is for; kept with it
-    scenes: int = Field(default=1, ge=1)  # traffic runs
-    frames: int | None = Field(default=None, ge=1)  # exactly so many, by as many scenes as they take
+    scenes: int = Field(default=1, ge=1, le=MOST)  # traffic runs
+    frames: int | None = Field(default=None, ge=1, le=MOST)  # exactly so many, by as many scenes as they take
     warmup_s: Warmup = 60.0  # until the first spin, as the town fills; two numbers: each scene draws one between them
-    spins_per_scene: int = Field(default=10, ge=1)  # every agent makes one frame at each
+    spins_per_scene: int = Field(default=10, ge=1, le=MOST)  # every agent makes one frame at each
     every_s: Duration = 1.0  # from one spin to the next, a multiple of 0.1
-    cavs: int = Field(default=1, ge=0)  # connected vehicles with sensors: cav0, cav1, ...
+    cavs: int = Field(default=1, ge=0, le=1000)  # connected vehicles with sensors: cav0, cav1, ...
     poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()  # those with sensors, by number
     vehicle_rig: NamedRig = RIGS["lidar32"]  # the name of a rig, or its sensors
     pole_rig: NamedRig = RIGS["lidar_pole"]  # the same for every pole
     weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])  # a name, values, or over time
     calibration_error: CalibrationError = CalibrationError()  # how far off is what agents believe of their sensors
     scenarios: tuple[Scenario, ...] = ()  # corner cases that happen in every scene
+
+    @model_validator(mode="after")
+    def _ends(self) -> "Recipe":
+        last_s = self.warmup_steps[1] * STEP_S + (self.spins_per_scene - 1) * self.every_s
+        if last_s > LONGEST_S:
+            raise ValueError(
+                f"warmup_s, spins_per_scene and every_s put the last spin at {last_s:g} s, after {LONGEST_S:g} s"
+            )
+        return self
 
     @model_validator(mode="after")
     def _scenarios_can_happen(self) -> "Recipe":

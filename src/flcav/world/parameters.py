@@ -7,11 +7,19 @@ from pydantic import AfterValidator, Field, model_validator
 from flcav.config import Config
 from flcav.world.shapes import SHAPES
 
+LARGEST_M = 1000.0
+
 
 def _interval(value: tuple[float, float]) -> tuple[float, float]:
-    if not 0 <= value[0] <= value[1]:
-        raise ValueError("must be two numbers, 0 <= low <= high")
+    if not 0 <= value[0] <= value[1] <= LARGEST_M:
+        raise ValueError(f"must be two numbers, 0 <= low <= high, up to {LARGEST_M:g}")
     return value
+
+
+def _extent(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] < 1:
+        raise ValueError("must be two numbers of at least 1, low <= high")
+    return _interval(value)
 
 
 def _vehicle_mix(value: dict[str, float]) -> dict[str, float]:
@@ -22,8 +30,8 @@ def _vehicle_mix(value: dict[str, float]) -> dict[str, float]:
 def _mix(value: dict[str, float], allowed: list[str]) -> dict[str, float]:
     if unknown := sorted(set(value) - set(allowed)):
         raise ValueError(f"unknown {unknown[0]!r}; allowed: {', '.join(allowed)}")
-    if min(value.values(), default=0.0) < 0 or sum(value.values()) <= 0:
-        raise ValueError("weights must be >= 0 and not all zero")
+    if not 1e-6 <= sum(value.values()) <= 1e6 or min(value.values(), default=0.0) < 0:
+        raise ValueError("weights must be >= 0 and not all zero, and their sum at most 1e+06")
     return value
 
 
@@ -42,8 +50,11 @@ CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, hei
 }
 
 Interval = Annotated[tuple[float, float], AfterValidator(_interval)]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+Height = Annotated[float, Field(ge=0.1, le=100)]
+Spacing = Annotated[float, Field(ge=0.5, le=10_000)]
+NotNegative = Annotated[float, Field(ge=0, le=10_000)]
+Many = Annotated[int, Field(ge=0, le=10_000)]
+Extent = Annotated[tuple[float, float], AfterValidator(_extent)]
 Share = Annotated[float, Field(ge=0, le=1)]
 VehicleMix = Annotated[dict[str, float], AfterValidator(_vehicle_mix)]
 ClutterMix = Annotated[dict[str, float], AfterValidator(_clutter_mix)]
@@ -54,13 +65,13 @@ class StreetParameters(Config):
 
     frontage_m: NotNegative = 0.0  # paving behind the sidewalk
     setback_m: Interval = (2.0, 4.0)  # from the paving to the facades
-    building_length_m: Interval = (9.0, 14.0)
-    building_depth_m: Interval = (8.0, 11.0)
-    building_height_m: Interval = (5.0, 8.0)
+    building_length_m: Extent = (9.0, 14.0)
+    building_depth_m: Extent = (8.0, 11.0)
+    building_height_m: Extent = (5.0, 8.0)
     building_gap_m: Interval = (3.0, 7.0)
-    tree_spacing_m: Positive = 18.0
-    lamp_spacing_m: Positive = 32.0
-    clutter_spacing_m: Positive = 25.0
+    tree_spacing_m: Spacing = 18.0
+    lamp_spacing_m: Spacing = 32.0
+    clutter_spacing_m: Spacing = 25.0
     clutter: ClutterMix = Field(default={"hedge": 1.0})
     parked: Share = 0.0  # share of the parking lane's places that are taken
     parked_mix: VehicleMix = Field(default={"car": 1.0})
@@ -71,11 +82,11 @@ class StreetParameters(Config):
 class PoleParameters(Config):
     """A candidate site at the kerb of an edge."""
 
-    id: Annotated[int, Field(ge=1)]
+    id: Annotated[int, Field(ge=1, le=10**6)]
     kind: Literal["straight", "cross", "tee", "roundabout"]
     edge: str  # stands on the right of this edge
     before_end_m: NotNegative  # distance to the edge's end; other than straight: watches the junction there
-    height_m: Positive = 6.0
+    height_m: Height = 6.0
 
 
 class GeoReference(Config):
@@ -83,7 +94,7 @@ class GeoReference(Config):
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] = 49.0
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 8.4
-    altitude_m: float = 0.0
+    altitude_m: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0
 
 
 class MapSource(Config):
@@ -99,9 +110,9 @@ class TownParameters(Config):
     description: str
     geo: GeoReference = GeoReference()
     source: MapSource | None = None  # None: drawn here
-    seed: int  # of everything that stands still
-    vehicles: Annotated[int, Field(ge=0)]  # moving at once, CAVs apart
-    pedestrians: Annotated[int, Field(ge=0)]
+    seed: Annotated[int, Field(ge=0, lt=2**63)]  # of everything that stands still
+    vehicles: Many  # moving at once, CAVs apart
+    pedestrians: Many
     mix: VehicleMix  # category -> weight among moving vehicles
     shapes: dict[str, dict[str, float]] = Field(default={})  # category -> shape -> weight; all alike where left out
     streets: dict[str, StreetParameters]  # by the net's edge type

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 LaneKind = Literal["driving", "bicycle", "parking", "shoulder", "sidewalk", "crossing", "walkingarea"]
 CARRIAGEWAY: tuple[LaneKind, ...] = ("driving", "bicycle", "parking", "shoulder")  # the last two are closed to traffic
 
+FARTHEST_M = 1e6
 ONLY_FOR: dict[str, LaneKind] = {"pedestrian": "sidewalk", "bicycle": "bicycle"}
 
 
@@ -95,16 +96,24 @@ def read_net(path: Path) -> RoadNet:
         root = ElementTree.parse(path).getroot()
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, IsADirectoryError, LookupError, ValueError) as error:
         raise InputError(f"{path}: not a SUMO net ({error})") from None
     if root.tag != "net":
         raise InputError(f"{path}: not a SUMO net (its root is <{root.tag}>, expected <net>)")
+    try:
+        return _net(root)
+    except (LookupError, ValueError) as error:
+        raise InputError(f"{path}: not a SUMO net ({type(error).__name__}: {error})") from None
+
+
+def _net(root: ElementTree.Element) -> RoadNet:
+    """Return the net below `root`; raises `LookupError` and `ValueError` where something is missing or no number."""
     edges = {row.attrib["id"]: _edge(row) for row in root.iterfind("edge")}
     junctions = {
         row.attrib["id"]: Junction(
             row.attrib["id"],
             row.attrib["type"],
-            np.array([float(row.attrib["x"]), float(row.attrib["y"])]),
+            np.array([_number(row.attrib["x"]), _number(row.attrib["y"])]),
             _points(row.get("shape", "")),
         )
         for row in root.iterfind("junction")
@@ -138,8 +147,8 @@ def _edge(row: ElementTree.Element) -> Edge:
             lane.attrib["id"],
             _lane_kind(function, lane),
             _points(lane.attrib["shape"]),
-            float(lane.get("width", "3.2")),
-            float(lane.attrib["speed"]),
+            _number(lane.get("width", "3.2")),
+            _number(lane.attrib["speed"]),
         )
         for lane in row.iterfind("lane")
     )
@@ -155,5 +164,12 @@ def _lane_kind(function: str, lane: ElementTree.Element) -> LaneKind:
 
 
 def _points(text: str) -> Array:
-    rows = [point.split(",")[:2] for point in text.split()]
+    rows = [[_number(part) for part in point.split(",")[:2]] for point in text.split()]
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not abs(value) <= FARTHEST_M:
+        raise ValueError(f"{text} is no place in a town")
+    return value

@@ -1,5 +1,6 @@
 """A town: what stands still. Roads come from a SUMO net, the rest from the town's parameter file."""
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from flcav.config import InputError, read_config
+from flcav.config import InputError, read_config, shorten
 from flcav.seeds import stream
 from flcav.world import placement
 from flcav.world.parameters import GeoReference, TownParameters
@@ -62,20 +63,30 @@ class Town:
     signals: Signals = field(default_factory=Signals.none)
 
 
-def load_town(name: str | Path) -> Town:
+def load_town(name: str | Path, beside: Path | None = None) -> Town:
     """Return the town of that name, or of the folder `name` with `town.net.xml` and `town.yaml`.
 
-    The same files give the same town. Raises `InputError` for an unknown name and for files that do not fit together.
+    A folder is looked for in the folder `beside`, where one is given, and then in the working directory. The same files
+    give the same town. Raises `InputError` for an unknown name and for files that do not fit together.
     """
-    folder = Path(name) if isinstance(name, Path) else Path(__file__).parent / "towns" / name
-    if isinstance(name, str) and name not in TOWNS:
-        folder = Path(name)
-        if not folder.is_dir():
-            raise InputError(f"unknown town {name!r}; known towns: {', '.join(TOWNS)}, or a folder with a town.yaml")
+    folder = name if isinstance(name, Path) else _folder(name, beside)
     parameters = read_config(TownParameters, folder / "town.yaml")
     net = read_net(folder / "town.net.xml")
     _check(net, parameters, folder / "town.yaml")
     return _furnish(folder.name, folder / "town.net.xml", net, parameters)
+
+
+def _folder(name: str, beside: Path | None) -> Path:
+    if name in TOWNS:
+        return Path(__file__).parent / "towns" / name
+    sought = [place / name for place in (beside, Path.cwd()) if place is not None]
+    for folder in sought:
+        if os.path.isdir(folder):  # noqa: PTH112 - which takes a name that can be none
+            return folder
+    places = " nor ".join(map(str, dict.fromkeys(folder.absolute() for folder in sought)))
+    raise InputError(
+        f"unknown town {shorten(name)}; known towns: {', '.join(TOWNS)}, or a folder, and there is no {places}"
+    )
 
 
 def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:

@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.files import atomic_path
+from flcav.parquet import read_parquet
+from flcav.world.shapes import SHAPES
 
 Array = NDArray[np.float64]
 
@@ -80,20 +82,24 @@ class Trace:
     @classmethod
     def load(cls, path: Path) -> "Trace":
         """Read a trace that `save` wrote; raises `InputError` where `path` is none."""
-        try:
-            table = pq.read_table(path)
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file") from None
-        except pa.ArrowInvalid as error:
-            raise InputError(f"{path}: not a trace ({error})") from None
+        table = read_parquet(path)
         metadata = table.schema.metadata or {}
         if METADATA not in metadata:
             raise InputError(f"{path}: not a trace (Parquet without the metadata {METADATA.decode()!r})")
-        rest = json.loads(metadata[METADATA])
         if missing := [name for name in STATE if name not in table.column_names]:
             raise InputError(f"{path}: a trace of another version (no column '{missing[0]}'); record it again")
+        try:
+            return cls._decode(json.loads(metadata[METADATA]), table)
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+            raise InputError(f"{path}: not a trace ({type(error).__name__}: {error})") from None
+
+    @classmethod
+    def _decode(cls, rest: dict[str, Any], table: pa.Table) -> "Trace":
+        """Return the trace of a file's metadata and rows; raises `ValueError` and others where they are of none."""
         instants, actors, lights = len(rest["time_s"]), len(rest["actor"]), len(rest["light"])
         at = (table["instant"].to_numpy(), table["actor"].to_numpy())
+        if min(column.min(initial=0) for column in at) < 0:
+            raise ValueError("a row is of no instant or no actor")
         state = np.full((instants, actors, len(STATE)), np.nan)
         state[at] = np.stack([table[name].to_numpy() for name in STATE], axis=1)
         present = np.zeros((instants, actors), dtype=np.bool_)
@@ -101,8 +107,8 @@ class Trace:
         light_state = np.full((instants, lights), "", dtype="<U1")
         for since, letters in rest["light_state"]:
             light_state[since:] = list(letters)
-        return cls(
-            town=rest["town"],
+        trace = cls(
+            town=str(rest["town"]),
             time_s=np.array(rest["time_s"], dtype=np.float64),
             actor=np.array(rest["actor"], dtype=np.str_),
             category=np.array(rest["category"], dtype=np.str_),
@@ -118,3 +124,21 @@ class Trace:
             light_state=light_state,
             events=tuple(Event(row["kind"], row["begins_s"], tuple(row["actors"])) for row in rest.get("events", [])),
         )
+        trace._check()
+        return trace
+
+    def _check(self) -> None:
+        """Raise `ValueError` where the fields cannot be those of a trace."""
+        if {len(each) for each in (self.actor, self.category, self.shape, self.size)} != {
+            len(set(self.actor.tolist()))
+        }:
+            raise ValueError("its actors are not told one by one")
+        for category, shape in zip(self.category.tolist(), self.shape.tolist()):
+            if not 0 <= shape < len(SHAPES.get(category, ())):
+                raise ValueError(f"there is no {category!r} of shape {shape}")
+        motion = (self.position, self.velocity, self.acceleration, self.yaw[..., None], self.yaw_rate[..., None])
+        numbers = (np.concatenate(motion, axis=2)[self.present], self.time_s, self.size)
+        if not all(np.isfinite(each).all() for each in numbers):
+            raise ValueError("a number is not finite")
+        if (self.size <= 0).any() or (np.diff(self.time_s) <= 0).any():
+            raise ValueError("a size is not above 0, or time does not go on")

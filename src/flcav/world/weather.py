@@ -124,11 +124,16 @@ def interpolate(one: Weather, other: Weather, share: float) -> Weather:
 
 
 def _named(value: Any) -> Any:
-    if not isinstance(value, str):
-        return value
-    if value not in WEATHERS:
+    """Return the fields of a weather that is named, or whose `preset` is; anything else as it is."""
+    if isinstance(value, dict) and "preset" in value:
+        return _preset(value["preset"]) | {field: given for field, given in value.items() if field != "preset"}
+    return _preset(value) if isinstance(value, str) else value
+
+
+def _preset(name: Any) -> dict[str, Any]:
+    if not isinstance(name, str) or name not in WEATHERS:
         raise ValueError(f"unknown weather; known weathers: {', '.join(WEATHERS)}")
-    return WEATHERS[value]
+    return WEATHERS[name].model_dump()
 
 
 class Keyframe(Config):
@@ -143,7 +148,7 @@ class WeatherSchedule(Config):
 
     With `turn_s`, a scene goes through all its classes in an order drawn for it, from one to the next in that time; a
     class may be named several times. In a recipe it may also be written as the name of a preset, as one weather, or as
-    the list of keyframes alone.
+    the list of keyframes alone. A weather is its fields, the name of a preset, or a `preset` with fields given anew.
     """
 
     keyframes: tuple[Keyframe, ...] = ()  # between them everything changes evenly
@@ -154,10 +159,16 @@ class WeatherSchedule(Config):
     @classmethod
     def _from_short_forms(cls, value: Any) -> Any:
         if isinstance(value, list | tuple):
+            if names := [each for each in value if isinstance(each, str)]:
+                raise ValueError(
+                    f"a list is of keyframes, such as {{at_s: 0, weather: {names[0]}}}; for scenes that each draw one "
+                    f"of several weathers write {{classes: [{', '.join(names)}]}}"
+                )
             return {"keyframes": value}
-        one = isinstance(value, str | Weather)
-        if one or (isinstance(value, dict) and not {"keyframes", "classes"} & set(value)):
-            return {"keyframes": [{"at_s": 0.0, "weather": value}]}
+        if isinstance(value, str | Weather) or (isinstance(value, dict) and not {"keyframes", "classes"} & set(value)):
+            return {"keyframes": [{"at_s": 0.0, "weather": _named(value)}]}
+        if not isinstance(value, dict | WeatherSchedule):
+            raise ValueError("must be the name of a weather, its fields, or a list of keyframes")
         return value
 
     @field_validator("classes")

@@ -98,6 +98,39 @@ def _sample(out: Path, table: dict, sample: dict) -> Seen:
     return Seen(Boxes.from_array(boxes, labels), points, images)
 
 
+def nuscenes_points(out: Path) -> list[tuple[list, list]]:
+    """Return of each sample the (M, 2) points of LiDAR and radar that its annotations claim, and that lie in them."""
+    tables = {path.stem: json.loads(path.read_text()) for path in (out / "v1.0-flcav").glob("*.json")}
+    by = {name: {row["token"]: row for row in rows} for name, rows in tables.items() if isinstance(rows, list)}
+    found = []
+    for sample in tables["sample"]:
+        clouds = {"lidar": [np.zeros((0, 3))], "radar": [np.zeros((0, 3))]}
+        for row in tables["sample_data"]:
+            calibrated = by["calibrated_sensor"][row["calibrated_sensor_token"]]
+            kind = by["sensor"][calibrated["sensor_token"]]["modality"]
+            if row["sample_token"] == sample["token"] and kind in clouds:
+                data = (out / row["filename"]).read_bytes()
+                if kind == "lidar":
+                    points = np.frombuffer(data, "<f4").reshape(-1, 5)[:, :3]
+                else:  # 43 bytes an echo, as the devkit has them, and one byte more
+                    rest = data.partition(b"DATA binary\n")[2][:-1]
+                    points = np.frombuffer(rest, "u1").reshape(-1, 43)[:, :12].copy().view("<f4")
+                world_from_sensor = _placed(by["ego_pose"][row["ego_pose_token"]]) @ _placed(calibrated)
+                clouds[kind].append(points @ world_from_sensor[:3, :3].T + world_from_sensor[:3, 3])
+        said, inside = [], []
+        for note in tables["sample_annotation"]:
+            if note["sample_token"] == sample["token"]:
+                said.append([note["num_lidar_pts"], note["num_radar_pts"]])
+                box_from_world, half = np.linalg.inv(_placed(note)), np.array(note["size"])[[1, 0, 2]] / 2
+                own = [
+                    np.concatenate(cloud) @ box_from_world[:3, :3].T + box_from_world[:3, 3]
+                    for cloud in clouds.values()
+                ]
+                inside.append([int((np.abs(points) <= half).all(axis=1).sum()) for points in own])
+        found.append((said, inside))
+    return found
+
+
 def opv2v(out: Path) -> dict[str, Seen]:
     seen = {}
     for scenario in sorted(path for split in out.iterdir() for path in split.iterdir()):

@@ -45,7 +45,9 @@ LOCAL = np.array(  # x, y, z, length, width, height, yaw against the agent, whos
         [3, 40, 0.75, 4.1, 1.8, 1.5, 0.0],  # in no image, without returns
     ]
 )
-RETURNS = np.array([60, 50, 40, 30, 20, 10, 15, 5, 0])
+IN_BOX = np.array([60, 50, 0, 30, 20, 10, 15, 5, 0])  # points of the LiDAR; the truck ahead shows and has none
+RETURNS = IN_BOX + 3 * (IN_BOX > 0)  # as recorded: of the actor itself, mirrors and all
+ECHOES = {0: 2, 5: 1}  # row -> echoes of the radar that lie in its box
 WEATHER = Weather(rain_mm_h=3.0)
 SIGNS = (("stop", "", 5), ("speed_60", "", 9), ("signal", "red", 6), ("signal", "green", 4), ("signal", "off", 7))
 
@@ -62,6 +64,8 @@ class PaintedSource:
     scene_count: int = 3
     spins: int = 2
     split: str = "train"
+    cut: int = 0  # frames that are missing at the end of every scene
+    deserted: bool = False  # nobody is there
     cameras: bool = True
     lidar: bool = True
     town: str = "painted"
@@ -73,12 +77,12 @@ class PaintedSource:
         return [f"painted-0-{scene:03d}" for scene in range(self.scene_count)]
 
     def frame_count(self, scene: str) -> int:
-        return 2 * self.spins
+        return 2 * self.spins - self.cut
 
     def frames(self, scene: str) -> Iterator[Frame]:
-        for index in range(self.spins):
-            for agent in ("cav0", "pole3"):
-                yield self.frame(scene, index, agent)
+        for number in range(self.frame_count(scene)):
+            index, agent = divmod(number, 2)
+            yield self.frame(scene, index, ("cav0", "pole3")[agent])
 
     def trace(self, scene: str) -> None:
         return None
@@ -87,13 +91,14 @@ class PaintedSource:
         rng = stream(0, scene, index, agent)
         x, y = rng.uniform(-50, 50, 2)
         world_from_agent = pose(float(x), float(y), yaw=float(rng.uniform(-3, 3)))
-        boxes = Boxes.from_array(LOCAL, CATEGORIES).transformed(world_from_agent)
+        boxes = Boxes.from_array(LOCAL, CATEGORIES).transformed(world_from_agent)[: 0 if self.deserted else None]
         cameras = ["front", "back"] if self.cameras and agent == "cav0" else []
         optical = [*cameras, *(["thermal"] if cameras else [])]
         then = world_from_agent @ pose(0.4, 0.03, yaw=0.02)
         pictures = {name: _picture(boxes, then @ MOUNTS[name]) for name in cameras}
         lidar = _points(boxes, world_from_agent @ MOUNTS["lidar"], rng)
-        radar = np.column_stack([rng.uniform(low, high, 4) for low, high in RADAR_RANGES]).astype(np.float32)
+        radar = _echoes(boxes, world_from_agent @ MOUNTS["radar"], rng)
+        returns = RETURNS[: len(boxes)]
         names = ["lidar", *optical, "radar", "gnss", "imu"] if agent == "cav0" else ["lidar"]
         mounts = {name: MOUNTS[name] for name in names}
         calibration = Calibration(
@@ -115,11 +120,11 @@ class PaintedSource:
             annotations=Annotations(
                 track=np.array([f"veh{i}" for i in range(len(boxes))]),
                 boxes=boxes,
-                velocity=np.array([[1.5, -0.5, 0.0]] * len(boxes)),
+                velocity=np.tile([1.5, -0.5, 0.0], (len(boxes), 1)),
                 acceleration=np.zeros((len(boxes), 3)),
-                returns=RETURNS * self.lidar,
+                returns=returns * self.lidar,
                 occlusion=np.linspace(0, 1, len(boxes)),
-                points={"lidar": RETURNS} | ({"radar": np.arange(len(boxes))} if agent == "cav0" else {}),
+                points={"lidar": returns} | ({"radar": np.arange(len(boxes))} if agent == "cav0" else {}),
                 views={name: pictures[name if name in pictures else "front"].views for name in optical},
                 signs={name: _signs() for name in cameras},
             ),
@@ -185,7 +190,7 @@ def _picture(boxes: Boxes, world_from_camera: NDArray[np.float64]) -> _Painted:
 def _points(boxes: Boxes, world_from_lidar: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float32]:
     """Return points within every box, and on the ground where no box is."""
     inside = []
-    for i, count in enumerate(RETURNS):
+    for i, count in enumerate(IN_BOX[: len(boxes)]):
         spread = rng.uniform(-0.45, 0.45, (count, 3)) * boxes.size[i]
         turned = spread @ pose(0, 0, yaw=boxes.yaw[i])[:3, :3].T
         inside.append(turned + boxes.center[i])
@@ -195,6 +200,15 @@ def _points(boxes: Boxes, world_from_lidar: NDArray[np.float64], rng: np.random.
     lidar_from_world = np.linalg.inv(world_from_lidar)
     xyz = world @ lidar_from_world[:3, :3].T + lidar_from_world[:3, 3]
     return np.column_stack((xyz, rng.uniform(0, 1, len(xyz)))).astype(np.float32)
+
+
+def _echoes(boxes: Boxes, world_from_radar: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return echoes from anywhere, after those from the middle of the boxes that `ECHOES` names."""
+    echoes = np.column_stack([rng.uniform(low, high, 4) for low, high in RADAR_RANGES])
+    middle = boxes.center[[row for row, count in ECHOES.items() for _ in range(count) if row < len(boxes)]]
+    x, y, z = ((middle - world_from_radar[:3, 3]) @ world_from_radar[:3, :3]).T
+    polar = np.stack((np.sqrt(x**2 + y**2 + z**2), np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), 0 * x, 0 * x + 3))
+    return np.concatenate((polar.T, echoes)).astype(np.float32)
 
 
 def _signs() -> SignViews:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,15 @@ import painted_source
 import pytest
 import shapely
 import yaml
-from format_readers import READERS, Seen, mcap_topics
-from painted_source import CATEGORIES, RETURNS, PaintedSource
+from format_readers import READERS, Seen, mcap_topics, nuscenes_points
+from google.protobuf.message import Message
+from painted_source import CATEGORIES, ECHOES, IN_BOX, PaintedSource
 from PIL import Image
 from shapely.geometry import MultiPoint
 
+from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.formats.export import EXPORTERS, export
+from flcav.dataset.formats.export import FORMATS, export
 from flcav.dataset.formats.exporter import ExportOptions
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
@@ -43,12 +46,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return Dataset.open(folder)
 
 
+def _options(name: str) -> ExportOptions:
+    return ExportOptions(validation=0.3) if "validation" in FORMATS[name].options else ExportOptions()
+
+
 @pytest.fixture(scope="module")
 def exported(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("exports")
-    options = ExportOptions(validation=0.3)
-    for name in EXPORTERS:
-        export(dataset, name, root / name, options)
+    for name in FORMATS:
+        export(dataset, name, root / name, _options(name))
     export(dataset, "yolo", root / "yolo_actors", ExportOptions(validation=0.3, labels="actors"))
     return {path.name: path for path in root.iterdir()}
 
@@ -64,9 +70,9 @@ def _kept(name: str, frame: Frame) -> np.ndarray:
         views = frame.annotations.views["front"]
         left, top, right, bottom = np.nan_to_num(views.amodal_box, nan=-1).T
         within = (right > 0) & (bottom > 0) & (left < painted_source.WIDTH - 1) & (top < painted_source.HEIGHT - 1)
-        return np.flatnonzero(within & ((views.pixels > 0) | (frame.annotations.returns > 0)))
+        return np.flatnonzero(within & (IN_BOX > 0))
     if name == "opv2v":
-        return np.flatnonzero(np.isin(CATEGORIES, ["car", "van", "truck", "bus"]) & (RETURNS > 0))
+        return np.flatnonzero(np.isin(CATEGORIES, ["car", "van", "truck", "bus"]) & (IN_BOX > 0))
     return np.arange(len(CATEGORIES))
 
 
@@ -102,7 +108,7 @@ def test_points_are_the_source_s_and_lie_in_their_boxes(name: str, dataset: Data
         truth = source.annotations.boxes.transformed(inverse(source.world_from_sensor("lidar")))
         rows = np.linalg.norm(frame.boxes.center[:, None] - truth.center[None], axis=2).argmin(axis=1)
         inside = points_in_boxes(frame.points, frame.boxes, 1e-3).sum(axis=1)
-        np.testing.assert_array_equal(inside, RETURNS[rows])
+        np.testing.assert_array_equal(inside, IN_BOX[rows])
 
 
 @pytest.mark.parametrize("name", READERS)
@@ -151,6 +157,8 @@ def test_kitti_splits_by_scene_and_has_what_openpcdet_expects(dataset: Dataset, 
     assert shapes == [12, 12, 12, 12, 9, 12, 12]
     for line in (out / "training" / "label_2" / "000000.txt").read_text().splitlines():
         name, *fields = line.split(" ")
+        if name == "DontCare":
+            continue
         assert name in {"Car", "Van", "Truck", "Cyclist", "Pedestrian"}
         assert len(fields) == 14
         truncation, occlusion, alpha, left, _, right, _, *_, x, _, z, rotation = map(float, fields)
@@ -174,6 +182,45 @@ def test_kitti_grades_occlusion(dataset: Dataset, seen: dict[str, dict[str, Seen
         wide, tall = painted_source.WIDTH - 1, painted_source.HEIGHT - 1
         np.testing.assert_allclose(rectangle, np.clip(views.amodal_box[i], 0, (wide, tall, wide, tall)), atol=1e-4)
     assert len(set(objects.occlusion.tolist())) > 1
+
+
+def test_kitti_marks_what_shows_without_a_point_as_not_labelled(
+    dataset: Dataset, exported: dict[str, Path], tmp_path: Path
+):
+    """The truck ahead shows and no point of the LiDAR lies in its box; asked for, it is labelled all the same."""
+    truck = CATEGORIES.index("truck")
+    box = dataset.frame(0).annotations.views["front"].visible_box[truck]
+    lines = (exported["kitti"] / "training" / "label_2" / "000000.txt").read_text().splitlines()
+    assert [line.split()[0] for line in lines].index("DontCare") == len(lines) - 1, "OpenPCDet counts on it to be last"
+    kind, *fields = lines[-1].split()
+    assert (kind, fields[:3], fields[7:]) == ("DontCare", ["-1", "-1", "-10"], ["-1"] * 3 + ["-1000"] * 3 + ["-10"])
+    np.testing.assert_allclose([float(field) for field in fields[3:7]], np.clip(box, 0, None), atol=1e-4)
+    exported_all = export(dataset, "kitti", tmp_path / "all", ExportOptions(min_points=0))
+    assert exported_all.counts["DontCare_regions"] == 0
+    more = (tmp_path / "all" / "training" / "label_2" / "000000.txt").read_text().splitlines()
+    assert len(more) == len(lines)
+    assert sum(line.startswith("Truck") for line in more) == 1 + sum(line.startswith("Truck") for line in lines)
+    few = export(dataset, "kitti", tmp_path / "few", ExportOptions(min_points=41))
+    assert few.counts["objects"] == 2 * few.counts["frames"]  # the car and the van ahead; the bus is behind
+
+
+def test_kitti_has_a_line_for_a_frame_without_labels(tmp_path: Path):
+    record(PaintedSource(1, spins=1, deserted=True), tmp_path / "dataset")
+    export(Dataset.open(tmp_path / "dataset"), "kitti", tmp_path / "out")
+    line = (tmp_path / "out" / "training" / "label_2" / "000000.txt").read_text()
+    assert line == "DontCare -1 -1 -10 0 0 1 1 -1 -1 -1 -1000 -1000 -1000 -10\n"
+    assert len(READERS["kitti"](tmp_path / "out")["painted-0-000_0000_cav0"].boxes) == 0
+
+
+def test_nuscenes_counts_the_points_in_the_boxes(exported: dict[str, Path]):
+    """Not those of the actor, of which the source has more, or another number."""
+    by_radar = 0
+    for said, inside in nuscenes_points(exported["nuscenes"]):
+        assert said == inside
+        lidar, radar = np.transpose(said)
+        np.testing.assert_array_equal(lidar, IN_BOX)
+        by_radar += all(radar[row] >= count for row, count in ECHOES.items())
+    assert by_radar == SCENES * 2  # the pole has none
 
 
 def _labels(found: dict[str, list], frame: Frame, camera: str, name: str) -> None:
@@ -297,6 +344,27 @@ def test_mcap_holds_every_modality(dataset: Dataset, exported: dict[str, Path]):
         np.testing.assert_allclose(found[name], box + 0.5)
 
 
+def test_every_time_stamp_of_an_mcap_is_set(exported: dict[str, Path]):
+    """Foxglove shows a message without one at no time at all."""
+    stamped = Counter()
+
+    def check(message: Message, path: str) -> None:
+        for field in message.DESCRIPTOR.fields:
+            if field.message_type is not None and field.message_type.full_name == "google.protobuf.Timestamp":
+                assert message.HasField(field.name), f"{path}.{field.name}"
+                stamped[message.DESCRIPTOR.name] += 1
+            elif field.message_type is not None:
+                value = getattr(message, field.name)
+                for part in value if field.is_repeated else [value]:
+                    check(part, f"{path}.{field.name}")
+
+    for topic, messages in mcap_topics(exported["mcap"] / "painted-0-000.mcap").items():
+        for message in messages:
+            if isinstance(message, Message):
+                check(message, topic)
+    assert stamped["ImageAnnotations"] == 2 * 3  # spins, cameras
+
+
 @pytest.mark.parametrize("name", READERS)
 def test_the_assumed_calibration_moves_the_sensors_only(name: str, dataset: Dataset, tmp_path: Path):
     """The source assumes the LiDAR 0.1 m too far ahead, so that boxes come 0.1 m too near to it."""
@@ -310,7 +378,7 @@ def test_the_assumed_calibration_moves_the_sensors_only(name: str, dataset: Data
             np.testing.assert_allclose(np.linalg.norm(away, axis=1), 0.1, atol=2e-4)
 
 
-@pytest.mark.parametrize("name", EXPORTERS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_an_export_that_ends_early_leaves_nothing(name: str, dataset: Dataset, tmp_path: Path):
     def full_disk(done: int, total: int, note: str) -> None:
         raise OSError(28, "No space left on device")
@@ -327,7 +395,7 @@ def test_an_export_that_ends_early_leaves_nothing(name: str, dataset: Dataset, t
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.parametrize("name", EXPORTERS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_progress_reaches_the_end(name: str, dataset: Dataset, tmp_path: Path):
     calls = []
     export(dataset, name, tmp_path / "out", progress=lambda done, total, note: calls.append((done, total)))
@@ -335,9 +403,9 @@ def test_progress_reaches_the_end(name: str, dataset: Dataset, tmp_path: Path):
     assert calls[-1] == (len(dataset), len(dataset))
 
 
-@pytest.mark.parametrize("name", EXPORTERS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_equal_exports_are_equal_bytes(name: str, dataset: Dataset, exported: dict[str, Path], tmp_path: Path):
-    export(dataset, name, tmp_path / "out", ExportOptions(validation=0.3))
+    export(dataset, name, tmp_path / "out", _options(name))
     files = {path.relative_to(tmp_path / "out"): path for path in (tmp_path / "out").rglob("*") if path.is_file()}
     assert len(files) == len([path for path in exported[name].rglob("*") if path.is_file()])
     for relative, path in files.items():
@@ -357,12 +425,12 @@ def test_targets_that_are_refused(dataset: Dataset, tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "source", "needed"),
     [
-        ("kitti", PaintedSource(1, cameras=False), "a level camera that looks ahead; the dataset has none"),
-        ("yolo", PaintedSource(1, cameras=False), "camera images"),
-        ("coco", PaintedSource(1, cameras=False), "camera images"),
-        ("kitti", PaintedSource(1, lidar=False), "a LiDAR and"),
-        ("nuscenes", PaintedSource(1, lidar=False), "a LiDAR on every agent; cav0 has none"),
-        ("opv2v", PaintedSource(1, lidar=False), "a LiDAR on every agent; cav0 has none"),
+        ("kitti", PaintedSource(2, cameras=False), "a level camera that looks ahead; the dataset has none"),
+        ("yolo", PaintedSource(2, cameras=False), "camera images"),
+        ("coco", PaintedSource(2, cameras=False), "camera images"),
+        ("kitti", PaintedSource(2, lidar=False), "a LiDAR and"),
+        ("nuscenes", PaintedSource(2, lidar=False), "a LiDAR on every agent; cav0 has none"),
+        ("opv2v", PaintedSource(2, lidar=False), "a LiDAR on every agent; cav0 has none"),
     ],
 )
 def test_what_a_dataset_lacks_is_one_sentence(name: str, source: PaintedSource, needed: str, tmp_path: Path):
@@ -379,3 +447,78 @@ def test_a_dataset_goes_to_the_split_it_was_recorded_for(split: str, lists: list
     export(Dataset.open(tmp_path / "dataset"), "opv2v", tmp_path / "out")
     folders = {"train": "train", "val": "validate", "test": "test"}
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(folders[name] for name in lists)
+
+
+@pytest.mark.parametrize("name", ["yolo", "opv2v"])
+def test_one_scene_cannot_train_and_validate(name: str, tmp_path: Path):
+    """Ultralytics refuses a data.yaml without `val`, OpenCOOD finds no folder; an empty one has to be asked for."""
+    record(PaintedSource(1, spins=1), tmp_path / "dataset")
+    dataset = Dataset.open(tmp_path / "dataset")
+    with pytest.raises(InputError, match=r"needs scenes that validate .* record two or more"):
+        export(dataset, name, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    export(dataset, name, tmp_path / "out", ExportOptions(validation=0))
+    assert not list((tmp_path / "out" / {"yolo": "images/val", "opv2v": "validate"}[name]).iterdir())
+
+
+@pytest.mark.parametrize("split", ["train", "val", "test"])
+def test_a_data_yaml_names_folders_to_train_and_to_validate(split: str, tmp_path: Path):
+    record(PaintedSource(2, spins=1, split=split), tmp_path / "dataset")
+    export(Dataset.open(tmp_path / "dataset"), "yolo", tmp_path / "out")
+    about = yaml.safe_load((tmp_path / "out" / "data.yaml").read_text())
+    assert [name for name in about if name != "names"] == ["train", "val", *(["test"] if split == "test" else [])]
+    pictures = {name: len(list((tmp_path / "out" / about[name]).iterdir())) for name in about if name != "names"}
+    assert pictures[split] == (2 if split == "train" else 4)
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if "validation" in FORMATS[name].options])
+def test_a_share_to_validate_is_refused_of_a_dataset_recorded_for_it(name: str, tmp_path: Path):
+    record(PaintedSource(2, spins=1, split="test"), tmp_path / "dataset")
+    with pytest.raises(InputError, match="its recipe says 'split: test', so --validation is not for it"):
+        export(Dataset.open(tmp_path / "dataset"), name, tmp_path / "out", ExportOptions(validation=0.2))
+
+
+def _summary(name: str, dataset: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    with pytest.raises(SystemExit) as end:
+        run(["export", name, str(dataset), "--out", str(out)])
+    assert not end.value.code
+    return capsys.readouterr().out.splitlines()
+
+
+def test_opv2v_holds_the_spins_that_every_agent_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """OpenCOOD takes the spins of the first agent and looks for them at all others."""
+    record(PaintedSource(2, spins=3, cut=1), tmp_path / "dataset")
+    written, left_out = _summary("opv2v", tmp_path / "dataset", tmp_path / "out", capsys)
+    assert "exported 2 scenarios, 8 frames, " in written
+    spins = "spin 2 of painted-0-000, spin 2 of painted-0-001"
+    assert left_out == f"2 frames left out, OPV2V needs each spin of every agent: {spins}"
+    seen = READERS["opv2v"](tmp_path / "out")
+    assert sorted({key[14:18] for key in seen}) == ["0000", "0001"]
+    assert len(seen) == 8
+
+
+def test_kitti_says_which_frames_it_leaves_out(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    written, left_out = _summary("kitti", dataset.folder, tmp_path / "out", capsys)
+    assert f"exported {2 * SCENES} frames, " in written
+    assert left_out == f"{2 * SCENES} frames left out, no level camera that looks ahead: pole3"
+
+
+VALUES = {"labels": "actors", "validation": 0.5, "min_pixels": 6, "min_points": 50, "calibration": "assumed"}
+
+
+@pytest.mark.parametrize("option", ExportOptions.model_fields)
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_option_changes_the_export_or_is_refused(
+    name: str, option: str, dataset: Dataset, exported: dict[str, Path], tmp_path: Path
+):
+    if option not in FORMATS[name].options:
+        with pytest.raises(InputError, match=f"format '{name}': has no use for --{option.replace('_', '-')}; it takes"):
+            export(dataset, name, tmp_path / "out", ExportOptions(**{option: VALUES[option]}))
+        return
+    asked = {"validation": 0.3} if "validation" in FORMATS[name].options else {}
+    export(dataset, name, tmp_path / "out", ExportOptions(**{**asked, option: VALUES[option]}))
+    assert _contents(tmp_path / "out") != _contents(exported[name])
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -12,7 +12,7 @@ import typer
 from flcav.cli.choices import Device, Engine, Format, Method, TaskName
 from flcav.cli.main import app, run
 from flcav.cli.tasks import TASKS
-from flcav.dataset.formats.export import EXPORTERS
+from flcav.dataset.formats.export import FORMATS
 from flcav.dataset.recorder import ENGINES
 from flcav.perception.device import device_named
 from flcav.report.inference import DRAWINGS
@@ -82,7 +82,7 @@ def test_what_can_be_chosen_is_listed(path, shown):
 
 
 def test_choices_are_those_that_there_are():
-    for listed, known in ((TaskName, TASKS), (TaskName, DRAWINGS), (Format, EXPORTERS), (Engine, ENGINES)):
+    for listed, known in ((TaskName, TASKS), (TaskName, DRAWINGS), (Format, FORMATS), (Engine, ENGINES)):
         assert [*listed] == [*known]
     for device in Device:
         if device != Device.cuda:

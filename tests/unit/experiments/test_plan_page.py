@@ -1,15 +1,19 @@
+import re
+from html import unescape
 from pathlib import Path
 from typing import Any
 
+import networkx as nx
 import pytest
 
 from flcav.experiments.fig3a import article_graph
 from flcav.experiments.plan_page import SHOWN, plan_page, plan_results
 from flcav.optimization.allocation import allocate
-from flcav.optimization.budget_sweep import budget_sweep
+from flcav.optimization.budget_sweep import savings
+from flcav.optimization.definitions import STEPS, TERMS
+from flcav.optimization.fleet import allocate_fleet
 from flcav.optimization.graph import read_problem
-from flcav.optimization.problem import Problem, Uplink
-from flcav.optimization.vehicles import vehicle_shares
+from flcav.optimization.problem import Budgets, Limits, Problem, Uplink
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 ONE = read_problem(RECIPES / "allocation" / "objects.yaml")
@@ -18,27 +22,23 @@ FLEET = ONE.model_copy(update={"tasks": (ONE.tasks[0].model_copy(update={"uplink
 
 
 def results_of(problem: Problem) -> dict[str, Any]:
-    plan = allocate(problem)
-    return plan_results(problem, plan, vehicle_shares(problem, plan.tasks))
+    plan, shares = allocate_fleet(problem)
+    return plan_results(problem, plan, shares, savings(problem, plan))
 
 
-def test_a_larger_budget_errs_no_more_and_its_own_budget_is_the_plan() -> None:
-    sweep = budget_sweep(ONE, factors=(0.5, 1.0, 2.0))
-    errors = [point.objective for point in sweep]
-    assert errors == sorted(errors, reverse=True)
-    assert sweep[1].objective == allocate(ONE).objective
-    assert sweep[2].budgets_mb.wireless_mb == 2 * ONE.budgets_mb.wireless
-    alone = budget_sweep(ONE, ("wireline",), factors=(2.0,))[0]
-    assert (alone.budgets_mb.wireless_mb, alone.budgets_mb.wireline_mb) == (4000, 8000)
-
-
-def test_budgets_that_allow_no_plan_are_left_out() -> None:
-    assert [point.factor for point in budget_sweep(ONE, factors=(0.01, 1.0))] == [1.0]
+def page_of(problem: Problem, graph: nx.Graph | None = None) -> str:
+    plan, shares = allocate_fleet(problem)
+    return plan_page(problem, plan, shares, savings(problem, plan), graph)
 
 
 @pytest.fixture(scope="module")
 def fleet() -> dict[str, Any]:
     return results_of(FLEET)
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return page_of(FLEET, article_graph())
 
 
 def test_parts_add_up_to_what_the_plan_uses(fleet: dict[str, Any]) -> None:
@@ -62,9 +62,15 @@ def test_stragglers_are_named() -> None:
     )
 
 
-def test_a_link_that_does_not_bind_is_worth_nothing_more(fleet: dict[str, Any]) -> None:
-    assert "MB of the wireline budget are used; more of it would not lower the error." in fleet["sentences"]["links"]
-    assert "1,000 MB more would lower the error by about" in fleet["sentences"]["links"]
+def test_more_of_a_budget_is_said_as_solved_anew(fleet: dict[str, Any]) -> None:
+    sentence = fleet["sentences"]["links"]
+    assert "MB of the wireline budget are used; up to 50% more of it would not lower the weighted error." in sentence
+    tenth, half = (
+        allocate(FLEET.model_copy(update={"budgets_mb": Budgets(wireless=factor * 4000, wireline=4000)})).objective
+        for factor in (1.1, 1.5)
+    )
+    by = f"{fleet['objective'] - tenth:.2g} (10% more) or {fleet['objective'] - half:.2g} (50% more)"
+    assert f"more of it would lower the weighted error by {by}." in sentence
 
 
 def test_many_tasks_are_drawn_as_a_few(fleet: dict[str, Any]) -> None:
@@ -81,20 +87,19 @@ def test_many_tasks_are_drawn_as_a_few(fleet: dict[str, Any]) -> None:
 def test_half_a_budget_that_allows_nothing_is_said() -> None:
     small = ONE.budgets_mb.model_copy(update={"wireless": 300.0})
     sentences = results_of(ONE.model_copy(update={"budgets_mb": small}))["sentences"]
-    assert "With half of both budgets the error would be nothing" not in sentences["budgets"]
     assert "half of both budgets no plan fits" in sentences["budgets"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("objective", "words"),
-    [("max-min", ("largest predicted error", "This is proven", "1,000 MB more would lower the largest error")),
-     ("area", ("area of the predicted accuracies", "not proven", "several local optima", "would raise the area"))],
+    [("max-min", ("predicted largest error", "This is proven", "more of it would lower the largest error")),
+     ("area", ("predicted area", "not proven", "several local optima", "would raise the area"))],
 )  # fmt: skip
 def test_other_objectives_are_called_what_they_are(objective: str, words: tuple[str, ...]) -> None:
     tasks = tuple(ONE.tasks[0].model_copy(update={"name": name, "sample_mb": mb}) for name, mb in zip("abc", (1, 2, 3)))
     asked = ONE.model_copy(update={"tasks": tasks, "objective": objective})
-    page = plan_page(asked, allocate(asked), {})
+    page = page_of(asked)
     for each in words:
         assert each in page
 
@@ -108,16 +113,35 @@ def test_simpler_plans_stand_beside(fleet: dict[str, Any]) -> None:
     assert said in fleet["sentences"]["others"]
 
 
-def test_a_graph_is_drawn_where_there_is_one() -> None:
-    plan = allocate(FLEET)
-    assert plan_page(FLEET, plan, {}, article_graph()).count("<img") == 4
-
-
-def test_the_page_needs_nothing_but_itself_and_tells_the_plan() -> None:
-    plan = allocate(FLEET)
-    page = plan_page(FLEET, plan, vehicle_shares(FLEET, plan.tasks))
+def test_the_page_needs_nothing_but_itself_and_tells_the_plan(page: str) -> None:
     assert page.count("data:image/png;base64,") == page.count("<img") == 3
     for absent in ("<script", "<link", "http", "None", "nan"):
         assert absent not in page.split("data:image")[0], absent
-    assert f"{plan.objective:.4f}" in page
+    told = re.sub("<[^>]*>", "", unescape(page))
+    for sentence in (
+        *STEPS.values(),
+        *(TERMS[name] for name in ("error", "weighted error", "budget", "saved", "proven")),
+    ):
+        assert sentence in told
+    assert f"{allocate(FLEET).objective:.4f}" in page
     assert "<td>car 4</td>" in page
+
+
+def test_weights_are_those_that_the_plan_is_made_by() -> None:
+    limits = Limits(samples=(100, 110), edge_rounds=(0, 1), cloud_rounds=(0, 1))
+    tasks = tuple(
+        ONE.tasks[0].model_copy(update={"name": name, "performance_without": without, "limits": limits})
+        for name, without in (("a", 0.5), ("b", 0.7))
+    )
+    results = results_of(ONE.model_copy(update={"tasks": tasks, "performance": 0.8}))
+    assert [task["weight"] for task in results["tasks"]] == pytest.approx([0.75, 0.25])
+
+
+def test_simpler_plans_that_links_do_not_carry_are_no_match() -> None:
+    few = {"edge_groups": (1, 1), "uplink_mbps": {"a": Uplink(wireless=9), "b": Uplink(wireless=3)}}
+    limits = Limits(samples=(100, 101), edge_rounds=(0, 2), cloud_rounds=(0, 0))
+    tasks = (ONE.tasks[0].model_copy(update={**few, "limits": limits}),)
+    results = results_of(ONE.model_copy(update={"tasks": tasks, "horizon_s": 250.0}))
+    assert "own links" in results["note"]
+    assert all(other["note"] is not None for other in results["others"])
+    assert results["sentences"]["others"].startswith("None of the simpler plans can be carried out")

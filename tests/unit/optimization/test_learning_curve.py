@@ -147,3 +147,19 @@ def test_both_forms_of_a_history_say_the_same():
     one, other = histories(long, "long", "")["a"], histories(joint, "joint", "runs")["runs"]
     np.testing.assert_array_equal(one.resources, other.resources)
     np.testing.assert_array_equal(one.accuracy, other.accuracy)
+
+
+def test_an_error_is_one_minus_an_accuracy():
+    joint = {"samples": [20, 100], "edge_rounds": [0, 0], "cloud_rounds": [0, 0]}
+    told = histories(joint | {"error": [0.5, 0.3]}, "t", "a")["a"]
+    assert told.accuracy == pytest.approx([0.5, 0.7])
+    long = {"task": ["a", "a"], "stage": ["pretrain", "pretrain"], "resource": [20, 100]}
+    assert histories(long | {"error": ["0.5", "0.3"]}, "t", "")["a"].accuracy == pytest.approx(told.accuracy)
+    both = joint | {"error": [0.5, 0.342], "accuracy": [0.5, 0.659]}  # rounded .6585 and .3415
+    assert histories(both, "t", "a")["a"].accuracy.tolist() == [0.5, 0.659]
+    with pytest.raises(InputError, match=r"row 2: accuracy = 0.3 and error = 0.3 do not sum to 1"):
+        histories(joint | {"error": [0.5, 0.3], "accuracy": [0.5, 0.3]}, "t", "a")
+    with pytest.raises(InputError, match=r"row 1: error = 1.5 must be"):
+        histories(joint | {"error": [1.5, 0.3]}, "t", "a")
+    with pytest.raises(InputError, match=r"'accuracy' is missing.*error may stand for accuracy"):
+        histories(joint, "t", "a")

@@ -53,7 +53,7 @@ def test_files_that_are_no_trace_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         Trace.load(tmp_path / "missing.parquet")
     (tmp_path / "text.parquet").write_text("not parquet at all, but some text")
-    with pytest.raises(InputError, match="not a trace"):
+    with pytest.raises(InputError, match="not a readable Parquet file"):
         Trace.load(tmp_path / "text.parquet")
     pq.write_table(pa.table({"x": [1.0]}), tmp_path / "other.parquet")
     with pytest.raises(InputError, match="not a trace"):

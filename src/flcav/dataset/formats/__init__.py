@@ -1,1 +1,1 @@
-"""Other people's dataset formats: exported to all of `EXPORTERS`, read from KITTI."""
+"""Other people's dataset formats: exported to all of `FORMATS`, read from KITTI."""

@@ -1,6 +1,6 @@
 """A dataset in COCO's layout: `images/<split>` and `annotations/<labels>_<split>.json`, signs and actors apart.
 
-Actors have their mask as uncompressed run lengths; signs have their rectangle only.
+Actors have their mask as COCO's compressed run lengths; signs have their rectangle only.
 """
 
 import json
@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from faster_coco_eval.core import mask as coco_mask
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import ExportOptions, lacks, read_frame
+from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks
 from flcav.dataset.formats.rectangles import CLASSES, rectangles
 from flcav.dataset.formats.splits import split_scenes
 from flcav.dataset.payloads import encode_png
@@ -20,13 +21,13 @@ from flcav.progress import Report
 from flcav.sensors.frame import Frame
 
 
-def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
     """Write every picture of `dataset` with the rectangles and masks in it: see `Exporter`."""
-    split_of = split_scenes(dataset, options.validation)
+    split_of = split_scenes(dataset, options)
     tables = {(labels, split): _empty(labels) for labels in CLASSES for split in split_of.values()}
     counts: Counter[str] = Counter(images=0, signs=0, actors=0)
     for i, key in enumerate(dataset.keys):
-        frame = read_frame(dataset, i, options)
+        frame = dataset.frame(i)
         split = split_of[key.scene]
         for camera, picture in frame.images.items():
             path = out / "images" / split / f"{frame.key}_{camera}.png"
@@ -47,15 +48,13 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
         path = out / "annotations" / f"{labels}_{split}.json"
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(table, allow_nan=False), encoding="utf-8")
-    return counts
+    return Exported(counts)
 
 
-def run_lengths(mask: NDArray[np.bool_]) -> dict[str, list[int]]:
-    """Return COCO's uncompressed run lengths of (H, W) pixels: column by column, of what is not in the mask first."""
-    flat = mask.ravel(order="F")
-    edges = np.flatnonzero(np.diff(flat)) + 1
-    runs = np.diff(edges, prepend=0, append=flat.size).tolist()
-    return {"size": list(mask.shape), "counts": [0, *runs] if flat[0] else runs}
+def run_lengths(mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return COCO's compressed run lengths of (H, W) pixels: its `size`, and `counts` as text."""
+    encoded = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
+    return {"size": list(mask.shape), "counts": encoded["counts"].decode("ascii")}
 
 
 def _empty(labels: str) -> dict[str, Any]:

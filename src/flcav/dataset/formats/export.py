@@ -2,13 +2,13 @@
 
 import contextlib
 import shutil
-from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from flcav.config import InputError
 from flcav.dataset.formats.coco import export_coco
-from flcav.dataset.formats.exporter import Exporter, ExportOptions
+from flcav.dataset.formats.exporter import Exported, Exporter, ExportOptions
 from flcav.dataset.formats.kitti.export import export_kitti
 from flcav.dataset.formats.mcap import export_mcap
 from flcav.dataset.formats.nuscenes import export_nuscenes
@@ -17,29 +17,42 @@ from flcav.dataset.formats.yolo import export_yolo
 from flcav.dataset.store import Dataset
 from flcav.progress import Report, silent
 
-EXPORTERS: Mapping[str, Exporter] = {
-    "kitti": export_kitti,
-    "yolo": export_yolo,
-    "coco": export_coco,
-    "nuscenes": export_nuscenes,
-    "opv2v": export_opv2v,
-    "mcap": export_mcap,
+
+@dataclass(frozen=True)
+class Format:
+    """How a format is written."""
+
+    write: Exporter
+    options: tuple[str, ...]  # those of `ExportOptions` that it has a use for
+
+
+FORMATS: Mapping[str, Format] = {
+    "kitti": Format(export_kitti, ("validation", "min_points", "calibration")),
+    "yolo": Format(export_yolo, ("labels", "validation", "min_pixels")),
+    "coco": Format(export_coco, ("validation", "min_pixels")),
+    "nuscenes": Format(export_nuscenes, ("validation", "calibration")),
+    "opv2v": Format(export_opv2v, ("validation", "min_points", "calibration")),
+    "mcap": Format(export_mcap, ("calibration",)),
 }
 DEFAULTS = ExportOptions()
 
 
 def export(
     dataset: Dataset, name: str, out: Path, options: ExportOptions = DEFAULTS, *, progress: Report = silent
-) -> Counter[str]:
-    """Write `dataset` in the format `name` to the new or empty folder `out`; returns counts of what was written.
+) -> Exported:
+    """Write `dataset` in the format `name` to the new or empty folder `out`; returns what was written and what not.
 
-    Raises `InputError` for an unknown format, a folder that holds files, and a dataset that lacks what the format
-    needs. However it ends early, `out` does not appear.
+    Raises `InputError` for an unknown format, an option that is set but of no use to the format, a folder that holds
+    files, and a dataset that lacks what the format needs. However it ends early, `out` does not appear.
     """
-    if name not in EXPORTERS:
-        raise InputError(f"format '{name}': unknown; known formats: {', '.join(EXPORTERS)}")
+    if name not in FORMATS:
+        raise InputError(f"format '{name}': unknown; known formats: {', '.join(FORMATS)}")
+    taken = FORMATS[name].options
+    if refused := options.model_fields_set.difference(taken):
+        flags = [f"--{option.replace('_', '-')}" for option in (min(refused), *taken)]
+        raise InputError(f"format '{name}': has no use for {flags[0]}; it takes {', '.join(flags[1:])}")
     with _new_folder(out) as folder:
-        return EXPORTERS[name](dataset, folder, options, progress)
+        return FORMATS[name].write(dataset, folder, options, progress)
 
 
 @contextlib.contextmanager

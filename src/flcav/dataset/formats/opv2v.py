@@ -4,7 +4,7 @@ Everything is in CARLA's left-handed frames (y to the right), poses are x, y, z 
 and vehicles share one list of numbers. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `transformation_utils.x_to_world`.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,17 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks, read_frame
+from flcav.dataset.formats.exporter import (
+    Exported,
+    ExportOptions,
+    check_rectified,
+    lacks,
+    points_in_each_box,
+    read_frame,
+)
 from flcav.dataset.formats.motion import agent_velocities
 from flcav.dataset.formats.mounts import channels, optical_yaw
-from flcav.dataset.formats.splits import split_scenes
+from flcav.dataset.formats.splits import split_validated
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
@@ -39,29 +46,49 @@ KMH = 3.6
 FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
 
 
-def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
     """Write one scenario for each scene of `dataset`: see `Exporter`."""
-    split_of = split_scenes(dataset, options.validation)
-    counts: Counter[str] = Counter(scenarios=0, frames=0, objects=0)
+    split_of = split_validated(dataset, options, "OPV2V")
+    exported = Exported(Counter(scenarios=0, frames=0, objects=0))
+    counts, done = exported.counts, 0
+    for split in ("train", "val") if "train" in split_of.values() else ():
+        (out / FOLDERS[split]).mkdir()
     for scene, split in split_of.items():
         folder = out / FOLDERS[split] / scene
         selected = dataset.select(scenes=[scene])
+        shared = _shared_spins(dataset, scene)
         numbers = agent_numbers(sorted({dataset.keys[i].agent for i in selected}))
         speeds = agent_velocities(dataset, scene)
         for i in selected:
+            done += 1
+            progress(done, len(dataset), "")
+            if (spin := dataset.keys[i].index) not in shared:
+                exported.left_out["OPV2V needs each spin of every agent", f"spin {spin} of {scene}"] += 1
+                continue
             frame = read_frame(dataset, i, options)
             if not frame.lidar:
                 raise lacks(dataset, "OPV2V", "a LiDAR on every agent", frame.agent)
             for track in frame.annotations.track.tolist():
                 numbers.setdefault(track, FIRST_TRACK + len(numbers))
             speed = float(np.linalg.norm(speeds[frame.agent, frame.index]))
-            counts["objects"] += _write_frame(frame, folder / str(numbers[frame.agent]), numbers, speed)
-            counts["frames"] += 1
-            progress(counts["frames"], len(dataset), "")
+            vehicles = _vehicles(frame, numbers, options.min_points)
+            _write_frame(frame, folder / str(numbers[frame.agent]), vehicles, speed)
+            counts.update(frames=1, objects=len(vehicles))
         protocol = {"recipe": dataset.manifest["recipe"], "numbers": numbers}
         (folder / "data_protocol.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False), encoding="utf-8")
         counts["scenarios"] += 1
-    return counts
+    return exported
+
+
+def _shared_spins(dataset: Dataset, scene: str) -> set[int]:
+    """Return the spins that every agent of a scene has: of a recording cut to a number of frames, not the last."""
+    spins: dict[str, set[int]] = defaultdict(set)
+    for i in dataset.select(scenes=[scene]):
+        spins[dataset.keys[i].agent].add(dataset.keys[i].index)
+    shared = set.intersection(*spins.values())
+    if not shared:
+        raise lacks(dataset, "OPV2V", "spins that every agent of a scene has", scene)
+    return shared
 
 
 def agent_numbers(agents: list[str]) -> dict[str, int]:
@@ -83,7 +110,7 @@ def carla_pose(world_from_body: Array) -> list[float]:
     return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw, pitch)).tolist()]
 
 
-def _write_frame(frame: Frame, folder: Path, numbers: dict[str, int], speed_m_s: float) -> int:
+def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, dict[str, Any]], speed_m_s: float) -> None:
     lidar, points = next(iter(frame.lidar.items()))
     folder.mkdir(parents=True, exist_ok=True)
     time = f"{frame.index:06d}"
@@ -102,7 +129,6 @@ def _write_frame(frame: Frame, folder: Path, numbers: dict[str, int], speed_m_s:
             "intrinsic": frame.calibration.intrinsics[name].tolist(),
         }
     ego = carla_pose(frame.world_from_agent)
-    vehicles = _vehicles(frame, numbers)
     about |= {
         "ego_speed": speed_m_s * KMH,
         "lidar_pose": carla_pose(world_from_lidar),
@@ -112,14 +138,14 @@ def _write_frame(frame: Frame, folder: Path, numbers: dict[str, int], speed_m_s:
         "vehicles": vehicles,
     }
     (folder / f"{time}.yaml").write_text(yaml.dump(about, Dumper=FAST_DUMPER), encoding="utf-8")
-    return len(vehicles)
 
 
-def _vehicles(frame: Frame, numbers: dict[str, int]) -> dict[int, dict[str, Any]]:
-    """Return number -> box of the vehicles that the LiDAR has a return from."""
+def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[int, dict[str, Any]]:
+    """Return number -> box of the vehicles that have so many of the LiDAR's points in it."""
     truth, boxes = frame.annotations, frame.annotations.boxes
+    enough = points_in_each_box(frame, *next(iter(frame.lidar.items()))) >= min_points
     vehicles = {}
-    for i in np.flatnonzero(np.isin(boxes.label, VEHICLES) & (truth.returns > 0)):
+    for i in np.flatnonzero(np.isin(boxes.label, VEHICLES) & enough):
         tall = boxes.size[i, 2]
         x, y, z, *rotation = carla_pose(pose(*boxes.center[i], yaw=boxes.yaw[i]))
         vehicles[numbers[str(truth.track[i])]] = {

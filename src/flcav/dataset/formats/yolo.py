@@ -8,20 +8,20 @@ from pathlib import Path
 
 import yaml
 
-from flcav.dataset.formats.exporter import ExportOptions, lacks, read_frame
+from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks
 from flcav.dataset.formats.rectangles import CLASSES, Rectangles, rectangles
-from flcav.dataset.formats.splits import SPLITS, split_scenes
+from flcav.dataset.formats.splits import split_validated
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
 
 
-def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
     """Write every picture of `dataset` with the signs and lights in it, or with its actors: see `Exporter`."""
-    split_of = split_scenes(dataset, options.validation)
+    split_of = split_validated(dataset, options, "YOLO")
     counts: Counter[str] = Counter(images=0, objects=0)
     for i, key in enumerate(dataset.keys):
-        frame = read_frame(dataset, i, options)
+        frame = dataset.frame(i)
         split = split_of[key.scene]
         for camera, picture in frame.images.items():
             found = rectangles(frame, camera, options.labels, options.min_pixels)
@@ -33,11 +33,12 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
         progress(i + 1, len(dataset), "")
     if not counts["images"]:
         raise lacks(dataset, "YOLO", "camera images")
-    used = [split for split in SPLITS if split in split_of.values()]
-    folders = {split: f"images/{split}" for split in used}
+    folders = {split: f"images/{split}" for split in ("train", "val", *split_of.values())}
+    for folder in folders.values():  # Ultralytics wants the first two named and there, if only to test
+        (out / folder).mkdir(exist_ok=True)
     names = dict(enumerate(CLASSES[options.labels]))
     (out / "data.yaml").write_text(yaml.safe_dump({**folders, "names": names}, sort_keys=False), encoding="utf-8")
-    return counts
+    return Exported(counts)
 
 
 def label_text(found: Rectangles, width: int, height: int) -> str:

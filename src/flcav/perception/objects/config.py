@@ -6,10 +6,12 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-STRICT = ConfigDict(extra="forbid")
-Positive = Annotated[float, Field(gt=0)]
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+CELLS = 4096  # of the grid, along an axis, at most
+Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
 Share = Annotated[float, Field(gt=0, lt=1)]
-Count = Annotated[int, Field(gt=0)]
+Count = Annotated[int, Field(gt=0, le=4096)]
+Layers = Annotated[int, Field(ge=0, le=64)]
 Span = tuple[Positive, Positive]  # from, to
 Portion = Annotated[float, Field(ge=0, lt=1)]
 
@@ -52,7 +54,7 @@ class SecondConfig:
     voxel_m: tuple[Positive, Positive, Positive]  # x, y, z
     sparse_channels: tuple[Count, Count, Count, Count]  # at strides 1, 2, 4, 8
     sparse_out: Count  # after the last convolution along z
-    bev_layers: tuple[int, int]  # 3x3 convolutions after the first, at head strides 1 and 2
+    bev_layers: tuple[Layers, Layers]  # 3x3 convolutions after the first, at head strides 1 and 2
     bev_channels: tuple[Count, Count]
     bev_up_channels: tuple[Count, Count]
     ground_z_m: float = -1.8  # height of the ground the anchors stand on: the sensor's height, negated
@@ -67,6 +69,8 @@ class SecondConfig:
         low, high = self.range_m[:3], self.range_m[3:]
         if any(b <= a for a, b in zip(low, high, strict=True)):
             raise ValueError("every axis of range_m needs a maximum above its minimum")
+        if any((b - a) / size > CELLS for a, b, size in zip(low, high, self.voxel_m, strict=True)):
+            raise ValueError(f"range_m has more than {CELLS} voxels along an axis")
         if self.calibration is not None and len(self.calibration) != len(self.anchors):
             raise ValueError(
                 f"{len(self.anchors)} classes need as many pairs in calibration, not {len(self.calibration)}"

@@ -8,7 +8,9 @@ from pydantic.dataclasses import dataclass
 from flcav.dataset.formats.rectangles import SIGNS
 
 STRIDES = (8, 16, 32)  # pixels between the cells of each level
-Size = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]  # width, height [px]
+Side = Annotated[float, Field(gt=0, le=8192)]
+Size = tuple[Side, Side]  # width, height [px]
+Window = Annotated[int, Field(ge=32, le=8192)]
 Level = tuple[Size, Size, Size]
 
 # Signs are about square, signal heads three times as high as wide.
@@ -19,16 +21,16 @@ ANCHORS_PX: tuple[Level, Level, Level] = (
 )
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
 class SignsConfig:
     """A detector on pictures of any size; sizes are in the pixels of the picture."""
 
-    width: Annotated[float, Field(gt=0)]  # times the channels of the largest published network
-    depth: Annotated[float, Field(gt=0)]  # times its bottlenecks
+    width: Annotated[float, Field(gt=0, le=4)]  # times the channels of the largest published network
+    depth: Annotated[float, Field(gt=0, le=4)]  # times its bottlenecks
     classes: Annotated[tuple[str, ...], Field(min_length=1)] = SIGNS  # in the order of the scores
     anchors_px: tuple[Level, Level, Level] = ANCHORS_PX  # the shapes boxes are regressed from, at each of STRIDES
-    window_px: tuple[int, int] = (320, 192)  # width, height of what one training step sees of a picture
-    smallest_px: Annotated[float, Field(ge=0)] = 6.0  # root of a box's area from which on it is to be found
+    window_px: tuple[Window, Window] = (320, 192)  # width, height of what one training step sees of a picture
+    smallest_px: Annotated[float, Field(ge=0, le=8192)] = 6.0  # root of a box's area from which on it is to be found
 
 
 CONFIGURATIONS = {

@@ -5,17 +5,19 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 STEP_S = 0.25  # between two points of a track
 PAST, FUTURE = 8, 12  # steps before and after the present: 2 s and 3 s
+Maps = Annotated[int, Field(ge=1, le=4096)]
 HORIZON_S = FUTURE * STEP_S
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+@dataclass(frozen=True, config=STRICT)
 class Patch:
     """The square of ground that is looked at, in the frame of the predicted road user: x ahead, y to the left."""
 
-    cells: Annotated[int, Field(ge=16, multiple_of=8)] = 64  # along each side
-    cell_m: Annotated[float, Field(gt=0)] = 1.0
+    cells: Annotated[int, Field(ge=16, le=1024, multiple_of=8)] = 64  # along each side
+    cell_m: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
     ahead: Annotated[float, Field(gt=0, lt=1)] = 0.75  # share of it that lies ahead
 
     @property
@@ -29,26 +31,26 @@ class Patch:
         return (self.ahead - 0.5) * self.side_m
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+@dataclass(frozen=True, config=STRICT)
 class CrossView:
     """A cross-view transformer: pictures of several cameras to features on the ground."""
 
-    width_px: Annotated[int, Field(ge=32, multiple_of=16)] = 96  # pictures are resized to this
-    height_px: Annotated[int, Field(ge=32, multiple_of=16)] = 48
-    features: Annotated[int, Field(ge=8, multiple_of=8)] = 32
-    heads: Annotated[int, Field(ge=1)] = 2
-    layers: Annotated[int, Field(ge=1)] = 1  # of attention, one after another
-    queries: Annotated[int, Field(ge=4)] = 16  # along each side of the patch
-    map_weight: Annotated[float, Field(ge=0)] = 8.0  # of the map's segmentation in the loss
+    width_px: Annotated[int, Field(ge=32, le=8192, multiple_of=16)] = 96  # pictures are resized to this
+    height_px: Annotated[int, Field(ge=32, le=8192, multiple_of=16)] = 48
+    features: Annotated[int, Field(ge=8, le=4096, multiple_of=8)] = 32
+    heads: Annotated[int, Field(ge=1, le=64)] = 2
+    layers: Annotated[int, Field(ge=1, le=64)] = 1  # of attention, one after another
+    queries: Annotated[int, Field(ge=4, le=256)] = 16  # along each side of the patch
+    map_weight: Annotated[float, Field(ge=0, le=1e6)] = 8.0  # of the map's segmentation in the loss
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+@dataclass(frozen=True, config=STRICT)
 class TrajectoryConfig:
     """An LSTM encoder-decoder that sees the surroundings as rasters of map and tracks, or through cameras."""
 
-    modes: Annotated[int, Field(ge=1)] = 6
-    hidden: Annotated[int, Field(ge=8)] = 64  # of both LSTMs
-    maps: Annotated[tuple[int, int, int], Field()] = (16, 32, 32)  # of the convolutions over the raster
+    modes: Annotated[int, Field(ge=1, le=256)] = 6
+    hidden: Annotated[int, Field(ge=8, le=4096)] = 64  # of both LSTMs
+    maps: tuple[Maps, Maps, Maps] = (16, 32, 32)  # of the convolutions over the raster
     patch: Patch = Patch()
     cameras: CrossView | None = None  # None: rasters
 

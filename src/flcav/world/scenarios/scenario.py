@@ -20,6 +20,7 @@ ROLES: dict[str, tuple[str, ...]] = {  # what takes part and is made for it -> c
     "van": ("van", "truck", "bus"),
     "pedestrian": ("pedestrian",),
 }
+LONGEST_S = 36_000.0
 NEAR_M = 50.0  # of a position
 
 
@@ -27,10 +28,12 @@ class Scenario(Config):
     """One corner case of a recipe: as soon after `at_s` as the traffic around `near` lends itself to it."""
 
     kind: Kind  # what happens
-    at_s: Annotated[float, Field(gt=0)]  # of the traffic's clock, as `warmup_s`; not before
-    near: Annotated[str, Field(pattern=r"^cav\d+$")] | None = None  # that vehicle (cav0); without it, the first
+    at_s: Annotated[float, Field(gt=0, le=LONGEST_S)]  # of the traffic's clock, as `warmup_s`; not before
+    near: Annotated[str, Field(pattern=r"^cav[0-9]{1,4}$")] | None = None  # that vehicle (cav0); without it, the first
     position: tuple[float, float] | None = None  # only while that vehicle is within 50 m of x, y [m]
-    lasts_s: Annotated[float, Field(gt=0)] | None = None  # a stalled vehicle drives on then; without it, never
+    lasts_s: Annotated[float, Field(ge=0.1, le=LONGEST_S)] | None = (
+        None  # a stalled vehicle drives on then; without it, never
+    )
     actors: dict[str, str] = Field(default={})  # who takes part, by role: "category.shape", e.g. van: van.high_van
 
     @model_validator(mode="after")

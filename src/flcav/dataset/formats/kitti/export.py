@@ -11,7 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import ExportOptions, check_rectified, lacks, read_frame
+from flcav.dataset.formats.exporter import (
+    Exported,
+    ExportOptions,
+    check_rectified,
+    lacks,
+    points_in_each_box,
+    read_frame,
+)
 from flcav.dataset.formats.mounts import front_camera
 from flcav.dataset.formats.splits import SPLITS, split_scenes
 from flcav.dataset.payloads import encode_png
@@ -31,26 +38,28 @@ CLASSES = {
 }
 PARTLY, LARGELY = 0.1, 0.5  # occlusion from which an object counts as partly and as largely occluded
 UNKNOWN = 3  # KITTI's occlusion of what shows no pixel
+NOTHING = "DontCare -1 -1 -10 0 0 1 1 -1 -1 -1 -1000 -1000 -1000 -10"  # of a frame without labels: readers want a line
 FRAMES = "frames.csv"  # which frame of the dataset each number is
 
 
-def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
     """Write `dataset` as `training` (or, recorded for testing, `testing`) and `ImageSets`: see `Exporter`."""
-    split_of = split_scenes(dataset, options.validation)
+    split_of = split_scenes(dataset, options)
     numbers: dict[str, list[str]] = defaultdict(list)
     rows = []
-    counts: Counter[str] = Counter(frames=0, objects=0, left_out=0)
+    exported = Exported(Counter(frames=0, objects=0, DontCare_regions=0))
+    counts = exported.counts
     for i, key in enumerate(dataset.keys):
         frame = read_frame(dataset, i, options)
         camera = front_camera({name: frame.calibration.agent_from_sensor[name] for name in frame.images})
         if camera is None or not frame.lidar:
-            counts["left_out"] += 1
+            exported.left_out["no level camera that looks ahead" if frame.lidar else "no LiDAR", frame.agent] += 1
         else:
             split, number = split_of[key.scene], f"{counts['frames']:06d}"
             folder = out / ("testing" if split == "test" else "training")
-            counts["objects"] += _write_frame(frame, camera, folder, number)
-            counts["frames"] += 1
+            objects, regions = _write_frame(frame, camera, folder, number, options.min_points)
             numbers[split].append(number)
+            counts.update(frames=1, objects=objects, DontCare_regions=regions)
             rows.append((number, split, frame.key, frame.agent, f"{frame.time_s:.3f}", camera))
         progress(i + 1, len(dataset), "")
     if not rows:
@@ -60,15 +69,15 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
     _write_lines(out / "ImageSets" / "trainval.txt", sorted(numbers["train"] + numbers["val"]))
     with (out / FRAMES).open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([("number", "split", "frame", "agent", "time_s", "camera"), *rows])
-    return counts
+    return exported
 
 
-def _write_frame(frame: Frame, camera: str, folder: Path, number: str) -> int:
+def _write_frame(frame: Frame, camera: str, folder: Path, number: str, min_points: int) -> tuple[int, int]:
     lidar = next(iter(frame.lidar))
     mounts = frame.calibration.agent_from_sensor
     check_rectified(frame, camera, "KITTI")
-    labels = label_lines(frame, camera)
-    _write_lines(folder / "label_2" / f"{number}.txt", labels)
+    objects, regions = label_lines(frame, camera, lidar, min_points)
+    _write_lines(folder / "label_2" / f"{number}.txt", objects + regions or [NOTHING])
     _write_lines(
         folder / "calib" / f"{number}.txt",
         calibration_lines(
@@ -79,14 +88,18 @@ def _write_frame(frame: Frame, camera: str, folder: Path, number: str) -> int:
     )
     _write(folder / "velodyne" / f"{number}.bin", frame.lidar[lidar].astype("<f4").tobytes())
     _write(folder / "image_2" / f"{number}.png", encode_png(frame.images[camera].rgb))
-    return len(labels)
+    return len(objects), len(regions)
 
 
-def label_lines(frame: Frame, camera: str) -> list[str]:
-    """Return KITTI's label of each actor in the image that shows in it, or that the LiDAR has a return from."""
+def label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -> tuple[list[str], list[str]]:
+    """Return KITTI's labels of the actors in the image, and the DontCare regions where others show.
+
+    Labelled is what has at least `min_points` of the LiDAR in its box and, where that is 0, at least shows.
+    """
     truth, views = frame.annotations, frame.annotations.views[camera]
     height, width = frame.images[camera].rgb.shape[:2]
-    rectangle = np.clip(views.amodal_box, 0, (width - 1, height - 1, width - 1, height - 1))
+    edge = (width - 1, height - 1, width - 1, height - 1)
+    rectangle = np.clip(views.amodal_box, 0, edge)
     within = (rectangle[:, 2:] > rectangle[:, :2]).all(axis=1)  # false where the box is not a number
     camera_from_world = inverse(frame.world_from_sensor(camera))
     boxes = truth.boxes
@@ -96,15 +109,24 @@ def label_lines(frame: Frame, camera: str) -> list[str]:
     rotation = wrap_angle(np.arctan2(-ahead[:, 2], ahead[:, 0]))
     alpha = wrap_angle(rotation - np.arctan2(bottom[:, 0], bottom[:, 2]))
     level = occlusion_levels(views.occlusion, views.pixels)
+    points, shows = points_in_each_box(frame, lidar, frame.lidar[lidar]), views.pixels > 0
+    labelled = within & (bottom[:, 2] > 0) & (points >= min_points) & (shows | (points > 0))
     lines = []
-    for i in np.flatnonzero(within & ((views.pixels > 0) | (truth.returns > 0)) & (bottom[:, 2] > 0)):
+    for i in np.flatnonzero(labelled):
         length, breadth, tall = boxes.size[i]
         numbers = (*rectangle[i], tall, breadth, length, *bottom[i], rotation[i])
         lines.append(
             f"{CLASSES[str(boxes.label[i])]} {views.truncation[i]:.4f} {level[i]} {alpha[i]:.4f} "
             + " ".join(f"{number:.4f}" for number in numbers)
         )
-    return lines
+    regions = [dont_care(np.clip(views.visible_box[i], 0, edge)) for i in np.flatnonzero(shows & ~labelled)]
+    return lines, regions
+
+
+def dont_care(rectangle: NDArray[np.float64]) -> str:
+    """Return KITTI's line for a region [px] in which objects are not labelled."""
+    left, top, right, bottom = (f"{number:.4f}" for number in rectangle)
+    return f"DontCare -1 -1 -10 {left} {top} {right} {bottom} -1 -1 -1 -1000 -1000 -1000 -10"
 
 
 def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -10,13 +10,13 @@ from google.protobuf.message import Message
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
-from flcav.dataset.formats.exporter import ExportOptions, read_frame
+from flcav.dataset.formats.exporter import Exported, ExportOptions, read_frame
 from flcav.dataset.formats.mcap.messages import Json, messages
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
 
 
-def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
     """Write `<scene>.mcap` for each scene of `dataset`: see `Exporter`."""
     counts: Counter[str] = Counter(files=0, messages=0, objects=0)
     done = 0
@@ -33,7 +33,7 @@ def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: R
                 progress(done, len(dataset), "")
             log.writer.finish()
         counts["files"] += 1
-    return counts
+    return Exported(counts)
 
 
 class _Log:

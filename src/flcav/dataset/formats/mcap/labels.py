@@ -68,7 +68,7 @@ def image_annotations(frame: Frame, camera: str, stamp: Timestamp) -> ImageAnnot
         for kind, state, box, distance_m in zip(signs.kind, signs.state, signs.box, signs.distance_m):
             about = {"class": str(kind), "state": str(state), "distance_m": f"{distance_m:.2f}"}
             rectangles.append(_rectangle(box, SIGN, about, stamp))
-    return ImageAnnotations(points=rectangles)
+    return ImageAnnotations(timestamp=stamp, points=rectangles)
 
 
 def pose_message(matrix: NDArray[np.float64]) -> Pose:

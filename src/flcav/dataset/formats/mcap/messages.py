@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from flcav.dataset.formats.mcap.labels import image_annotations, pose_message, scene_update
 from flcav.dataset.payloads import encode_png
 from flcav.sensors.frame import Frame
+from flcav.sensors.radar import echo_directions
 
 LIDAR_FIELDS = ("x", "y", "z", "intensity")
 TIME_FIELD = "time"  # of a point [s] after the cloud's time stamp, as ROS drivers of spinning LiDARs have it
@@ -90,10 +91,7 @@ def messages(frame: Frame) -> Iterator[Logged]:
 
 def radar_points(echoes: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return (N, 8): x, y, z [m] in the radar's frame before range, azimuth, elevation, Doppler and RCS."""
-    distance, azimuth, elevation = echoes[:, :3].T
-    level = distance * np.cos(elevation)
-    xyz = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)), axis=1)
-    return np.concatenate((xyz, echoes), axis=1).astype(np.float32)
+    return np.concatenate((echoes[:, :1] * echo_directions(echoes), echoes), axis=1).astype(np.float32)
 
 
 def _cloud(points: NDArray[np.float32], names: tuple[str, ...], **place: Any) -> PointCloud:

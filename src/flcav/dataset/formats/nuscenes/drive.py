@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import check_rectified
+from flcav.dataset.formats.exporter import check_rectified, points_in_each_box
 from flcav.dataset.formats.mounts import channels, optical_yaw, quaternion
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, lidar_bin, radar_pcd
 from flcav.dataset.formats.nuscenes.tables import CAMERAS, CATEGORIES, RADARS, Row, attribute, chain, token, visibility
 from flcav.dataset.payloads import encode_png
 from flcav.geometry import pose, transform_points, yaw_of
 from flcav.sensors.frame import Frame
+from flcav.sensors.radar import echo_directions
 
 Array = NDArray[np.float64]
 
@@ -109,8 +110,11 @@ class Drive:
 
     def _add_annotations(self, frame: Frame) -> None:
         truth, boxes = frame.annotations, frame.annotations.boxes
-        lidar = truth.points.get(next(iter(frame.lidar)), truth.returns)
-        radar = sum((truth.points[name] for name in frame.radar if name in truth.points), np.zeros(len(truth), int))
+        top, cloud = next(iter(frame.lidar.items()))
+        lidar = points_in_each_box(frame, top, cloud)
+        radar = np.zeros_like(lidar)
+        for name, echoes in frame.radar.items():
+            radar += points_in_each_box(frame, name, echoes[:, :1] * echo_directions(echoes))
         center = transform_points(self.global_from_world, boxes.center)
         for i, (track, category) in enumerate(zip(truth.track.tolist(), boxes.label.tolist())):
             length, width, height = boxes.size[i].tolist()

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import ExportOptions, lacks, read_frame
+from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks, read_frame
 from flcav.dataset.formats.motion import agent_velocities
 from flcav.dataset.formats.nuscenes.drive import Drive
 from flcav.dataset.formats.nuscenes.files import RESOLUTION_M, map_mask
@@ -30,9 +30,9 @@ MAP = "maps/map.png"
 UNKNOWN_MARGIN_M = 120.0  # of the map around the agents, where the town is not known
 
 
-def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Counter[str]:
+def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
     """Write one nuScenes scene for each agent and scene of `dataset`: see `Exporter`."""
-    split_of = split_scenes(dataset, options.validation)
+    split_of = split_scenes(dataset, options)
     tables = constant_rows()
     global_from_world = _write_map(dataset, out / MAP)
     location = Path(str(dataset.manifest["recipe"].get("town", "unknown"))).name
@@ -69,7 +69,7 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(rows, indent=0, allow_nan=False), encoding="utf-8")
     (out / "sweeps").mkdir()
-    return counts
+    return Exported(counts)
 
 
 def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from flcav.sensors.radar import echo_directions
 from flcav.world.town import Town
 
 OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # theirs: x right, y ahead
@@ -42,9 +43,8 @@ def radar_pcd(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> byt
     if not len(echoes):
         rows["x"] = np.nan
     else:
-        distance, azimuth, elevation, doppler, rcs = echoes.T.astype(np.float64)
-        level = np.cos(elevation)
-        ray = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=1)
+        distance, _, _, doppler, rcs = echoes.T.astype(np.float64)
+        ray = echo_directions(echoes)
         over_ground = doppler + ray @ velocity
         for axis, name in enumerate("xyz"):
             rows[name] = distance * ray[:, axis]

@@ -1,0 +1,23 @@
+"""Parquet files as tables, read strictly."""
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from flcav.config import InputError
+
+
+def read_parquet(path: Path) -> pa.Table:
+    """Return the table in a Parquet file; its text is UTF-8.
+
+    Raises `InputError` where the file is missing, no Parquet or damaged.
+    """
+    try:
+        table = pq.ParquetFile(path).read()
+        table.validate(full=True)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable Parquet file ({error})") from None
+    return table

@@ -1,0 +1,241 @@
+"""Every command on mutated inputs, and the contract that holds whatever they are.
+
+The exit code is 0 or 2. On 2 there is one sentence on stderr, no traceback, and nothing half-written.
+"""
+
+import contextlib
+import io
+import os
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import traceback
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+from mutations import Rng, link_tree, mutate, odd_number
+
+from flcav.cli.main import run
+
+
+@dataclass(frozen=True)
+class Call:
+    """A command line whose inputs may be mutated; words of it that name an input are paths, OUT is a new one."""
+
+    words: str  # "#5" is the number 5, and now and then an extreme one
+    inputs: tuple[str, ...]  # globs of files, below the folder of inputs, that may be mutated
+    seconds: float  # about so long takes an input that is valid
+    problems: bool = False  # whether it reports problems of its input with exit code 1
+    kept: tuple[str, ...] = ()  # what is whole, and kept where a later input is bad
+
+    def arguments(self, folder: Path, out: Path, rng: Rng) -> list[str]:
+        """Return the command line for inputs in `folder`."""
+        return [self._argument(word, folder, out, rng) for word in self.words.split()]
+
+    def _argument(self, word: str, folder: Path, out: Path, rng: Rng) -> str:
+        if word.startswith("OUT"):
+            return str(out) + word.removeprefix("OUT")
+        if "/" in word or ("." in word and (folder / word).exists()):
+            return str(folder / word)
+        return re.sub(r"#([\d.]+)", lambda found: odd_number(rng) if rng.random() < 0.15 else found[1], word)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one case."""
+
+    number: int
+    words: str
+    done: str  # to the inputs
+    code: int
+    said: str  # on stderr
+    broken: str  # in what way the contract is; "" where it holds
+    slow: bool = False
+
+
+class Slow(BaseException):
+    """The time for one case is over."""
+
+
+DATASET = ("data/*", "data/*/*")
+BEGUN, DRAWN = ("out/events", "out/checkpoint.pt"), ("out/0",)
+FORMATS = ("kitti", "yolo", "yolo", "coco", "nuscenes", "opv2v", "mcap")
+LEARNERS = {"weather": 0.1, "signs": 1.0, "objects": 1.0, "trajectory": 0.3}
+SCORED = {"weather": "", "signs": "--threshold #0.3", "objects": "--threshold #0.3", "trajectory": ""}
+FILES = {"weather": "picture.*", "signs": "picture.*", "objects": "cloud.bin"}
+
+
+def calls() -> list[Call]:
+    """Return every command that reads something, in the ways it can be asked to."""
+    found = [
+        Call("validate data/", DATASET, 0.1, problems=True),
+        Call("validate data/ data/", DATASET, 0.2, problems=True),
+        Call("birdseye data/ --out OUT.png --range #40", DATASET, 0.3),
+        *(Call(f"export {name} data/ --out OUT --min-pixels #1", DATASET, 0.2) for name in FORMATS),
+        Call("export yolo data/ --out OUT --labels actors --validation #0.5", DATASET, 0.1),
+        Call("export kitti data/ --out OUT --calibration assumed", DATASET, 0.1),
+        Call("view data/ --save OUT.rrd", DATASET, 0.5),
+        Call("place --errors errors.csv --poles poles.csv --range #40 --count #2", ("errors.csv", "poles.csv"), 0.02),
+        Call(
+            "place --errors errors.parquet --poles poles.parquet --range #40 --count #1 --json --method greedy",
+            ("errors.parquet", "poles.parquet"),
+            0.02,
+        ),
+        Call("fit history.csv --json --repeats 20 --at #500,#2,#1 --level #0.9 --seed #0", ("history.csv",), 0.3),
+        Call("fit joint.csv --repeats 20 --at #500,1", ("joint.csv",), 0.3),
+        Call("fit history.parquet --repeats 20", ("history.parquet",), 0.3),
+        Call(
+            "fit joint.csv --json --repeats 20 --model effective --group-samples #700 --alpha #0.1 --beta #0.5",
+            ("joint.csv",),
+            0.3,
+        ),
+        Call("fit joint.csv --repeats 20 --model effective --group-samples #700", ("joint.csv",), 0.3),
+        *(Call(f"allocate {name} --json", (name,), 0.2) for name in ("problem.yaml", "graph.yaml", "graph.json")),
+        Call("allocate problem.yaml --progress progress.yaml", ("problem.yaml", "progress.yaml"), 0.2),
+        Call("allocate graph.yaml --out OUT.html", ("graph.yaml",), 1.0),
+        *(
+            Call(f"allocate problem.yaml --baseline {name} --json", ("problem.yaml",), 0.3)
+            for name in ("equal-stages", "equal-tasks", "max-throughput", "article")
+        ),
+        Call("towns show town/ --out OUT.png", ("town/*",), 2.0),
+        Call("towns import map.xodr --out OUT", ("map.xodr",), 2.0),
+        Call("record recipe.yaml --out OUT --frames #1 --seed #3", ("recipe.yaml",), 1.5),
+        Call("record elsewhere.yaml --out OUT --frames 1", ("town/*",), 2.0),
+        Call("reproduce sim-to-real --kitti real/ --out OUT", ("real/training/*/*",), 9.0),
+    ]
+    for task, seconds in LEARNERS.items():
+        weights = f"weights/{task}.safetensors"
+        found += [
+            Call(f"train {task} --data data/ --out OUT --epochs 1 --seed #0", DATASET, seconds, kept=BEGUN),
+            Call(
+                f"train {task} --data data/ --validation data/ --out OUT --epochs 1", DATASET, 2 * seconds, kept=BEGUN
+            ),
+            Call(f"evaluate {task} --data data/ --weights {weights} --json", (*DATASET, weights), seconds),
+            Call(f"infer {task} data/ --weights {weights} {SCORED[task]}", (*DATASET, weights), seconds),
+            Call(
+                f"infer {task} data/ --weights {weights} --pictures OUT --json",
+                (*DATASET, weights),
+                3 * seconds,
+                kept=DRAWN,
+            ),
+        ]
+        if task in FILES:
+            suffixes = ("png", "jpg", "webp") if "picture" in FILES[task] else ("bin",)
+            found += [
+                Call(f"infer {task} {name} --weights {weights} --json", (name, weights), seconds / 3)
+                for name in (f"{FILES[task].partition('.')[0]}.{suffix}" for suffix in suffixes)
+            ]
+    weights = "weights/objects.safetensors"
+    found.append(Call(f"evaluate objects --data data/ --weights {weights} --tracks", DATASET, 2.0))
+    return found
+
+
+def run_case(inputs: Path, number: int, scratch: Path, choices: list[Call], limit_s: float) -> Outcome:
+    """Run case `number` on mutated links to the files of `inputs`, in the new folder `scratch`."""
+    rng = np.random.default_rng([number, 1])
+    weights = np.array([1 / (call.seconds + 0.05) for call in choices])
+    call = choices[int(rng.choice(len(choices), p=weights / weights.sum()))]
+    link_tree(inputs, scratch / "in")
+    done = []
+    files = sorted({path for glob in call.inputs for path in (scratch / "in").glob(glob) if path.is_file()})
+    count = min(len(files), int(rng.choice((1, 1, 1, 2))))
+    for path in rng.choice(np.array(files, dtype=object), count, replace=False):
+        done.append(mutate(path, rng))
+    arguments = call.arguments(scratch / "in", scratch / "out", rng)
+    before = _files(scratch)
+    code, out, said, slow, trace = _run(arguments, limit_s)
+    broken = trace or ("" if slow else _broken(call, code, out, said, scratch, before))
+    shutil.rmtree(scratch, ignore_errors=True)
+    return Outcome(number, " ".join(arguments), "; ".join(done), code, said, broken, slow)
+
+
+def _broken(call: Call, code: int, out: str, said: str, scratch: Path, before: set[str]) -> str:
+    """Return in what way the contract is broken."""
+    if call.problems and code == 1 and not said and out:
+        return ""
+    if code not in (0, 2):
+        return f"exit code {code}"
+    left = _files(scratch) - before - {"out"}
+    if code == 2:
+        lines = said.splitlines()
+        if len(lines) != 1 or not lines[0].startswith("flcav: "):
+            return f"{len(lines)} lines on stderr"
+        if len(lines[0]) > 1500:
+            return f"a sentence of {len(lines[0])} characters"
+        if left := {name for name in left if not name.startswith(call.kept)}:
+            return f"left behind: {sorted(left)[:3]}"
+    if parts := [name for name in left if ".part" in name]:
+        return f"left behind: {parts[:3]}"
+    return ""
+
+
+def _files(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def _run(arguments: list[str], limit_s: float) -> tuple[int, str, str, bool, str]:
+    """Return exit code, stdout, stderr, whether the time was over, and the traceback of what was not caught."""
+    code, slow, trace = 1, False, ""
+    out = io.StringIO()
+    with _stderr() as said, warnings.catch_warnings():
+        warnings.simplefilter("default", RuntimeWarning)
+        warnings.simplefilter("default", UserWarning)
+        try:
+            with contextlib.redirect_stdout(out), _within(limit_s):
+                run(arguments)
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        except Slow:
+            slow = True
+        except BaseException as error:
+            trace = _traceback(error)
+    return code, out.getvalue(), said.getvalue(), slow, trace
+
+
+def _traceback(error: BaseException) -> str:
+    """Return where in flcav the exception came from, and what it says."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "/flcav/" in frame.filename]
+    places = [f"{frame.filename.partition('/flcav/')[2]}:{frame.lineno} {frame.name}" for frame in frames[-4:]]
+    return f"{' > '.join(places)}\n{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+
+
+@contextlib.contextmanager
+def _stderr() -> Iterator[io.StringIO]:
+    """Yield what Python and the libraries below it write to stderr, after the block."""
+    said, kept = io.StringIO(), os.dup(2)
+    with tempfile.TemporaryFile() as file, io.TextIOWrapper(file, write_through=True) as stream:
+        sys.stderr.flush()
+        os.dup2(file.fileno(), 2)
+        try:
+            with contextlib.redirect_stderr(stream):
+                yield said
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            said.write(file.read().decode(errors="replace"))
+
+
+@contextlib.contextmanager
+def _within(limit_s: float) -> Iterator[None]:
+    """Raise `Slow` in the block after so many seconds of computing, or ten times as many of waiting."""
+
+    def over(number: int, frame: FrameType | None) -> None:
+        raise Slow
+
+    clocks = ((signal.ITIMER_PROF, signal.SIGPROF, limit_s), (signal.ITIMER_REAL, signal.SIGALRM, 10 * limit_s))
+    before = [signal.signal(number, over) for _, number, _ in clocks]
+    for clock, _, seconds in clocks:
+        signal.setitimer(clock, seconds)
+    try:
+        yield
+    finally:
+        for (clock, number, _), handler in zip(clocks, before, strict=True):
+            signal.setitimer(clock, 0)
+            signal.signal(number, handler)

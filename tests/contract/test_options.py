@@ -1,0 +1,174 @@
+"""No option is passed over in silence: each is used, or refused in a sentence where it would have no effect."""
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Callable, Iterator
+
+import click
+import pytest
+import typer
+
+from flcav.cli.main import app, run
+from flcav.cli.reproduce import Target
+from flcav.cli.tasks import TASKS
+from flcav.config import InputError
+from flcav.dataset.formats.export import FORMATS
+
+ALWAYS = "always"
+STUDIES = tuple(target.value for target in Target if target.value not in ("fig1b", "fig3a", "sim-to-real"))
+# command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
+CHOICES: dict[str, dict[str, str]] = {
+    "export": {name: f"{name} none --out out" for name in FORMATS},
+    "train": {
+        **{task: f"{task} --data none --validation none --out out" for task in TASKS},
+        "unvalidated": "weather --data none --out out",
+    },
+    "evaluate": {task: f"{task} --data none" for task in TASKS},
+    "infer": {task: f"{task} none" for task in TASKS},
+    "errors": {task: f"{task} --data none --out errors.csv" for task in ("signs", "objects", "trajectory")},
+    "fit": {model: f"none --model {model}" for model in ("additive", "effective")},
+    "reproduce": {target.value: f"{target.value} --out out" for target in Target},
+}
+RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads", "--device"), ALWAYS)
+# command -> option -> what of CHOICES takes it; `--out` and `--json` are always taken
+TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
+    "demo": {"--seed": ALWAYS, "--jobs": ALWAYS},
+    "towns list": {},
+    "towns show": {"--poles": ALWAYS},
+    "towns import": {},
+    "record": {"--frames": ALWAYS, "--seed": ALWAYS, "--jobs": ALWAYS, "--engine": ALWAYS},
+    "validate": {},
+    "birdseye": {"--frame": ALWAYS, "--range": ALWAYS},
+    "camera": {"--frame": ALWAYS, "--camera": ALWAYS, "--boxes": ALWAYS},
+    "view": {"--scene": ALWAYS, "--save": ALWAYS},
+    "export": {  # which format takes which is said beside the formats
+        "--labels": ALWAYS,
+        "--validation": ALWAYS,
+        "--min-pixels": ALWAYS,
+        "--min-points": ALWAYS,
+        "--calibration": ALWAYS,
+    },
+    "train": {
+        "--data": ALWAYS,
+        "--validation": ALWAYS,
+        "--network": ALWAYS,
+        "--epochs": ALWAYS,
+        "--patience": tuple(TASKS),
+        "--seed": ALWAYS,
+        **RUNS,
+    },
+    "evaluate": {"--data": ALWAYS, "--weights": ALWAYS, "--tracks": ("objects",), "--range": ("objects",), **RUNS},
+    "infer": {"--weights": ALWAYS, "--threshold": ("signs", "objects"), "--pictures": ALWAYS, **RUNS},
+    "errors": {
+        "--data": ALWAYS,
+        "--weights": ALWAYS,
+        "--threshold": ("signs", "objects"),
+        "--map": ALWAYS,
+        **RUNS,
+    },
+    "allocate": {"--baseline": ALWAYS, "--progress": ALWAYS},
+    "place": {
+        "--errors": ALWAYS,
+        "--poles": ALWAYS,
+        "--range": ALWAYS,
+        "--count": ALWAYS,
+        "--method": ALWAYS,
+        "--town": ALWAYS,
+        "--map": ALWAYS,
+    },
+    "fit": {
+        **dict.fromkeys(("--model", "--at", "--problem", "--level", "--repeats", "--seed"), ALWAYS),
+        **dict.fromkeys(("--group-samples", "--alpha", "--beta", "--edge-rounds-per-cloud-round"), ("effective",)),
+    },
+    "reproduce": {
+        **dict.fromkeys(("--seeds", "--scale"), STUDIES),
+        "--jobs": (*STUDIES, "sim-to-real"),
+        "--kitti": ("sim-to-real",),
+        "--weights": ("sim-to-real",),
+    },
+}
+LATER = {("place", "range_m"), ("export", "validation"), ("infer", "threshold")}  # are refused by what takes them
+VALUES = {"--labels": "actors", "--calibration": "assumed", "--scale": "quick", "--tracks": None}  # else 0.5 or 1
+
+
+def commands(group: click.Group, before: str = "") -> Iterator[tuple[str, click.Command]]:
+    """Yield every command of the app by what one types."""
+    for name, command in group.commands.items():
+        if isinstance(command, click.Group):
+            yield from commands(command, f"{name} ")
+        else:
+            yield before + name, command
+
+
+def app_commands() -> dict[str, click.Command]:
+    group = typer.main.get_command(app)
+    assert isinstance(group, click.Group)
+    return dict(commands(group))
+
+
+def options(command: click.Command) -> set[str]:
+    found = {parameter.opts[0] for parameter in command.params if isinstance(parameter, click.Option)}
+    return found - {"--out", "--json", "--help"}
+
+
+def test_every_option_of_every_command_has_its_row() -> None:
+    assert {name: options(command) for name, command in app_commands().items()} == {
+        name: set(row) for name, row in TAKEN.items()
+    }
+
+
+@pytest.mark.parametrize("name", app_commands())
+def test_every_parameter_is_read(name: str) -> None:
+    command = app_commands()[name].callback
+    assert command is not None
+    function: Callable[..., object] = inspect.unwrap(command)
+    body = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
+    read = {node.id for node in ast.walk(body) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)}
+    assert not set(inspect.signature(function).parameters) - read
+
+
+@pytest.mark.parametrize("name", app_commands())
+def test_no_number_that_is_none_passes(name: str) -> None:
+    command = app_commands()[name]
+    for option in command.params:
+        if isinstance(option.type, click.types.FloatParamType | click.FloatRange) and (name, option.name) not in LATER:
+            with pytest.raises(InputError, match=f"{option.opts[0]} nan: a finite number"):
+                option.process_value(click.Context(command), "nan")
+
+
+def said(capsys: pytest.CaptureFixture[str], command: str, choice: str, option: str) -> str:
+    """Return what a command answers that is asked for `choice` with the option, and for what is not there."""
+    found = next(each for each in app_commands()[command].params if option in each.opts)
+    value = "1" if isinstance(found.type, click.IntRange | click.types.IntParamType) else "0.5"
+    given = [option] if VALUES.get(option, "") is None else [option, VALUES.get(option) or value]
+    with pytest.raises(SystemExit) as ended:
+        run([*command.split(), *CHOICES[command][choice].split(), *given])
+    told = capsys.readouterr()
+    assert (ended.value.code, told.out, told.err.count("\n")) == (2, "", 1)
+    return told.err
+
+
+CASES = [
+    (command, choice, option, choice in taken)
+    for command, row in TAKEN.items()
+    for option, taken in row.items()
+    if taken != ALWAYS
+    for choice in CHOICES[command]
+]
+
+
+@pytest.mark.parametrize(("command", "choice", "option"), [case[:3] for case in CASES if not case[3]])
+def test_an_option_without_effect_is_refused(
+    command: str, choice: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert option in said(capsys, command, choice, option)
+
+
+@pytest.mark.parametrize(
+    ("command", "choice", "option"), [case[:3] for case in CASES if case[3] and case[0] != "reproduce"]
+)
+def test_an_option_with_an_effect_is_taken(
+    command: str, choice: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert option not in said(capsys, command, choice, option)
