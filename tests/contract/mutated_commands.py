@@ -65,7 +65,10 @@ class Slow(BaseException):
 
 DATASET = ("data/*", "data/*/*")
 BEGUN, DRAWN = ("out/events", "out/checkpoint.pt"), ("out/0",)
-FORMATS = ("kitti", "yolo", "yolo", "coco", "nuscenes", "opv2v", "mcap")
+FORMATS = {
+    **{"kitti": "--min-points #1 --calibration assumed", "yolo": "--labels actors --validation #0.5 --min-pixels #1"},
+    **{"coco": "--min-pixels #1", "nuscenes": "--validation #0.5", "opv2v": "--min-points #2", "mcap": ""},
+}
 LEARNERS = {"weather": 0.1, "signs": 1.0, "objects": 1.0, "trajectory": 0.3}
 SCORED = {"weather": "", "signs": "--threshold #0.3", "objects": "--threshold #0.3", "trajectory": ""}
 FILES = {"weather": "picture.*", "signs": "picture.*", "objects": "cloud.bin"}
@@ -77,9 +80,9 @@ def calls() -> list[Call]:
         Call("validate data/", DATASET, 0.1, problems=True),
         Call("validate data/ data/", DATASET, 0.2, problems=True),
         Call("birdseye data/ --out OUT.png --range #40", DATASET, 0.3),
-        *(Call(f"export {name} data/ --out OUT --min-pixels #1", DATASET, 0.2) for name in FORMATS),
-        Call("export yolo data/ --out OUT --labels actors --validation #0.5", DATASET, 0.1),
-        Call("export kitti data/ --out OUT --calibration assumed", DATASET, 0.1),
+        Call("camera data/ --out OUT.png --boxes", DATASET, 0.5),
+        *(Call(f"export {name} data/ --out OUT {options}", DATASET, 0.2) for name, options in FORMATS.items()),
+        Call("export yolo data/ --out OUT", DATASET, 0.1),
         Call("view data/ --save OUT.rrd", DATASET, 0.5),
         Call("place --errors errors.csv --poles poles.csv --range #40 --count #2", ("errors.csv", "poles.csv"), 0.02),
         Call(
@@ -87,8 +90,15 @@ def calls() -> list[Call]:
             ("errors.parquet", "poles.parquet"),
             0.02,
         ),
+        Call(
+            "place --errors errors.csv --poles poles.csv --range 40 --count 1 --town town/ --map OUT.png",
+            ("errors.csv", "poles.csv", "town/*"),
+            2.0,
+        ),
         Call("fit history.csv --json --repeats 20 --at #500,#2,#1 --level #0.9 --seed #0", ("history.csv",), 0.3),
-        Call("fit joint.csv --repeats 20 --at #500,1", ("joint.csv",), 0.3),
+        Call("fit joint.csv --repeats 20 --at #500,1", ("joint.csv",), 3.0),
+        Call("fit history.csv --repeats 20 --problem problem.yaml", ("history.csv", "problem.yaml"), 0.3),
+        Call("fit history.csv --repeats 20 --problem OUT.yaml", ("history.csv",), 0.3),
         Call("fit history.parquet --repeats 20", ("history.parquet",), 0.3),
         Call(
             "fit joint.csv --json --repeats 20 --model effective --group-samples #700 --alpha #0.1 --beta #0.5",
@@ -104,6 +114,7 @@ def calls() -> list[Call]:
             for name in ("equal-stages", "equal-tasks", "max-throughput", "article")
         ),
         Call("towns show town/ --out OUT.png", ("town/*",), 2.0),
+        Call("towns show town/ --poles OUT.csv", ("town/*",), 1.0),
         Call("towns import map.xodr --out OUT", ("map.xodr",), 2.0),
         Call("record recipe.yaml --out OUT --frames #1 --seed #3", ("recipe.yaml",), 1.5),
         Call("record elsewhere.yaml --out OUT --frames 1", ("town/*",), 2.0),
@@ -131,9 +142,12 @@ def calls() -> list[Call]:
                 Call(f"infer {task} {name} --weights {weights} --json", (name, weights), seconds / 3)
                 for name in (f"{FILES[task].partition('.')[0]}.{suffix}" for suffix in suffixes)
             ]
+        if task != "weather":
+            options = f"--data data/ --weights {weights} --out OUT.csv {SCORED[task]}"
+            found.append(Call(f"errors {task} {options}", (*DATASET, weights), seconds))
     weights = "weights/objects.safetensors"
-    found.append(Call(f"evaluate objects --data data/ --weights {weights} --tracks", DATASET, 2.0))
-    return found
+    tracks = f"evaluate objects --data data/ --weights {weights} --tracks"
+    return [*found, Call(f"{tracks} --agents vehicles --range #30,#20", DATASET, 2.0)]
 
 
 def run_case(inputs: Path, number: int, scratch: Path, choices: list[Call], limit_s: float) -> Outcome:
@@ -155,28 +169,31 @@ def run_case(inputs: Path, number: int, scratch: Path, choices: list[Call], limi
     return Outcome(number, " ".join(arguments), "; ".join(done), code, said, broken, slow)
 
 
-def _broken(call: Call, code: int, out: str, said: str, scratch: Path, before: set[str]) -> str:
+def _broken(call: Call, code: int, out: str, said: str, scratch: Path, before: dict[str, tuple[int, int]]) -> str:
     """Return in what way the contract is broken."""
     if call.problems and code == 1 and not said and out:
         return ""
     if code not in (0, 2):
         return f"exit code {code}"
-    left = _files(scratch) - before - {"out"}
+    after = _files(scratch)
+    left = {name for name, state in after.items() if before.get(name) != state and name not in (".", "out")}
     if code == 2:
         lines = said.splitlines()
         if len(lines) != 1 or not lines[0].startswith("flcav: "):
             return f"{len(lines)} lines on stderr"
         if len(lines[0]) > 1500:
             return f"a sentence of {len(lines[0])} characters"
-        if left := {name for name in left if not name.startswith(call.kept)}:
+        if left := {name for name in left if not name.startswith(call.kept)} | before.keys() - after.keys():
             return f"left behind: {sorted(left)[:3]}"
     if parts := [name for name in left if ".part" in name]:
         return f"left behind: {parts[:3]}"
     return ""
 
 
-def _files(folder: Path) -> set[str]:
-    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+def _files(folder: Path) -> dict[str, tuple[int, int]]:
+    """Return what lies in the folder, with sizes and times; folders count as they are, not what is in them."""
+    found = ((str(path.relative_to(folder)), path) for path in folder.rglob("*"))
+    return {name: (0, 0) if path.is_dir() else (path.stat().st_size, path.stat().st_mtime_ns) for name, path in found}
 
 
 def _run(arguments: list[str], limit_s: float) -> tuple[int, str, str, bool, str]:

@@ -21,6 +21,7 @@ from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import configuration, fresh
 from flcav.perception.weights import save_network
 from flcav.sensors.frame import Frame, Views
+from flcav.sensors.lens import BODY_FROM_OPTICAL
 
 DATA = Path(__file__).parents[1] / "data"
 TOWN = Path(flcav.world.__path__[0]) / "towns" / "suburb"
@@ -126,13 +127,22 @@ Tr_velo_to_cam: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3
 KITTI_LABELS = "Car 0.00 0 1.57 520 170 640 260 1.5 1.6 4.0 0.5 1.6 12.0 1.6\n"
 
 
+OPTICAL = pose(0.5, 0.0, 1.5) @ BODY_FROM_OPTICAL
+
+
 class AllSensors(Drives):
     """Drives seen by every kind of sensor, so that no table of the dataset is empty."""
 
     def frame(self, scene: str, index: int) -> Frame:
         """Return the drive's frame with what the other sensors measured."""
         frame = super().frame(scene, index)
-        mounts = {"thermal": np.eye(4), "radar": pose(2.0, 0.0, 0.5), "gnss": pose(0, 0, 1.9), "imu": pose(0, 0, 0.4)}
+        mounts = {
+            "front": OPTICAL,
+            "thermal": OPTICAL,
+            "radar": pose(2.0, 0.0, 0.5),
+            "gnss": pose(0, 0, 1.9),
+            "imu": pose(0, 0, 0.4),
+        }
         lens = frame.calibration.intrinsics["front"]
         calibration = replace(
             frame.calibration,
@@ -171,7 +181,7 @@ def make_inputs(folder: Path) -> None:
         save_network(task, fresh(task, networks[name], 1), folder / "weights" / f"{name}.safetensors")
     shutil.copytree(TOWN, folder / "town")
     for name, values in (("recipe", RECIPE), ("problem", PROBLEM), ("graph", GRAPH), ("progress", PROGRESS)):
-        (folder / f"{name}.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False))
     (folder / "graph.json").write_text(json.dumps(GRAPH))
     (folder / "elsewhere.yaml").write_text(yaml.safe_dump({**RECIPE, "town": str(folder / "town")}, sort_keys=False))
     (folder / "history.csv").write_text(HISTORY)

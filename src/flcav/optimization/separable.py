@@ -66,7 +66,8 @@ class Separable:
         if self.of is None:
             return (x + self.x0) / (self.b + 1)
         shifted = x[self.of] + self.x0
-        return prices / self._summed(self.a * self.b * (self.b + 1) * shifted ** (-self.b - 2))
+        with np.errstate(divide="ignore", invalid="ignore"):  # of what gains nothing: it stands at its least
+            return prices / self._summed(self.a * self.b * (self.b + 1) * shifted ** (-self.b - 2))
 
     def _level(self, prices: Array) -> Array:
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 LaneKind = Literal["driving", "bicycle", "parking", "shoulder", "sidewalk", "crossing", "walkingarea"]
 CARRIAGEWAY: tuple[LaneKind, ...] = ("driving", "bicycle", "parking", "shoulder")  # the last two are closed to traffic
 
-FARTHEST_M = 1e6
+FARTHEST_M = 1e8  # maps may lie as far from their origin as the Earth is round
 ONLY_FOR: dict[str, LaneKind] = {"pedestrian": "sidewalk", "bicycle": "bicycle"}
 
 
