@@ -5,12 +5,11 @@ import inspect
 import io
 import re
 import tokenize
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-import annotated_types
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from pydantic.fields import FieldInfo
@@ -51,6 +50,8 @@ UNITS = {
     **{"mm_h": "mm/h", "m_s": "m/s", "ms": "ms", "m": "m", "s": "s"},
     **{"deg": "°", "rad": "rad", "px": "px", "hz": "Hz", "k": "K"},
 }  # by the end of a field's name
+SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+LARGEST = 2**63  # of a seed: not worth a word
 WORDS = {int: "whole number", float: "number", bool: "true, false", str: "text"}
 LISTS = {int: "whole numbers", float: "numbers", str: "names"}
 LINKS: Mapping[type[Config], str] = {  # to where a model is explained
@@ -130,24 +131,22 @@ def said_and_unit(name: str, comment: str) -> tuple[str, str]:
 
 def value_of(field: FieldInfo) -> str:
     """Return what may be given, in words."""
-    limits = {type(each): each for each in field.metadata}
-    low = limits.get(annotated_types.Ge) or limits.get(annotated_types.Gt)
-    high = limits.get(annotated_types.Le) or limits.get(annotated_types.Lt)
-    words = kind_of(field.annotation)
-    if isinstance(low, annotated_types.Ge) and isinstance(high, annotated_types.Le):
-        return f"{words}, {number(low.ge)} to {number(high.le)}"
-    for each, sign, name in ((low, "≥", "ge"), (low, ">", "gt"), (high, "≤", "le"), (high, "<", "lt")):
-        if hasattr(each, name) and getattr(each, name) != 2**63:
-            words += f", {sign} {number(getattr(each, name))}"
-    return words
+    return kind_of(field.annotation) + limits_of(field.metadata)
+
+
+def limits_of(metadata: Iterable[Any]) -> str:
+    """Return the limits of a number, in words."""
+    limits = {name: getattr(each, name) for each in metadata for name in SIGNS if hasattr(each, name)}
+    if {*limits} == {"ge", "le"}:
+        return f", {number(limits['ge'])} to {number(limits['le'])}"
+    return "".join(f", {SIGNS[name]} {number(limit)}" for name, limit in limits.items() if limit != LARGEST)
 
 
 def kind_of(annotation: Any) -> str:
     """Return a type in words; of a model, a link to where it is explained."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        limits = [f", > {each.gt:g}" for each in inner[1].metadata if isinstance(each, annotated_types.Gt)]
-        return kind_of(inner[0]) + "".join(limits)
+        return kind_of(inner[0]) + "".join(limits_of(getattr(each, "metadata", ())) for each in inner[1:])
     if origin in (Union, UnionType):
         return " or ".join(kind_of(each) for each in inner if each is not NoneType)
     if origin is Literal:
@@ -158,9 +157,7 @@ def kind_of(annotation: Any) -> str:
         return f"{len(inner)} numbers"
     if origin is tuple:
         return f"list of {LISTS.get(inner[0]) or kind_of(inner[0])}"
-    if annotation in WORDS:
-        return WORDS[annotation]
-    return LINKS[annotation]
+    return WORDS.get(annotation) or LINKS[annotation]
 
 
 def default_of(field: FieldInfo) -> str:

@@ -37,7 +37,8 @@ def check_writable(folder: Path) -> None:
     try:
         tempfile.TemporaryFile(dir=nearest).close()
     except OSError as error:
-        raise OSError(error.errno, error.strerror, str(folder)) from None
+        # even where the system says that something is not there: it is not the user who named a wrong input
+        raise PermissionError(error.errno, error.strerror, str(folder)) from None
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -199,9 +199,9 @@ def test_the_help_names_the_exit_codes(call):
 @pytest.mark.parametrize(
     "command",
     [
-        ("train", "poetry", "--data", "none", "--out", "none"),
-        ("evaluate", "poetry", "--data", "none"),
-        ("infer", "poetry", "none"),
+        ("train", "weather", "--data", "none", "--out", "none"),
+        ("evaluate", "weather", "--data", "none"),
+        ("infer", "weather", "none"),
         ("reproduce", "sim-to-real", "--out", "none"),
     ],
     ids=lambda command: command[0],

@@ -98,7 +98,7 @@ def test_a_ray_cluster_records_the_same_bytes(recipe: Path, reference: Path, tmp
 
 def test_an_unknown_engine_exits_2(recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert flcav("record", recipe, "--out", tmp_path / "data", "--engine", "steam") == 2
-    assert "engine 'steam': unknown; known engines: processes, ray" in capsys.readouterr().err
+    assert "'steam' is not one of 'processes', 'ray'" in capsys.readouterr().err
     assert not (tmp_path / "data").exists()
 
 

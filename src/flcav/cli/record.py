@@ -27,10 +27,12 @@ def record(
     from flcav.config import parse_config, read_config
     from flcav.dataset.layout import read_manifest, trace_path
     from flcav.dataset.recorder import record as write
+    from flcav.files import check_writable
     from flcav.sources.embedded import EmbeddedSource
     from flcav.sources.recipe import Recipe
     from flcav.world.trace import Trace
 
+    check_writable(out)
     changes = {name: value for name, value in (("frames", frames), ("seed", seed)) if value is not None}
     asked = read_config(Recipe, recipe)
     source = EmbeddedSource(parse_config(Recipe, asked.model_dump() | changes, str(recipe)), recipe.parent)

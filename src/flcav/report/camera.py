@@ -17,6 +17,7 @@ from flcav.sensors.frame import Frame, SignViews
 
 ONE_IN, SHEET_IN = 8.0, 12.0  # width of a picture alone, and of several
 TITLE_IN = 0.32
+ONE_ROW = 3
 KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {  # in the key -> colour, categories
     "cars and vans": (style.BLUE, ("car", "van")),
     "trucks and buses": (style.PURPLE, ("truck", "bus")),
@@ -54,14 +55,17 @@ def shot(frame: Frame, camera: str) -> Shot:
 
 
 def in_rows(frame: Frame, cameras: Sequence[str]) -> list[list[str]]:
-    """Return the cameras as they are looked at: those that look ahead from left to right, below them those behind."""
+    """Return the cameras as they are looked at: those that look ahead from left to right, below them those behind.
+
+    Up to three are in one row.
+    """
     yaw = {}
     for name in cameras:
         ahead = frame.agent_from_sensor[name][:2, 2]  # of the optical axis
         yaw[name] = float(np.degrees(np.arctan2(ahead[1], ahead[0])))
     front = sorted((name for name in cameras if abs(yaw[name]) <= 90), key=lambda name: -yaw[name])
     back = sorted((name for name in cameras if abs(yaw[name]) > 90), key=lambda name: yaw[name] % 360)
-    return [row for row in (front, back) if row]
+    return [[*front, *back]] if len(cameras) <= ONE_ROW else [row for row in (front, back) if row]
 
 
 @style.styled
@@ -70,12 +74,15 @@ def camera_sheet(title: str, rows: Sequence[Sequence[Shot]], *, boxes: bool) -> 
     shots = [shot for row in rows for shot in row]
     width = ONE_IN if len(shots) == 1 else SHEET_IN
     aspects = [[shot.view.picture.shape[1] / shot.view.picture.shape[0] for shot in row] for row in rows]
-    heights = [width / sum(row) + TITLE_IN for row in aspects]
-    figure = style.canvas(width, sum(heights) + (TITLE_IN if boxes else 0))
-    bands = figure.subfigures(len(rows), 1, height_ratios=heights, squeeze=False)[:, 0]
+    widest = max(map(sum, aspects))  # all pictures are as high as those of the row that fills the width
+    height = width / widest + TITLE_IN
+    figure = style.canvas(width, len(rows) * height + (TITLE_IN if boxes else 0))
+    bands = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for band, row, ratios in zip(bands, rows, aspects, strict=True):
-        panels = band.subplots(1, len(row), width_ratios=ratios, squeeze=False)[0]
-        for axes, each in zip(panels, row, strict=True):
+        free = round(widest - sum(ratios), 6)
+        grid = band.add_gridspec(1, len(row) + (free > 0), width_ratios=[*ratios, *([free] if free > 0 else [])])
+        for column, each in enumerate(row):
+            axes = band.add_subplot(grid[column])
             show_view(axes, each.view)
             axes.set_title(f"{title} · {each.name}" if each is shots[0] else each.name)
             if boxes:

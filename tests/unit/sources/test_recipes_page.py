@@ -82,7 +82,7 @@ def test_its_examples_are_recipes():
     frames = sum(source.frame_count(scene) for scene in source.scenes())
     assert f"2 scenes × 5 spins × 3 agents are {frames} frames" in PAGE
     forms = re.split(r"^(?=weather:)", weathers, flags=re.MULTILINE)[1:]
-    assert len(forms) == 5
+    assert len(forms) == 6
     for form in forms:
         parse_config(Recipe, {"town": "grid", **yaml.safe_load(form)}, "the page")
 
