@@ -188,7 +188,7 @@ def test_a_schedule_survives_its_own_dump(value: Any):
             ["night", "heavy_rain"],
             r"a list is of keyframes, such as {at_s: 0, weather: night}; .* {classes: \[night",
         ),
-        (None, "'weather' = None: must be the name of a weather, its fields, or a list of keyframes"),
+        (5, "'weather' = 5: must be the name of a weather, its fields, or a list of keyframes"),
         ({"sun_azimuth_deg": float("inf")}, "sun_azimuth_deg' = inf: Input should be a finite number"),
         ({"rain_mm_h": -1}, r"rain_mm_h' = -1"),
         ({"colour": 1}, "unknown field"),
