@@ -1,8 +1,9 @@
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flcav.geometry import Boxes, inverse, points_in_boxes, pose, transform_points, wrap_angle
+from flcav.geometry import Boxes, inverse, is_rigid, points_in_boxes, pose, transform_points, wrap_angle
 
 coordinate = st.floats(-100, 100)
 angle = st.floats(-10, 10)
@@ -39,3 +40,11 @@ def test_boxes_move_as_their_corners_do(x, y, yaw):
     box = Boxes.from_array([[3, -2, 0.8, 4.2, 1.8, 1.6, 0.3]], "Car")
     expected = transform_points(target_from_source, box.corners()[0])
     np.testing.assert_allclose(box.transformed(target_from_source).corners()[0], expected, atol=1e-9)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1e155, np.inf, np.nan, -3.0])
+def test_a_matrix_of_huge_numbers_is_not_rigid(value: float):
+    matrix = np.eye(4)
+    matrix[0, 1] = value
+    assert not is_rigid(matrix)

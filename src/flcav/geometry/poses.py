@@ -46,6 +46,7 @@ def is_rigid(target_from_source: Array) -> bool:
     rotation = target_from_source[:3, :3]
     return bool(
         np.isfinite(target_from_source).all()
+        and np.abs(rotation).max() < 2  # before numbers are multiplied that overflow
         and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
         and np.linalg.det(rotation) > 0
         and np.array_equal(target_from_source[3], (0, 0, 0, 1))
