@@ -10,13 +10,13 @@ from typing import Any
 
 from flcav.dataset.layout import package_versions
 from flcav.experiments.demo import demo_protocol
-from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.pipeline import central_step, cloud_step, edge_step, plan_step, shared_steps, test_step
 from flcav.experiments.points import HISTORY_FILE, append_points, points_of
 from flcav.experiments.pretraining import LEDGER
 from flcav.experiments.protocol import Protocol
 from flcav.experiments.steps import Notify, Step, run_side_by_side
 from flcav.experiments.testing import difference
+from flcav.intervals import mean_over_seeds
 from flcav.network.ledger import LINKS, Ledger
 from flcav.report import figures, style
 

@@ -18,7 +18,6 @@ from flcav.config import parse_config
 from flcav.dataset.layout import package_versions
 from flcav.experiments.demo_arms import arms_protocol
 from flcav.experiments.fig6a_findings import EQUAL, JOINT, TOWN, allocation_findings
-from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.pipeline import cloud_step, edge_step, plan_step, shared_steps, test_step
 from flcav.experiments.planning import PROBLEM, history_table, run_problem
 from flcav.experiments.points import HISTORY_FILE, append_points, points_of
@@ -26,6 +25,7 @@ from flcav.experiments.pretraining import LEDGER
 from flcav.experiments.protocol import REGIONS, Protocol
 from flcav.experiments.steps import Notify, Step, Work, run_side_by_side
 from flcav.experiments.testing import difference
+from flcav.intervals import mean_over_seeds
 from flcav.network.ledger import LINKS, Ledger
 from flcav.optimization.baselines import baseline
 from flcav.optimization.problem import Problem

@@ -7,14 +7,9 @@ held, wholly below it did not, around 0 the run does not decide.
 from collections.abc import Mapping
 from typing import Any
 
-HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
-CAVEAT = "ideal road detector, upper bound"
+from flcav.verdicts import UNDECIDED, signed, verdict, verdict_words
 
-_IN_WORDS = {
-    HELD: "the interval lies above 0, so the claim held in this run",
-    NOT_HELD: "the interval lies below 0, so the claim did not hold in this run",
-    UNDECIDED: "the interval contains 0, so this run does not decide",
-}
+CAVEAT = "ideal road detector, upper bound"
 
 
 def findings(results: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -41,13 +36,6 @@ def findings(results: Mapping[str, Any]) -> list[dict[str, str]]:
     ]
 
 
-def verdict(low: float, high: float) -> str:
-    """Return what the interval [low, high] of a difference says of the claim that it is positive."""
-    if low > 0:
-        return HELD
-    return NOT_HELD if high < 0 else UNDECIDED
-
-
 def _pole_finding(results: Mapping[str, Any]) -> dict[str, str]:
     question = "Does the placed pole beat the pole with the densest traffic?"
     place = results["placement"]
@@ -71,11 +59,7 @@ def _finding(
     mean, low, high = difference["mean"], difference["low"], difference["high"]
     decided = verdict(low, high)
     sentence = (
-        f"{measured}: {_signed(mean)}, 95 % interval {_signed(low)} to {_signed(high)} over {results['test_frames']} "
-        f"test frames of {results['test_scenes']} scenes; {_IN_WORDS[decided]} ({CAVEAT})."
+        f"{measured}: {signed(mean)}, 95 % interval {signed(low)} to {signed(high)} over {results['test_frames']} "
+        f"test frames of {results['test_scenes']} scenes; {verdict_words(decided)} ({CAVEAT})."
     )
     return {"name": name, "question": question, "verdict": decided, "sentence": sentence}
-
-
-def _signed(value: float) -> str:
-    return f"{value:+.3f}".replace("-", "−")

@@ -8,9 +8,9 @@ import yaml
 
 from flcav.config import parse_config
 from flcav.dataset.formats.rectangles import SIGNS
-from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.signs_tables import name_of, tables
 from flcav.experiments.studies.signs import STUDY
+from flcav.intervals import mean_over_seeds
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 

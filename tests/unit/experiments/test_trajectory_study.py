@@ -7,10 +7,10 @@ import pytest
 import yaml
 
 from flcav.config import parse_config
-from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.studies import STUDIES
 from flcav.experiments.studies.trajectory import CAMERAS, STUDY
 from flcav.experiments.trajectory_tables import tables
+from flcav.intervals import mean_over_seeds
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import metrics
 from flcav.sources.recipe import Recipe

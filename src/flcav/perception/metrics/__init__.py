@@ -1,7 +1,6 @@
 """Detection metrics."""
 
 from flcav.perception.metrics.average_precision import (
-    CONFIDENCE,
     average_precision,
     bootstrap_difference,
     bootstrap_interval,
@@ -13,7 +12,6 @@ from flcav.perception.metrics.calibration import calibration_error, fit_logistic
 from flcav.perception.metrics.matching import Matches, match
 
 __all__ = [
-    "CONFIDENCE",
     "Matches",
     "average_precision",
     "bootstrap_difference",
