@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flcav.dataset.workers import end_with_parent
-from flcav.experiments.provenance import Provenance, provenance
-from flcav.experiments.steps.record import Record, value_of, write_done, write_started
-from flcav.experiments.steps.step import Step, Work
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.steps.record import Record, value_of, write_done, write_started
+from flcav.pipeline.steps.step import Step, Work
 from flcav.progress import Report
 from flcav.threads import use_threads
 

@@ -21,11 +21,11 @@ from queue import Queue, SimpleQueue
 from typing import IO, Any
 
 from flcav.dataset.ray_engine import ray_session
-from flcav.experiments.provenance import provenance
-from flcav.experiments.steps.engines import KILLED, Engine, Hands, perform
-from flcav.experiments.steps.record import Record, aside, remove, value_of
-from flcav.experiments.steps.source_hash import package_hash
-from flcav.experiments.steps.step import Step
+from flcav.pipeline.provenance import provenance
+from flcav.pipeline.steps.engines import KILLED, Engine, Hands, perform
+from flcav.pipeline.steps.record import Record, aside, remove, value_of
+from flcav.pipeline.steps.source_hash import package_hash
+from flcav.pipeline.steps.step import Step
 from flcav.threads import use_threads
 
 PIECE_BYTES = 8_000_000

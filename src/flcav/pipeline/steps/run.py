@@ -19,11 +19,11 @@ from queue import Empty
 from typing import Any
 
 from flcav.config import InputError, read_json
-from flcav.experiments.steps.engines import Engine, Processes
-from flcav.experiments.steps.record import DONE, Record, Stale, aside, held_in, refusal, remove, value_of
-from flcav.experiments.steps.source_hash import Sources, starts
-from flcav.experiments.steps.step import DONE_BEFORE, DONE_NOW, KEPT, Notify, Step
 from flcav.files import write_json
+from flcav.pipeline.steps.engines import Engine, Processes
+from flcav.pipeline.steps.record import DONE, Record, Stale, aside, held_in, refusal, remove, value_of
+from flcav.pipeline.steps.source_hash import Sources, starts
+from flcav.pipeline.steps.step import DONE_BEFORE, DONE_NOW, KEPT, Notify, Step
 
 
 @contextlib.contextmanager
@@ -33,7 +33,7 @@ def _processes(jobs: int) -> Iterator[Engine]:
 
 @contextlib.contextmanager
 def _ray(jobs: int) -> Iterator[Engine]:
-    from flcav.experiments.steps.cluster import ray_cluster
+    from flcav.pipeline.steps.cluster import ray_cluster
 
     with ray_cluster(jobs) as engine:
         yield engine
@@ -57,7 +57,7 @@ def run_steps(
     """Run `steps` (in an order where each comes after what it needs) and return their values by name.
 
     `jobs` workers of one thread each: processes, which end with this one however it ends, or actors on the machines of
-    a Ray cluster, see `flcav.experiments.steps.cluster`. What other code began or finished is refused, done again
+    a Ray cluster, see `flcav.pipeline.steps.cluster`. What other code began or finished is refused, done again
     ("redo") or taken as it is ("keep"); what is kept stays known as of that code. Raises `InputError` where `folder`
     holds steps of other arguments or, where that is refused, of other code; `OSError` where a worker was killed.
     """
@@ -75,13 +75,17 @@ def run_side_by_side(
     notify: Notify,
     stale: Stale = "refuse",
     engine: str = "processes",
+    names: Mapping[Path, str] | None = None,
 ) -> dict[Path, dict[str, Any]]:
-    """Run the steps of each folder, up to `jobs` folders at a time; return `run_steps` of each."""
+    """Run the steps of each folder, up to `jobs` folders at a time; return `run_steps` of each.
 
+    `names` are what the folders' steps are told under (None: the folders' own names).
+    """
     sources = Sources()
 
     def named(folder: Path) -> Notify:
-        return lambda step, done, total, note: notify(f"{folder.name}/{step}", done, total, note)
+        name = folder.name if names is None else names[folder]
+        return lambda step, done, total, note: notify(f"{name}/{step}", done, total, note)
 
     plans = [_planned(steps, folder, named(folder), stale, sources) for folder, steps in runs.items()]
     waiting = [plan for plan in plans if plan.waiting]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from flcav.experiments.steps.record import digest, value_of
+from flcav.pipeline.steps.record import digest, value_of
 from flcav.progress import Report
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note

@@ -25,7 +25,7 @@ class Record:
     """What a step is."""
 
     fingerprint: str  # of what was asked: function, arguments, and those of the steps it needs
-    code: Mapping[str, str]  # hash of what it reaches of each module, see `flcav.experiments.steps.source_hash`
+    code: Mapping[str, str]  # hash of what it reaches of each module, see `flcav.pipeline.steps.source_hash`
     lineage: str  # of its code and of the lineages of the steps it needs; "" where the code is not known
 
     @classmethod

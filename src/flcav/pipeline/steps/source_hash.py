@@ -6,7 +6,7 @@ within itself, and through packages that only hand names on, to the module that 
 docstrings do not count, nor do imports for type checkers, and code that runs only where a module is the program.
 
 Not seen are names looked up by strings (but those of a module's `__getattr__`, see `_lazy`), data files, and other
-packages: their versions are in `flcav.experiments.provenance`.
+packages: their versions are in `flcav.pipeline.provenance`.
 """
 
 import ast
