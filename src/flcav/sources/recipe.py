@@ -1,15 +1,18 @@
 """What a user asks to have recorded."""
 
+import os
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from flcav.config import Config
+from flcav.config import Config, read_config
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
+from flcav.world.town import TOWNS
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
 STEP_S = 0.1  # of the traffic
@@ -103,3 +106,16 @@ class Recipe(Config):
         """Return the (spins_per_scene,) times of the spins in a run after a warm-up of so many steps [s]."""
         steps = warmup_steps + np.arange(self.spins_per_scene) * round(self.every_s / STEP_S)
         return np.round(steps * np.float64(STEP_S), 1)
+
+
+def load_recipe(path: Path | str) -> Recipe:
+    """Return the recipe in the YAML file at `path`, see docs/recipes.md.
+
+    A town's folder that lies beside the file is named by its whole path. Raises `InputError` naming file, field, value
+    and rule where it is none.
+    """
+    recipe = read_config(Recipe, Path(path))
+    folder = Path(path).absolute().parent / recipe.town
+    if recipe.town in TOWNS or not os.path.isdir(folder):  # noqa: PTH112 - which takes a name that can be none
+        return recipe
+    return recipe.model_copy(update={"town": str(folder)})

@@ -8,7 +8,7 @@ import yaml
 
 from flcav.config import parse_config
 from flcav.experiments.intervals import mean_over_seeds
-from flcav.experiments.studies import STUDIES
+from flcav.experiments.studies import study_named
 from flcav.experiments.studies.trajectory import CAMERAS, STUDY
 from flcav.experiments.trajectory_tables import tables
 from flcav.perception.trajectory.config import FUTURE, PAST
@@ -81,5 +81,5 @@ def test_errors_have_a_row_for_each_slice_and_predictor():
 
 
 def test_the_picture_shows_every_test():
-    assert STUDIES["trajectory"] is STUDY
+    assert study_named("trajectory") is STUDY
     assert STUDY.draw(results(4.0, 4.1)).startswith(b"\x89PNG")
