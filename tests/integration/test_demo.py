@@ -15,16 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from flcav.experiments.demo import demo_steps, run_demo
+from flcav.experiments.planning import update_mb
+from flcav.experiments.protocol import Protocol, Split, Training
 from PIL import Image
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.experiments.demo import demo_steps, run_demo
-from flcav.experiments.planning import update_mb
-from flcav.experiments.protocol import Protocol, Split, Training
-from flcav.pipeline.steps import run_steps, stopwatch
 from flcav.network.ledger import LINKS, Ledger, Link
+from flcav.pipeline.steps import run_steps, stopwatch
 
 pytestmark = pytest.mark.slow
 

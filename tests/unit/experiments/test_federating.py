@@ -3,15 +3,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from flcav.experiments import federating
 from flcav.experiments.federating import _checkpoint, _resumed, _share_of
 from flcav.experiments.protocol import Protocol
-from flcav.pipeline.steps import Work
+
+from flcav.experiments import federating
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.pipeline.steps import Work
 
 START = {"w": np.zeros(3, dtype=np.float32), "count": np.array(0, dtype=np.int64)}
 STAGE_ONE = LedgerEntry("pretrain", "t", "wireless", "up", 0, "suburb/cav0", 4_000_000)

@@ -1,6 +1,7 @@
 import copy
 
 from flcav.experiments.findings import findings
+
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
 
 RESULTS = {

@@ -1,8 +1,8 @@
 import pytest
-
-from flcav.config import parse_config
 from flcav.experiments.planning import fixed_plan, history_fit, problem_for, update_mb
 from flcav.experiments.protocol import Protocol
+
+from flcav.config import parse_config
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import LocalUpdate

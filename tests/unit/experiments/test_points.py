@@ -3,9 +3,9 @@ import json
 from pathlib import Path
 
 import pytest
+from flcav.experiments.points import append_points, points_of
 
 from flcav.cli.main import run
-from flcav.experiments.points import append_points, points_of
 
 VALUES = {
     "plan": {"tasks": [{"samples": 200, "edge_rounds": 3, "cloud_rounds": 1}]},

@@ -3,10 +3,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-
-from flcav.experiments import pretraining
 from flcav.experiments.pretraining import next_factor, own_label_threshold
 from flcav.experiments.protocol import Training
+
+from flcav.experiments import pretraining
 from flcav.geometry import Boxes
 from flcav.perception.objects.evaluate import Asked
 

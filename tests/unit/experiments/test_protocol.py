@@ -1,10 +1,10 @@
 from itertools import product
 
 import pytest
+from flcav.experiments.protocol import REGIONS, SPLITS, Protocol, Split
 from pydantic import ValidationError
 
 from flcav.config import parse_config
-from flcav.experiments.protocol import REGIONS, SPLITS, Protocol, Split
 from flcav.sources.recipe import Recipe
 
 TOWNS = ("suburb", *REGIONS)
