@@ -1,5 +1,6 @@
 """Where things lie in a dataset folder, and its manifest."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -79,9 +80,9 @@ def trace_path(scene: str) -> str:
     return f"{TRACES}/{scene}.parquet"
 
 
-def package_versions() -> dict[str, str]:
-    """Return the versions of the packages that decide what is recorded."""
-    return {name: version(name) for name in PACKAGES}
+def package_versions(names: Sequence[str] = PACKAGES) -> dict[str, str]:
+    """Return the versions of packages, by default of those that decide what is recorded."""
+    return {name: version(name) for name in names}
 
 
 def town_path(town: str) -> str:

@@ -7,6 +7,7 @@ RAY_ADDRESS names; where it names none, Ray is started on this machine.
 import contextlib
 import logging
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from flcav.extras import installation
 from flcav.sources.source import Source
 from flcav.threads import VARIABLES
 
-STORE_BYTES = 128_000_000  # of a Ray started here; only tasks pass through it
+STORE_BYTES = 128_000_000  # of a Ray started here; only tasks, and pieces of files, pass through it
 
 
 @contextlib.contextmanager
@@ -27,23 +28,37 @@ def ray_cluster(source: Source, work: Path, jobs: int, wrote: Callable[[int], No
 
     Raises `InputError` where Ray is not installed.
     """
+    with ray_session(jobs) as ray:
+        shared = ray.put(source)
+        actors = [ray.remote(num_cpus=1)(_Worker).remote(shared, work.absolute()) for _ in range(jobs)]
+        yield _Actors(actors, wrote)
+
+
+@contextlib.contextmanager
+def ray_session(jobs: int) -> Iterator[Any]:
+    """Yield the package `ray`, connected to the cluster or, where RAY_ADDRESS names none, to one of `jobs` processors.
+
+    Its workers compute on one thread each. Raises `InputError` where Ray is not installed.
+    """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray warns without
     try:
         import ray  # pyright: ignore[reportMissingImports]: an extra
     except ImportError:
         raise InputError(f"--engine ray needs Ray, which is not installed: {installation('ray')}") from None
-    local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
+    variables: dict[str, str] = dict.fromkeys(VARIABLES, "1")
+    local: dict[str, Any] = {}
+    if "RAY_ADDRESS" not in os.environ:
+        local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
+        variables["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # modules are found as they are here
     ray.init(
-        **({} if "RAY_ADDRESS" in os.environ else local),
-        runtime_env={"env_vars": dict.fromkeys(VARIABLES, "1")},
+        **local,
+        runtime_env={"env_vars": variables},
         log_to_driver=False,
         logging_level=logging.ERROR,
     )
     try:
-        shared = ray.put(source)
-        actors = [ray.remote(num_cpus=1)(_Worker).remote(shared, work.absolute()) for _ in range(jobs)]
-        yield _Actors(actors, wrote)
+        yield ray
     finally:
         ray.shutdown()
 

@@ -14,7 +14,6 @@ from flcav.dataset.formats.kitti.folder import KittiFolder, KittiFrame
 from flcav.dataset.store import Dataset
 from flcav.experiments.clouds import Labelled, describe
 from flcav.experiments.recording import DATA, record_split
-from flcav.experiments.steps import Notify, Step, run_steps
 from flcav.geometry import Boxes, inverse
 from flcav.perception.camera_view import kitti_view
 from flcav.perception.metrics import average_precision, match
@@ -23,6 +22,7 @@ from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import LOWEST_SCORE, OVERLAPS, number_or_none, of_class
 from flcav.perception.objects.infer import box_rows
 from flcav.perception.objects.model import Second
+from flcav.pipeline.steps import Notify, Step, run_steps
 from flcav.report import style
 from flcav.report.clouds import real_frame
 

@@ -12,11 +12,11 @@ from flcav.config import InputError, read_yaml
 from flcav.dataset.layout import package_versions
 from flcav.dataset.store import Dataset
 from flcav.experiments.recording import opened, record_split
-from flcav.experiments.steps import Notify, Step, Work, run_steps
 from flcav.intervals import mean_over_seeds
 from flcav.perception.task import Task
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
+from flcav.pipeline.steps import Notify, Step, Work, run_steps
 from flcav.sources.recipe import recipe_path
 
 RecipeFields = Mapping[str, Any]  # of a `Recipe`, as YAML has it

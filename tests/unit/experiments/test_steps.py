@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from flcav.config import InputError
-from flcav.experiments.steps import Step, Work, run_side_by_side, run_steps
+from flcav.pipeline.steps import Step, Work, run_side_by_side, run_steps
 
 
 def count(work: Work, start: int) -> int:

@@ -7,6 +7,7 @@ from flcav.perception.metrics.average_precision import (
     interval_words,
     orientation_similarity,
     right_headings,
+    weighted_precision,
 )
 from flcav.perception.metrics.calibration import calibration_error, fit_logistic
 from flcav.perception.metrics.matching import Matches, match
@@ -22,4 +23,5 @@ __all__ = [
     "match",
     "orientation_similarity",
     "right_headings",
+    "weighted_precision",
 ]

@@ -22,13 +22,13 @@ def average_precision(matches: Matches, frames: ArrayLike | None = None) -> floa
 
     NaN where those frames hold nothing to find.
     """
-    return float(_weighted(matches, _times(matches, frames))[0])
+    return float(weighted_precision(matches, _times(matches, frames))[0])
 
 
 def orientation_similarity(matches: Matches, frames: ArrayLike | None = None) -> float:
     """Return the average orientation similarity (AOS|R40) in [0, AP|R40] over `frames`, as `average_precision` does."""
     worth = (1 + np.cos(np.nan_to_num(matches.turned))) / 2
-    return float(_weighted(matches, _times(matches, frames), worth)[0])
+    return float(weighted_precision(matches, _times(matches, frames), worth)[0])
 
 
 def right_headings(matches: Matches) -> float:
@@ -45,14 +45,16 @@ def bootstrap_interval(
     """
     if len(np.unique(np.asarray(scene_of_frame)[matches.targets > 0])) < 2:
         return float("nan"), float("nan")
-    return over_scenes(lambda times: _weighted(matches, times), scene_of_frame, n, rng=rng)
+    return over_scenes(lambda times: weighted_precision(matches, times), scene_of_frame, n, rng=rng)
 
 
 def bootstrap_difference(
     before: Matches, after: Matches, scene_of_frame: ArrayLike, n: int = REDRAWS, *, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Return the 95 % percentile interval of AP(after) - AP(before), both on the same redrawn frames."""
-    return over_scenes(lambda times: _weighted(after, times) - _weighted(before, times), scene_of_frame, n, rng=rng)
+    return over_scenes(
+        lambda times: weighted_precision(after, times) - weighted_precision(before, times), scene_of_frame, n, rng=rng
+    )
 
 
 def interval_words(low: float | None, high: float | None) -> str:
@@ -67,7 +69,7 @@ def _times(matches: Matches, frames: ArrayLike | None) -> NDArray[np.int64]:
     return np.bincount(np.asarray(frames, dtype=np.int64), minlength=len(matches.targets))[None]
 
 
-def _weighted(
+def weighted_precision(
     matches: Matches, times: NDArray[np.int64], worth: NDArray[np.float64] | float = 1.0
 ) -> NDArray[np.float64]:
     """Return AP (n,) where each frame counts `times` (n, F) and each hit `worth` (D,) towards the precision."""

@@ -1,0 +1,67 @@
+"""By what results were made: revision, versions, kind of processor, threads, seed. Nothing of when."""
+
+import functools
+import platform
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import flcav
+from flcav.dataset.layout import PACKAGES, package_versions
+
+LEARNING = ("flwr", "scipy", "torch")  # packages that decide results, beside those that decide recordings
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What would have to be the same for the same result."""
+
+    revision: str | None  # of git; None where flcav does not run from a checkout
+    uncommitted: bool  # changes since that revision, in the package's folder
+    versions: Mapping[str, str]
+    processor: str  # kind of, see `flcav.perception.device`
+    threads: int
+    seed: int | None
+
+
+def provenance(seed: int | None = None) -> Provenance:
+    """Return the provenance of what this process makes on its processor."""
+    import torch  # here, so that steps without networks start without it
+
+    from flcav.perception.device import CPU, processor_of
+
+    revision, uncommitted = checkout(Path(flcav.__file__).parent)
+    return Provenance(revision, uncommitted, versions(), processor_of(CPU), torch.get_num_threads(), seed)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide results, as far as they are installed."""
+    found = {"python": platform.python_version()}
+    for name in sorted({*PACKAGES, *LEARNING}):
+        try:
+            found |= package_versions((name,))
+        except PackageNotFoundError:
+            continue  # embreex is not everywhere
+    return found
+
+
+@functools.cache
+def checkout(folder: Path) -> tuple[str | None, bool]:
+    """Return the revision of the git checkout that `folder` is tracked in, and whether files below it have changed.
+
+    None where there is no git, no checkout, or one that ignores the folder, as it does an environment within it.
+    """
+    tracked = _git(folder, "ls-files", "--", ".")
+    revision = _git(folder, "rev-parse", "HEAD") if tracked else None
+    return revision, bool(revision and _git(folder, "status", "--porcelain", "--", "."))
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    command = ["git", "--no-optional-locks", *arguments]
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
