@@ -15,7 +15,9 @@ import flcav
 VAGUE = frozenset({"Any", "object"})
 
 UNCHECKED = "takes what a user's file holds, before it is checked"
-VIEWER = "Rerun's own types: the extra `view` is not installed where types are checked"
+EXTRA = "types of an extra (view, ray) that is not installed where types are checked"
+STEPS = "a step's function, arguments and JSON value: whatever the step is"
+OWN = "what a user's module holds, of the protocol that was asked for"
 DTYPE = "a cloud or a picture: arrays of whatever type of number"
 GENERIC = "the same for every curve, task, network or sample: the parameters play no part"
 MANIFEST = "manifest.json as it is read; a record of its own is wanted"
@@ -28,8 +30,8 @@ ALLOWED: Mapping[str, str] = {
     "flcav.config:shorten": UNCHECKED,
     "flcav.dataset.layout:read_manifest": MANIFEST,
     "flcav.dataset.leakage:leaks": MANIFEST,
+    "flcav.dataset.ray_engine:ray_session": EXTRA,
     "flcav.dataset.store:Dataset.__init__": MANIFEST,
-    "flcav.experiments.demo:run_demo": STUDY,
     "flcav.experiments.demo_arms:draw_arms": STUDY,
     "flcav.experiments.demo_arms:run_arms": STUDY,
     "flcav.experiments.fig3a:draw_fig3a": STUDY,
@@ -45,15 +47,24 @@ ALLOWED: Mapping[str, str] = {
     "flcav.optimization.problem_file:learned": GENERIC,
     "flcav.perception.agents:choose_frames": GENERIC,
     "flcav.perception.errors:RegistersErrors.register_errors": GENERIC,
-    "flcav.perception.objects.evaluate:Evaluation.summary": FOUND,
     "flcav.perception.objects.infer:box_rows": FOUND,
     "flcav.perception.objects.infer:boxes_of_rows": FOUND,
+    "flcav.perception.outcomes:Outcomes.arrays": DTYPE,
+    "flcav.perception.outcomes:difference": GENERIC,
+    "flcav.perception.outcomes:interval": GENERIC,
+    "flcav.perception.outcomes:measurable": GENERIC,
+    "flcav.perception.outcomes:measured": GENERIC,
+    "flcav.perception.outcomes:score_on": GENERIC,
+    "flcav.perception.sharing:shared": GENERIC,
     "flcav.perception.task:Finding.result": FOUND,
     "flcav.perception.task:Finding.seen": DTYPE,
     "flcav.perception.task:Task.evaluate": FOUND,
     "flcav.perception.task:Task.evaluation_lines": FOUND,
     "flcav.perception.task:Task.finding_lines": FOUND,
     "flcav.perception.task:Task.score": FOUND,
+    "flcav.perception.task:configuration": GENERIC,
+    "flcav.perception.task:fresh": GENERIC,
+    "flcav.perception.tasks:task_named": GENERIC,
     "flcav.perception.tracking.evaluate:evaluate_tracks": FOUND,
     "flcav.perception.tracking.evaluate:tracks_lines": FOUND,
     "flcav.perception.training.loop:train_steps": GENERIC,
@@ -61,20 +72,24 @@ ALLOWED: Mapping[str, str] = {
     "flcav.perception.training.run:train_network": GENERIC,
     "flcav.perception.weather.task:over_the_whole_space": FOUND,
     "flcav.perception.weights:load_network": GENERIC,
+    "flcav.perception.weights:load_weights": GENERIC,
+    "flcav.perception.weights:save_network": GENERIC,
     "flcav.perception.weights:shipped": GENERIC,
+    "flcav.pipeline.steps.run:run_steps": STEPS,
+    "flcav.pipeline.steps.step:Step.arguments": STEPS,
+    "flcav.pipeline.steps.step:Step.run": STEPS,
+    "flcav.pipeline.steps.step:Work.result": STEPS,
+    "flcav.plugins:load_own": OWN,
     "flcav.report.clouds:compare": STUDY,
     "flcav.report.clouds:real_frame": FOUND,
     "flcav.report.curve_charts:fig3a": STUDY,
-    "flcav.report.figures:ap_by_round": STUDY,
     "flcav.report.figures:arms": STUDY,
-    "flcav.report.figures:megabytes": STUDY,
-    "flcav.report.figures:overview": STUDY,
     "flcav.report.html:render": STUDY,
     "flcav.report.inference:sign_boxes": FOUND,
     "flcav.report.plans:predicted_and_realised": STUDY,
     "flcav.report.predicted_paths:paths_on_map": FOUND,
-    "flcav.report.rerun_log:blueprint": VIEWER,
-    "flcav.report.rerun_log:log_scene": VIEWER,
+    "flcav.report.rerun_log:blueprint": EXTRA,
+    "flcav.report.rerun_log:log_scene": EXTRA,
 }
 
 
