@@ -76,12 +76,12 @@ def load_weights(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path) 
     _fill(network, tensors, path)
 
 
-def to_arrays(network: nn.Module) -> dict[str, NDArray[Any]]:
+def to_arrays(network: nn.Module) -> dict[str, NDArray[np.number]]:
     """Return copies of parameters and buffers by name, without the counters of batch normalisation."""
     return {name: tensor.detach().cpu().numpy().copy() for name, tensor in _learned(network).items()}
 
 
-def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
+def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[np.number]]) -> None:
     """Set parameters and buffers from what `to_arrays` returned; raises `InputError` where they do not fit."""
     state = _learned(network)
     if set(arrays) != set(state):
