@@ -14,8 +14,9 @@ from flcav.config import read_config
 from flcav.perception.signs.config import CONFIGURATIONS
 from flcav.perception.signs.detect import detect
 from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.outcomes import LOWEST_SCORE
 from flcav.perception.signs.samples import Sample, sample_of
-from flcav.perception.signs.task import LOWEST_SCORE, SIGNS
+from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import fresh
 from flcav.perception.training import adamw, step
 from flcav.seeds import stream

@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from flcav.experiments.demo import demo_protocol, demo_steps
 
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
+from flcav.pipeline.graph import Graph
+from flcav.pipeline.recipe import Federation, load_run_recipe
 from flcav.pipeline.steps import Step
+from flcav.sources.recipe import recipe_path
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "06_bring_your_own_strategy.py"
 SCHEDULE = Schedule(rounds=3, steps=2, learning_rate=0.1, final_learning_rate=0.05, seed=3)
@@ -135,14 +137,19 @@ def test_it_travels_to_the_step_that_federates_and_is_in_its_fingerprint(strateg
     assert len({print_of(each) for each in (strategy, *changed)}) == 1 + len(numbers)
 
 
-def test_another_strategy_leaves_what_comes_before_it_as_it_is(strategy):
-    def prints(of: Strategy) -> dict[str, str]:
+def test_another_strategy_leaves_what_comes_before_it_as_it_is():
+    def prints(of: str) -> dict[str, str]:
+        recipe = load_run_recipe(recipe_path("runs/demo"))
+        changed = recipe.model_copy(update={"federation": Federation(strategy=of)})
         found: dict[str, str] = {}
-        for step in demo_steps(demo_protocol(1), of):
+        for step in Graph(changed, Path()).steps:
             found[step.name] = step.fingerprint(found)
         return found
 
-    one, other = prints(strategy), prints(Other())
+    one, other = prints("fedavg"), prints("my_package.own:Last")
     changed = {name for name in one if one[name] != other[name]}
-    assert {"grid-edge-chosen", "grid-edge-densest", "ring-edge-chosen", "cloud", "test-cloud-grid"} <= changed
-    assert {"plan", "pretrain", "grid-place", "grid-edge", "test-pretrain-grid"}.isdisjoint(changed)
+    federated = {"grid-edge-fl-objects", "grid-edge-fl-objects-densest", "ring-edge-fl-objects", "cloud-fl-objects"}
+    assert federated | {"test-cloud-fl-objects-grid"} <= changed
+    before = {"pretrain-objects", "grid-place", "grid-edge-objects", "test-pretrain-objects-grid"}
+    assert before <= set(one)
+    assert before.isdisjoint(changed)

@@ -135,7 +135,8 @@ class Graph:
         recipe, names = self.recipe, self.names
         starts = recipe.with_role("pretrain")
         pools = {task: [names.recording(region, "pool", task) for region in starts] for task in recipe.tasks}
-        asked = recipe.model_dump(mode="json", exclude={"arms", "splits", "training", "recording"})
+        asked = recipe.model_dump(mode="json", exclude={"arms", "splits", "training", "recording", "placement"})
+        asked["federation"] = {"edge_rounds_per_cloud_round": recipe.federation.edge_rounds_per_cloud_round}
         planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "beside": str(self.beside)}
         plan = names.plan(arm.name)
         self._add(_step(plan, plan_step, planned, [step for steps in pools.values() for step in steps]))

@@ -340,7 +340,13 @@ def _grouped(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[int, 
     if not numbers:
         return split.vehicles
     sites = sites_of(split, split if steps["recorded"] else None)
-    return frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], steps["group_range_m"])
+    near = frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], steps["group_range_m"])
+    if not near:
+        raise InputError(
+            f"{split.data.folder.parent.name}: no vehicle comes within {steps['group_range_m']:g} m "
+            f"(placement.group_range_m) of a sensor, so that none can take part"
+        )
+    return near
 
 
 def _edge_groups(recipe: RunRecipe) -> tuple[int, ...]:

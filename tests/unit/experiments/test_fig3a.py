@@ -1,11 +1,12 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
-from flcav.experiments.planning import history_table
 
 from flcav.experiments.fig3a import article_graph, draw_fig3a, fig3a
 from flcav.optimization.graph import to_problem
+from flcav.pipeline.planning import history_of
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +34,7 @@ def test_bands_hold_their_curve_and_curves_rise(results: dict) -> None:
 
 def test_every_point_of_our_own_history_is_drawn(results: dict) -> None:
     drawn = sum(len(line["points"]) for line in results["own"]["lines"])
-    assert drawn == len(history_table())
+    assert drawn == len(history_of("objects", "objects", Path()).accuracy)
 
 
 def test_the_figure_is_drawn_from_what_the_file_holds(results: dict) -> None:

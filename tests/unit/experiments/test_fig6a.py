@@ -1,5 +1,4 @@
 import copy
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,16 +8,11 @@ from flcav.experiments.fig6a_allocation import (
     COUNTS,
     PLANS,
     STAGES,
-    _recordings,
-    _share,
-    allocation_protocol,
     draw_allocation,
-    plan_steps,
     summarise,
 )
 from flcav.experiments.fig6a_findings import EQUAL, JOINT, allocation_findings
 from flcav.experiments.fig6a_tables import tables
-from flcav.pipeline.steps import Step, run_steps
 
 PREDICTED = {EQUAL: (0.49, 0.60, 0.62), JOINT: (0.53, 0.63, 0.66)}
 HISTORY = {"samples": [80.0, 320.0], "edge_rounds": [0.0, 6.0], "cloud_rounds": [0.0, 3.0]}
@@ -141,39 +135,3 @@ def test_tables_hold_a_row_per_run() -> None:
 
 def test_the_picture_is_a_png() -> None:
     assert draw_allocation(WRONG).startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("scale", ["paper", "quick"])
-def test_every_step_comes_after_what_it_needs(scale: str) -> None:
-    for name in PLANS:
-        before: set[str] = set()
-        for step in plan_steps(allocation_protocol(1, scale), name):
-            assert set(step.needs) <= before, step.name
-            before.add(step.name)
-
-
-def test_both_plans_share_recordings_that_no_plan_decides() -> None:
-    protocol = allocation_protocol(1, "quick")
-    shared = {step.name: step.fingerprint({}) for step in _recordings(protocol)}
-    assert {"suburb-pool", "suburb-validation", "grid-registry", "grid-test", "ring-test"} <= set(shared)
-    for name in PLANS:
-        steps = {step.name: step for step in plan_steps(protocol, name)}
-        assert all(steps[key].fingerprint({}) == value for key, value in shared.items())
-    plans = [next(step for step in plan_steps(protocol, name) if step.name == "plan") for name in PLANS]
-    assert plans[0].run is not plans[1].run
-
-
-def _write(work: Any, text: str) -> str:
-    (work.folder / "data").write_text(text)
-    return text
-
-
-def test_shared_steps_are_done_where_they_are_linked(tmp_path: Path) -> None:
-    steps = [Step("frames", _write, {"text": "recorded"})]
-    run_steps(steps, tmp_path / "frames", jobs=1, notify=lambda *told: None)
-    for _ in range(2):  # a second start finds the links
-        _share(steps, tmp_path / "frames", tmp_path / "run")
-    told: list[tuple[str, str]] = []
-    values = run_steps(steps, tmp_path / "run", jobs=1, notify=lambda step, a, b, note: told.append((step, note)))
-    assert values == {"frames": "recorded"}
-    assert told == [("frames", "done before")]

@@ -5,106 +5,127 @@ from typing import Any
 import numpy as np
 
 from flcav.geometry import Boxes
+from flcav.pipeline.provenance import Provenance
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results import (
+    ArmResult,
+    Block,
+    Difference,
+    Estimate,
+    Finding,
+    LinkUse,
+    Placed,
+    Plan,
+    Pole,
+    Pretrained,
+    Run,
+    Spent,
+    TaskPlan,
+    Test,
+    Tested,
+)
 from flcav.report.maps import ErrorMap, poles_of
 from flcav.report.sweeps import Detections, Sweep
 from flcav.world.town import load_town
 
-
-def stage(name: str, town: str, ap50: float, **more: float) -> dict[str, Any]:
-    return {
-        "name": name,
-        "town": town,
-        "ap50": ap50,
-        "ap50_low": ap50 - 0.041,
-        "ap50_high": ap50 + 0.038,
-        "ap70": ap50 - 0.19,
-        "aos50": ap50 - 0.02,
-        "right_headings": 0.96,
-        "samples": 0,
-        "rounds": 0,
-        "wireless_mb": 0.0,
-        "wireline_mb": 0.0,
-    } | more
+MEANS = {"grid": (0.412, 0.503, 0.511), "ring": (0.381, 0.447, 0.468)}
+BUDGETS = {"wireless": 230.0, "wireline": 135.0}
+SENT = (
+    ("pretrain", "wireless", 118.4),
+    ("pretrain", "wireline", 118.4),
+    ("edge", "wireless", 64.2),
+    ("edge", "wireline", 0.0),
+    ("cloud", "wireless", 32.1),
+    ("cloud", "wireline", 9.2),
+)
+STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"}
 
 
-def results() -> dict[str, Any]:
-    """Return the results of an invented run; findings are left to `flcav.experiments.findings`."""
-    stages = {
-        town: [
-            stage("pretrained", town, first, samples=320, wireless_mb=118.4, wireline_mb=118.4),
-            stage("edge FL", town, second, rounds=6, wireless_mb=64.2),
-            stage("edge + cloud FL", town, third, rounds=3, wireless_mb=32.1, wireline_mb=9.2),
-        ]
-        for town, first, second, third in (("grid", 0.412, 0.503, 0.511), ("ring", 0.381, 0.447, 0.468))
-    }
-    return {
-        "seed": 7,
-        "elapsed_s": 538.2,
-        "test_frames": 96,
-        "test_scenes": 8,
-        "stages": stages["grid"],
-        "ring": stages["ring"],
-        "placement": {
-            "chosen": 2,
-            "densest": 8,
-            "errors": 61,
-            "covered": 19,
-            "range_m": 40.0,
-            "ap50_chosen": 0.503,
-            "ap50_densest": 0.471,
-            "difference": {"mean": 0.032, "low": 0.004, "high": 0.061},
-            "coverage": [
-                {"pole": pole, "covered": covered, "actors": actors}
-                for pole, (covered, actors) in enumerate(
-                    zip((12, 19, 9, 7, 15, 11, 4, 6, 3), (5.1, 6.2, 4.4, 3.8, 7.0, 5.5, 6.1, 12.4, 2.2)), start=1
-                )
-            ],
-        },
-        "differences": {
-            "edge_minus_pretrained": {"mean": 0.091, "low": 0.055, "high": 0.127},
-            "cloud_minus_edge": {"mean": 0.008, "low": -0.012, "high": 0.027},
-        },
-        "allocation": {
-            "samples": 320,
-            "edge_rounds": 6,
-            "cloud_rounds": 3,
-            "predicted_error": 0.47,
-            "vehicles": [4, 3],
-        },
-        "ledger": {
-            "wireless": {"budget_mb": 230.0, "used_mb": 214.7, "planned_mb": 216.0},
-            "wireline": {"budget_mb": 135.0, "used_mb": 127.6, "planned_mb": 128.1},
-        },
-        "ledger_by_stage": [
-            {"stage": stage, "link": link, "mb": mb}
-            for stage, link, mb in (
-                ("pretraining", "wireless", 118.4),
-                ("pretraining", "wireline", 118.4),
-                ("edge FL", "wireless", 64.2),
-                ("edge FL", "wireline", 0.0),
-                ("cloud FL", "wireless", 32.1),
-                ("cloud FL", "wireline", 9.2),
+def run() -> Run:
+    """Return an invented run."""
+    covered = (12, 19, 9, 7, 15, 11, 4, 6, 3)
+    actors = (5.1, 6.2, 4.4, 3.8, 7.0, 5.5, 6.1, 12.4, 2.2)
+    poles = tuple(Pole(*row) for row in zip(range(1, 10), covered, actors, strict=True))
+    verdicts = (("edge", "held"), ("cloud", "undecided"), ("pole", "did not hold"))
+    own = TaskPlan(320, 6, 3, 216.0, 128.1, 0.37, 1.35, {"pretrain": 0.41, "edge": 0.5, "cloud": 0.53})
+    return Run(
+        recipe=RunRecipe.model_validate(
+            {
+                "seed": 7,
+                "tasks": {"objects": {"history": "objects"}},
+                "regions": {
+                    "suburb": {"role": "pretrain"},
+                    "grid": {"role": "federate"},
+                    "ring": {"role": "federate"},
+                },
+                "budgets_mb": BUDGETS,
+            }
+        ),
+        arms={
+            MAIN: ArmResult(
+                plan=Plan("joint", {"objects": own}),
+                placed=(Placed("grid", "vrcsp", (2,), 61, 19, 40.0, poles),),
+                stages=(),
+                links={"wireless": LinkUse(230.0, 216.0, 214.7), "wireline": LinkUse(135.0, 128.1, 127.6)},
+                spent=tuple(Spent(stage, "objects", link, mb) for stage, link, mb in SENT),
             )
-        ],
-        "rounds": rounds(),
-        "versions": {"flcav": "0.1.0", "numpy": "2.2.6", "torch": "2.9.0"},
-    }
+        },
+        pretrained=(Pretrained("objects", "tiny", {"suburb": (0,)}, (Block(1.0, 2.0, 0.4),), 100, 0.5),),
+        watched=(),
+        tested=tuple(
+            Test(MAIN, stage, town, "objects", "test", tested(town, mean))
+            for town, means in MEANS.items()
+            for stage, mean in zip((PRETRAIN, EDGE, CLOUD), means, strict=True)
+        ),
+        differences=(
+            Difference(
+                "grid, objects: edge FL - pretrained", MAIN, EDGE, MAIN, PRETRAIN, "grid", "objects",
+                Estimate(0.091, 0.055, 0.127),
+            ),
+        ),
+        findings=tuple(
+            Finding("grid, objects", f"Does {name} help?", said, f"What {name} did.") for name, said in verdicts
+        ),
+        gap_closed={},
+        caveats=("ideal road detector, upper bound",),
+        provenance=Provenance("0123456789abcdef", False, {"flcav": "0.1.0", "torch": "2.9.0"}, "x86-64", 1, 7),
+        elapsed_s=538.2,
+    )  # fmt: skip
+
+
+def tested(town: str, mean: float) -> Tested:
+    estimate = Estimate(mean, mean - 0.041, mean + 0.038)
+    return Tested(town, "objects", "AP50", estimate, {"AP70": mean - 0.19, "right headings": 0.96}, 96, 8)
+
+
+def tests() -> list[dict[str, Any]]:
+    """Return the tested rows of a chart."""
+    return [
+        {"stage": stage, "town": town, "score": mean, "low": mean - 0.041, "high": mean + 0.038}
+        for town, means in MEANS.items()
+        for stage, mean in zip(STAGE_NAMES.values(), means, strict=True)
+    ]
+
+
+def sent() -> list[dict[str, Any]]:
+    return [{"stage": STAGE_NAMES[stage], "link": link, "mb": mb} for stage, link, mb in SENT]
 
 
 def rounds() -> list[dict[str, Any]]:
     rng = np.random.default_rng(3)
-    rows = [
-        {"stage": "pretraining", "round": n, "town": "suburb", "ap50": 0.62 * (1 - np.exp(-n / 3))} for n in range(1, 9)
+    rows: list[dict[str, Any]] = [
+        {"stage": "pretraining", "round": n, "town": "suburb", "score": 0.62 * (1 - np.exp(-n / 3))}
+        for n in range(1, 9)
     ]
     for town, start, middle, end in (("grid", 0.41, 0.50, 0.51), ("ring", 0.38, 0.45, 0.47)):
-        rows.append({"stage": "pretraining", "round": 8, "town": town, "ap50": start})
+        rows.append({"stage": "pretraining", "round": 8, "town": town, "score": start})
         for n in range(1, 7):
-            ap50 = middle - (middle - start) * np.exp(-n / 2) + rng.normal(0, 0.006)
-            rows.append({"stage": "edge FL", "round": n, "town": town, "ap50": ap50})
+            score = middle - (middle - start) * np.exp(-n / 2) + rng.normal(0, 0.006)
+            rows.append({"stage": "edge FL", "round": n, "town": town, "score": score})
         for n in range(1, 4):
-            ap50 = end - (end - middle) * np.exp(-n) + rng.normal(0, 0.004)
-            rows.append({"stage": "cloud FL", "round": n, "town": town, "ap50": ap50})
-    return [{**row, "ap50": float(row["ap50"])} for row in rows]
+            score = end - (end - middle) * np.exp(-n) + rng.normal(0, 0.004)
+            rows.append({"stage": "cloud FL", "round": n, "town": town, "score": score})
+    return [{**row, "score": float(row["score"])} for row in rows]
 
 
 def error_map(town: str = "grid", errors: int = 61) -> ErrorMap:

@@ -11,9 +11,8 @@ from matplotlib.text import Text
 
 from flcav.report import figures, style
 
-RESULTS = made_up_run.results()
-TESTED = RESULTS["stages"] + RESULTS["ring"]
-BUDGETS = {link: row["budget_mb"] for link, row in RESULTS["ledger"].items()}
+TESTED, ROUNDS = made_up_run.tests(), made_up_run.rounds()
+BUDGETS, SENT = made_up_run.BUDGETS, made_up_run.sent()
 ARMS = [
     {"arm": arm, "town": town, "ap50": ap50, "low": ap50 - 0.03, "high": ap50 + 0.04}
     for town in ("grid", "ring")
@@ -23,10 +22,10 @@ ARMS = [
 DRAWN: dict[str, Callable[[], Figure]] = {
     "town_map": lambda: figures.town_map(made_up_run.error_map()),
     "before_after": lambda: figures.before_after(made_up_run.sweep()),
-    "ap_by_round": lambda: figures.ap_by_round(RESULTS["rounds"], TESTED),
-    "megabytes": lambda: figures.megabytes(RESULTS["ledger_by_stage"], BUDGETS),
+    "by_round": lambda: figures.by_round(ROUNDS, TESTED, "AP50"),
+    "megabytes": lambda: figures.megabytes(SENT, BUDGETS),
     "arms": lambda: figures.arms(ARMS),
-    "overview": lambda: figures.overview(made_up_run.error_map(), made_up_run.sweep(), RESULTS["rounds"], TESTED),
+    "overview": lambda: figures.overview(made_up_run.error_map(), made_up_run.sweep(), ROUNDS, TESTED, "AP50"),
 }
 
 
@@ -84,13 +83,13 @@ def test_ahead_is_up_and_left_is_left() -> None:
 
 
 def test_tested_values_stand_at_the_ends_of_their_stages() -> None:
-    axes = figures.ap_by_round(RESULTS["rounds"], TESTED).axes[0]
+    axes = figures.by_round(ROUNDS, TESTED, "AP50").axes[0]
     assert _tested(axes) == {0: {0.412, 0.381}, 1: {0.503, 0.447}, 2: {0.511, 0.468}}
 
 
 def test_a_stage_without_rounds_takes_its_tested_values_with_it() -> None:
-    rounds = [row for row in RESULTS["rounds"] if row["stage"] != "edge FL"]
-    axes = figures.ap_by_round(rounds, TESTED).axes[0]
+    rounds = [row for row in ROUNDS if row["stage"] != "edge FL"]
+    axes = figures.by_round(rounds, TESTED, "AP50").axes[0]
     assert _tested(axes) == {0: {0.412, 0.381}, 1: {0.511, 0.468}}
     assert {"pretraining", "cloud FL"} <= {text.get_text() for text in axes.texts}
 
@@ -105,11 +104,11 @@ def _tested(axes) -> dict[int, set[float]]:
 
 
 def test_bars_add_up_to_the_ledger_and_budgets_stand_where_they_are() -> None:
-    axes = figures.megabytes(RESULTS["ledger_by_stage"], BUDGETS).axes[0]
+    axes = figures.megabytes(SENT, BUDGETS).axes[0]
     bars = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
     for y, link in enumerate(BUDGETS):
         own = [bar for bar in bars if bar.get_y() < y < bar.get_y() + bar.get_height()]
-        total = sum(row["mb"] for row in RESULTS["ledger_by_stage"] if row["link"] == link)
+        total = sum(row["mb"] for row in SENT if row["link"] == link)
         assert sum(bar.get_width() for bar in own) == pytest.approx(total)
         assert max(bar.get_x() + bar.get_width() for bar in own) == pytest.approx(total)
     assert "215 of 230 MB" in {text.get_text() for text in axes.texts}
@@ -121,3 +120,19 @@ def test_arms_stand_in_a_panel_per_town_with_their_intervals() -> None:
     assert [grid.get_title(loc="left"), ring.get_title(loc="left")] == ["grid", "ring"]
     assert [label.get_text() for label in ring.get_yticklabels()] == ["pretrained", "edge FL", "oracle"]
     assert "0.500  (0.470–0.540)" in {text.get_text() for text in ring.texts}
+
+
+def test_a_town_of_ones_own_has_a_colour_of_its_own() -> None:
+    rounds = [{**row, "town": "mine" if row["town"] == "ring" else row["town"]} for row in ROUNDS]
+    axes = figures.by_round(rounds, [], "AP50").axes[0]
+    colours = {str(line.get_color()) for line in axes.get_lines() if len(np.asarray(line.get_xdata())) > 2}
+    assert len(colours) >= 3
+
+
+def test_a_measure_of_one_scene_is_drawn_without_a_bar() -> None:
+    single = [{**row, "low": None, "high": None} for row in TESTED]
+    assert _tested(figures.by_round(ROUNDS, single, "AP50").axes[0]) == {
+        0: {0.412, 0.381},
+        1: {0.503, 0.447},
+        2: {0.511, 0.468},
+    }

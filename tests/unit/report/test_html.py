@@ -1,21 +1,20 @@
 from html.parser import HTMLParser
+from typing import Any
 
 import made_up_run
 import pytest
 from jinja2 import UndefinedError
 
+from flcav.pipeline.results import Finding
 from flcav.report.html import render
+from flcav.report.run_page import page
 
 PIXEL = b"\x89PNG made up"
-PICTURES: dict[str, bytes] = dict.fromkeys(("town_map", "before_after", "ap_by_round", "megabytes"), PIXEL)
+PICTURES: dict[str, bytes] = dict.fromkeys(("map_grid", "before_after", "rounds_objects", "megabytes"), PIXEL)
 
 
-def results() -> dict:
-    findings = [
-        {"name": name, "question": f"Does {name} help?", "verdict": verdict, "sentence": f"What {name} did."}
-        for name, verdict in (("edge", "held"), ("cloud", "undecided"), ("pole", "did not hold"))
-    ]
-    return made_up_run.results() | {"findings": findings}
+def results() -> dict[str, Any]:
+    return page(made_up_run.run())
 
 
 class Page(HTMLParser):
@@ -47,62 +46,63 @@ class Page(HTMLParser):
 
 def test_the_page_needs_nothing_but_itself() -> None:
     text = render(results(), PICTURES)
-    page = Page(text)
-    assert page.open == []
-    assert not {"script", "link", "iframe"} & {tag for tag, _ in page.tags}
-    sources = [attributes[key] for _, attributes in page.tags for key in ("src", "href") if key in attributes]
+    read = Page(text)
+    assert read.open == []
+    assert not {"script", "link", "iframe"} & {tag for tag, _ in read.tags}
+    sources = [attributes[key] for _, attributes in read.tags for key in ("src", "href") if key in attributes]
     assert len(sources) == 4
     assert all(str(source).startswith("data:image/png;base64,") for source in sources)
     assert "url(" not in text
-    assert "viewport" in {attributes.get("name") for tag, attributes in page.tags if tag == "meta"}
-    assert all(attributes.get("alt") for tag, attributes in page.tags if tag == "img")
+    assert "viewport" in {attributes.get("name") for tag, attributes in read.tags if tag == "meta"}
+    assert all(attributes.get("alt") for tag, attributes in read.tags if tag == "img")
 
 
 def test_the_page_tells_the_numbers() -> None:
     text = Page(render(results(), PICTURES)).text
     for shown in (
-        "pretrained 0.412 0.371–0.450",
-        "edge + cloud FL 0.511 0.470–0.549",
-        "96 test frames of 8 scenes",
-        "ideal road detector: an upper bound",
+        "objects, pretrained 0.412 0.371–0.450",
+        "objects, edge + cloud FL 0.511 0.470–0.549",
+        "edge + cloud FL ring 0.468 0.427–0.506 0.278 0.96 96 8",
+        "ideal road detector, upper bound",
+        "grid, objects: edge FL - pretrained +0.091 +0.055 to +0.127",
         "wireless 230.0 216.0 214.7",
         "2 · placed 19 of 61 6.2",
         "8 · densest traffic 6 of 61 12.4",
-        "320 samples, 6 edge rounds, 3 cloud rounds for 4 + 3 vehicles",
-        "Seed 7; 538 s; flcav 0.1.0",
+        "objects 320 6 3 216.0 128.1 0.530",
+        "Seed 7; 538 s; x86-64; revision 0123456789; flcav 0.1.0",
     ):
         assert shown in text
 
 
 def test_an_interval_that_one_scene_leaves_unknown_is_said() -> None:
     told = results()
-    told["stages"][0] = told["stages"][0] | {"ap50_low": None, "ap50_high": None}
+    told["stages"][0] = told["stages"][0] | {"low": None, "high": None}
     assert "pretrained 0.412 no interval: one scene" in Page(render(told, PICTURES)).text
 
 
-def test_verdicts_stand_at_their_findings_and_under_the_pictures() -> None:
+def test_verdicts_stand_at_their_findings() -> None:
     text = render(results(), PICTURES)
-    page = Page(text).text
-    assert "undecided Does cloud help? What cloud did." in page
-    assert page.count("What pole did.") == 2
+    told = Page(text).text
+    assert "undecided Does cloud help? What cloud did." in told
+    assert told.count("What pole did.") == 1
     assert '<span class="badge did-not-hold">did not hold</span>' in text
 
 
 def test_values_are_escaped() -> None:
     told = results()
-    told["findings"][0]["sentence"] = "<script>alert('x')</script> & more"
+    told["findings"] = (Finding("grid", "Really?", "held", "<script>alert('x')</script> & more"),)
     text = render(told, {})
     assert "<script" not in text
     assert "&lt;script&gt;" in text
 
 
 def test_a_picture_that_was_not_made_is_left_out() -> None:
-    page = Page(render(results(), {"megabytes": PIXEL}))
-    assert [tag for tag, _ in page.tags].count("img") == 1
+    read = Page(render(results(), {"megabytes": PIXEL}))
+    assert [tag for tag, _ in read.tags].count("img") == 1
 
 
 def test_missing_results_are_not_passed_over() -> None:
     told = results()
-    del told["placement"]["covered"]
-    with pytest.raises(UndefinedError, match="covered"):
+    del told["plan"]
+    with pytest.raises(UndefinedError, match="plan"):
         render(told, PICTURES)
