@@ -32,10 +32,18 @@ class Format(StrEnum):
 
 
 class Engine(StrEnum):
-    """Who records, see `flcav.dataset.recorder`."""
+    """Who works, see `flcav.dataset.recorder` and `flcav.experiments.steps`."""
 
     processes = "processes"
     ray = "ray"
+
+
+class Stale(StrEnum):
+    """What becomes of what other code did, see `flcav.experiments.steps`."""
+
+    refuse = "refuse"
+    redo = "redo"
+    keep = "keep"
 
 
 class Method(StrEnum):
