@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from flcav.experiments.demo import demo_protocol, demo_steps
-from flcav.experiments.steps import Step
+from flcav.pipeline.steps import Step
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy

@@ -23,7 +23,7 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.demo import demo_steps, run_demo
 from flcav.experiments.planning import update_mb
 from flcav.experiments.protocol import Protocol, Split, Training
-from flcav.experiments.steps import run_steps, stopwatch
+from flcav.pipeline.steps import run_steps, stopwatch
 from flcav.network.ledger import LINKS, Ledger, Link
 
 pytestmark = pytest.mark.slow
@@ -48,7 +48,7 @@ import sys
 from pathlib import Path
 from flcav.experiments.demo import demo_steps
 from flcav.experiments.protocol import Protocol
-from flcav.experiments.steps import run_steps
+from flcav.pipeline.steps import run_steps
 steps = demo_steps(Protocol.model_validate_json(sys.argv[1]))
 run_steps(steps, Path(sys.argv[2]), jobs=1, notify=lambda *told: None)
 """
@@ -58,7 +58,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from flcav.experiments.demo import demo_steps
 from flcav.experiments.protocol import Protocol
-from flcav.experiments.steps import run_steps
+from flcav.pipeline.steps import run_steps
 
 @dataclass(frozen=True)
 class Last:

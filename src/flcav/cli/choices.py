@@ -32,14 +32,14 @@ class Format(StrEnum):
 
 
 class Engine(StrEnum):
-    """Who works, see `flcav.dataset.recorder` and `flcav.experiments.steps`."""
+    """Who works, see `flcav.dataset.recorder` and `flcav.pipeline.steps`."""
 
     processes = "processes"
     ray = "ray"
 
 
 class Stale(StrEnum):
-    """What becomes of what other code did, see `flcav.experiments.steps`."""
+    """What becomes of what other code did, see `flcav.pipeline.steps`."""
 
     refuse = "refuse"
     redo = "redo"

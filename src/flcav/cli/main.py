@@ -10,7 +10,6 @@ from flcav.cli import (
     allocate,
     birdseye,
     camera,
-    demo,
     errors,
     evaluate,
     export,
@@ -23,6 +22,9 @@ from flcav.cli import (
     train,
     validate,
     view,
+)
+from flcav.cli import (
+    run as run_command,
 )
 from flcav.cli.interruption import Interrupted
 from flcav.cli.literal import literal
@@ -55,7 +57,7 @@ def _main(
 
 
 for command in (
-    demo,
+    run_command,
     towns,
     record,
     validate,

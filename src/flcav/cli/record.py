@@ -30,10 +30,11 @@ def record(
     from flcav.dataset.recorder import record as write
     from flcav.files import check_writable
     from flcav.sources.embedded import EmbeddedSource
-    from flcav.sources.recipe import Recipe
+    from flcav.sources.recipe import Recipe, find_recipe
     from flcav.world.trace import Trace
 
     check_writable(out)
+    recipe = find_recipe(recipe)
     changes = {name: value for name, value in (("frames", frames), ("seed", seed)) if value is not None}
     asked = read_config(Recipe, recipe)
     source = EmbeddedSource(parse_config(Recipe, asked.model_dump() | changes, str(recipe)), recipe.parent)

@@ -84,7 +84,7 @@ def reproduce(
         _task(target.value, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
         run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
-        run(out, numbers, "quick" if quick else "paper", jobs)
+        run(out, count, "quick" if quick else "paper", jobs)
     typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
 
 
@@ -112,13 +112,13 @@ def _fig3a(out: Path) -> None:
 
 
 @when_interrupted()
-def _demo_arms(out: Path, seeds: range, scale: str, jobs: int) -> None:
+def _demo_arms(out: Path, seeds: int, scale: str, jobs: int) -> None:
     from flcav.cli.steps import live_steps
-    from flcav.experiments.demo_arms import arms_protocol, draw_arms, run_arms
+    from flcav.experiments.demo_arms import draw_arms, run_arms, study_recipe
     from flcav.files import write_bytes, write_json
 
     with live_steps(Target.demo_arms.value) as notify:
-        results = run_arms([arms_protocol(seed, scale) for seed in seeds], out, jobs=jobs, notify=notify)
+        results = run_arms(study_recipe("arms", scale), out, seeds=seeds, jobs=jobs, notify=notify)
     write_json(out / "result.json", results)
     write_bytes(out / "arms.png", draw_arms(results))
     for arm, closed in results["summary"]["gap_closed"].items():
@@ -126,13 +126,14 @@ def _demo_arms(out: Path, seeds: range, scale: str, jobs: int) -> None:
 
 
 @when_interrupted()
-def _fig6a_allocation(out: Path, seeds: range, scale: str, jobs: int) -> None:
+def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int) -> None:
     from flcav.cli.steps import live_steps
-    from flcav.experiments.fig6a_allocation import allocation_protocol, draw_allocation, run_allocation
+    from flcav.experiments.demo_arms import study_recipe
+    from flcav.experiments.fig6a_allocation import draw_allocation, run_allocation
     from flcav.files import write_bytes, write_json
 
     with live_steps(Target.fig6a_allocation.value) as notify:
-        results = run_allocation([allocation_protocol(seed, scale) for seed in seeds], out, jobs=jobs, notify=notify)
+        results = run_allocation(study_recipe("allocation", scale), out, seeds=seeds, jobs=jobs, notify=notify)
     write_json(out / "result.json", results)
     write_bytes(out / "plans.png", draw_allocation(results))
     for finding in results["findings"]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from flcav.experiments.steps import FINISHED, Notify
+from flcav.pipeline.steps import FINISHED, Notify
 
 
 @contextlib.contextmanager

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from flcav.experiments.demo_arms import ARMS
-from flcav.experiments.findings import HELD, NOT_HELD, UNDECIDED, verdict
 from flcav.markdown import interval, table
+from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, verdict
 
 
 def tables(results: Mapping[str, Any]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""What each step buys, against its alternatives: seven arms on the same frames, from the same weights, over seeds.
+"""What each step buys, against its alternatives: the arms of recipes/runs/arms.yaml on the same frames, over seeds.
 
 Every arm takes as many optimiser steps as the vehicles of stage II take together, and has a ledger of its own. Within a
 seed, intervals redraw test scenes; over seeds, they are Student's t, so they hold what training and traffic vary too.
@@ -8,34 +8,33 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from flcav.config import read_config
 from flcav.dataset.layout import package_versions
-from flcav.experiments.demo import demo_protocol
-from flcav.experiments.intervals import mean_over_seeds
-from flcav.experiments.pipeline import central_step, cloud_step, edge_step, plan_step, shared_steps, test_step
-from flcav.experiments.points import HISTORY_FILE, append_points, points_of
-from flcav.experiments.pretraining import LEDGER
-from flcav.experiments.protocol import Protocol
-from flcav.experiments.steps import Notify, Step, run_side_by_side
-from flcav.experiments.testing import difference
-from flcav.network.ledger import LINKS, Ledger
+from flcav.intervals import mean_over_seeds
+from flcav.pipeline.findings import in_words
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results import Run
+from flcav.pipeline.run import run_seeds
+from flcav.pipeline.steps import Notify
 from flcav.report import figures, style
+from flcav.sources.recipe import recipe_path
 
-MORE, ORACLE = "more-pretraining", "oracle"
-ARMS = {
+TASK = "objects"
+ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: what the page calls an arm's stage
     "grid": {
-        "pretrained": "pretrain",
-        "more pretraining": MORE,
-        "edge FL, no road sensor": "grid-edge-none",
-        "edge FL, densest pole": "grid-edge-densest",
-        "edge FL, VRCSP pole": "grid-edge-chosen",
-        "edge + cloud FL": "cloud",
-        "oracle": ORACLE,
+        "pretrained": (MAIN, PRETRAIN),
+        "more pretraining": ("more", CENTRAL),
+        "edge FL, no road sensor": ("no_pole", EDGE),
+        "edge FL, densest pole": ("densest", EDGE),
+        "edge FL, VRCSP pole": (MAIN, EDGE),
+        "edge + cloud FL": (MAIN, CLOUD),
+        "oracle": ("oracle", CENTRAL),
     },
     "ring": {
-        "pretrained": "pretrain",
-        "more pretraining": MORE,
-        "edge FL, VRCSP pole": "ring-edge-chosen",
-        "edge + cloud FL": "cloud",
+        "pretrained": (MAIN, PRETRAIN),
+        "more pretraining": ("more", CENTRAL),
+        "edge FL, VRCSP pole": (MAIN, EDGE),
+        "edge + cloud FL": (MAIN, CLOUD),
     },
 }
 COMPARED = (  # (after, before): claims of the article and controls
@@ -47,87 +46,84 @@ COMPARED = (  # (after, before): claims of the article and controls
 )
 
 
-def arms_protocol(seed: int, scale: str) -> Protocol:
-    """Return the reproduction's size: "paper" as committed, "quick" the demo's."""
-    return Protocol(seed=seed) if scale == "paper" else demo_protocol(seed)
+def study_recipe(name: str, scale: str) -> RunRecipe:
+    """Return the committed recipe of a comparison: "paper" as it stands, "quick" of the demo's size."""
+    recipe = read_config(RunRecipe, recipe_path(f"runs/{name}"))
+    return recipe if scale == "paper" else recipe.model_copy(update={"size": "demo"})
 
 
-def arm_steps(protocol: Protocol) -> list[Step]:
-    """Return the steps of all arms of one seed."""
-    steps = shared_steps(protocol, plan_step(protocol))
-    steps += [edge_step(protocol, "grid", sensor) for sensor in ("chosen", "densest", "none")]
-    steps += [edge_step(protocol, "ring", "chosen"), cloud_step(protocol)]
-    steps += [central_step(protocol, MORE, "suburb"), central_step(protocol, ORACLE, "grid")]
-    return steps + [test_step(arm, town) for town, arms in ARMS.items() for arm in arms.values()]
-
-
-def run_arms(protocols: Sequence[Protocol], out: Path, *, jobs: int, notify: Notify) -> dict[str, Any]:
+def run_arms(recipe: RunRecipe, out: Path, *, seeds: int, jobs: int, notify: Notify) -> dict[str, Any]:
     """Run or finish all arms of each seed in folders below `out` and return the results."""
-    folders = [out / f"seed{protocol.seed}" for protocol in protocols]
-    runs = {folder: arm_steps(protocol) for folder, protocol in zip(folders, protocols, strict=True)}
-    values = run_side_by_side(runs, jobs=jobs, notify=notify)
-    for folder in folders:
-        append_points(out / HISTORY_FILE, points_of(values[folder], folder.name))
-    seeds = [_one_seed(protocol, folder, values[folder]) for protocol, folder in zip(protocols, folders, strict=True)]
+    runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify)
+    rows = [one_seed(run) for run in runs]
     return {
-        "protocol": protocols[0].model_dump(mode="json", exclude={"seed"}),
-        "seeds": seeds,
-        "summary": summarise(seeds),
+        "recipe": recipe.model_dump(mode="json", exclude={"seed"}),
+        "seeds": rows,
+        "summary": summarise(rows),
         "versions": package_versions(),
         "note": "road labels come from an ideal road detector: arms with a pole are upper bounds",
     }
 
 
-def _one_seed(protocol: Protocol, folder: Path, values: dict[str, Any]) -> dict[str, Any]:
-    ap = {town: {arm: values[f"test-{step}-{town}"] for arm, step in arms.items()} for town, arms in ARMS.items()}
-    differences = {
-        f"{town}: {after} - {before}": difference(
-            folder / f"test-{ARMS[town][before]}-{town}", folder / f"test-{ARMS[town][after]}-{town}", protocol.seed
-        )
-        for town in ARMS
-        for after, before in COMPARED
-        if {after, before} <= set(ARMS[town])
+def one_seed(run: Run) -> dict[str, Any]:
+    """Return what the page tells of a seed."""
+    main, pretrained = run.arms[MAIN], run.pretrained[0]
+    own, plan = main.links, main.plan.tasks[TASK]
+    ap = {town: {arm: _tested(run, town, *stage) for arm, stage in arms.items()} for town, arms in ARMS.items()}
+    found = {
+        (each.region, each.arm, each.stage, each.before_arm, each.before_stage): each.estimate
+        for each in run.differences
     }
-    grid = ap["grid"]
-    start, end = grid["pretrained"]["ap50"], grid["oracle"]["ap50"]
-    pretraining = values["pretrain"]
+    differences = {
+        f"{town}: {after} - {before}": vars(found[town, *arms[after], *arms[before]])
+        for town, arms in ARMS.items()
+        for after, before in COMPARED
+        if {after, before} <= set(arms)
+    }
+    closed = {
+        arm: run.gap_closed[name]
+        for arm, stage in ARMS["grid"].items()
+        if (name := f"grid, {TASK}: {in_words(*stage)}") in run.gap_closed
+    }
     return {
-        "seed": protocol.seed,
-        "plan": {name: values["plan"]["tasks"][0][name] for name in ("samples", "edge_rounds", "cloud_rounds")},
-        "pretraining": {name: pretraining[name] for name in ("steps", "threshold", "curve")},
-        "placement": {town: values[f"{town}-place"] for town in ARMS},
+        "seed": run.recipe.seed,
+        "plan": {name: getattr(plan, name) for name in ("samples", "edge_rounds", "cloud_rounds")},
+        "pretraining": {
+            "steps": pretrained.steps,
+            "threshold": pretrained.threshold,
+            "curve": [vars(block) for block in pretrained.blocks],
+        },
+        "placement": {placed.region: _placed(run, placed.region) for placed in main.placed},
         "ap": ap,
         "differences": differences,
-        "gap_closed": {
-            arm: (test["ap50"] - start) / (end - start)
-            for arm, test in grid.items()
-            if arm not in ("pretrained", "oracle")
-        },
-        "used_mb": {
-            arm: _used_mb(folder, step) for arm, step in ARMS["grid"].items() if (folder / step / LEDGER).exists()
-        },
+        "gap_closed": closed,
+        "used_mb": {"edge + cloud FL": {link: use.used_mb for link, use in own.items()}},
     }
 
 
-def _used_mb(folder: Path, step: str) -> dict[str, float]:
-    """Return what an arm has spent; stage II books in ledgers of its own, which stage I came before."""
-    books = [Ledger.load(folder / step / LEDGER)]
-    if step.startswith("grid-edge-"):
-        books.append(Ledger.load(folder / "pretrain" / LEDGER))
-    return {link: sum(book.used_mb(link) for book in books) for link in LINKS}
+def _tested(run: Run, town: str, arm: str, stage: str) -> dict[str, float | None]:
+    test = run.test(arm=arm, stage=stage, region=town, task=TASK)
+    estimate, more = test.estimate, test.numbers
+    return {"ap50": estimate.mean, "ap50_low": estimate.low, "ap50_high": estimate.high, "ap70": more["AP70"]}
+
+
+def _placed(run: Run, town: str) -> dict[str, Any]:
+    placed = next(each for each in run.arms[MAIN].placed if each.region == town)
+    coverage = [{"pole": pole.pole, "covered": pole.covered, "actors": pole.actors} for pole in placed.poles]
+    more = {"errors": placed.errors, "covered": placed.covered, "range_m": placed.range_m}
+    return {"chosen": placed.chosen[0], "densest": placed.densest, "coverage": coverage, **more}
 
 
 def summarise(seeds: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return means over seeds with their 95 % intervals."""
     first = seeds[0]
     return {
-        "ap50": {
-            town: {arm: mean_over_seeds([seed["ap"][town][arm]["ap50"] for seed in seeds]) for arm in arms}
-            for town, arms in first["ap"].items()
-        },
-        "ap70": {
-            town: {arm: mean_over_seeds([seed["ap"][town][arm]["ap70"] for seed in seeds]) for arm in arms}
-            for town, arms in first["ap"].items()
+        **{
+            number: {
+                town: {arm: mean_over_seeds([seed["ap"][town][arm][number] for seed in seeds]) for arm in arms}
+                for town, arms in first["ap"].items()
+            }
+            for number in ("ap50", "ap70")
         },
         "differences": {
             name: mean_over_seeds([seed["differences"][name]["mean"] for seed in seeds])

@@ -6,6 +6,7 @@ the additive form that plans are made from.
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import networkx as nx
@@ -13,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import parse_config
-from flcav.experiments.planning import history_fit, history_table
-from flcav.experiments.provenance import provenance
 from flcav.optimization.bands import Bands, bands
 from flcav.optimization.curves import Additive
 from flcav.optimization.graph import Layers, build
 from flcav.optimization.history import History, article_histories
 from flcav.optimization.learning_curve import Fit, fit_additive
+from flcav.pipeline.planning import history_of
+from flcav.pipeline.provenance import provenance
 from flcav.report import curve_charts, style
 
 Array = NDArray[np.float64]
@@ -62,9 +63,10 @@ def _line(fit: Fit, found: Bands | None, where: Array) -> dict[str, list[float]]
 
 def _own_curves() -> dict[str, Any]:
     """Return a line per number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
-    table = history_table()
-    samples, edge_rounds, cloud_rounds, _ = table.T
-    fit = history_fit()
+    history = history_of("objects", "objects", Path())
+    samples, edge_rounds, cloud_rounds = history.resources.T
+    fit = fit_additive(samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
+    points = np.column_stack((history.resources, history.accuracy)).tolist()
     found = bands(fit, level=LEVEL)
     route = [(e, 0) for e in range(int(edge_rounds.max()) + 1)]
     route += [(int(edge_rounds.max()), c) for c in range(1, int(cloud_rounds.max()) + 1)]
@@ -77,7 +79,7 @@ def _own_curves() -> dict[str, Any]:
             {
                 "samples": int(count),
                 **_line(fit, found, np.array([(count, *each) for each in route], dtype=np.float64)),
-                "points": [(place[int(e), int(c)], float(y)) for x, e, c, y in table if x == count],
+                "points": [(place[int(e), int(c)], float(y)) for x, e, c, y in points if x == count],
             }
             for count in np.unique(samples)
         ],

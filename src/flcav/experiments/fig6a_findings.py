@@ -3,19 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-from flcav.experiments.findings import HELD, NOT_HELD, UNDECIDED, verdict
-from flcav.experiments.intervals import mean_over_seeds
+from flcav.intervals import mean_over_seeds
+from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, signed, verdict, verdict_words
 
 EQUAL, JOINT = "equal-stages", "joint"
 TOWN = "grid"  # whose accuracies the planner's history holds
 STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"}
 COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
-
-_VERDICTS = {
-    HELD: "the interval lies above 0, so the claim held",
-    NOT_HELD: "the interval lies below 0, so the claim did not hold",
-    UNDECIDED: "the interval contains 0, so these runs do not decide",
-}
 
 
 def allocation_findings(results: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -27,10 +21,11 @@ def _better(results: Mapping[str, Any]) -> dict[str, str]:
     realised = results["summary"]["realised"][TOWN]
     difference, how = _difference(results)
     decided = verdict(difference["low"], difference["high"])
+    words = verdict_words(decided, len(results["seeds"]))
     sentence = (
         f"On {TOWN}, AP50 after the last stage was {realised[EQUAL]['cloud']['mean']:.3f} with equal stages and "
-        f"{realised[JOINT]['cloud']['mean']:.3f} with the joint plan: {_signed(difference['mean'])}, 95 % interval "
-        f"{_signed(difference['low'])} to {_signed(difference['high'])} {how}; {_VERDICTS[decided]}."
+        f"{realised[JOINT]['cloud']['mean']:.3f} with the joint plan: {signed(difference['mean'])}, 95 % interval "
+        f"{signed(difference['low'])} to {signed(difference['high'])} {how}; {words}."
     )
     return _finding("Does the joint plan beat equal shares for every stage?", decided, sentence)
 
@@ -51,9 +46,7 @@ def _ranking(results: Mapping[str, Any]) -> dict[str, str]:
         return _finding(question, UNDECIDED, "Both plans are predicted to reach the same: there is nothing to rank.")
     seeds = results["seeds"]
     agree = sum(predicted * (_ap(seed, JOINT, "cloud") - _ap(seed, EQUAL, "cloud")) > 0 for seed in seeds)
-    expected = (
-        f"The curve predicts {_signed(predicted)} for the joint plan; {agree} of {len(seeds)} seeds agree in sign"
-    )
+    expected = f"The curve predicts {signed(predicted)} for the joint plan; {agree} of {len(seeds)} seeds agree in sign"
     towards = sorted((difference["low"] * _sign(predicted), difference["high"] * _sign(predicted)))
     decided = verdict(*towards)
     if difference["mean"] * predicted > 0 and decided != NOT_HELD:
@@ -71,7 +64,7 @@ def _why(results: Mapping[str, Any]) -> str:
     stage = max(STAGE_NAMES, key=lambda name: abs(predicted[name] - realised[name]))
     sentence = (
         f"They part most in {STAGE_NAMES[stage]}: of what that stage adds, the joint plan was to have "
-        f"{_signed(predicted[stage])} more than equal stages, and had {_signed(realised[stage])}."
+        f"{signed(predicted[stage])} more than equal stages, and had {signed(realised[stage])}."
     )
     beyond = [
         f"{COUNT_NAMES[count]} {plans[name][count]} of the {name} plan (history: {low:g} to {high:g})"
@@ -118,7 +111,7 @@ def _gain(results: Mapping[str, Any], town: str, name: str, stage: str) -> dict[
 
 
 def _interval(gain: Mapping[str, float]) -> str:
-    return f"{_signed(gain['mean'])} ({_signed(gain['low'])} to {_signed(gain['high'])})"
+    return f"{signed(gain['mean'])} ({signed(gain['low'])} to {signed(gain['high'])})"
 
 
 def _gains(after: Mapping[str, float]) -> dict[str, float]:
@@ -139,7 +132,7 @@ def _accuracy(results: Mapping[str, Any]) -> dict[str, str]:
     compared = "less" if wide < claimed else "no less"
     sentence = (
         f"Over {len(errors)} runs, AP50 after the last stage was off its prediction by {wide:.3f} on average (from "
-        f"{_signed(min(errors))} to {_signed(max(errors))}): {compared} than the {claimed:.3f} that are predicted to "
+        f"{signed(min(errors))} to {signed(max(errors))}): {compared} than the {claimed:.3f} that are predicted to "
         f"lie between the plans."
     )
     return _finding("Is the prediction exact enough to tell the plans apart?", decided, sentence)
@@ -152,7 +145,7 @@ def _budgets(results: Mapping[str, Any]) -> dict[str, str]:
     spent = [row["used_mb"] / row["budget_mb"] for row in rows]
     sentence = (
         f"Every ledger ends {'within' if within else 'above'} its budgets, at {min(spent):.0%} to {max(spent):.0%} of "
-        f"a link's; what was sent differs from the plan's price by {_signed(min(off), 2)} to {_signed(max(off), 2)} MB."
+        f"a link's; what was sent differs from the plan's price by {signed(min(off), 2)} to {signed(max(off), 2)} MB."
     )
     return _finding("Did the runs keep their budgets?", HELD if within else NOT_HELD, sentence)
 
@@ -167,7 +160,3 @@ def _finding(question: str, decided: str, sentence: str) -> dict[str, str]:
 
 def _sign(value: float) -> int:
     return 1 if value > 0 else -1
-
-
-def _signed(value: float, digits: int = 3) -> str:
-    return f"{value:+.{digits}f}".replace("-", "−")

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from flcav.experiments.aims import aim_sentence
 from flcav.experiments.task_study import training_rows
 from flcav.markdown import bullets, table
+from flcav.verdicts import aim_sentence
 
 WANTED = {  # of cars on other scenes of the towns that were learned from
     "Car AP 3d at 0.5": (0.85, "Car AP3D@0.5 of 0.85"),

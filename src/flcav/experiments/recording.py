@@ -1,22 +1,19 @@
-"""Steps that make frames."""
+"""Steps that make a study's frames."""
 
 from typing import Any
 
 from flcav.config import parse_config
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.experiments.steps import Work
+from flcav.pipeline.steps import Work
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
 DATA = "data"
 
 
-def record_split(work: Work, recipe: dict[str, Any], poles_from: tuple[str, ...] = ()) -> dict[str, int]:
-    """Record one split; the steps named in `poles_from` chose the poles that are to see it too."""
-    for step in poles_from:
-        placed = work.result(step)
-        recipe = {**recipe, "poles": sorted({*recipe["poles"], placed["chosen"], placed["densest"]})}
+def record_split(work: Work, recipe: dict[str, Any]) -> dict[str, int]:
+    """Record one split."""
     source = EmbeddedSource(parse_config(Recipe, recipe, work.folder.name))
     record(source, work.folder / DATA, progress=work.report)
     return {"frames": len(Dataset.open(work.folder / DATA))}

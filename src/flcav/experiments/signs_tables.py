@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-from flcav.experiments.aims import aim_sentence
 from flcav.experiments.task_study import training_rows
 from flcav.markdown import bullets, table
+from flcav.verdicts import aim_sentence
 
 WANTED = 0.75  # mAP50 on scenes that were not learned from
 

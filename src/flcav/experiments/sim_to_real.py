@@ -14,9 +14,7 @@ import numpy as np
 from flcav.dataset.formats.kitti.folder import KittiFolder, KittiFrame
 from flcav.dataset.store import Dataset
 from flcav.experiments.clouds import Labelled, describe
-from flcav.experiments.provenance import provenance
 from flcav.experiments.recording import DATA, record_split
-from flcav.experiments.steps import Notify, Step, run_steps
 from flcav.geometry import Boxes, inverse
 from flcav.perception.camera_view import kitti_view
 from flcav.perception.metrics import average_precision, match
@@ -25,6 +23,8 @@ from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import LOWEST_SCORE, OVERLAPS, number_or_none, of_class
 from flcav.perception.objects.infer import box_rows
 from flcav.perception.objects.model import Second
+from flcav.pipeline.provenance import provenance
+from flcav.pipeline.steps import Notify, Step, run_steps
 from flcav.report import style
 from flcav.report.clouds import real_frame
 

@@ -8,15 +8,16 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from flcav.config import InputError
+from flcav.config import InputError, read_yaml
 from flcav.dataset.store import Dataset
-from flcav.experiments.intervals import mean_over_seeds
-from flcav.experiments.provenance import provenance
 from flcav.experiments.recording import opened, record_split
-from flcav.experiments.steps import Notify, Step, Work, run_steps
+from flcav.intervals import mean_over_seeds
 from flcav.perception.task import Task
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
+from flcav.pipeline.provenance import provenance
+from flcav.pipeline.steps import Notify, Step, Work, run_steps
+from flcav.sources.recipe import recipe_path
 
 RecipeFields = Mapping[str, Any]  # of a `Recipe`, as YAML has it
 Result = Mapping[str, Any]  # of `Task.evaluate`, and the extra numbers
@@ -58,6 +59,13 @@ class Study:
     def _tested(self, name: str, network: Any, data: Dataset, work: Work) -> dict[str, Any]:
         result = self.task.evaluate(network, data, progress=work.report)
         return result | (self.extra[name](network, data) if name in self.extra else {})
+
+
+def recipe_of(name: str) -> RecipeFields:
+    """Return the fields of a recipe that comes with flcav as YAML has them, without its split: a study has its own."""
+    fields = read_yaml(recipe_path(name))
+    assert isinstance(fields, dict)
+    return {field: value for field, value in fields.items() if field != "split"}
 
 
 def run_study(

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from flcav.experiments.aims import aim_sentence
 from flcav.markdown import bullets, interval, table
+from flcav.verdicts import aim_sentence
 
 WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # of constant velocity's final error at junctions, at most
 SLICE = "at junctions"

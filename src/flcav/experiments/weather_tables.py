@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from flcav.experiments.aims import aim_sentence
 from flcav.markdown import bullets, interval, table
+from flcav.verdicts import aim_sentence
 
 WANTED = 0.95  # accuracy
 

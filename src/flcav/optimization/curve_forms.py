@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.optimization.curves import STAGES, Additive, Decay, Effective
+from flcav.optimization.curves import STAGES, Additive, Decay, Effective, effective_samples
 
 Array = NDArray[np.float64]
 CurveT = TypeVar("CurveT", Additive, Effective, covariant=True)
@@ -152,8 +152,8 @@ class EffectiveForm:
 
     def predict(self, p: Array, resources: Array) -> Array:
         """Return the errors (n,) at `resources` (n, 3)."""
-        shared = self.group_samples * (1 - 1 / (resources[:, 1] + self.k * resources[:, 2] + 1))
-        effective = self.alpha * resources[:, 0] + self._beta(p) * shared
+        t = resources[:, 1] + self.k * resources[:, 2]
+        effective = effective_samples(resources[:, 0], t, self.alpha, self._beta(p) * self.group_samples)
         return p[0] * (effective / self.middle) ** -p[1] + (p[2] if self.floor else 0.0)
 
     def curve(self, p: Array) -> Effective:
@@ -182,8 +182,8 @@ def effective_forms(
     t = resources[:, 1] + k * resources[:, 2]
     if beta is None and (group_samples == 0 or len(np.unique(t)) < 2):
         beta = DEFAULT_BETA
-    share = 1 - 1 / (t + 1)
-    effective = alpha * resources[:, 0] + (DEFAULT_BETA if beta is None else beta) * group_samples * share
+    group = (DEFAULT_BETA if beta is None else beta) * group_samples
+    effective = effective_samples(resources[:, 0], t, alpha, group)
     if np.any(alpha * resources[:, 0] <= 0):
         raise InputError("history has a point without samples: its effective samples would be none, its error infinite")
     parameters = 2 + (beta is None)

@@ -1,6 +1,6 @@
 """Learning curves: the error that is left after so many samples, edge rounds and cloud rounds."""
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,23 @@ STAGES = ("pretrain", "edge", "cloud")  # measured in samples, edge rounds, clou
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+
+
+Array = NDArray[np.float64]
+
+
+@overload
+def effective_samples(samples: float, t: float, alpha: float, group: float) -> float: ...
+@overload
+def effective_samples(samples: float | Array, t: Array, alpha: float | Array, group: float | Array) -> Array: ...
+def effective_samples(
+    samples: float | Array, t: float | Array, alpha: float | Array, group: float | Array
+) -> float | Array:
+    """Return n = alpha * samples + group * (1 - 1 / (t + 1)) effective samples, elementwise, after `t` rounds.
+
+    Rounds bring the vehicles' own `group` samples in, ever more slowly; `alpha` is what an uploaded one is worth.
+    """
+    return alpha * samples + group * (1 - 1 / (t + 1))
 
 
 class Fitted(Config):
@@ -36,7 +53,7 @@ class Decay(Fitted):
         """Return whether the error is infinite before the first sample or round."""
         return self.a > 0 and self.x0 == 0
 
-    def at(self, resource: ArrayLike) -> NDArray[np.float64]:
+    def at(self, resource: ArrayLike) -> Array:
         """Return the error left after `resource` samples or rounds."""
         shifted = np.asarray(resource, dtype=np.float64) + self.x0
         with np.errstate(divide="ignore"):
@@ -61,15 +78,13 @@ class Additive(Fitted):
         """Return the decays in the order of `STAGES`."""
         return self.pretrain, self.edge, self.cloud
 
-    def error(
-        self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1
-    ) -> NDArray[np.float64]:
+    def error(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1) -> Array:
         """Return the error after so much of each stage, elementwise; `k` plays no part in this model."""
         return self.floor + self.pretrain.at(samples) + self.edge.at(edge_rounds) + self.cloud.at(cloud_rounds)
 
 
 class Effective(Fitted):
-    """error = floor + a * n^(-b) at n = alpha * samples + beta * group_samples * (1 - 1 / (t + 1)) effective samples.
+    """error = floor + a * n^(-b) at n `effective_samples` of group = beta * group_samples.
 
     t = edge_rounds + k * cloud_rounds; group_samples are those that the vehicles of all groups hold.
     """
@@ -88,18 +103,14 @@ class Effective(Fitted):
         held = f"{self.beta * self.group_samples:.4g} (1 - 1/(t + 1))"
         return f"{floor}{self.a:.4g} ({self.alpha:.4g} x + {held})^-{self.b:.4g}"
 
-    def error(
-        self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1
-    ) -> NDArray[np.float64]:
+    def error(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1) -> Array:
         """Return the error after so much of each stage, elementwise, at `k` edge rounds per cloud round."""
         return self.floor + self.a * self.effective_samples(samples, edge_rounds, cloud_rounds, k) ** -self.b
 
-    def effective_samples(
-        self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int
-    ) -> NDArray[np.float64]:
+    def effective_samples(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int) -> Array:
         """Return n, elementwise."""
-        t = np.asarray(edge_rounds) + k * np.asarray(cloud_rounds)
-        return self.alpha * np.asarray(samples) + self.beta * self.group_samples * (1 - 1 / (t + 1.0))
+        t = np.asarray(edge_rounds, np.float64) + k * np.asarray(cloud_rounds)
+        return effective_samples(np.asarray(samples, np.float64), t, self.alpha, self.beta * self.group_samples)
 
 
 class Member(Config):
@@ -123,9 +134,7 @@ class Shared(Config):
                 raise ValueError(f"members: {member.name!r} shares its network, so its curve must be additive")
         return self
 
-    def error(
-        self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1
-    ) -> NDArray[np.float64]:
+    def error(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1) -> Array:
         """Return the weighted mean error after so much of each stage, elementwise."""
         weights = [member.weight for member in self.members]
         errors = [member.curve.error(samples, edge_rounds, cloud_rounds, k) for member in self.members]

@@ -1,6 +1,6 @@
 """Effective samples in arrays: what the least Lagrangian over whole samples and rounds is, for many tasks at once.
 
-    weight a (alpha x + beta G (1 - 1 / (t + 1)))^(-b),   t = y + k z
+    weight a n^(-b),   n = `effective_samples` of x samples and t = y + k z rounds
 
 A cloud round costs what k edge rounds cost on the wireless link and more on the wireline one, so of all (y, z) that
 give the same t the one with the fewest cloud rounds is as good as any: only the values of t need to be tried. For each,
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.curves import Effective
+from flcav.optimization.curves import Effective, effective_samples
 from flcav.optimization.rounding import outermost
 
 Array = NDArray[np.float64]
@@ -38,7 +38,8 @@ class EffectiveTasks:
     def error(self, x: Array) -> Array:
         """Return the weighted (E,) errors above their floors at x (n,) of the whole problem."""
         own = x[self.quantity]
-        effective = self.alpha[:, 0] * own[:, 0] + self.group[:, 0] * _share(own[:, 1] + self.k * own[:, 2])
+        t = own[:, 1] + self.k * own[:, 2]
+        effective = effective_samples(own[:, 0], t, self.alpha[:, 0], self.group[:, 0])
         return self.gain[:, 0] * effective ** -self.b[:, 0]
 
     def cheapest(self, multipliers: Array) -> tuple[Array, Array]:
@@ -70,7 +71,7 @@ class EffectiveTasks:
         price = (self.sample_cost @ multipliers)[:, None]
         with np.errstate(divide="ignore"):
             level = (self.gain * self.b * self.alpha / price) ** (1 / (self.b + 1))
-        ideal = (level - self._from_rounds()) / self.alpha
+        ideal = (level - self._effective(0.0)) / self.alpha
         below = np.clip(np.floor(np.minimum(ideal, self.most)), self.least, self.most)
         above = np.minimum(below + 1, self.most)
         values = self._value(below, multipliers), self._value(above, multipliers)
@@ -78,13 +79,14 @@ class EffectiveTasks:
 
     def _value(self, samples: Array, multipliers: Array) -> Array:
         price = (self.sample_cost @ multipliers)[:, None]
-        error = self.gain * (self.alpha * samples + self._from_rounds()) ** -self.b
+        error = self.gain * self._effective(samples) ** -self.b
         with np.errstate(invalid="ignore"):
             rounds = self.rounds_cost @ multipliers
         return error + price * samples + np.where(np.isinf(self.rounds_cost[:, :, 0]), np.inf, rounds)
 
-    def _from_rounds(self) -> Array:
-        return self.group * _share(self.rounds[:, :, 0] + self.k * self.rounds[:, :, 1])
+    def _effective(self, samples: Array | float) -> Array:
+        """Return the effective samples (E, T) of each choice with `samples` (E, T)."""
+        return effective_samples(samples, self.rounds[:, :, 0] + self.k * self.rounds[:, :, 1], self.alpha, self.group)
 
 
 def effective_tasks(
@@ -115,7 +117,3 @@ def _rounds(low: Array, high: Array, k: int) -> Array:
     cloud = np.maximum(np.ceil((t - high[1]) / k), low[2])
     edge = t - k * cloud
     return np.column_stack((edge, cloud))[edge >= low[1]]
-
-
-def _share(t: Array) -> Array:
-    return 1 - 1 / (t + 1)

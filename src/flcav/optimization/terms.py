@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.optimization.curves import effective_samples
 from flcav.optimization.cutting_planes import Line, Term
 from flcav.optimization.instance import Instance
 
@@ -41,7 +42,7 @@ class PowerTerm:
 
 @dataclass(frozen=True)
 class EffectiveTerm:
-    """gain * (alpha x + group (1 - 1 / (t + 1)))^(-b) of x[first : first + 3], t = y + k z; its lines are tangents."""
+    """gain * n^(-b), n the `effective_samples` of x[first : first + 3], t = y + k z; its lines are tangents."""
 
     first: int
     gain: float
@@ -66,7 +67,7 @@ class EffectiveTerm:
         return [Line(index, tuple(map(float, slope)), self.value(x) - float(slope @ x[self.first : self.first + 3]))]
 
     def _effective(self, samples: float, t: float) -> float:
-        return float(self.alpha * samples + self.group * (1 - 1 / (t + 1)))
+        return float(effective_samples(samples, t, self.alpha, self.group))
 
 
 def terms_of(instance: Instance) -> list[Term]:

@@ -1,6 +1,6 @@
-"""Charts of numbers: AP through the stages, megabytes per link, arms side by side."""
+"""Charts of numbers: a measure through the stages, megabytes per link, arms side by side."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -13,32 +13,38 @@ Row = Mapping[str, Any]
 STAGES = ("pretraining", "edge FL", "cloud FL")  # what `rounds` call them, in the order of a town's tested rows
 
 
-def draw_ap_by_round(axes: Axes, rounds: Sequence[Row], stages: Sequence[Row]) -> None:
-    """Draw AP50 after every round, a line per town, and the tested values with their intervals where stages end.
+def draw_by_round(axes: Axes, rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> None:
+    """Draw a measure after every round, a line per town, and the tested values with their intervals where stages end.
 
-    `rounds` has rows stage, round, town, ap50; `stages` has one tested row for each of `STAGES` and town, a town's in
-    that order. Every stage is equally wide, however many rounds it has.
+    `rounds` has rows stage, round, town, score; `tested` has rows stage, town, score, low, high. Stages are called as
+    in `STAGES`; every one is equally wide, however many rounds it has.
     """
     places = _places(rounds)
     lines = {
-        town: sorted((places[row["stage"]][row["round"]], row["ap50"]) for row in rounds if row["town"] == town)
+        town: sorted((places[row["stage"]][row["round"]], row["score"]) for row in rounds if row["town"] == town)
         for town in dict.fromkeys(row["town"] for row in rounds)
     }
     for town, line in lines.items():
-        colour = style.TOWN_COLOURS.get(town, style.GREEN)
+        colour = _colour(town, lines)
         axes.plot(*zip(*line, strict=True), color=colour, linewidth=1.6, marker="o", markersize=2.5)
         beside = [other[-1] for other in lines.values() if other is not line and other[-1][0] == line[-1][0]]
         side = "center" if not beside else "bottom" if line[-1] > max(beside) else "top"  # two names stay apart
         axes.annotate(town, line[-1], (9, 0), textcoords="offset points", color=colour, va=side, fontweight="bold")
-    towns = list(dict.fromkeys(row["town"] for row in stages))
+    towns = list(dict.fromkeys(row["town"] for row in tested))
     for number, town in enumerate(towns):
         aside = 0.04 * (number - (len(towns) - 1) / 2)  # so that the intervals of two towns do not hide each other
-        for stage, row in zip(STAGES, (row for row in stages if row["town"] == town), strict=True):
-            if stage in places:
-                _draw_tested(axes, max(places[stage].values()) + aside, row)
+        for row in tested:
+            if row["town"] == town and row["stage"] in places:
+                _draw_tested(axes, max(places[row["stage"]].values()) + aside, row, _colour(town, [*lines, *towns]))
     _mark_stages(axes, places)
-    axes.set(xlabel="round of the stage", ylabel="AP50", ylim=(0, None))
+    axes.set(xlabel="round of the stage", ylabel=measure, ylim=(0, None))
     axes.grid(axis="y")
+
+
+def _colour(town: str, towns: Iterable[str]) -> str:
+    """Return a town's colour: its own, or one that is left."""
+    others = [name for name in dict.fromkeys(towns) if name not in style.TOWN_COLOURS]
+    return style.TOWN_COLOURS.get(town) or style.OTHER_COLOURS[others.index(town) % len(style.OTHER_COLOURS)]
 
 
 def _places(rounds: Sequence[Row]) -> dict[str, dict[int, float]]:
@@ -65,10 +71,10 @@ def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
     axes.set_xlim(0, len(places) + 0.12)
 
 
-def _draw_tested(axes: Axes, x: float, row: Row) -> None:
-    colour = style.TOWN_COLOURS.get(row["town"], style.GREEN)
-    axes.plot([x, x], [row["ap50_low"], row["ap50_high"]], color=colour, marker="_", markersize=7)
-    axes.plot(x, row["ap50"], "o", color=colour, markersize=6, markeredgecolor="white")
+def _draw_tested(axes: Axes, x: float, row: Row, colour: str) -> None:
+    if row["low"] is not None:
+        axes.plot([x, x], [row["low"], row["high"]], color=colour, marker="_", markersize=7)
+    axes.plot(x, row["score"], "o", color=colour, markersize=6, markeredgecolor="white")
 
 
 def draw_megabytes(axes: Axes, ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> None:
@@ -94,7 +100,7 @@ def draw_megabytes(axes: Axes, ledger_by_stage: Sequence[Row], budgets: Mapping[
 def draw_arms(axes: Axes, rows: Sequence[Row]) -> None:
     """Draw a forest plot: one line per row (arm, town, ap50, low, high), with its numbers."""
     for y, row in enumerate(rows):
-        colour = style.TOWN_COLOURS.get(row["town"], style.GREEN)
+        colour = _colour(row["town"], [row["town"]])
         axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=2)
         axes.plot(row["ap50"], y, "s", color=colour, markersize=6)
         axes.annotate(

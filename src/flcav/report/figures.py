@@ -35,10 +35,10 @@ def before_after(sweep: sweeps.Sweep, extent: sweeps.Extent = EXTENT) -> Figure:
 
 
 @style.styled
-def ap_by_round(rounds: Sequence[Row], stages: Sequence[Row]) -> Figure:
-    """Return AP50 through the stages, a line per town; `stages` are the tested rows of all towns."""
+def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figure:
+    """Return a measure through the stages, a line per town; `tested` are rows of all towns, see `charts`."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
-    charts.draw_ap_by_round(figure.add_subplot(), rounds, stages)
+    charts.draw_by_round(figure.add_subplot(), rounds, tested, measure)
     return figure
 
 
@@ -63,8 +63,10 @@ def arms(rows: Sequence[Row]) -> Figure:
 
 
 @style.styled
-def overview(scene: maps.ErrorMap, sweep: sweeps.Sweep, rounds: Sequence[Row], stages: Sequence[Row]) -> Figure:
-    """Return one wide picture of a run: errors and pole, a sweep before and after, AP through the stages."""
+def overview(
+    scene: maps.ErrorMap, sweep: sweeps.Sweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
+) -> Figure:
+    """Return one wide picture of a run: errors and pole, a sweep before and after, a measure through the stages."""
     figure = style.canvas(9.6, 4.4)
     grid = figure.add_gridspec(1, 3, width_ratios=(4.1, 2.1, 3.4))
     left, middle, right = (figure.add_subfigure(grid[column]) for column in range(3))
@@ -79,6 +81,6 @@ def overview(scene: maps.ErrorMap, sweep: sweeps.Sweep, rounds: Sequence[Row], s
     middle.supylabel("metres ahead", fontsize=style.TEXT, color=style.MUTED)
     style.key(middle, sweeps.key(), columnspacing=0.8)
     axes = right.add_subplot()
-    charts.draw_ap_by_round(axes, rounds, stages)
-    axes.set_title("AP50 through the stages", fontweight="bold", pad=22)
+    charts.draw_by_round(axes, rounds, tested, measure)
+    axes.set_title(f"{measure} through the stages", fontweight="bold", pad=22)
     return figure

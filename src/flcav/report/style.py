@@ -31,6 +31,7 @@ PURPLE = "#cc79a7"
 
 HIT, MISSED, FALSE = BLUE, ORANGE, VERMILLION
 TOWN_COLOURS = {"grid": BLUE, "ring": VERMILLION, "suburb": MUTED}
+OTHER_COLOURS = (GREEN, PURPLE, ORANGE, SKY)  # of towns of one's own, in turn
 STAGE_COLOURS = (RULE, SKY, ORANGE)  # in the order of the run
 
 SMALL, TEXT = 9, 10  # [pt]

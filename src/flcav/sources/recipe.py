@@ -1,12 +1,13 @@
 """What a user asks to have recorded."""
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from flcav.config import Config
+from flcav.config import Config, InputError, shorten
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
@@ -103,3 +104,27 @@ class Recipe(Config):
         """Return the (spins_per_scene,) times of the spins in a run after a warm-up of so many steps [s]."""
         steps = warmup_steps + np.arange(self.spins_per_scene) * round(self.every_s / STEP_S)
         return np.round(steps * np.float64(STEP_S), 1)
+
+
+def recipe_path(name: str) -> Path:
+    """Return the file of a recipe that comes with flcav: "objects", or of a kind, "allocation/three_tasks".
+
+    They are the folder `recipes/` of a checkout, and within the package where it was installed. Raises `InputError` for
+    an unknown name.
+    """
+    package = Path(__file__).parents[1]
+    folder = next(filter(Path.is_dir, (package / "recipes", package.parents[1] / "recipes")))
+    known = {file.relative_to(folder).with_suffix("").as_posix(): file for file in sorted(folder.rglob("*.yaml"))}
+    if name not in known:
+        raise InputError(f"unknown recipe {shorten(name)}; those that come with flcav: {', '.join(known)}")
+    return known[name]
+
+
+def find_recipe(path: Path) -> Path:
+    """Return `path`; where there is no such file, the recipe that comes with flcav by this path: recipes/grid.yaml."""
+    if path.parts[:1] != ("recipes",) or path.suffix != ".yaml" or path.exists():
+        return path
+    try:
+        return recipe_path(path.relative_to("recipes").with_suffix("").as_posix())
+    except InputError:
+        return path

@@ -7,7 +7,7 @@ import pytest
 from flcav.experiments import federating
 from flcav.experiments.federating import _checkpoint, _resumed, _share_of
 from flcav.experiments.protocol import Protocol
-from flcav.experiments.steps import Work
+from flcav.pipeline.steps import Work
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights

@@ -18,7 +18,7 @@ from flcav.experiments.fig6a_allocation import (
 )
 from flcav.experiments.fig6a_findings import EQUAL, JOINT, allocation_findings
 from flcav.experiments.fig6a_tables import tables
-from flcav.experiments.steps import Step, run_steps
+from flcav.pipeline.steps import Step, run_steps
 
 PREDICTED = {EQUAL: (0.49, 0.60, 0.62), JOINT: (0.53, 0.63, 0.66)}
 HISTORY = {"samples": [80.0, 320.0], "edge_rounds": [0.0, 6.0], "cloud_rounds": [0.0, 3.0]}

@@ -3,9 +3,9 @@
 import numpy as np
 
 from flcav.experiments import objects_tables, sim_to_real_tables
-from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.studies.objects import STUDY
 from flcav.geometry import Boxes
+from flcav.intervals import mean_over_seeds
 from flcav.perception.camera_view import CameraView
 from flcav.report import style
 from flcav.report.clouds import compare, real_frame

@@ -1,20 +1,17 @@
-"""The study of the sign task: that it is of the recipes users have, its tables and its picture."""
+"""The study of the sign task: its amber lights, its tables and its picture."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from flcav.config import parse_config
 from flcav.dataset.formats.rectangles import SIGNS
-from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.signs_tables import name_of, tables
 from flcav.experiments.studies.signs import STUDY
+from flcav.intervals import mean_over_seeds
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
-RECIPES = Path(__file__).parents[3] / "recipes"
 MISSING = frozenset({"stop", "speed_90"})  # in the held-out town
 
 
@@ -49,13 +46,6 @@ def results(*scores: float) -> dict[str, Any]:
         for name, of_seeds in rows.items()
     }
     return {"seeds": seeds, "summary": summary}
-
-
-@pytest.mark.parametrize(("name", "number"), [("signs", 0), ("signs_suburb", 1), ("signs_grid", 2)])
-def test_it_learns_from_the_recipes_of_users(name: str, number: int):
-    recipe = yaml.safe_load((RECIPES / f"{name}.yaml").read_text())
-    assert recipe.pop("split") == "train"
-    assert recipe == STUDY.train[number]
 
 
 @pytest.mark.slow

@@ -10,12 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from flcav.experiments import testing
-from flcav.experiments.federating import cloud_fl, edge_fl
-from flcav.experiments.pretraining import pretrain
 from flcav.experiments.recording import record_split
-from flcav.experiments.steps.source_hash import PACKAGES, Sources, starts
 from flcav.experiments.studies import STUDIES
+from flcav.pipeline import work
+from flcav.pipeline.steps.source_hash import PACKAGES, Sources, starts
 
 TOY = {
     "__init__.py": """
@@ -64,6 +62,8 @@ TOY = {
         def one(): return toy.whole.FIRST
         def any_of_it(): return getattr(all_of_it, "SECOND")
         def circle(): return rounded()
+        TABLE = {"other": "toy.other:Other"}
+        def by_name(name): return find(TABLE[name])
         if __name__ == "__main__":
             circle()
         """,
@@ -93,6 +93,8 @@ def test_a_step_reaches_definitions_through_packages_that_hand_them_on(toy):
     assert set(hashes(toy)) == {"toy.work", "toy.shapes.boxes", "toy.shapes.hidden", "toy.late"}
     assert set(hashes(toy, "one")) == set(hashes(toy, "any_of_it")) == {"toy.work", "toy.whole"}
     assert set(hashes(toy, "circle")) == {"toy.work", "toy.shapes.round"}
+    assert set(hashes(toy, "by_name")) == {"toy.work", "toy.other"}
+    assert list(starts({"strategy": "toy.other:Other", "note": "at 12:30"})) == [("toy.other", "Other")]
 
 
 @pytest.mark.parametrize(
@@ -145,20 +147,21 @@ def test_one_constant_of_a_module_is_reached_or_all_where_the_module_is_passed_o
 
 
 STEPS = {
-    "pretraining": pretrain,
     "recording": record_split,
-    "evaluation": testing.test_arm,
-    "stage II": edge_fl,
-    "stage III": cloud_fl,
+    "frames": work.record_step,
+    "pretraining": work.pretrain_step,
+    "evaluation": work.test_step,
+    "stage II": work.edge_step,
+    "stage III": work.cloud_step,
 } | {f"{name}, {part}": getattr(study, part) for name, study in STUDIES.items() for part in ("learn", "test")}
 
 
 @pytest.mark.parametrize("run", STEPS.values(), ids=STEPS.keys())
 def test_no_step_reaches_the_drawing_of_results_or_the_command_line(run):
     reached = Sources().hashes(starts(run))
-    assert 50 < len(reached) < 150
+    assert 50 < len(reached) < 250
     assert not [name for name in reached if name.startswith(("flcav.report", "flcav.cli"))]
-    assert not [name for name in reached if name.startswith("flcav.experiments.steps.run")]
+    assert not [name for name in reached if name.startswith("flcav.pipeline.steps.run")]
 
 
 def test_an_edit_of_flcav_makes_stale_what_it_should(tmp_path):
@@ -177,20 +180,21 @@ def test_an_edit_of_flcav_makes_stale_what_it_should(tmp_path):
     assert {"pretraining", "stage II", "stage III", "objects, learn"} <= (
         by_loss := changed("perception/objects/loss.py")
     )
-    assert by_loss.isdisjoint({"recording", "weather, learn", "signs, test"})
-    assert "recording" in changed("sensors/lidar.py")
+    assert by_loss.isdisjoint({"recording", "frames", "weather, learn", "signs, test"})
+    assert {"recording", "frames"} <= changed("sensors/lidar.py")
     for drawing in (copy / "report").glob("*.py"):
         assert not changed(f"report/{drawing.name}")
         break
 
 
+@pytest.mark.slow
 def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches(tmp_path):
     """Modules that the interpreter runs code of while sensors observe a frame, by its own account."""
     code = """
         import sys
         from pathlib import Path
         from flcav.experiments.recording import record_split
-        from flcav.experiments.steps import Work
+        from flcav.pipeline.steps import Work
         ran = set()
         def trace(frame, event, argument):
             name = frame.f_globals.get("__name__", "")

@@ -16,8 +16,8 @@ import pytest
 
 import flcav
 from flcav.config import InputError
-from flcav.experiments.provenance import checkout
-from flcav.experiments.steps import Step, Work, run_side_by_side, run_steps
+from flcav.pipeline.provenance import checkout
+from flcav.pipeline.steps import Step, Work, run_side_by_side, run_steps
 
 
 def count(work: Work, start: int) -> int:

@@ -1,35 +1,14 @@
 """The trajectory task's studies: what they record, their numbers, tables and picture."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import yaml
 
-from flcav.config import parse_config
-from flcav.experiments.intervals import mean_over_seeds
 from flcav.experiments.studies import STUDIES
 from flcav.experiments.studies.trajectory import CAMERAS, STUDY
 from flcav.experiments.trajectory_tables import tables
+from flcav.intervals import mean_over_seeds
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import metrics
-from flcav.sources.recipe import Recipe
-
-RECIPES = Path(__file__).parents[3] / "recipes"
-
-
-@pytest.mark.parametrize(
-    ("name", "recorded"),
-    [
-        ("trajectory", STUDY.train[0]),
-        ("trajectory_suburb", STUDY.train[1]),
-        ("trajectory_ring", STUDY.tests["held-out town"]),
-        ("trajectory_cameras", CAMERAS.train[0]),
-    ],
-)
-def test_recipes_are_those_of_the_studies(name, recorded):
-    committed = parse_config(Recipe, yaml.safe_load((RECIPES / f"{name}.yaml").read_text()), name)
-    assert committed == parse_config(Recipe, dict(recorded), name)
 
 
 @pytest.mark.parametrize("study", [STUDY, CAMERAS])

@@ -5,7 +5,7 @@ import pytest
 
 from flcav.config import InputError, parse_config, read_config
 from flcav.sensors.rig import RIGS
-from flcav.sources.recipe import Recipe
+from flcav.sources.recipe import Recipe, find_recipe, recipe_path
 from flcav.world.town import load_town
 
 RECIPES = Path(__file__).parents[3] / "recipes"
@@ -76,3 +76,24 @@ def test_bad_values_get_one_sentence(fields: dict, message: str):
 def test_the_recipes_we_ship_are_valid(path: Path):
     recipe = read_config(Recipe, path)
     assert load_town(recipe.town).name == recipe.town
+
+
+def test_a_recipe_that_comes_with_flcav_is_found_by_its_name_from_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert read_config(Recipe, recipe_path("objects")).town == "suburb"
+    assert recipe_path("allocation/objects") != recipe_path("objects")
+    assert find_recipe(Path("recipes/objects.yaml")) == recipe_path("objects")
+    assert find_recipe(Path("recipes/graphs/three_layers.yaml")) == recipe_path("graphs/three_layers")
+    with pytest.raises(InputError, match=r"unknown recipe 'objekts'; those that come with flcav: .*signs_grid"):
+        recipe_path("objekts")
+
+
+def test_a_users_own_file_is_never_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "recipes").mkdir()
+    own = Path("recipes/objects.yaml")
+    own.write_text("town: ring")
+    for path in (own, Path("objects.yaml"), Path("mine/objects.yaml"), Path("recipes/none.yaml"), Path("recipes")):
+        assert find_recipe(path) == path

@@ -10,7 +10,7 @@ from shapely.geometry import Polygon
 from flcav.config import InputError
 from flcav.geometry import wrap_angle
 from flcav.seeds import child_seed
-from flcav.world.density import poles_density
+from flcav.world.density import mean_actors
 from flcav.world.shapes import SHAPES
 from flcav.world.surfaces import footprint
 from flcav.world.town import KERB_M, TOWNS, Town, load_town
@@ -201,7 +201,7 @@ def test_pole_8_of_grid_is_the_densest() -> None:
     for seed in range(3):
         trace = simulate(town, seed=seed, cavs=4, times_s=60.0 + 5.0 * np.arange(20))
         for range_m in (30.0, 40.0, 50.0):
-            assert town.poles.id[np.argmax(poles_density(town, trace, range_m))] == 8, (seed, range_m)
+            assert town.poles.id[np.argmax(mean_actors(town.poles.position, trace, range_m))] == 8, (seed, range_m)
 
 
 def test_density_counts_who_is_within_range() -> None:
@@ -213,8 +213,8 @@ def test_density_counts_who_is_within_range() -> None:
             for actor in np.flatnonzero(trace.present[instant]):
                 centre = trace.position[instant, actor] + [0, 0, trace.size[actor, 2] / 2]
                 expected[pole] += np.sqrt(((centre - mount) ** 2).sum()) <= 35.0
-    np.testing.assert_array_equal(poles_density(town, trace, 35.0), expected / 2)
-    np.testing.assert_array_equal(poles_density(town, [trace, trace], 35.0), expected / 2)
+    np.testing.assert_array_equal(mean_actors(town.poles.position, trace, 35.0), expected / 2)
+    np.testing.assert_array_equal(mean_actors(town.poles.position, [trace, trace], 35.0), expected / 2)
 
 
 def test_towns_differ_in_who_drives() -> None:

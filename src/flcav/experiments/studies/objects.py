@@ -9,21 +9,15 @@ from typing import Any
 import numpy as np
 
 from flcav.dataset.store import Dataset
-from flcav.experiments.task_study import RecipeFields, Result, Study
+from flcav.experiments.task_study import Result, Study, recipe_of
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.tracking import evaluate_tracks
 from flcav.report import style
 from flcav.report.precision import Bar, precisions
 
-RECIPE: RecipeFields = {
-    "warmup_s": 60.0,
-    "spins_per_scene": 6,
-    "every_s": 4.0,
-    "cavs": 4,
-    "vehicle_rig": "kitti_lidar",
-}
-SEQUENCES: RecipeFields = {**RECIPE, "spins_per_scene": 30, "every_s": 0.5, "cavs": 1}
+RECIPE = recipe_of("objects")
+SEQUENCES = {**RECIPE, "spins_per_scene": 30, "every_s": 0.5, "cavs": 1}
 TOWNS = ("suburb", "ring", "grid")
 CHANGING = {"classes": ["clear", "light_rain", "heavy_rain", "fog"], "turn_s": 4.0}
 WEATHERS = "weathers"
@@ -77,7 +71,7 @@ def _draw(results: Mapping[str, Any]) -> bytes:
 STUDY = Study(
     task=OBJECTS,
     network="small",
-    train=tuple({**RECIPE, "town": town, "seed": 21, "scenes": 16} for town in TOWNS),
+    train=tuple({**RECIPE, "town": town} for town in TOWNS),
     validation={**RECIPE, "town": "suburb", "seed": 121, "split": "validation", "scenes": 2},
     tests={
         **{town: {**RECIPE, "town": town, "seed": 431, "split": "test", "scenes": 6} for town in TOWNS},

@@ -1,6 +1,6 @@
 """The study of the sign task: three towns to learn from; held-out scenes and a held-out town to test.
 
-The recipes are those of recipes/signs.yaml, signs_suburb.yaml and signs_grid.yaml, of some scenes of the latter two.
+It learns from recipes/signs.yaml, signs_suburb.yaml and signs_grid.yaml.
 The held-out scenes have all eight classes; the held-out town has speed limits of 30, yield signs and lights alone.
 """
 
@@ -8,28 +8,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from flcav.experiments.signs_tables import name_of
-from flcav.experiments.task_study import RecipeFields, Result, Study
+from flcav.experiments.task_study import Result, Study, recipe_of
 from flcav.perception.signs.task import SIGNS
 from flcav.report import style
 from flcav.report.precision import Bar, precisions
 
-RECIPE: RecipeFields = {
-    "spins_per_scene": 4,
-    "cavs": 8,
-    "vehicle_rig": {
-        "cameras": {
-            "camera": {
-                "mount": {"x": 0.5, "z": 1.5},
-                "settings": {"width": 640, "height": 384, "fov_deg": 45.0},
-            }
-        }
-    },
-    "weather": {"classes": ["clear", "cloudy", "overcast", "light_rain"]},
-}
-ARTERIAL: RecipeFields = {**RECIPE, "town": "arterial", "warmup_s": [86.0, 89.5], "every_s": 15.0}
-GRID: RecipeFields = {**RECIPE, "town": "grid", "warmup_s": [78.0, 80.5], "every_s": 15.0}
-SUBURB: RecipeFields = {**RECIPE, "town": "suburb", "warmup_s": [45.0, 105.0], "every_s": 5.0}
-RING: RecipeFields = {**RECIPE, "town": "ring", "warmup_s": [87.0, 89.5], "every_s": 15.0}
+ARTERIAL, SUBURB, GRID = recipe_of("signs"), recipe_of("signs_suburb"), recipe_of("signs_grid")
+RING = {**ARTERIAL, "town": "ring", "warmup_s": [87.0, 89.5]}
 
 
 def _numbers(result: Result) -> Mapping[str, float]:
@@ -59,11 +44,7 @@ def _draw(results: Mapping[str, Any]) -> bytes:
 STUDY = Study(
     task=SIGNS,
     network="n",
-    train=(
-        {**ARTERIAL, "seed": 14, "scenes": 24},
-        {**SUBURB, "seed": 15, "scenes": 7},
-        {**GRID, "seed": 16, "scenes": 7},
-    ),
+    train=(ARTERIAL, SUBURB, GRID),
     validation={**ARTERIAL, "seed": 114, "split": "validation", "scenes": 6},
     tests={
         "held-out scenes": {**ARTERIAL, "seed": 414, "split": "test", "scenes": 12},

@@ -10,30 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from flcav.experiments.task_study import RecipeFields, Result, Study
+from flcav.experiments.task_study import Result, Study, recipe_of
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.report import style
 from flcav.report.path_errors import Bar, path_errors
 
-RECIPE: RecipeFields = {
-    "warmup_s": 60.0,
-    "spins_per_scene": 81,
-    "every_s": 0.5,
-    "cavs": 1,
-    "vehicle_rig": {"lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 4, "azimuth_steps": 90}}}},
-}
-YAWS_DEG = {"front": 0.0, "front_left": 60.0, "front_right": -60.0, "back_left": 120.0, "back_right": -120.0}
-CAMERA_RECIPE: RecipeFields = RECIPE | {
-    "warmup_s": [40.0, 120.0],
-    "spins_per_scene": 41,
-    "cavs": 4,
-    "vehicle_rig": {
-        "cameras": {
-            name: {"mount": {"z": 1.7, "yaw_deg": yaw_deg}, "settings": {"width": 96, "height": 48, "fov_deg": 64.0}}
-            for name, yaw_deg in (YAWS_DEG | {"back": 180.0}).items()
-        }
-    },
-}
+GRID, SUBURB, RING = recipe_of("trajectory"), recipe_of("trajectory_suburb"), recipe_of("trajectory_ring")
+CAMERA_RECIPE = recipe_of("trajectory_cameras")
 PREDICTORS = {
     "constant velocity": "constant_velocity_FDE",
     "single path": "single_FDE",
@@ -75,14 +58,11 @@ def _bar(name: str, seeds: list[float]) -> Bar:
 STUDY = Study(
     task=TRAJECTORY,
     network="tiny",
-    train=(
-        {**RECIPE, "town": "grid", "seed": 21, "scenes": 6},
-        {**RECIPE, "town": "suburb", "seed": 24, "scenes": 5},
-    ),
-    validation={**RECIPE, "town": "grid", "seed": 121, "split": "validation", "scenes": 1},
+    train=(GRID, SUBURB),
+    validation={**GRID, "seed": 121, "split": "validation", "scenes": 1},
     tests={
-        "held-out scenes": {**RECIPE, "town": "grid", "seed": 221, "split": "test", "scenes": 3},
-        "held-out town": {**RECIPE, "town": "ring", "seed": 25, "split": "test", "scenes": 3},
+        "held-out scenes": {**GRID, "seed": 221, "split": "test", "scenes": 3},
+        "held-out town": {**RING, "split": "test"},
     },
     epochs=3,
     patience=3,
@@ -94,9 +74,9 @@ STUDY = Study(
 CAMERAS = Study(
     task=TRAJECTORY,
     network="tiny-cameras",
-    train=({**CAMERA_RECIPE, "town": "grid", "seed": 31, "scenes": 24},),
-    validation={**CAMERA_RECIPE, "town": "grid", "seed": 131, "split": "validation", "cavs": 3, "scenes": 4},
-    tests={"held-out scenes": {**CAMERA_RECIPE, "town": "grid", "seed": 331, "split": "test", "cavs": 3, "scenes": 6}},
+    train=(CAMERA_RECIPE,),
+    validation={**CAMERA_RECIPE, "seed": 131, "split": "validation", "cavs": 3, "scenes": 4},
+    tests={"held-out scenes": {**CAMERA_RECIPE, "seed": 331, "split": "test", "cavs": 3, "scenes": 6}},
     epochs=5,
     patience=5,
     numbers=_numbers,

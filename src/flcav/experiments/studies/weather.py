@@ -8,27 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from flcav.experiments.task_study import RecipeFields, Result, Study
+from flcav.experiments.task_study import Result, Study, recipe_of
 from flcav.perception.weather.task import WEATHER, over_the_whole_space
 from flcav.report import style
 from flcav.report.confusion import confusions
-from flcav.world.weather import ANY, WEATHER_CLASSES
+from flcav.world.weather import ANY
 
-RECIPE: RecipeFields = {
-    "warmup_s": 40.0,
-    "spins_per_scene": 8,
-    "every_s": 4.0,
-    "cavs": 3,
-    "vehicle_rig": {
-        "cameras": {
-            "camera": {
-                "mount": {"x": 0.5, "z": 1.5},
-                "settings": {"width": 320, "height": 192, "fov_deg": 90.0},
-            }
-        }
-    },
-    "weather": {"classes": list(WEATHER_CLASSES), "turn_s": 4.0},
-}
+RECIPE = recipe_of("weather")
 WHOLE_SPACE = "whole space"
 ANY_WEATHER = {"classes": [ANY] * 8, "turn_s": 4.0}
 
@@ -50,16 +36,12 @@ def _draw(results: Mapping[str, Any]) -> bytes:
 STUDY = Study(
     task=WEATHER,
     network="tiny",
-    train=(
-        {**RECIPE, "town": "ring", "seed": 13, "scenes": 80},
-        {**RECIPE, "town": "suburb", "seed": 113, "scenes": 80},
-        {**RECIPE, "town": "arterial", "seed": 613, "scenes": 80},
-    ),
-    validation={**RECIPE, "town": "ring", "seed": 213, "split": "validation", "scenes": 20},
+    train=(RECIPE, {**RECIPE, "town": "suburb", "seed": 113}, {**RECIPE, "town": "arterial", "seed": 613}),
+    validation={**RECIPE, "seed": 213, "split": "validation", "scenes": 20},
     tests={
-        "held-out scenes": {**RECIPE, "town": "ring", "seed": 1013, "split": "test", "scenes": 12},
+        "held-out scenes": {**RECIPE, "seed": 1013, "split": "test", "scenes": 12},
         "held-out town": {**RECIPE, "town": "grid", "seed": 1113, "split": "test", "scenes": 12},
-        WHOLE_SPACE: {**RECIPE, "town": "ring", "seed": 1213, "split": "test", "scenes": 12, "weather": ANY_WEATHER},
+        WHOLE_SPACE: {**RECIPE, "seed": 1213, "split": "test", "scenes": 12, "weather": ANY_WEATHER},
     },
     epochs=60,
     patience=15,

@@ -7,13 +7,15 @@ run record, a message's id, and the wire form of a record.
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 
-from flwr.app import ConfigRecord, Context, Error, Message, RecordDict
+from flwr.app import ConfigRecord, Context, Error, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 from flwr.common.serde import recorddict_to_proto
 from flwr.serverapp import Grid
 from flwr.supercore.run import Run
 from flwr.supercore.task_identity import TaskIdentity
 
+from flcav.federation.records import ARRAYS, LOSS, METRICS, SAMPLES, to_arrays
+from flcav.federation.trainable import Weights
 from flcav.network.ledger import BudgetExceeded
 
 RUN_ID, SERVER_NODE, CLIENT_APP_RAISED = 1, 1, 2
@@ -23,6 +25,11 @@ FIRST_NODE = 2
 def wire_bytes(content: RecordDict) -> int:
     """Return the size of a message's content as Flower serialises it [bytes]."""
     return recorddict_to_proto(content).ByteSize()
+
+
+def update_bytes(weights: Weights) -> int:
+    """Return the size of a client's update with such weights as Flower serialises it [bytes]."""
+    return wire_bytes(RecordDict({ARRAYS: to_arrays(weights), METRICS: MetricRecord({SAMPLES: 0, LOSS: 0.0})}))
 
 
 @contextlib.contextmanager

@@ -1,7 +1,24 @@
 """How an aggregator combines updates."""
 
+from dataclasses import is_dataclass
+
+from flcav.config import InputError
 from flcav.federation.strategies.fedavg import FedAvg
 from flcav.federation.strategies.strategy import Strategy
+from flcav.plugins import load_own
 
 STRATEGIES: dict[str, type[Strategy]] = {"fedavg": FedAvg}
 FEDAVG = FedAvg()  # the default everywhere
+
+
+def strategy_named(name: str) -> Strategy:
+    """Return the strategy of that name with its default settings: one of `STRATEGIES`, or your own as `module:NAME`.
+
+    Raises `InputError` for an unknown name, and where the user's module is not there or holds no strategy of that name.
+    """
+    if name in STRATEGIES:
+        return STRATEGIES[name]()
+    found: Strategy = load_own("strategy", name, STRATEGIES, Strategy)
+    if not is_dataclass(found):
+        raise InputError(f"strategy '{name}': is no dataclass, so that its settings are not known")
+    return found

@@ -1,19 +1,18 @@
 """Detection metrics."""
 
 from flcav.perception.metrics.average_precision import (
-    CONFIDENCE,
     average_precision,
     bootstrap_difference,
     bootstrap_interval,
     interval_words,
     orientation_similarity,
     right_headings,
+    weighted_precision,
 )
 from flcav.perception.metrics.calibration import calibration_error, fit_logistic
 from flcav.perception.metrics.matching import Matches, match
 
 __all__ = [
-    "CONFIDENCE",
     "Matches",
     "average_precision",
     "bootstrap_difference",
@@ -24,4 +23,5 @@ __all__ = [
     "match",
     "orientation_similarity",
     "right_headings",
+    "weighted_precision",
 ]

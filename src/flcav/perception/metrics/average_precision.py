@@ -4,16 +4,17 @@ AP|R40 is the mean over recalls 1/40, 2/40, ..., 1 of the best precision reached
 (Simonelli et al., "Disentangling Monocular 3D Object Detection", ICCV 2019, sec. 5; KITTI's measure since then).
 Average orientation similarity is the same mean of another precision: a hit turned by t counts (1 + cos t) / 2 (Geiger
 et al., "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012, sec. 2.5, eqs. 1-2).
-Intervals are percentile bootstraps over scenes: frames of one scene share traffic, so whole scenes are redrawn.
+Intervals are over scenes, see `flcav.intervals`.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flcav.intervals import REDRAWS, over_scenes
 from flcav.perception.metrics.matching import Matches
 
 RECALLS = np.arange(1, 41) / 40
-CONFIDENCE = 0.95
+AT_ONCE = 2**15  # redrawings times detections: arrays of 0.25 MB stay in a processor's cache
 
 
 def average_precision(matches: Matches, frames: ArrayLike | None = None) -> float:
@@ -21,12 +22,13 @@ def average_precision(matches: Matches, frames: ArrayLike | None = None) -> floa
 
     NaN where those frames hold nothing to find.
     """
-    return _weighted(matches, _times(matches, frames))
+    return float(weighted_precision(matches, _times(matches, frames))[0])
 
 
 def orientation_similarity(matches: Matches, frames: ArrayLike | None = None) -> float:
     """Return the average orientation similarity (AOS|R40) in [0, AP|R40] over `frames`, as `average_precision` does."""
-    return _weighted(matches, _times(matches, frames), (1 + np.cos(np.nan_to_num(matches.turned))) / 2)
+    worth = (1 + np.cos(np.nan_to_num(matches.turned))) / 2
+    return float(weighted_precision(matches, _times(matches, frames), worth)[0])
 
 
 def right_headings(matches: Matches) -> float:
@@ -35,7 +37,7 @@ def right_headings(matches: Matches) -> float:
 
 
 def bootstrap_interval(
-    matches: Matches, scene_of_frame: ArrayLike, n: int = 1000, *, rng: np.random.Generator
+    matches: Matches, scene_of_frame: ArrayLike, n: int = REDRAWS, *, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Return the 95 % percentile interval of AP under redrawing of scenes; `scene_of_frame` (F,) names each's scene.
 
@@ -43,16 +45,16 @@ def bootstrap_interval(
     """
     if len(np.unique(np.asarray(scene_of_frame)[matches.targets > 0])) < 2:
         return float("nan"), float("nan")
-    draws = np.array([_weighted(matches, times) for times in _redrawn(scene_of_frame, n, rng)])
-    return _interval(draws)
+    return over_scenes(lambda times: weighted_precision(matches, times), scene_of_frame, n, rng=rng)
 
 
 def bootstrap_difference(
-    before: Matches, after: Matches, scene_of_frame: ArrayLike, n: int = 1000, *, rng: np.random.Generator
+    before: Matches, after: Matches, scene_of_frame: ArrayLike, n: int = REDRAWS, *, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Return the 95 % percentile interval of AP(after) - AP(before), both on the same redrawn frames."""
-    draws = [_weighted(after, times) - _weighted(before, times) for times in _redrawn(scene_of_frame, n, rng)]
-    return _interval(np.array(draws))
+    return over_scenes(
+        lambda times: weighted_precision(after, times) - weighted_precision(before, times), scene_of_frame, n, rng=rng
+    )
 
 
 def interval_words(low: float | None, high: float | None) -> str:
@@ -61,37 +63,33 @@ def interval_words(low: float | None, high: float | None) -> str:
 
 
 def _times(matches: Matches, frames: ArrayLike | None) -> NDArray[np.int64]:
-    """Return (F,) how often each frame counts."""
+    """Return (1, F) how often each frame counts."""
     if frames is None:
-        return np.ones(len(matches.targets), dtype=np.int64)
-    return np.bincount(np.asarray(frames, dtype=np.int64), minlength=len(matches.targets))
+        return np.ones((1, len(matches.targets)), dtype=np.int64)
+    return np.bincount(np.asarray(frames, dtype=np.int64), minlength=len(matches.targets))[None]
 
 
-def _weighted(matches: Matches, times: NDArray[np.int64], worth: NDArray[np.float64] | float = 1.0) -> float:
-    """Return AP where each frame counts `times` (F,) and each hit `worth` (D,) towards the precision."""
-    wanted = int((matches.targets * times).sum())
-    if not wanted:
-        return float("nan")
-    weight = times[matches.frame]
-    hits, all_detections = np.cumsum(weight * matches.hit), np.cumsum(weight)
-    worths = np.cumsum(weight * matches.hit * worth)
+def weighted_precision(
+    matches: Matches, times: NDArray[np.int64], worth: NDArray[np.float64] | float = 1.0
+) -> NDArray[np.float64]:
+    """Return AP (n,) where each frame counts `times` (n, F) and each hit `worth` (D,) towards the precision."""
     ends = np.flatnonzero(np.diff(matches.score, append=-np.inf) != 0)  # equal scores enter together
-    precision = worths[ends] / np.maximum(all_detections[ends], 1)
-    best_onwards = np.maximum.accumulate(precision[::-1])[::-1]
-    place = np.searchsorted(hits[ends], RECALLS * wanted - 1e-9)  # first threshold that reaches the recall
-    return float(np.append(best_onwards, 0.0)[place].mean())
+    worths, block = np.where(matches.hit, worth, 0.0), max(AT_ONCE // max(len(matches.score), 1), 1)
+    blocks = (times[start : start + block] for start in range(0, len(times), block))
+    return np.concatenate([_average(matches, worths, ends, part) for part in blocks])
 
 
-def _redrawn(scene_of_frame: ArrayLike, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return (n, F) how often each frame occurs in each of n redrawings of the scenes."""
-    names, scene = np.unique(np.asarray(scene_of_frame), return_inverse=True)
-    times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=n)
-    return times[:, scene]
-
-
-def _interval(draws: NDArray[np.float64]) -> tuple[float, float]:
-    known = draws[np.isfinite(draws)]
-    if not len(known):
-        return float("nan"), float("nan")
-    low, high = np.quantile(known, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(low), float(high)
+def _average(
+    matches: Matches, worths: NDArray[np.float64], ends: NDArray[np.intp], times: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return AP (n,) of `times` (n, F); NaN where nothing is to be found. `ends` (E,): the last of equal scores."""
+    wanted = times @ matches.targets
+    weight = np.take(times, matches.frame, axis=1)
+    hits, detections = np.cumsum(weight * matches.hit, axis=1)[:, ends], np.cumsum(weight, axis=1)[:, ends]
+    precision = np.cumsum(weight * worths, axis=1)[:, ends] / np.maximum(detections, 1)
+    best_onwards = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
+    best_onwards = np.column_stack((best_onwards, np.zeros(len(times))))
+    needed = RECALLS * wanted[:, None] - 1e-9
+    place = np.stack([np.searchsorted(*one) for one in zip(hits, needed)])  # first threshold that reaches the recall
+    found = np.take_along_axis(best_onwards, place, axis=1).mean(axis=1)
+    return np.where(wanted > 0, found, np.nan)

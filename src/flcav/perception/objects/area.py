@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from flcav.config import InputError
-from flcav.perception.metrics import CONFIDENCE
+from flcav.intervals import CONFIDENCE
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.truth import MIN_RETURNS
 

@@ -21,6 +21,7 @@ from flcav.perception.objects.errors import register_errors
 from flcav.perception.objects.evaluate import detections_and_truths, score_detections
 from flcav.perception.objects.infer import box_rows, point_clouds
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
+from flcav.perception.objects.outcomes import ObjectsOutcomes
 from flcav.perception.objects.paste import Cutouts, cut, pasted
 from flcav.perception.objects.samples import RecordedSweeps, Sample, fitting_frames
 from flcav.perception.objects.slices import slice_lines, sliced
@@ -29,13 +30,15 @@ from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
 
 
-class ObjectsTask:
+class ObjectsTask(ObjectsOutcomes):
     """3D boxes of road users in a LiDAR sweep."""
 
     name = "objects"
     family = "second"
     configurations = CONFIGURATIONS
     practice = Practice(batch=2, learning_rate=2e-3)
+    recording: Mapping[str, Any] = {}
+    labels = ("ideal-road", "own-detections")
 
     def __init__(self) -> None:
         self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # what was cut out last, and of which samples
@@ -95,6 +98,10 @@ class ObjectsTask:
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the calibration of the network's scores, see `flcav.perception.objects.calibrate`."""
         calibrate(network, map(data.frame, of_frames(data, frames)))
+
+    def sample_bytes(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> list[int]:
+        """Return the bytes of each sweep with its annotation rows."""
+        return [data.payload_bytes(i) for i in frames]
 
     def score(self, result: Mapping[str, Any]) -> float:
         """Return the mean over classes of AP in 3D at IoU 0.5; 0 where there was nothing to find."""

@@ -1,7 +1,6 @@
 """Detection of signs and traffic lights as a `Task`."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,28 +10,35 @@ from torch import Tensor
 from flcav.dataset.store import Dataset
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.images import pictures
+from flcav.perception.sharing import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
 from flcav.perception.signs.detect import Detections, detect, predict
 from flcav.perception.signs.errors import register_errors
-from flcav.perception.signs.evaluate import Truth, mean_average_precision
+from flcav.perception.signs.evaluate import mean_average_precision
 from flcav.perception.signs.loss import detection_loss
 from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.outcomes import SignsOutcomes, by_picture
 from flcav.perception.signs.samples import RecordedPictures, Sample
 from flcav.perception.signs.targets import assign
 from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
 
-LOWEST_SCORE = 0.01  # detections below hardly change the average precision
+BOX_BYTES = 4 * 4 + 1  # of a label: a box in float32, and its class
 
 
-class SignsTask:
+class SignsTask(SignsOutcomes):
     """Boxes of signs and signal heads in a camera picture, and what they show."""
 
     name = "signs"
     family = "yolo"
     configurations = CONFIGURATIONS
     practice = Practice(batch=8, learning_rate=2e-3)
+    recording: Mapping[str, Any] = {
+        "vehicle_rig": camera_ahead(640, 384, 45.0),
+        "weather": {"classes": ["clear", "cloudy", "overcast", "light_rain"]},
+    }
+    labels = (ANNOTATED,)
 
     def build(self, config: SignsConfig) -> SignDetector:
         """Return a fresh network."""
@@ -55,14 +61,16 @@ class SignsTask:
         self, network: SignDetector, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
     ) -> dict[str, Any]:
         """Return COCO's mAP, by class and by size, see `mean_average_precision`."""
-        recorded = _last_asked_for(data, network.config, None if frames is None else tuple(frames))
-        truths, found = [], []
-        for done, sample in enumerate(recorded, start=1):
-            truths.append(Truth(sample.boxes, sample.label, sample.ignore))
-            found.append(detect(network, sample.picture, threshold=LOWEST_SCORE))
-            progress(done, len(recorded), "")
+        kept = self.outcomes(network, data, of_frames(data, frames), progress)
+        found, truths = by_picture(kept)
         result = mean_average_precision(found, truths, network.config.classes, network.config.smallest_px)
-        return result | {"scenes": len({recorded.scene(number) for number in range(len(recorded))})}
+        return result | {"scenes": len(set(kept.scene.tolist()))}
+
+    def sample_bytes(self, data: Dataset, config: SignsConfig, frames: Sequence[int]) -> list[int]:
+        """Return the bytes of each frame's pictures with their boxes: four float32 and a class."""
+        return [
+            picture_bytes(data, i) + BOX_BYTES * sum(map(len, data.frame(i).annotations.signs.values())) for i in frames
+        ]
 
     def score(self, result: Mapping[str, Any]) -> float:
         """Return mAP at IoU 0.5; 0 where there was nothing to find."""
@@ -108,12 +116,6 @@ class SignsTask:
 
 
 SIGNS = SignsTask()
-
-
-@lru_cache(maxsize=1)
-def _last_asked_for(data: Dataset, config: SignsConfig, frames: tuple[int, ...] | None) -> RecordedPictures:
-    """Return the pictures; training asks for those of its validation again and again."""
-    return RecordedPictures(data, config, frames)
 
 
 def box_rows(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:

@@ -1,5 +1,6 @@
 """Trajectory prediction as a `Task`."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from flcav.perception.trajectory.evaluate import metrics
 from flcav.perception.trajectory.infer import findings
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
 from flcav.perception.trajectory.model import TrajectoryNetwork
+from flcav.perception.trajectory.outcomes import TrajectoryOutcomes
 from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.samples import Sample, samples_of, watching_frames
 from flcav.progress import Report, silent
@@ -25,13 +27,18 @@ from flcav.progress import Report, silent
 Array = NDArray[np.float64]
 
 
-class TrajectoryTask:
+class TrajectoryTask(TrajectoryOutcomes):
     """Where road users will be in the next three seconds."""
 
     name = "trajectory"
     family = "trajectory-lstm"
     configurations = CONFIGURATIONS
     practice = Practice(batch=64, learning_rate=2e-3)
+    recording: Mapping[str, Any] = {
+        "vehicle_rig": {"lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 4, "azimuth_steps": 90}}}},
+        "every_s": 0.5,
+    }
+    labels = ("future",)
 
     def build(self, config: TrajectoryConfig) -> TrajectoryNetwork:
         """Return a fresh network."""
@@ -71,6 +78,13 @@ class TrajectoryTask:
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
         return metrics(paths, probabilities, samples.columns)
+
+    def sample_bytes(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> list[int]:
+        """Return the bytes of each frame's tracks, past and future in float32; the map is known to everybody."""
+        columns = samples_of(data, config, frames).columns
+        each = 4 * int(np.prod(columns["past"].shape[1:]) + np.prod(columns["future"].shape[1:]))
+        counts = Counter(columns["frame"].tolist())
+        return [each * counts[i] for i in frames]
 
     def score(self, result: Mapping[str, Any]) -> float:
         """Return 1 / (1 + the mean of the likeliest and the best mode's final error in metres)."""

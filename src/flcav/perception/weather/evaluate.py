@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.perception.metrics import CONFIDENCE
+from flcav.intervals import CONFIDENCE, over_scenes
 from flcav.seeds import stream
-
-REDRAWS = 1000
 
 
 def classification(
@@ -41,11 +39,6 @@ def classification(
 
 
 def _interval(right: NDArray[np.bool_], scenes: Sequence[str], seed: int) -> tuple[float, float] | tuple[None, None]:
-    _, scene = np.unique(np.asarray(scenes), return_inverse=True)
-    count = int(scene.max()) + 1
-    if count < 2:
+    if len(set(scenes)) < 2:
         return None, None
-    hits, sizes = np.bincount(scene, right), np.bincount(scene)
-    times = stream(seed, "bootstrap").multinomial(count, np.full(count, 1 / count), size=REDRAWS)
-    low, high = np.quantile(times @ hits / (times @ sizes), ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
-    return float(low), float(high)
+    return over_scenes(lambda times: times @ right / times.sum(axis=1), scenes, rng=stream(seed, "bootstrap"))

@@ -10,26 +10,32 @@ from torch import Tensor
 from torch.nn import functional
 
 from flcav.dataset.store import Dataset
-from flcav.perception.images import Picture, pictures
+from flcav.perception.images import pictures
 from flcav.perception.metrics import interval_words
+from flcav.perception.sharing import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.task import Finding, Practice
 from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
 from flcav.perception.weather.evaluate import classification
 from flcav.perception.weather.model import Classifier, LeNet
-from flcav.perception.weather.samples import Sample, augment, batched, labelled, small
+from flcav.perception.weather.outcomes import WeatherOutcomes
+from flcav.perception.weather.probabilities import probabilities, tensor_of
+from flcav.perception.weather.samples import Sample, augment, labelled, small
 from flcav.progress import Report, silent
-from flcav.world.weather import nearest_class
-
-BATCH = 256  # pictures at once where nothing is learned
+from flcav.world.weather import WEATHER_CLASSES, nearest_class
 
 
-class WeatherTask:
+class WeatherTask(WeatherOutcomes):
     """Which of the classes of weather a picture shows."""
 
     name = "weather"
     family = "lenet"
     configurations = CONFIGURATIONS
     practice = Practice(batch=32, learning_rate=4e-3)
+    recording: Mapping[str, Any] = {
+        "vehicle_rig": camera_ahead(320, 192, 90.0),
+        "weather": {"classes": list(WEATHER_CLASSES), "turn_s": 4.0},
+    }
+    labels = (ANNOTATED,)
 
     def build(self, config: LeNetConfig) -> Classifier:
         """Return a fresh network."""
@@ -45,7 +51,7 @@ class WeatherTask:
 
     def loss(self, network: Classifier, samples: Sequence[Sample]) -> Tensor:
         """Return the cross entropy of a batch."""
-        logits = network(_tensor(network, [sample.picture for sample in samples]))
+        logits = network(tensor_of(network, [sample.picture for sample in samples]))
         return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
 
     def evaluate(
@@ -53,6 +59,10 @@ class WeatherTask:
     ) -> dict[str, Any]:
         """Return accuracy, recall per class and the confusion matrix, see `classification`."""
         return classified(network, self.samples(data, network.config, frames), progress)
+
+    def sample_bytes(self, data: Dataset, config: LeNetConfig, frames: Sequence[int]) -> list[int]:
+        """Return the bytes of each frame's pictures, with one for the class."""
+        return [picture_bytes(data, i) + 1 for i in frames]
 
     def score(self, result: Mapping[str, Any]) -> float:
         """Return the accuracy."""
@@ -101,21 +111,3 @@ def over_the_whole_space(network: Classifier, data: Dataset) -> dict[str, Any]:
     """Return {"nearest": as `classified`} where pictures between and beyond the regions count as of the nearest."""
     samples = labelled(data, network.config.classes, named=nearest_class)
     return {"nearest": classified(network, samples)}
-
-
-def probabilities(network: Classifier, small_pictures: Sequence[Picture], progress: Report = silent) -> np.ndarray:
-    """Return (N, classes) probabilities of pictures of 32 x 32 pixels; the network's mode is left as it was."""
-    training = network.training
-    network.eval()
-    parts = []
-    with torch.inference_mode():
-        for first in range(0, len(small_pictures), BATCH):
-            logits = network(_tensor(network, list(small_pictures[first : first + BATCH])))
-            parts.append(logits.softmax(1).cpu().numpy())
-            progress(min(first + BATCH, len(small_pictures)), len(small_pictures), "")
-    network.train(training)
-    return np.concatenate(parts)
-
-
-def _tensor(network: Classifier, small_pictures: list[Picture]) -> Tensor:
-    return torch.from_numpy(batched(small_pictures)).to(next(network.parameters()).device)

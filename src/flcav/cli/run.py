@@ -1,0 +1,142 @@
+"""`flcav run`, `flcav demo`, `flcav compare`: the three stages of a recipe, and two runs side by side."""
+
+import dataclasses
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from flcav.cli.choices import Engine, listed
+from flcav.cli.interruption import when_interrupted
+from flcav.threads import use_threads
+
+if TYPE_CHECKING:
+    from flcav.pipeline.results import Run, Summary
+
+
+class Stale(StrEnum):
+    """What becomes of steps that other code began or finished."""
+
+    refuse = "refuse"
+    redo = "redo"
+    keep = "keep"
+
+
+JOBS = typer.Option(2, "--jobs", min=1, help="Workers, of one thread each; the results are the same.")
+SEEDS = typer.Option(1, "--seeds", min=1, help="Number of seeds, from the recipe's on; above 1, a folder each.")
+ENGINE = typer.Option(Engine.processes, "--engine", help="Who works: processes here, or a cluster by Ray.")
+STALE = typer.Option(Stale.refuse, "--stale", help=f"Steps that other code began or finished: {listed(Stale)}.")
+AS_JSON = typer.Option(False, "--json", help="Print one JSON object instead of sentences.")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command()(run)
+    app.command()(demo)
+    app.command()(compare)
+
+
+@when_interrupted()
+def run(
+    recipe: Path = typer.Argument(help="Run recipe (YAML): tasks, regions, budgets, arms; see docs/runs.md."),
+    out: Path = typer.Option(..., "--out", help="Folder of the run; the same command goes on after a stop."),
+    jobs: int = JOBS,
+    seeds: int = SEEDS,
+    engine: Engine = ENGINE,
+    stale: Stale = STALE,
+    as_json: bool = AS_JSON,
+) -> None:
+    """Run a recipe through the three stages; write report.html, results.json and history.csv."""
+    _run(recipe, None, out, jobs, seeds, engine, stale, as_json, "run")
+
+
+@when_interrupted()
+def demo(
+    out: Path = typer.Option(
+        Path("out/demo"), "--out", help="Folder of the run; the same command goes on after a stop."
+    ),
+    seed: int | None = typer.Option(None, "--seed", min=0, help="Seed of traffic, sensors and training, if not 1."),
+    recipe: Path = typer.Option(Path("recipes/runs/demo.yaml"), "--recipe", help="Another run recipe."),
+    jobs: int = JOBS,
+    stale: Stale = STALE,
+) -> None:
+    """Run recipes/runs/demo.yaml: pretraining, a roadside sensor, edge FL and cloud FL on three towns."""
+    _run(recipe, seed, out, jobs, 1, Engine.processes, stale, False, "demo")
+
+
+def _run(
+    path: Path,
+    seed: int | None,
+    out: Path,
+    jobs: int,
+    seeds: int,
+    engine: Engine,
+    stale: Stale,
+    as_json: bool,
+    title: str,
+) -> None:
+    use_threads(1)
+    from flcav.cli.steps import live_steps
+    from flcav.files import check_writable
+    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.pipeline.run import run as run_one
+    from flcav.pipeline.run import run_seeds
+    from flcav.report.run_page import write_report
+    from flcav.sources.recipe import find_recipe
+
+    check_writable(out)
+    found = find_recipe(path)
+    asked = load_run_recipe(found)
+    if seed is not None:
+        asked = asked.model_copy(update={"seed": seed})
+    how = {"beside": found.parent, "jobs": jobs, "stale": stale.value, "engine": engine.value}
+    with live_steps(title) as notify:
+        if seeds == 1:
+            results = {out: run_one(asked, out, notify=notify, **how)}
+            summary = None
+        else:
+            runs, summary = run_seeds(asked, out, seeds=seeds, notify=notify, **how)
+            results = {out / f"seed{each.recipe.seed}": each for each in runs}
+    reports = [write_report(result, folder) for folder, result in results.items()]
+    if as_json:
+        first = next(iter(results.values()))
+        typer.echo(json.dumps((summary or first).as_json()))
+        return
+    _tell(list(results.values()), summary)
+    for report, result in zip(reports, results.values(), strict=True):
+        took = f", in {result.elapsed_s / 60:.1f} minutes" if result.elapsed_s else ""
+        typer.echo(f"{report}: the report{took}")
+
+
+def _tell(results: "list[Run]", summary: "Summary | None") -> None:
+    if summary is None:
+        for finding in results[0].findings:
+            typer.echo(f"{finding.question}: {finding.verdict}. {finding.sentence}")
+        return
+    for row in (*summary.measures, *summary.differences):
+        low, high = row.estimate.low, row.estimate.high
+        typer.echo(f"{row.name}: {row.estimate.mean:.3f} ({low:.3f} to {high:.3f}) over {len(summary.seeds)} seeds")
+
+
+def compare(
+    first: Path = typer.Argument(help="Folder of a run, of one seed or several."),
+    second: Path = typer.Argument(help="Folder of another, with the same test frames."),
+    as_json: bool = AS_JSON,
+) -> None:
+    """Compare two runs: differences, second minus first, of every test that both made on the same frames."""
+    from flcav.pipeline.compare import compare as compare_runs
+
+    rows = compare_runs(first, second)
+    if as_json:
+        typer.echo(json.dumps({"compared": [dataclasses.asdict(row) for row in rows]}))
+        return
+    for row in rows:
+        change = row.difference
+        interval = "no interval: one scene" if change.low is None else f"{change.low:+.3f} to {change.high:+.3f}"
+        arm = "" if row.arm == "main" else f" ({row.arm})"
+        typer.echo(
+            f"{row.region}, {row.task}, {row.stage}{arm}: {row.measure} {row.first:.3f} -> {row.second:.3f}, "
+            f"{change.mean:+.3f} ({interval}): {row.verdict}"
+        )

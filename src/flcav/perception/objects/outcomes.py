@@ -1,0 +1,79 @@
+"""What a detector of objects did in each frame, and average precision from it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.intervals import REDRAWS
+from flcav.perception.metrics import Matches, match, orientation_similarity, right_headings, weighted_precision
+from flcav.perception.objects.evaluate import detections_and_truths, of_class
+from flcav.perception.objects.model import Second
+from flcav.perception.ops.rotated import Kind
+from flcav.perception.outcomes import Outcomes, Times, Values
+from flcav.progress import Report, silent
+
+CLASSES, HIDDEN = "classes", "hidden"
+MEASURED = "3d50"
+KEPT: Mapping[str, tuple[Kind, float]] = {MEASURED: ("3d", 0.5), "3d70": ("3d", 0.7), "bev50": ("bev", 0.5)}
+
+
+class ObjectsOutcomes:
+    """Average precision (AP|R40) in 3D at IoU 0.5, the mean over classes."""
+
+    measure_name = "AP50"
+    redraws = REDRAWS
+
+    def outcomes(self, network: Second, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
+        """Return which detections of which frames hit."""
+        found, truths = detections_and_truths(network, map(data.frame, frames), total=len(frames), progress=progress)
+        classes = network.config.classes
+        if not truths:
+            raise InputError("evaluation on 0 frames: at least one is wanted")
+        hidden = [sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes]
+        arrays: dict[str, Any] = {CLASSES: np.array(classes), HIDDEN: np.array(hidden)}
+        for name in classes:
+            own = [of_class(boxes, name) for boxes in found]
+            targets = [of_class(truth.targets, name) for truth in truths]
+            neutral = [of_class(truth.neutral, name) for truth in truths]
+            for key, (kind, overlap) in KEPT.items():
+                matches = match(own, targets, neutral, overlap, kind)
+                arrays |= {f"{name}/{key}/{field}": value for field, value in vars(matches).items()}
+        return Outcomes(np.array([truth.scene for truth in truths]), arrays)
+
+    def measure(self, outcomes: Outcomes, times: Times) -> Values:
+        """Return the mean over classes of AP; of classes that have targets."""
+        return self._mean_precision(outcomes, MEASURED, times)
+
+    def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
+        """Return AP at IoU 0.7 and from above, AOS, the share of right headings, targets, hidden objects."""
+        once = np.ones((1, len(outcomes.scene)), dtype=np.int64)
+        each = [matches_of(outcomes, name) for name in outcomes.arrays[CLASSES]]
+        known = [matches for matches in each if matches.targets.any()]
+        right = [share for matches in known if not np.isnan(share := right_headings(matches))]
+        return {
+            "AP70": _number(self._mean_precision(outcomes, "3d70", once)[0]),
+            "BEV AP50": _number(self._mean_precision(outcomes, "bev50", once)[0]),
+            "AOS50": float(np.mean([orientation_similarity(matches) for matches in known])) if known else None,
+            "right headings": float(np.mean(right)) if right else None,
+            "targets": float(sum(int(matches.targets.sum()) for matches in each)),
+            "hidden": float(outcomes.arrays[HIDDEN].sum()),
+        }
+
+    def _mean_precision(self, outcomes: Outcomes, key: str, times: Times) -> Values:
+        each = [weighted_precision(matches_of(outcomes, name, key), times) for name in outcomes.arrays[CLASSES]]
+        known = ~np.isnan(each)
+        with np.errstate(invalid="ignore"):
+            return np.where(known, each, 0.0).sum(axis=0) / known.sum(axis=0)
+
+
+def matches_of(outcomes: Outcomes, name: str, key: str = MEASURED) -> Matches:
+    """Return the matches of a class under a measure of overlap, one of `KEPT`."""
+    return Matches(**{field.name: outcomes.arrays[f"{name}/{key}/{field.name}"] for field in fields(Matches)})
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)

@@ -1,0 +1,30 @@
+"""The perception tasks by name: those of the package, the one list of them, and a user's own."""
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from flcav.plugins import load_own
+
+if TYPE_CHECKING:
+    from flcav.perception.task import Task
+
+TASKS: Mapping[str, str] = {  # name -> module:NAME, so that listing them loads none
+    "weather": "flcav.perception.weather.task:WEATHER",
+    "signs": "flcav.perception.signs.task:SIGNS",
+    "objects": "flcav.perception.objects.task:OBJECTS",
+    "trajectory": "flcav.perception.trajectory.task:TRAJECTORY",
+}
+
+
+def task_named(name: str) -> "Task[Any, Any, Any]":
+    """Return the task of that name, one of `TASKS`, or a user's own as `module:NAME`.
+
+    Raises `InputError` for an unknown name, and where the user's module is not there or holds no task of that name.
+    """
+    if name in TASKS:
+        module, _, attribute = TASKS[name].partition(":")
+        return getattr(import_module(module), attribute)
+    from flcav.perception.task import Task
+
+    return load_own("task", name, TASKS, Task)

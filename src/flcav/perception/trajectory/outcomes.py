@@ -1,0 +1,54 @@
+"""How far predicted paths ended from where each road user went, and a score from it."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from flcav.dataset.store import Dataset
+from flcav.intervals import REDRAWS
+from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
+from flcav.perception.trajectory.evaluate import MISS_M, errors_of
+from flcav.perception.trajectory.model import TrajectoryNetwork
+from flcav.perception.trajectory.predict import predict
+from flcav.perception.trajectory.samples import samples_of
+from flcav.perception.trajectory.tracks import constant_velocity
+from flcav.progress import Report, silent
+
+NUMBERS = {
+    "single path FDE m": "single_FDE",
+    "best mode FDE m": "minFDE_K",
+    "constant velocity FDE m": "constant_velocity_FDE",
+}
+
+
+class TrajectoryOutcomes:
+    """1 / (1 + the mean of the likeliest and the best mode's final error in metres)."""
+
+    measure_name = "1 / (1 + FDE in m)"
+    redraws = REDRAWS
+
+    def outcomes(
+        self, network: TrajectoryNetwork, data: Dataset, frames: Sequence[int], progress: Report = silent
+    ) -> Outcomes:
+        """Return the errors of each road user's prediction [m]."""
+        samples = samples_of(data, network.config, frames)
+        paths, probabilities = predict(network, samples, progress)
+        columns = samples.columns
+        future, past = columns["future"].astype(np.float64), columns["past"]
+        errors = errors_of(paths, probabilities, future, constant_velocity(past))
+        return Outcomes(np.asarray(columns["scene"], dtype=np.str_), dict(errors))
+
+    def measure(self, outcomes: Outcomes, times: Times) -> Values:
+        """Return the score."""
+        likeliest, best = (weighted_mean(outcomes.arrays[name], times) for name in ("minFDE_1", "minFDE_K"))
+        return 1 / (1 + (likeliest + best) / 2)
+
+    def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
+        """Return final errors [m], the share of misses, and how many road users there are."""
+        errors = outcomes.arrays
+        means = {name: float(errors[column].mean()) for name, column in NUMBERS.items()}
+        return {
+            **means,
+            "missed": float((errors["single_FDE"] > MISS_M).mean()),
+            "road users": float(len(outcomes.scene)),
+        }

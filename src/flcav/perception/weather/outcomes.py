@@ -1,0 +1,39 @@
+"""Which pictures' weather was named rightly, and accuracy from it."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from flcav.dataset.store import Dataset
+from flcav.intervals import REDRAWS
+from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
+from flcav.perception.weather.model import Classifier
+from flcav.perception.weather.probabilities import probabilities
+from flcav.perception.weather.samples import labelled
+from flcav.progress import Report, silent
+
+
+class WeatherOutcomes:
+    """Accuracy: the share of pictures whose class of weather was named."""
+
+    measure_name = "accuracy"
+    redraws = REDRAWS
+
+    def outcomes(
+        self, network: Classifier, data: Dataset, frames: Sequence[int], progress: Report = silent
+    ) -> Outcomes:
+        """Return each picture's class and the one that was named."""
+        samples = labelled(data, network.config.classes, frames)
+        named = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
+        truth = np.array([sample.label for sample in samples])
+        return Outcomes(np.array([sample.scene for sample in samples]), {"truth": truth, "named": named})
+
+    def measure(self, outcomes: Outcomes, times: Times) -> Values:
+        """Return the accuracy."""
+        return weighted_mean((outcomes.arrays["truth"] == outcomes.arrays["named"]).astype(np.float64), times)
+
+    def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
+        """Return the least recall of a class, and how many pictures there are."""
+        truth, named = outcomes.arrays["truth"], outcomes.arrays["named"]
+        recalls = [float((named[truth == label] == label).mean()) for label in np.unique(truth)]
+        return {"least recall": min(recalls), "pictures": float(len(truth))}

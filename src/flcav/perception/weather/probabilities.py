@@ -1,0 +1,33 @@
+"""The classifier's probabilities of pictures, many at once."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flcav.perception.images import Picture
+from flcav.perception.weather.model import Classifier
+from flcav.perception.weather.samples import batched
+from flcav.progress import Report, silent
+
+BATCH = 256  # pictures at once where nothing is learned
+
+
+def probabilities(network: Classifier, small_pictures: Sequence[Picture], progress: Report = silent) -> np.ndarray:
+    """Return (N, classes) probabilities of pictures of 32 x 32 pixels; the network's mode is left as it was."""
+    training = network.training
+    network.eval()
+    parts = []
+    with torch.inference_mode():
+        for first in range(0, len(small_pictures), BATCH):
+            logits = network(tensor_of(network, list(small_pictures[first : first + BATCH])))
+            parts.append(logits.softmax(1).cpu().numpy())
+            progress(min(first + BATCH, len(small_pictures)), len(small_pictures), "")
+    network.train(training)
+    return np.concatenate(parts)
+
+
+def tensor_of(network: Classifier, small_pictures: list[Picture]) -> Tensor:
+    """Return (N, 3, 32, 32) the pictures as the network takes them, on its device."""
+    return torch.from_numpy(batched(small_pictures)).to(next(network.parameters()).device)

@@ -1,0 +1,112 @@
+"""The arms of a run as whole settings, and the names of the steps that they share."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, Arm, Federation, Placement, RunRecipe
+
+PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
+PLANNED = ("plan",)
+PLACED = ("plan", "placement")
+LEARNED = ("plan", "placement", "labels", "federation")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One arm, nothing left open."""
+
+    name: str
+    plan: PlanRule
+    placement: Placement
+    labels: Mapping[str, str]  # by task
+    federation: Federation
+    central: Literal["pretrain", "federate"] | None
+    regions: tuple[str, ...]  # that federate in it
+    stages: tuple[str, ...]  # after pretraining
+
+
+def settings_of(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:
+    """Return the run itself and its other arms by name, the run first; `labels` by task are the run's."""
+    return {name: _setting(recipe, labels, name, arm) for name, arm in {MAIN: Arm(), **recipe.arms}.items()}
+
+
+def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, arm: Arm) -> Setting:
+    return Setting(
+        name,
+        arm.plan,
+        Placement.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
+        dict(labels) | dict(arm.labels),
+        Federation.model_validate(recipe.federation.model_dump() | dict(arm.federation)),
+        arm.central,
+        arm.regions or recipe.with_role("federate"),
+        (CENTRAL,) if arm.central else arm.stages,
+    )
+
+
+class Names:
+    """The names of a run's steps. Arms that agree in what a step rests on share it, under the first one's name."""
+
+    def __init__(self, settings: Mapping[str, Setting]) -> None:
+        self._settings = settings
+
+    def recording(self, region: str, split: str, task: str) -> str:
+        """Return the step that records frames; all arms share it."""
+        return f"{region}-{split}-{task}"
+
+    def plan(self, arm: str) -> str:
+        """Return the step that plans."""
+        return "plan" + self._suffix(arm, PLANNED)
+
+    def pretrain(self, arm: str, task: str) -> str:
+        """Return stage I of a task."""
+        return f"{PRETRAIN}-{task}" + self._suffix(arm, PLANNED)
+
+    def errors(self, arm: str, region: str, task: str) -> str:
+        """Return the step that registers a task's errors in a region."""
+        return f"{region}-errors-{task}" + self._suffix(arm, PLANNED)
+
+    def place(self, arm: str, region: str) -> str:
+        """Return the step that places roadside sensors in a region."""
+        return f"{region}-place" + self._suffix(arm, PLACED)
+
+    def edge(self, arm: str, region: str, task: str) -> str:
+        """Return stage II of a task in a region."""
+        return f"{region}-{EDGE}-fl-{task}" + self._suffix(arm, LEARNED, task)
+
+    def cloud(self, arm: str, task: str) -> str:
+        """Return stage III of a task."""
+        return f"{CLOUD}-fl-{task}" + self._suffix(arm, LEARNED, task)
+
+    def central(self, arm: str, region: str, task: str) -> str:
+        """Return the training of a central arm."""
+        return f"{region}-{CENTRAL}-{task}-{arm}"
+
+    def stage(self, arm: str, stage: str, region: str, task: str) -> str:
+        """Return the step whose network an arm has in a region after a stage."""
+        if stage == PRETRAIN:
+            return self.pretrain(arm, task)
+        if stage == CLOUD:
+            return self.cloud(arm, task)
+        return (self.edge if stage == EDGE else self.central)(arm, region, task)
+
+    def test(self, trained: str, region: str) -> str:
+        """Return the test of a step's network in a region."""
+        return f"test-{trained}-{region}"
+
+    def rounds(self, trained: str, region: str) -> str:
+        """Return the validation of a step's network after each of its rounds in a region."""
+        return f"rounds-{trained}-{region}"
+
+    def _suffix(self, arm: str, fields: tuple[str, ...], task: str | None = None) -> str:
+        own = self._rests_on(arm, fields, task)
+        first = next(name for name in self._settings if self._rests_on(name, fields, task) == own)
+        return "" if first == MAIN else f"-{first}"
+
+    def _rests_on(self, arm: str, fields: tuple[str, ...], task: str | None) -> list[object]:
+        """Return what a step rests on; a task's labels, not those of the others."""
+        setting = self._settings[arm]
+        values = {name: getattr(setting, name) for name in fields}
+        if task is not None:
+            values["labels"] = setting.labels[task]
+        return list(values.values())

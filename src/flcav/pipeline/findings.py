@@ -1,0 +1,105 @@
+"""What the method claims, held against one run: sentences computed from the run's numbers.
+
+A claim is about a difference of a measure. Its interval is a paired bootstrap over scenes (95 %): wholly above 0 the
+claim held, wholly below it did not, around 0 the run does not decide.
+"""
+
+from collections.abc import Mapping, Sequence
+
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.pipeline.results import ArmResult, Difference, Finding, Test
+from flcav.verdicts import UNDECIDED, signed, verdict, verdict_words
+
+WORDS = {PRETRAIN: "pretrained", EDGE: "edge FL", CLOUD: "edge + cloud FL", CENTRAL: "central training"}
+
+
+def in_words(arm: str, stage: str) -> str:
+    """Return an arm's stage as pages name it."""
+    return WORDS[stage] if arm == MAIN else f"{WORDS[stage]} ({arm})"
+
+
+def findings(
+    differences: Sequence[Difference],
+    tests: Sequence[Test],
+    arms: Mapping[str, ArmResult],
+    rules: Mapping[str, str],
+    roles: Mapping[str, str],
+    caveats: Mapping[str, str],
+) -> tuple[Finding, ...]:
+    """Return a finding for each difference of the run itself.
+
+    `rules` are the arms' placement rules, `roles` the regions', `caveats` by task what figures after pretraining rest on.
+    """
+    values = {(test.arm, test.stage, test.region, test.task): test for test in tests}
+    return tuple(
+        _finding(each, _question(each, rules, roles), values, arms, caveats.get(each.task, ""))
+        for each in differences
+        if each.arm == MAIN
+    )
+
+
+def _finding(
+    each: Difference,
+    question: str,
+    values: Mapping[tuple[str, str, str, str], Test],
+    arms: Mapping[str, ArmResult],
+    caveat: str,
+) -> Finding:
+    after = values[each.arm, each.stage, each.region, each.task].result
+    before = _before(each, values).result
+    place = f"{each.region}, {each.task}"
+    same = _same_poles(each, arms)
+    if same is not None:
+        sentence = (
+            f"{_poles(same)}, placed by VRCSP, is also where traffic is densest: there is nothing to compare, so this "
+            f"run does not decide."
+        )
+        return Finding(place, question, UNDECIDED, sentence)
+    mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
+    told = (
+        f"On {each.region}, {after.measure} of {each.task} was {before.estimate.mean:.3f} "
+        f"({in_words(each.before_arm, each.before_stage)}) and {after.estimate.mean:.3f} "
+        f"({in_words(each.arm, each.stage)}): {signed(mean)}"
+    )
+    over = f"{after.frames} test frames of {after.scenes} scenes"
+    if low is None or high is None:
+        return Finding(place, question, UNDECIDED, f"{told}, over {over}: too few scenes for an interval.")
+    decided = verdict(low, high)
+    rests = f" ({caveat})" if caveat else ""
+    sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over}; {verdict_words(decided)}{rests}."
+    return Finding(place, question, decided, sentence)
+
+
+def _before(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) -> Test:
+    key = (each.before_arm, each.before_stage, each.region, each.task)
+    return values.get(key) or values[MAIN, *key[1:]]
+
+
+def _question(each: Difference, rules: Mapping[str, str], roles: Mapping[str, str]) -> str:
+    if each.before_arm == MAIN:
+        if each.stage == EDGE:
+            return "Does federated learning beat pretraining alone?"
+        if each.before_stage == EDGE:
+            return "Does cloud FL add to edge FL?"
+        where = "in the town of pretraining, too" if roles[each.region] == "pretrain" else "where nobody learned"
+        return f"Does federated learning help {where}?"
+    if rules[each.before_arm] == "densest" and rules[MAIN] == "vrcsp":
+        return "Does the placed pole beat the pole with the densest traffic?"
+    if rules[each.before_arm] == "none":
+        return "Does the placed pole beat no pole?"
+    return f"Does the run beat its arm '{each.before_arm}'?"
+
+
+def _same_poles(each: Difference, arms: Mapping[str, ArmResult]) -> tuple[int, ...] | None:
+    """Return the poles of both arms where they differ in nothing but the rule that chose the same ones."""
+    if each.before_arm == MAIN or each.estimate.mean or each.estimate.low or each.estimate.high:
+        return None
+    chosen = [
+        next((placed.chosen for placed in arms[arm].placed if placed.region == each.region), ())
+        for arm in (each.arm, each.before_arm)
+    ]
+    return chosen[0] if chosen[0] and set(chosen[0]) == set(chosen[1]) else None
+
+
+def _poles(numbers: Sequence[int]) -> str:
+    return f"Pole {numbers[0]}" if len(numbers) == 1 else f"Each of the poles {', '.join(map(str, numbers))}"

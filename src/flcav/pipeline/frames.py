@@ -1,0 +1,139 @@
+"""Frames of a run: recorded in a town, or dealt from a dataset that was recorded before."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flcav.config import InputError, parse_config
+from flcav.dataset.layout import read_manifest
+from flcav.dataset.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.files import sha256
+from flcav.perception.agents import POLE, kind_of
+from flcav.perception.sharing import shared
+from flcav.perception.tasks import task_named
+from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName
+from flcav.pipeline.results import Recorded
+from flcav.progress import Report
+from flcav.seeds import child_seed, stream
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+from flcav.world.town import TOWNS
+
+DATA = "data"
+SHORTEST_S = 10.0  # of a scene whose tracks are learned: a past, a future, and some presents
+
+Fields = Mapping[str, Any]  # of a `Recipe`, as YAML has it
+
+
+SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # of a dataset's scenes
+    "pretrain": {"pool": 0.7, "validation": 0.15, "test": 0.15},
+    "federate": {"validation": 0.15, "registry": 0.2, "edge": 0.4, "test": 0.25},
+    "unseen": {"validation": 0.3, "test": 0.7},
+}
+
+
+@dataclass(frozen=True)
+class Frames:
+    """An opened split."""
+
+    data: Dataset
+    vehicles: tuple[int, ...]  # numbers of the vehicles' frames
+    poles: Mapping[int, tuple[int, ...]]  # of each roadside sensor's
+
+    @classmethod
+    def open(cls, folder: Path) -> "Frames":
+        """Return the split that a step recorded in `folder`."""
+        recorded = Recorded.load(folder)
+        return cls(Dataset.open(folder / recorded.folder), recorded.vehicles, recorded.poles)
+
+
+def recording_fields(recipe: RunRecipe, region: str, split: SplitName, task: str) -> Fields:
+    """Return the recipe of one split in a region's town, as YAML has it, without poles."""
+    place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
+    changes = [shared(task_named(task)).recording, recipe.recording.fields(), place.recording.fields()]
+    how: dict[str, Any] = {"every_s": frames.every_s}
+    for more in (*changes, recipe.tasks[task].recording.fields()):
+        how |= more
+    spins = frames.spins
+    if how["every_s"] < frames.every_s:  # as long a drive, looked at more often
+        spins = round(max(frames.spins * frames.every_s, SHORTEST_S) / how["every_s"]) + 1
+    return {
+        **how,
+        "town": place.town or region,
+        "split": split,
+        "seed": child_seed(recipe.seed, region, split),
+        "scenes": frames.scenes,
+        "spins_per_scene": spins,
+        "cavs": recipe.vehicles(region) if split == "edge" else frames.cavs,
+    }
+
+
+def record_frames(fields: Fields, poles: Sequence[int], beside: Path, folder: Path, report: Report) -> Recorded:
+    """Record a split below `folder`, seen by the vehicles and these poles; goes on where it was interrupted."""
+    asked = parse_config(Recipe, {**fields, "poles": sorted(set(poles))}, folder.name)
+    source = EmbeddedSource(asked, beside)
+    record(source, folder / DATA, progress=report)
+    return describe(Dataset.open(folder / DATA), DATA)
+
+
+def deal_frames(path: Path, split: SplitName, role: Role, seed: int, whole: bool) -> Recorded:
+    """Return the frames of one split of a recorded dataset: all of it, or its share of the scenes, dealt at random.
+
+    Raises `InputError` where there are too few scenes.
+    """
+    data = Dataset.open(path)
+    if whole:
+        return describe(data, str(path))
+    scenes = sorted({key.scene for key in data.keys})
+    least = len(SPLITS_OF[role]) + 1  # tests take two
+    if len(scenes) < least:
+        raise InputError(f"{path}: {len(scenes)} scenes; at least {least} are wanted to deal to a region to {role}")
+    order = stream(seed, "deal").permutation(len(scenes))
+    return describe(data, str(path), {scenes[number] for number in order[_own_part(split, role, len(scenes))]})
+
+
+def _own_part(split: SplitName, role: Role, scenes: int) -> slice:
+    """Return which of the shuffled scenes are a split's: at least one, of tests two, and shares of the rest."""
+    shares = SHARES[role]
+    least = {name: 2 if name == "test" else 1 for name in shares}
+    free = scenes - sum(least.values())
+    ends = np.round(np.cumsum(list(shares.values())) * free).astype(int)
+    counts = {name: least[name] + more for name, more in zip(shares, np.diff(ends, prepend=0).tolist(), strict=True)}
+    names = list(shares)
+    start = sum(counts[name] for name in names[: names.index(split)])
+    return slice(start, start + counts[split])
+
+
+def describe(data: Dataset, folder: str, scenes: set[str] | None = None) -> Recorded:
+    """Return which frames of a dataset are whose, in these scenes (None: all); raises `InputError` for no vehicle's."""
+    frames = data.select(scenes=scenes)
+    vehicles = tuple(i for i in frames if kind_of(data.keys[i].agent) != POLE)
+    if not vehicles:
+        raise InputError(f"{data.folder}: no frame of a vehicle")
+    poles: dict[int, list[int]] = {}
+    for i in frames:
+        number = data.keys[i].agent.removeprefix(POLE)
+        if kind_of(data.keys[i].agent) == POLE and number.isdigit():
+            poles.setdefault(int(number), []).append(i)
+    count = len({data.keys[i].scene for i in frames})
+    return Recorded(folder, vehicles, {pole: tuple(own) for pole, own in poles.items()}, count)
+
+
+def town_hashes(town: str, beside: Path) -> dict[str, str]:
+    """Return what names the version of a town that does not come with flcav: its files and their SHA-256."""
+    if town in TOWNS:
+        return {}
+    folder = next((place / town for place in (beside, Path.cwd()) if (place / town).is_dir()), None)
+    if folder is None:
+        raise InputError(f"region '{town}': no town of flcav, and there is no folder {(beside / town).absolute()}")
+    return {path.name: sha256(path) for path in sorted(folder.iterdir()) if path.is_file()}
+
+
+def data_hash(path: Path) -> str:
+    """Return what names a dataset's version: its manifest's SHA-256; raises `InputError` where there is none."""
+    read_manifest(path)
+    return sha256(path / "manifest.json")

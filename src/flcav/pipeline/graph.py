@@ -1,0 +1,263 @@
+"""The graph of a run's steps: for every task, region and arm of a recipe, each done once where arms agree on it.
+
+Plan, pretrain, register errors, place, edge FL, cloud FL, test.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from flcav.config import InputError
+from flcav.pipeline.arms import Names, Setting, settings_of
+from flcav.pipeline.frames import data_hash, recording_fields, town_hashes
+from flcav.pipeline.labels import KINDS, labels_of
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, SPLITS_OF, Region, RunRecipe, SplitName
+from flcav.pipeline.steps import Step
+from flcav.pipeline.work import (
+    central_step,
+    cloud_step,
+    deal_step,
+    edge_step,
+    errors_step,
+    look_step,
+    place_step,
+    plan_step,
+    pretrain_step,
+    record_step,
+    rounds_step,
+    test_step,
+)
+
+LOOK, OBJECTS = "look", "objects"
+
+
+class Graph:
+    """The steps of a recipe, in an order where each comes after what it needs.
+
+    `beside` is the folder that towns, datasets and histories are looked for in. Raises `InputError` where a task, its
+    labels, a town or a dataset cannot be used.
+    """
+
+    def __init__(self, recipe: RunRecipe, beside: Path) -> None:
+        self.recipe, self.beside = recipe, beside.absolute()
+        labels = {task: labels_of(task, own.labels) for task, own in recipe.tasks.items()}
+        self.settings = settings_of(recipe, labels)
+        for setting in self.settings.values():
+            for task, kind in setting.labels.items():
+                labels_of(task, kind)
+        self.names = Names(self.settings)
+        self.federating = recipe.with_role("federate")
+        self._steps: dict[str, Step] = {}
+        self._add_recordings()
+        for arm in self.settings.values():
+            self._add_start(arm)
+        for region in self.federating:
+            for task in recipe.tasks:
+                self._add(self._recording(region, EDGE, task, self.sites(region)))
+        for arm in self.settings.values():
+            self._add_stages(arm)
+            self._add_tests(arm)
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """Return the steps."""
+        return tuple(self._steps.values())
+
+    def sites(self, region: str) -> tuple[str, ...]:
+        """Return the steps that place sensors in a region, for every arm that federates there."""
+        placed = [self.names.place(name, region) for name, arm in self.settings.items() if region in arm.regions]
+        return tuple(dict.fromkeys(placed))
+
+    def tested(self, arm: Setting) -> list[tuple[str, str, str]]:
+        """Return stage, region and task of every test of an arm: pretrained and after cloud FL in every region."""
+        tests = []
+        for task in self.recipe.tasks:
+            if arm.name == MAIN or self.names.plan(arm.name) != self.names.plan(MAIN):
+                tests += [(PRETRAIN, region, task) for region in self.recipe.regions]
+            for stage in arm.stages:
+                where = tuple(self.recipe.regions) if stage == CLOUD else arm.regions
+                tests += [(stage, region, task) for region in where]
+        return tests
+
+    def watched(self) -> list[tuple[str, str, str]]:
+        """Return stage, region and task of what is measured after every round: the run itself, where it federates."""
+        main = self.settings[MAIN]
+        return [(stage, region, task) for task in self.recipe.tasks for stage in main.stages for region in main.regions]
+
+    def _add(self, step: Step) -> None:
+        self._steps.setdefault(step.name, step)
+
+    def _add_recordings(self) -> None:
+        for region, own in self.recipe.regions.items():
+            for split in SPLITS_OF[own.role]:
+                for task in self.recipe.tasks:
+                    if split == "registry" and task not in self.recipe.placement.tasks and not self._first(task):
+                        continue
+                    if split != EDGE:
+                        self._add(self._recording(region, split, task, ()))
+
+    def _first(self, task: str) -> bool:
+        """Return whether a task is the one whose recorded traffic says where it is dense."""
+        return task == (self.recipe.placement.tasks or tuple(self.recipe.tasks))[0]
+
+    def _recording(self, region: str, split: SplitName, task: str, places: Sequence[str]) -> Step:
+        own, name = self.recipe.regions[region], self.names.recording(region, split, task)
+        if own.data is not None:
+            path = self._folder_of(own, split)
+            dealt = {"path": str(path), "split": split, "role": own.role, "seed": self.recipe.seed}
+            whole = isinstance(own.data, Mapping)
+            return _step(name, deal_step, dealt | {"whole": whole, "version": data_hash(path)}, ())
+        fields = recording_fields(self.recipe, region, split, task)
+        helped = any(KINDS[arm.labels[task]].from_poles for arm in self.settings.values())
+        seen = list(places) if helped else []
+        version = town_hashes(fields["town"], self.beside)
+        arguments = {"fields": fields, "beside": str(self.beside), "places": seen, "version": version}
+        return _step(name, record_step, arguments, seen)
+
+    def _folder_of(self, region: Region, split: SplitName) -> Path:
+        named = region.data[split] if isinstance(region.data, Mapping) else str(region.data)
+        found = next((place / named for place in (self.beside, Path.cwd()) if (place / named).is_dir()), None)
+        if found is None:
+            raise InputError(f"regions: there is no dataset {(self.beside / named)}")
+        return found.absolute()
+
+    def _learning(self, task: str) -> dict[str, Any]:
+        own = self.recipe.tasks[task]
+        training = self.recipe.training_of(task).model_dump(mode="json")
+        return {"task": task, "network": own.network, "training": training, "seed": self.recipe.seed}
+
+    @property
+    def _budget_mb(self) -> list[float]:
+        return [self.recipe.budgets_mb.wireless, self.recipe.budgets_mb.wireline]
+
+    def _add_start(self, arm: Setting) -> None:
+        """Add plan, stage I, registered errors and placed sensors of an arm."""
+        recipe, names = self.recipe, self.names
+        starts = recipe.with_role("pretrain")
+        pools = {task: [names.recording(region, "pool", task) for region in starts] for task in recipe.tasks}
+        asked = recipe.model_dump(mode="json", exclude={"arms", "splits", "training", "recording"})
+        planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "beside": str(self.beside)}
+        plan = names.plan(arm.name)
+        self._add(_step(plan, plan_step, planned, [step for steps in pools.values() for step in steps]))
+        for task in recipe.tasks:
+            own = {region: names.recording(region, "pool", task) for region in starts}
+            validation = [names.recording(region, "validation", task) for region in starts]
+            thresholded = any(KINDS[each.labels[task]].from_detections for each in self.settings.values())
+            arguments = {"plan": plan, "pools": own, "validation": validation, "budget_mb": self._budget_mb}
+            step = names.pretrain(arm.name, task)
+            arguments |= {"thresholded": thresholded, **self._learning(task)}
+            self._add(_step(step, pretrain_step, arguments, [plan, *own.values(), *validation]))
+        for region in arm.regions:
+            self._add_placement(arm, region)
+
+    def _add_placement(self, arm: Setting, region: str) -> None:
+        names, errors = self.names, {}
+        for task in arm.placement.tasks:
+            pretrained, registry = names.pretrain(arm.name, task), names.recording(region, "registry", task)
+            errors[task] = names.errors(arm.name, region, task)
+            arguments = {"task": task, "region": region, "pretrained": pretrained, "registry": registry}
+            self._add(_step(errors[task], errors_step, arguments, [pretrained, registry]))
+        first = (self.recipe.placement.tasks or tuple(self.recipe.tasks))[0]
+        registry = names.recording(region, "registry", first)
+        edge = names.recording(region, EDGE, first) if self.recipe.regions[region].data is not None else None
+        if edge is not None:
+            self._add(self._recording(region, EDGE, first, ()))
+        weights = {task: self.recipe.tasks[task].weight for task in errors}
+        arguments = {
+            "region": region,
+            "how": arm.placement.model_dump(mode="json"),
+            "errors": errors,
+            "weights": weights,
+            "registry": registry,
+            "edge": edge,
+        }
+        needs = [*errors.values(), registry, *([edge] if edge else [])]
+        self._add(_step(names.place(arm.name, region), place_step, arguments, needs))
+
+    def _rests_on(self, arm: Setting, region: str, task: str) -> dict[str, Any]:
+        """Return the steps that a vehicle's labelled samples rest on, see `work`."""
+        names = self.names
+        helped = any(KINDS[each.labels[task]].from_poles for each in self.settings.values())
+        return {
+            "plan": names.plan(arm.name),
+            "pretrain": names.pretrain(arm.name, task),
+            "frames": names.recording(region, EDGE, task),
+            "place": names.place(arm.name, region),
+            "sites": list(self.sites(region)) if helped else [],
+            "group_range_m": self.recipe.placement.group_range_m,
+            "recorded": self.recipe.regions[region].data is not None,
+        }
+
+    def _add_stages(self, arm: Setting) -> None:
+        for task in self.recipe.tasks:
+            if arm.central:
+                for region in arm.regions:
+                    self._add(self._central(arm, region, task))
+                continue
+            rests = {region: self._rests_on(arm, region, task) for region in arm.regions}
+            federation = arm.federation.model_dump(mode="json")
+            common = {**self._learning(task), "labels": arm.labels[task], "federation": federation}
+            for region, steps in rests.items():
+                own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
+                name = self.names.edge(arm.name, region, task)
+                self._add(_step(name, edge_step, common | own, _named_in(steps)))
+            if CLOUD in arm.stages:
+                for region, steps in rests.items():
+                    steps["edge"] = self.names.edge(arm.name, region, task)
+                needs = [step for steps in rests.values() for step in _named_in(steps)]
+                arguments = common | {"budget_mb": self._budget_mb, "regions": rests}
+                self._add(_step(self.names.cloud(arm.name, task), cloud_step, arguments, needs))
+
+    def _central(self, arm: Setting, region: str, task: str) -> Step:
+        steps = self._rests_on(arm, region, task)
+        starts = self.recipe.with_role("pretrain")
+        pools = {name: self.names.recording(name, "pool", task) for name in starts}
+        arguments = {
+            **self._learning(task),
+            "region": region,
+            "vehicles": self._vehicles()[region],
+            "source": arm.central,
+            "steps": steps | {"pools": pools},
+        }
+        needs = [*_named_in(steps), *pools.values()]
+        return _step(self.names.central(arm.name, region, task), central_step, arguments, needs)
+
+    @property
+    def shown(self) -> tuple[str, str] | None:
+        """Return the region and the stage whose sweep is shown before and after; None where no objects are learned."""
+        main = self.settings[MAIN]
+        return (main.regions[0], main.stages[-1]) if OBJECTS in self.recipe.tasks else None
+
+    def _vehicles(self) -> dict[str, int]:
+        return {region: self.recipe.vehicles(region) for region in self.federating}
+
+    def _add_tests(self, arm: Setting) -> None:
+        for stage, region, task in self.tested(arm):
+            trained = self.names.stage(arm.name, stage, region, task)
+            frames = self.names.recording(region, "test", task)
+            arguments = {"task": task, "region": region, "trained": trained, "frames": frames}
+            step = self.names.test(trained, region)
+            self._add(_step(step, test_step, arguments | {"seed": self.recipe.seed}, [trained, frames]))
+        if arm.name == MAIN:
+            if self.shown is not None:
+                region, stage = self.shown
+                before, after = (self.names.stage(MAIN, each, region, OBJECTS) for each in (PRETRAIN, stage))
+                frames = self.names.recording(region, "test", OBJECTS)
+                arguments = {"before": before, "after": after, "frames": frames}
+                self._add(_step(LOOK, look_step, arguments, [before, after, frames]))
+            for stage, region, task in self.watched():
+                trained = self.names.stage(MAIN, stage, region, task)
+                frames = self.names.recording(region, "validation", task)
+                start = self.names.pretrain(MAIN, task)
+                arguments = {"task": task, "region": region, "trained": trained, "start": start, "frames": frames}
+                self._add(_step(self.names.rounds(trained, region), rounds_step, arguments, [trained, start, frames]))
+
+
+def _step(name: str, function: Callable[..., None], arguments: Mapping[str, Any], needs: Sequence[str]) -> Step:
+    return Step(name, function, dict(arguments), tuple(dict.fromkeys(needs)))
+
+
+def _named_in(steps: Mapping[str, Any]) -> list[str]:
+    """Return the names of the steps that `Graph._rests_on` tells, and that of stage II for stage III."""
+    one = [steps[key] for key in ("plan", "pretrain", "frames", "place", "edge") if key in steps]
+    return [*one, *steps["sites"]]

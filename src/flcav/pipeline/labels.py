@@ -1,0 +1,124 @@
+"""Labels of stages II and III: how the samples of a vehicle come by them, by name."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.fusion.labels import label_sample
+from flcav.fusion.road import RoadView, road_view
+from flcav.network.ledger import Ledger, LedgerEntry
+from flcav.perception.metrics import match
+from flcav.perception.objects.detect import detect_all
+from flcav.perception.objects.evaluate import asked_of
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import only_lidar
+from flcav.perception.sharing import shared
+from flcav.perception.task import Task
+from flcav.perception.tasks import task_named
+from flcav.pipeline.frames import Frames
+from flcav.progress import Report
+
+PRECISION = 0.9  # on validation, of the detections that a vehicle may take for labels
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A way to come by labels."""
+
+    from_detections: bool = False  # of the frozen stage I network
+    from_poles: bool = False  # of roadside sensors
+    caveat: str = ""  # what every figure on them says
+
+
+KINDS: Mapping[str, Kind] = {
+    "own-detections": Kind(from_detections=True),
+    "ideal-road": Kind(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
+    "annotated": Kind(caveat="ground truth as labels, upper bound"),
+    "future": Kind(caveat="every vehicle knows all tracks around it, upper bound"),  # where everybody went
+}
+
+
+def labels_of(task: str, asked: str | None) -> str:
+    """Return the kind of labels of a task, its first for None; raises `InputError` for one it has not."""
+    known = shared(task_named(task)).labels
+    if asked is not None and asked not in known:
+        raise InputError(f"labels of '{task}': '{asked}' is none of {', '.join(known)}")
+    return asked or known[0]
+
+
+def own_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
+    """Return the lowest score from which on at least `PRECISION` of the detections on validation frames are right."""
+    frames = [split.data.frame(i) for split in splits for i in split.vehicles]
+    truths = [asked_of(frame, network.config) for frame in frames]
+    found = detect_all(network, [frame.lidar[only_lidar(frame)] for frame in frames])
+    matches = match(found, [t.targets for t in truths], [t.neutral for t in truths], 0.5)
+    precision = np.cumsum(matches.hit) / np.arange(1, len(matches.hit) + 1)
+    good = np.flatnonzero(precision >= PRECISION)
+    return float(matches.score[good[-1]]) if len(good) else 1.0
+
+
+def annotated_samples(
+    task: Task[Any, Any, Any], config: Any, split: Frames, frames: Sequence[int], region: str
+) -> dict[str, Sequence[Any]]:
+    """Return each vehicle's samples as they were recorded with them, by its name."""
+    own: dict[str, list[int]] = {}
+    for i in frames:
+        own.setdefault(f"{region}/{split.data.keys[i].agent}", []).append(i)
+    return {name: task.samples(split.data, config, numbers) for name, numbers in own.items()}
+
+
+def self_labelled_samples(
+    network: Second,
+    threshold: float,
+    split: Frames,
+    frames: Sequence[int],
+    poles: Sequence[int],
+    region: str,
+    report: Report,
+    book: Ledger | None = None,
+) -> dict[str, list[Sample]]:
+    """Return each vehicle's sweeps, labelled by the frozen network's detections and the roadside sensors `poles`.
+
+    The road's views are booked as downlink where a `book` is given (once: the labels are kept through the stages).
+    """
+    data = split.data
+    views = _views(split, poles)
+    samples: dict[str, list[Sample]] = {}
+    for done, i in enumerate(frames):
+        key, frame = data.keys[i], data.frame(i)
+        lidar = only_lidar(frame)
+        detections = detect_all(network, [frame.lidar[lidar]], score_threshold=threshold)[0]
+        told = views.get((key.scene, key.index), [])
+        name = f"{region}/{key.agent}"
+        samples.setdefault(name, []).append(label_sample(frame, detections, told, network.config, lidar))
+        if book is not None:
+            for view in told:
+                book.enter(LedgerEntry("edge", OBJECTS.name, "wireless", "down", 0, name, len(view.message())))
+        report(done, len(frames), "labels")
+    return samples
+
+
+def _views(split: Frames, poles: Sequence[int]) -> dict[tuple[str, int], list[RoadView]]:
+    views: dict[tuple[str, int], list[RoadView]] = {}
+    for pole in poles:
+        for i in split.poles.get(pole, ()):
+            key, frame = split.data.keys[i], split.data.frame(i)
+            views.setdefault((key.scene, key.index), []).append(road_view(frame, only_lidar(frame)))
+    return views
+
+
+def frames_near(split: Frames, sites: np.ndarray, range_m: float) -> tuple[int, ...]:
+    """Return the vehicles' frames within `range_m` of one of the sites (P, 2), world [m]; all for no site."""
+    if not len(sites):
+        return split.vehicles
+
+    def near(i: int) -> bool:
+        place = split.data.frame(i).world_from_agent[:2, 3]
+        return bool((np.linalg.norm(sites - place, axis=1) <= range_m).any())
+
+    return tuple(i for i in split.vehicles if near(i))

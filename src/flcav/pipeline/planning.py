@@ -1,0 +1,185 @@
+"""The plan: how many samples and rounds of each task both uplink budgets buy, by what earlier runs learned."""
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.csv
+
+from flcav.config import InputError, parse_config
+from flcav.federation.runtimes.embedded import update_bytes
+from flcav.files import atomic_path
+from flcav.network.ledger import BYTES_PER_MB
+from flcav.network.plan import MessageSizes, Price, StagePlan, price
+from flcav.optimization.allocation import TaskPlan as Allotted
+from flcav.optimization.allocation import allocate
+from flcav.optimization.baselines import baseline
+from flcav.optimization.history import JOINT, History, histories
+from flcav.optimization.learning_curve import fit_additive
+from flcav.optimization.problem import Problem
+from flcav.perception.task import Task, configuration, fresh
+from flcav.perception.weights import to_arrays
+from flcav.pipeline.arms import PlanRule
+from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits, RunRecipe
+from flcav.pipeline.results import Plan, TaskPlan
+
+HISTORIES = resources.files("flcav.pipeline") / "histories"
+POINT: tuple[str, ...] = ("task", *JOINT, "weight", "run")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What one task's plan rests on."""
+
+    name: str
+    weight: float
+    sizes: MessageSizes
+    pool: int  # samples that can be had
+    history: History | None  # None: the plan is fixed
+    fixed: FixedPlan | None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What all tasks share."""
+
+    budgets_mb: Price
+    headroom: float
+    limits: Limits
+    edge_groups: tuple[int, ...]  # vehicles of each edge server
+    edge_rounds_per_cloud_round: int
+
+    def stage_plan(self, samples: int, edge_rounds: int, cloud_rounds: int) -> StagePlan:
+        """Return what a task moves."""
+        return StagePlan(samples, edge_rounds, cloud_rounds, self.edge_groups, self.edge_rounds_per_cloud_round)
+
+
+def make_plan(tasks: tuple[Asked, ...], frame: Frame, rule: PlanRule) -> tuple[Plan, Problem | None]:
+    """Return the allocation of both budgets, and the problem it solves: that of the tasks whose plan is not fixed.
+
+    Fixed plans are paid first. Raises `InputError` where the budgets do not carry them, `Infeasible` where they do not
+    carry the least of the others.
+    """
+    plans: dict[str, TaskPlan] = {}
+    left = np.array([frame.budgets_mb.wireless_mb, frame.budgets_mb.wireline_mb]) * (1 - frame.headroom)
+    for task in tasks:
+        if task.fixed is not None:
+            plans[task.name] = _fixed(task, task.fixed, frame)
+            left -= (plans[task.name].wireless_mb, plans[task.name].wireline_mb)
+    if (left < 0).any():
+        raise InputError(
+            f"budgets_mb: the fixed plans take {-left.min():.1f} MB more than "
+            f"{'wireless' if left[0] == left.min() else 'wireline'} carries with a headroom of {frame.headroom:.0%}"
+        )
+    learned = [task for task in tasks if task.history is not None]
+    problem = _problem(learned, frame, left) if learned else None
+    if problem is not None:
+        allotted = allocate(problem).tasks if rule == "joint" else baseline(problem, rule).tasks
+        for task, own in zip(learned, allotted, strict=True):
+            plans[task.name] = _planned(task, own, problem)
+    return Plan(rule, {task.name: plans[task.name] for task in tasks}), problem
+
+
+def _problem(tasks: list[Asked], frame: Frame, budgets_mb: np.ndarray) -> Problem:
+    """Return the allocation problem, as `flcav allocate` reads it."""
+    wireless, wireline = budgets_mb.tolist()
+    values = {
+        "budgets_mb": {"wireless": wireless, "wireline": wireline},
+        "edge_rounds_per_cloud_round": frame.edge_rounds_per_cloud_round,
+        "tasks": [_task(task, frame) for task in tasks],
+    }
+    return parse_config(Problem, values, "the run's allocation problem")
+
+
+def _task(task: Asked, frame: Frame) -> dict[str, Any]:
+    assert task.history is not None
+    samples, edge_rounds, cloud_rounds = task.history.resources.T
+    fit = fit_additive(samples, edge_rounds, cloud_rounds, task.history.accuracy, task.history.weight)
+    least, most = frame.limits.samples
+    most = task.pool if most is None else min(most, task.pool)
+    return {
+        "name": task.name,
+        "weight": task.weight,
+        "sample_mb": task.sizes.sample_mb,
+        "model_mb": task.sizes.model_mb,
+        "edge_groups": list(frame.edge_groups),
+        "limits": {
+            "samples": [min(least, most), most],
+            "edge_rounds": list(frame.limits.edge_rounds),
+            "cloud_rounds": list(frame.limits.cloud_rounds),
+        },
+        "curve": fit.curve.model_dump(),
+    }
+
+
+def _fixed(task: Asked, fixed: FixedPlan, frame: Frame) -> TaskPlan:
+    if fixed.samples > task.pool:
+        raise InputError(f"tasks.{task.name}.plan: {fixed.samples} samples; the pools hold {task.pool}")
+    counts = (fixed.samples, fixed.edge_rounds, fixed.cloud_rounds)
+    cost = price(frame.stage_plan(*counts), task.sizes)
+    return TaskPlan(*counts, cost.wireless_mb, cost.wireline_mb, task.sizes.sample_mb, task.sizes.model_mb, None)
+
+
+def _planned(task: Asked, own: Allotted, problem: Problem) -> TaskPlan:
+    curve = next(each.curve for each in problem.tasks if each.name == task.name)
+    k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
+    spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
+    predicted = {stage: max(1 - float(curve.error(*each, k)), 0.0) for stage, each in spent.items()}
+    sizes = task.sizes
+    return TaskPlan(*counts, own.wireless_mb, own.wireline_mb, sizes.sample_mb, sizes.model_mb, predicted)
+
+
+def model_mb(task: Task[Any, Any, Any], network: str | None) -> float:
+    """Return the size of one model update on the wire, by a dry run of the message [MB]."""
+    return update_bytes(to_arrays(fresh(task, configuration(task, network), 0))) / BYTES_PER_MB
+
+
+def history_of(task: str, name: str, beside: Path) -> History:
+    """Return a task's learning history: one of the package by its name, or a table (CSV) beside the recipe.
+
+    Raises `InputError` where there is none, or none of this task in it.
+    """
+    packaged = HISTORIES / f"{name}.csv"
+    if packaged.is_file():
+        with packaged.open("rb") as file:
+            table = pyarrow.csv.read_csv(file)
+    else:
+        path = next((place / name for place in (beside, Path.cwd()) if (place / name).is_file()), None)
+        if path is None:
+            known = sorted(entry.name.removesuffix(".csv") for entry in HISTORIES.iterdir() if ".csv" in entry.name)
+            raise InputError(
+                f"tasks.{task}.history: '{name}' is no history of the package ({', '.join(known)}), and there is no "
+                f"file {(beside / name).absolute()}"
+            )
+        try:
+            table = pyarrow.csv.read_csv(path)
+        except pyarrow.ArrowInvalid as error:
+            raise InputError(f"{path}: not a CSV table ({error})") from None
+    found = histories(table.to_pydict(), name, task)
+    if task not in found:
+        raise InputError(f"tasks.{task}.history: {name} has no rows of '{task}', but of {', '.join(found)}")
+    return found[task]
+
+
+def asked_of(recipe: RunRecipe, task: str, sizes: MessageSizes, pool: int, beside: Path) -> Asked:
+    """Return what a task's plan rests on."""
+    own = recipe.tasks[task]
+    history = None if own.history is None else history_of(task, own.history, beside)
+    return Asked(task, own.weight, sizes, pool, history, own.plan)
+
+
+def append_points(path: Path, points: list[Mapping[str, Any]]) -> None:
+    """Add to the history at `path` the points that it does not hold yet; it reads as `flcav fit` reads one."""
+    held: list[dict[str, str]] = []
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as file:
+            held = list(csv.DictReader(file))
+    told = [{name: str(value) for name, value in point.items()} for point in points]
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, POINT, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([*held, *(point for point in told if point not in held)])

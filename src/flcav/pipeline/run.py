@@ -1,0 +1,287 @@
+"""A run: a recipe carried out, and what its steps result in."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.intervals import mean_over_seeds
+from flcav.network.ledger import LINKS, Budget, Ledger
+from flcav.perception.outcomes import Outcomes, difference
+from flcav.perception.tasks import task_named
+from flcav.pipeline.arms import Setting
+from flcav.pipeline.findings import findings, in_words
+from flcav.pipeline.graph import Graph
+from flcav.pipeline.labels import KINDS
+from flcav.pipeline.planning import POINT, append_points
+from flcav.pipeline.provenance import provenance
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results import (
+    LEDGER,
+    OUTCOMES,
+    ArmResult,
+    Difference,
+    Estimate,
+    LinkUse,
+    Mean,
+    Placed,
+    Plan,
+    Pretrained,
+    Run,
+    Spent,
+    StageResult,
+    Summary,
+    Test,
+    Tested,
+    Watched,
+)
+from flcav.pipeline.steps import Notify, Stale, run_side_by_side, run_steps, stopwatch
+
+WORK, RESULTS, SUMMARY, HISTORY = "work", "results.json", "summary.json", "history.csv"
+
+
+def _silent(step: str, done: int, total: int, note: str) -> None:
+    pass
+
+
+def run(
+    recipe: RunRecipe,
+    out: Path | str,
+    *,
+    beside: Path | str | None = None,
+    jobs: int = 1,
+    notify: Notify = _silent,
+    stale: Stale = "refuse",
+    engine: str = "processes",
+) -> Run:
+    """Run or finish a recipe in the folder `out`; write results.json and history.csv there, and return the results.
+
+    Towns, datasets and histories are looked for in `beside` (None: the working directory). `jobs` workers of one thread
+    each; `engine` and `stale` are those of `run_steps`. Raises `InputError` where something of the recipe cannot be
+    used, or `out` holds another run, or one by other code that is refused.
+    """
+    out = Path(out)
+    graph, clock = Graph(recipe, Path(beside or ".")), stopwatch(out / WORK)
+
+    def timed(step: str, done: int, total: int, note: str) -> None:
+        if note == "done":
+            clock()
+        notify(step, done, total, note)
+
+    run_steps(graph.steps, out / WORK, jobs=jobs, notify=timed, stale=stale, engine=engine)
+    return _kept(graph, out, out / HISTORY, clock())
+
+
+def run_seeds(
+    recipe: RunRecipe,
+    out: Path | str,
+    *,
+    seeds: int,
+    beside: Path | str | None = None,
+    jobs: int = 1,
+    notify: Notify = _silent,
+    stale: Stale = "refuse",
+    engine: str = "processes",
+) -> tuple[tuple[Run, ...], Summary]:
+    """Run or finish a recipe with `seeds` seeds, from its own on, each in a folder of `out`; return what they say.
+
+    summary.json and a common history.csv are written beside. Everything else is as of `run`.
+    """
+    out = Path(out)
+    graphs = {
+        out / f"seed{seed}": Graph(recipe.model_copy(update={"seed": seed}), Path(beside or "."))
+        for seed in range(recipe.seed, recipe.seed + seeds)
+    }
+    steps = {folder / WORK: graph.steps for folder, graph in graphs.items()}
+    names = {folder / WORK: folder.name for folder in graphs}
+    run_side_by_side(steps, jobs=jobs, notify=notify, stale=stale, engine=engine, names=names)
+    runs = tuple(_kept(graph, folder, out / HISTORY, 0.0) for folder, graph in graphs.items())
+    summary = summarise(runs)
+    summary.save(out, SUMMARY)
+    return runs, summary
+
+
+def _kept(graph: Graph, out: Path, history: Path, elapsed_s: float) -> Run:
+    """Return the results of finished steps, written to `out`, their points added to the history."""
+    result = replace(collect(graph, out / WORK), elapsed_s=round(elapsed_s, 1))
+    append_points(history, points_of(result, f"seed{graph.recipe.seed}"))
+    result.save(out, RESULTS)
+    return result
+
+
+def summarise(runs: Sequence[Run]) -> Summary:
+    """Return means over the seeds of a recipe with Student's intervals."""
+
+    def means(of: Callable[[Run], Mapping[str, float]]) -> tuple[Mean, ...]:
+        rows = [of(each) for each in runs]
+        return tuple(Mean(name, Estimate(**mean_over_seeds([row[name] for row in rows]))) for name in rows[0])
+
+    return Summary(
+        tuple(each.recipe.seed for each in runs),
+        means(lambda one: {_measure_name(test): test.result.estimate.mean for test in one.tested}),
+        means(lambda one: {each.name: each.estimate.mean for each in one.differences}),
+        means(lambda one: one.gap_closed),
+    )
+
+
+def _measure_name(test: Test) -> str:
+    return f"{test.region}, {test.task}: {in_words(test.arm, test.stage)}"
+
+
+def seed_folders(folder: Path) -> dict[int, Path]:
+    """Return the folders of a run, or of each of its seeds, by seed; raises `InputError` where there is no run."""
+    own = [folder] if (folder / RESULTS).is_file() else sorted(folder.glob("seed*"))
+    found = {Run.load(each, RESULTS).recipe.seed: each for each in own if (each / RESULTS).is_file()}
+    if not found:
+        raise InputError(f"{folder}: no finished run, it has no {RESULTS}")
+    return found
+
+
+def collect(graph: Graph, work: Path) -> Run:
+    """Return what the finished steps in `work` resulted in."""
+    recipe, names, main = graph.recipe, graph.names, graph.settings[MAIN]
+    tests = []
+    for arm in graph.settings.values():
+        for stage, region, task in graph.tested(arm):
+            step = test_folder(graph, arm.name, stage, region, task)
+            tests.append(Test(arm.name, stage, region, task, step, Tested.load(work / step)))
+    watched = [
+        Watched.load(work / names.rounds(names.stage(MAIN, stage, region, task), region))
+        for stage, region, task in graph.watched()
+    ]
+    arms = {name: _arm(graph, work, arm) for name, arm in graph.settings.items()}
+    differences = _differences(graph, work)
+    rules = {name: arm.placement.rule for name, arm in graph.settings.items()}
+    roles = {name: region.role for name, region in recipe.regions.items()}
+    rests = {task: KINDS[kind].caveat for task, kind in main.labels.items()}
+    return Run(
+        recipe=recipe,
+        arms=arms,
+        pretrained=tuple(Pretrained.load(work / names.pretrain(MAIN, task)) for task in recipe.tasks),
+        watched=tuple(watched),
+        tested=tuple(tests),
+        differences=tuple(differences),
+        findings=findings(differences, tests, arms, rules, roles, rests),
+        gap_closed=gaps_closed(tests, recipe),
+        provenance=provenance(recipe.seed),
+        caveats=tuple(dict.fromkeys(filter(None, rests.values()))),
+    )
+
+
+def test_folder(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:
+    """Return the step that tested an arm's network after a stage."""
+    return graph.names.test(graph.names.stage(arm, stage, region, task), region)
+
+
+def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
+    names, tasks = graph.names, graph.recipe.tasks
+    plan = Plan.load(work / names.plan(arm.name))
+    trained = [
+        names.stage(arm.name, stage, region, task)
+        for task in tasks
+        for stage in arm.stages
+        for region in (arm.regions if stage != CLOUD else arm.regions[:1])
+    ]
+    books = [Ledger.load(work / names.pretrain(arm.name, task) / LEDGER) for task in tasks]
+    if arm.stages != (CENTRAL,):
+        books += [
+            Ledger.load(work / names.edge(arm.name, region, task) / LEDGER) for task in tasks for region in arm.regions
+        ]
+    if CLOUD in arm.stages:
+        books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they go on from those
+    budgets = graph.recipe.budgets_mb
+    book = Ledger(Budget(budgets.wireless, budgets.wireline), (entry for each in books for entry in each.entries))
+    book.save(work.parent / "ledgers" / f"{arm.name}.parquet")
+    return ArmResult(
+        plan=plan,
+        placed=tuple(Placed.load(work / names.place(arm.name, region)) for region in arm.regions),
+        stages=tuple(StageResult.load(work / step) for step in trained),
+        links={
+            link: LinkUse(
+                getattr(budgets, link),
+                sum(getattr(task, f"{link}_mb") for task in plan.tasks.values()),
+                book.used_mb(link),
+            )
+            for link in LINKS
+        },
+        spent=tuple(
+            Spent(stage, task, link, book.used_mb(link, stage=stage, task=task_named(task).name))
+            for task in tasks
+            for stage in (PRETRAIN, EDGE, CLOUD)
+            for link in LINKS
+        ),
+    )
+
+
+def _differences(graph: Graph, work: Path) -> list[Difference]:
+    """Return each stage minus the one before it, and the run itself minus each other arm at the same stage."""
+    main = graph.settings[MAIN]
+    pairs: list[tuple[tuple[str, str], tuple[str, str], str, str]] = []
+    for arm in graph.settings.values():
+        for stage, region, task in graph.tested(arm):
+            if stage != PRETRAIN:
+                earlier = EDGE if stage == CLOUD and region in arm.regions else PRETRAIN
+                pairs.append(((arm.name, stage), (arm.name, earlier), region, task))
+            if arm.name != MAIN and (region in main.regions or stage != EDGE):
+                pairs.append(((MAIN, EDGE if stage == CENTRAL else stage), (arm.name, stage), region, task))
+    found: dict[tuple[str, str], Difference] = {}
+    for after, before, region, task in pairs:
+        steps = test_folder(graph, *after, region, task), test_folder(graph, *before, region, task)
+        if steps[0] != steps[1] and steps not in found:
+            estimate = paired(task, work / steps[1], work / steps[0], graph.recipe.seed)
+            told = [in_words(_owner(graph, *each, region, task), each[1]) for each in (after, before)]
+            name = f"{region}, {task}: {' - '.join(told)}"
+            found[steps] = Difference(name, *after, *before, region, task, estimate)
+    return list(found.values())
+
+
+def _owner(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:
+    """Return the first arm that shares the step."""
+    step = graph.names.stage(arm, stage, region, task)
+    return next(name for name in graph.settings if graph.names.stage(name, stage, region, task) == step)
+
+
+def paired(task: str, before: Path, after: Path, seed: int) -> Estimate:
+    """Return the measure in the test folder `after` minus that in `before`, and its 95 % interval over scenes."""
+    first, second = (Outcomes.load(folder / OUTCOMES) for folder in (before, after))
+    return Estimate(*difference(task_named(task), first, second, seed))
+
+
+def gap_closed(start: float, reached: float, end: float) -> float:
+    """Return which share of the way from `start` to `end` was come."""
+    return (reached - start) / (end - start) if end != start else 0.0
+
+
+def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
+    """Return how much of the gap to central training on a region's own ground truth each stage closes, if there is."""
+    values = {(test.arm, test.stage, test.region, test.task): test.result.estimate.mean for test in tests}
+    oracle = next((name for name, arm in recipe.arms.items() if arm.central == "federate"), None)
+    closed = {}
+    for (arm, stage, region, task), reached in values.items():
+        end = values.get((oracle or "", CENTRAL, region, task))
+        if end is not None and stage != PRETRAIN and arm != oracle:
+            start = values.get((arm, PRETRAIN, region, task), values[MAIN, PRETRAIN, region, task])
+            closed[f"{region}, {task}: {in_words(arm, stage)}"] = gap_closed(start, reached, end)
+    return closed
+
+
+def points_of(result: Run, run: str) -> list[Mapping[str, Any]]:
+    """Return what a run adds to history: what each task reached on validation frames after so much of each stage.
+
+    A point is the mean over the regions, weighted by frames.
+    """
+    points: list[Mapping[str, Any]] = []
+    for task, own in result.arms[MAIN].plan.tasks.items():
+        for stage in (EDGE, CLOUD):
+            each = [watched for watched in result.watched if (watched.task, watched.stage) == (task, stage)]
+            frames = [watched.frames for watched in each]
+            for rounds in zip(*(watched.rounds for watched in each), strict=True):
+                number = rounds[0].round
+                counts = (number, 0) if stage == EDGE else (own.edge_rounds, number)
+                score = np.average([at.score for at in rounds], weights=frames)
+                point = (task, own.samples, *counts, f"{score:.4f}", sum(frames), run)
+                points.append(dict(zip(POINT, point, strict=True)))
+    return points

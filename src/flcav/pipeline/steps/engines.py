@@ -1,0 +1,101 @@
+"""Who performs steps: an engine takes them one by one, and tells what they report."""
+
+import contextlib
+import multiprocessing
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from flcav.dataset.workers import end_with_parent
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.steps.record import Record, value_of, write_done, write_started
+from flcav.pipeline.steps.step import Step, Work
+from flcav.progress import Report
+from flcav.threads import use_threads
+
+KILLED = "a step's process was killed from outside, most often for want of memory"
+
+
+@dataclass(frozen=True)
+class Hands:
+    """Those that work on the steps of one folder."""
+
+    submit: Callable[[Step, Record], Future[Any]]  # -> its value
+    reports: Any  # a queue of (step, done, total, note)
+
+
+class Engine(Protocol):
+    """What steps are performed by."""
+
+    def hands(self, folder: Path, jobs: int) -> contextlib.AbstractContextManager[Hands]:
+        """Return a context of `jobs` workers for the steps in `folder`; leaving it by an exception stops them."""
+        ...
+
+    def stop(self) -> None:
+        """Stop all workers of all folders."""
+        ...
+
+
+class Processes:
+    """Processes of one thread each on this machine, which end with this one however it ends."""
+
+    @contextlib.contextmanager
+    def hands(self, folder: Path, jobs: int) -> Iterator[Hands]:
+        """Yield `jobs` processes; raises `OSError` where one was killed."""
+        context = multiprocessing.get_context("spawn")
+        queue = context.Queue()
+        made_by = replace(provenance(), threads=1)
+        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start, initargs=(queue,)) as pool:
+            try:
+                yield Hands(lambda step, record: pool.submit(_perform, step, folder, record, made_by), queue)
+            except BrokenProcessPool:
+                raise OSError(KILLED) from None
+            except BaseException:
+                for process in list(pool._processes.values()):  # not those of a run beside this one
+                    process.terminate()
+                raise
+
+    def stop(self) -> None:
+        """Terminate the processes."""
+        for process in multiprocessing.active_children():
+            process.terminate()
+
+
+def perform(step: Step, folder: Path, record: Record, made_by: Provenance, report: Report) -> Any:
+    """Do a step in its folder below `folder`, where the steps that it needs lie too, and return its value."""
+    own = folder / step.name
+    own.mkdir(parents=True, exist_ok=True)
+    report(0, 1, "")
+    write_started(own, record)
+    value = step.run(Work(own, {name: folder / name for name in step.needs}, report), **step.arguments)
+    write_done(own, record, value, asdict(replace(made_by, seed=seed_in(step.arguments))))
+    return value_of(own)
+
+
+def seed_in(arguments: Mapping[str, Any]) -> int | None:
+    """Return the seed among a step's arguments, or in one of them: a recipe, a protocol; None where there is none."""
+    for values in (arguments, *arguments.values()):
+        seed = values.get("seed") if isinstance(values, Mapping) else getattr(values, "seed", None)
+        if isinstance(seed, int):
+            return seed
+    return None
+
+
+_queue: Any = None
+
+
+def _start(queue: Any) -> None:
+    global _queue
+    _queue = queue
+    end_with_parent()
+    use_threads(1)
+
+
+def _perform(step: Step, folder: Path, record: Record, made_by: Provenance) -> Any:
+    def report(done: int, total: int, note: str = "") -> None:
+        _queue.put((step.name, done, total, note))
+
+    return perform(step, folder, record, made_by, report)

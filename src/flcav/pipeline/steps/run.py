@@ -1,0 +1,198 @@
+"""Steps run in order, by processes or on a cluster, going on with what is there.
+
+A step is finished when its `done.json` is there: its value, what was asked of it, the code that it reaches, and by what
+it was made. That is written last, so a killed run goes on from its last finished step; a step may keep files to go on
+from within itself. What was asked stands in `started.json` before that, so that it is not gone on with as it was not
+begun.
+
+What was asked differently, by function or arguments, belongs into another folder. What other code began or finished is
+stale, and so is whatever was built on it: it is refused, done again or kept, as one chooses.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty
+from typing import Any
+
+from flcav.config import InputError, read_json
+from flcav.files import write_json
+from flcav.pipeline.steps.engines import Engine, Processes
+from flcav.pipeline.steps.record import DONE, STALE, Record, aside, held_in, refusal, remove, value_of
+from flcav.pipeline.steps.source_hash import Sources, starts
+from flcav.pipeline.steps.step import DONE_BEFORE, DONE_NOW, KEPT, Notify, Step
+
+
+@contextlib.contextmanager
+def _processes(jobs: int) -> Iterator[Engine]:
+    yield Processes()
+
+
+@contextlib.contextmanager
+def _ray(jobs: int) -> Iterator[Engine]:
+    from flcav.pipeline.steps.cluster import ray_cluster
+
+    with ray_cluster(jobs) as engine:
+        yield engine
+
+
+ENGINES: Mapping[str, Callable[[int], contextlib.AbstractContextManager[Engine]]] = {
+    "processes": _processes,
+    "ray": _ray,
+}
+
+
+def run_steps(
+    steps: Sequence[Step],
+    folder: Path,
+    *,
+    jobs: int,
+    notify: Notify,
+    stale: str = "refuse",
+    engine: str = "processes",
+) -> dict[str, Any]:
+    """Run `steps` (in an order where each comes after what it needs) and return their values by name.
+
+    `jobs` workers of one thread each: processes, which end with this one however it ends, or actors on the machines of
+    a Ray cluster, see `flcav.pipeline.steps.cluster`. What other code began or finished is refused, done again
+    ("redo") or taken as it is ("keep"); what is kept stays known as of that code. Raises `InputError` where `folder`
+    holds steps of other arguments or, where that is refused, of other code; `OSError` where a worker was killed.
+    """
+    plan = _planned(steps, folder, notify, stale, Sources())
+    if plan.waiting:
+        with _opened(engine, jobs) as workers:
+            _run(plan, workers, jobs, notify)
+    return plan.values
+
+
+def run_side_by_side(
+    runs: Mapping[Path, Sequence[Step]],
+    *,
+    jobs: int,
+    notify: Notify,
+    stale: str = "refuse",
+    engine: str = "processes",
+    names: Mapping[Path, str] | None = None,
+) -> dict[Path, dict[str, Any]]:
+    """Run the steps of each folder, up to `jobs` folders at a time; return `run_steps` of each.
+
+    `names` are what the folders' steps are told under (None: the folders' own names).
+    """
+    sources = Sources()
+
+    def named(folder: Path) -> Notify:
+        name = folder.name if names is None else names[folder]
+        return lambda step, done, total, note: notify(f"{name}/{step}", done, total, note)
+
+    plans = [_planned(steps, folder, named(folder), stale, sources) for folder, steps in runs.items()]
+    waiting = [plan for plan in plans if plan.waiting]
+    if waiting:
+        with _opened(engine, jobs) as workers, ThreadPoolExecutor(jobs) as threads:
+            each = max(1, jobs // len(runs))
+            started = [threads.submit(_run, plan, workers, each, named(plan.folder)) for plan in waiting]
+            try:
+                for future in wait(started, return_when=FIRST_EXCEPTION).done:
+                    future.result()
+            except BaseException:
+                threads.shutdown(wait=False, cancel_futures=True)
+                workers.stop()
+                raise
+    return {plan.folder: plan.values for plan in plans}
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What is to be done in a folder."""
+
+    folder: Path
+    records: Mapping[str, Record]
+    waiting: list[Step]
+    values: dict[str, Any]  # of the steps that are done
+
+
+def _opened(engine: str, jobs: int) -> contextlib.AbstractContextManager[Engine]:
+    """Return a context of an engine; raises `InputError` for an unknown one."""
+    if engine not in ENGINES:
+        raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
+    return ENGINES[engine](jobs)
+
+
+def _planned(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Plan:
+    """Return what of `steps` is left to do; raises `InputError` as `run_steps` does."""
+    records, kept = _settled(steps, folder, stale, sources)
+    values: dict[str, Any] = {}
+    for step in steps:
+        if (folder / step.name / DONE).exists():
+            values[step.name] = value_of(folder / step.name)
+            notify(step.name, 1, 1, KEPT if step.name in kept else DONE_BEFORE)
+    return _Plan(folder, records, [step for step in steps if step.name not in values], values)
+
+
+def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify) -> None:
+    waiting, values = plan.waiting, plan.values
+    with workers.hands(plan.folder, jobs) as hands:
+        running: dict[Future[Any], Step] = {}
+        while waiting or running:
+            ready = [step for step in waiting if all(name in values for name in step.needs)]
+            for step in ready[: jobs - len(running)]:
+                waiting.remove(step)
+                running[hands.submit(step, plan.records[step.name])] = step
+            finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+            _drain(hands.reports, notify)
+            for future in finished:
+                step = running.pop(future)
+                values[step.name] = future.result()
+                notify(step.name, 1, 1, DONE_NOW)
+
+
+def _settled(steps: Sequence[Step], folder: Path, stale: str, sources: Sources) -> tuple[dict[str, Record], set[str]]:
+    """Return the records by which steps are to be done, or are, and the steps that are kept though stale."""
+    if stale not in STALE:
+        raise InputError(f"stale '{stale}': choose one of {', '.join(STALE)}")
+    records: dict[str, Record] = {}
+    outdated: dict[str, tuple[Record, Record]] = {}
+    for step in steps:
+        asked = step.fingerprint({name: records[name].fingerprint for name in step.needs})
+        code = sources.hashes(starts((step.run, step.arguments)))
+        record = Record.of(asked, code, [records[name] for name in step.needs])
+        held = held_in(folder / step.name)
+        if held is not None and held.fingerprint != asked:
+            raise InputError(f"{folder}: holds the steps of another configuration; choose another folder")
+        if held is not None and held.lineage != record.lineage:
+            outdated[step.name] = held, record
+            record = held if stale == "keep" else record
+        records[step.name] = record
+    if outdated and stale == "refuse":
+        raise refusal(folder, outdated)
+    for step in steps:
+        aside(folder / step.name, "old")
+        if stale == "redo" and step.name in outdated:
+            remove(folder / step.name)
+    return records, set(outdated)
+
+
+def stopwatch(folder: Path) -> Callable[[], float]:
+    """Return a clock of the seconds spent on the run in `folder`, those of its earlier, interrupted starts included.
+
+    A start's seconds count up to the last time that the clock was read.
+    """
+    path, start = folder / "elapsed.json", time.monotonic()
+    earlier = read_json(path)["elapsed_s"] if path.exists() else 0.0
+
+    def clock() -> float:
+        elapsed = earlier + time.monotonic() - start
+        write_json(path, {"elapsed_s": elapsed})
+        return elapsed
+
+    return clock
+
+
+def _drain(reports: Any, notify: Notify) -> None:
+    while True:
+        try:
+            notify(*reports.get_nowait())
+        except Empty:
+            return

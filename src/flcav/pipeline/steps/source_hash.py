@@ -1,0 +1,323 @@
+"""The code that a step's value rests on: what its function reaches of the package, by imports and by names.
+
+They are read from the source's syntax; nothing is imported. A definition is what one statement at the top of a module
+binds: a function, a class, a constant. It reaches those that it mentions, through imports at the top of its module or
+within itself, and through packages that only hand names on, to the module that defines them. Formatting, comments and
+docstrings do not count, nor do imports for type checkers, and code that runs only where a module is the program.
+
+A string `module:NAME` is taken for that name, and so are those of a module's `__getattr__` (see `_lazy`). Not seen are
+other names looked up by strings, data files, and other packages: their versions are in `flcav.pipeline.provenance`.
+"""
+
+import ast
+import functools
+import hashlib
+import importlib.util
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from types import FunctionType, MethodType
+from typing import Any
+
+import flcav
+
+Place = tuple[str, str]  # module, name that a statement at its top binds; WHOLE: all of them
+Target = tuple[str, str]  # module, dotted name in it, "" for the module itself
+WHOLE = "*"
+NAMED = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)")  # how tables, recipes and options name what is of a module
+PACKAGES = {"flcav": Path(flcav.__file__).parent}
+
+
+class Sources:
+    """The source of `packages` (name -> folder), and of single modules beside them, as it is when first read."""
+
+    def __init__(self, packages: Mapping[str, Path] = PACKAGES) -> None:
+        self._packages = packages
+        self._modules: dict[str, _Module | None] = {}
+        self._hashes: dict[frozenset[Place], dict[str, str]] = {}
+
+    def hashes(self, starts: Iterable[Place]) -> dict[str, str]:
+        """Return of every module that `starts` reach a hash of what they reach in it."""
+        key = frozenset(starts)
+        if key not in self._hashes:
+            self._hashes[key] = {
+                name: hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
+                for name, texts in sorted(self._reached(key).items())
+                if texts
+            }
+        return self._hashes[key]
+
+    def _reached(self, starts: Iterable[Place]) -> dict[str, list[str]]:
+        """Return the statements that `starts` reach, as text in the order of the source, by module."""
+        found: dict[str, set[_Statement]] = {}
+        others: dict[str, set[str]] = {}
+        left, seen = list(starts), set(starts)
+        while left:
+            name, wanted = left.pop()
+            module = self._module(name)
+            if module is None:
+                continue
+            if package := name.rpartition(".")[0]:
+                left += [(package, "")] if (package, "") not in seen else []  # it is run before its modules
+                seen.add((package, ""))
+            for statement in {*module.always, *module.binding(wanted)} - found.setdefault(name, set()):
+                found[name].add(statement)
+                for target, as_written in statement.mentions:
+                    places = list(self._resolve(target))
+                    if as_written and not places:
+                        others.setdefault(name, set()).add(f"{as_written}: {target}")
+                    left += [place for place in places if place not in seen]
+                    seen.update(places)
+        return {
+            name: [s.text for s in sorted(statements, key=lambda s: s.line)] + sorted(others.get(name, ()))
+            for name, statements in found.items()
+        }
+
+    def _resolve(self, target: Target) -> Iterator[Place]:
+        """Yield where what an import names is defined; nothing where that is in no source here."""
+        name, path = target
+        while (module := self._module(name)) is not None:
+            part, _, beyond = path.partition(".")
+            inner = f"{name}.{part}"
+            if not part:
+                yield name, WHOLE
+            elif part in module.defined:
+                yield name, part
+            elif part in module.imports and module.imports[part] != (name, part):
+                origin, first = module.imports[part]
+                yield from self._resolve((origin, f"{first}.{beyond}".strip(".")))
+            elif self._module(inner) is not None:
+                name, path = inner, beyond
+                continue
+            elif part in module.lazy:
+                yield from self._resolve((module.lazy[part], path))
+            elif not part.startswith("__"):
+                yield name, WHOLE
+            return
+
+    def _module(self, name: str) -> "_Module | None":
+        if name not in self._modules:
+            path = self._file(name)
+            self._modules[name] = None if path is None else _read(name, path.name == "__init__.py", path.read_text())
+        return self._modules[name]
+
+    def _file(self, name: str) -> Path | None:
+        top, *parts = name.split(".")
+        if top in self._packages:
+            folder = self._packages[top].joinpath(*parts)
+            return next((path for path in (folder / "__init__.py", folder.with_suffix(".py")) if path.is_file()), None)
+        loaded = getattr(sys.modules.get(name), "__file__", None) or ""
+        if not loaded and not parts and name != "__main__" and (spec := importlib.util.find_spec(name)) is not None:
+            loaded = spec.origin or ""
+        foreign = top in sys.stdlib_module_names - {"__main__"} or "site-packages" in loaded
+        return None if foreign or not loaded.endswith(".py") else Path(loaded)
+
+
+def starts(value: Any) -> Iterator[Place]:
+    """Yield where the functions and classes in `value` are defined: in its fields, items and bound arguments too.
+
+    Of a dataclass, fields that it is not compared by are left out.
+    """
+    if isinstance(value, MethodType):
+        yield from starts(value.__self__)
+    elif isinstance(value, functools.partial):
+        yield from starts((value.func, value.args, value.keywords))
+    elif isinstance(value, FunctionType | type):
+        name = value.__qualname__.partition(".")[0]
+        yield value.__module__, WHOLE if name == "<lambda>" else name
+    elif isinstance(value, str):
+        if found := NAMED.fullmatch(value):
+            yield found[1], found[2]
+    elif isinstance(value, Mapping):
+        yield from starts(tuple(value.values()))
+    elif isinstance(value, list | tuple | set | frozenset):
+        for item in value:
+            yield from starts(item)
+    else:
+        yield from starts(type(value))
+        if is_dataclass(value):
+            yield from starts([getattr(value, each.name) for each in fields(value) if each.compare])
+
+
+def package_hash() -> str:
+    """Return a hash of all of flcav's source as it is, to tell whether two machines run the same."""
+    hashed = hashlib.sha256()
+    for name, folder in PACKAGES.items():
+        for path in sorted(folder.rglob("*.py")):
+            hashed.update(f"{name}/{path.relative_to(folder).as_posix()}\n".encode() + path.read_bytes())
+    return hashed.hexdigest()[:16]
+
+
+class _Statement:
+    """A statement at the top of a module."""
+
+    def __init__(self, module: "_Module", node: ast.stmt) -> None:
+        self.module, self.node, self.line = module, node, node.lineno
+
+    @functools.cached_property
+    def text(self) -> str:
+        return ast.unparse(self.node)
+
+    @functools.cached_property
+    def mentions(self) -> list[tuple[Target, str]]:
+        """What it mentions of its module and of others, with the name that this has here."""
+        names = _Names(self.module.name, self.module.package)
+        names.visit(self.node)
+        found = [((module, ""), module) for module in names.star] + [(target, "") for target in names.named]
+        for root, rest in sorted(names.found):
+            for imports in (names.imports, self.module.imports):
+                if root in imports:
+                    module, first = imports[root]
+                    found.append(((module, f"{first}.{rest}".strip(".")), root))
+            if root in self.module.defined:
+                found.append(((self.module.name, root), root))
+        return found
+
+
+class _Module:
+    """What a module's source says."""
+
+    def __init__(self, name: str, package: bool) -> None:
+        self.name, self.package = name, package
+        self.imports: dict[str, Target] = {}  # by the name that they bind
+        self.defined: dict[str, list[_Statement]] = {}
+        self.always: list[_Statement] = []  # what runs whatever is asked for
+        self.lazy: dict[str, str] = {}
+
+    def binding(self, name: str) -> list[_Statement]:
+        """Return the statements that bind `name`."""
+        if name == WHOLE:
+            return [statement for statements in self.defined.values() for statement in statements]
+        return self.defined.get(name, [])
+
+
+class _Names(ast.NodeVisitor):
+    """The names in a piece of source, with the attributes that follow them, and the imports in it."""
+
+    def __init__(self, module: str, package: bool) -> None:
+        self._module, self._package = module, package
+        self.found: set[tuple[str, str]] = set()
+        self.imports: dict[str, Target] = {}
+        self.star: list[str] = []
+        self.named: list[Target] = []
+
+    def visit_Constant(self, node: ast.Constant) -> None:
+        if isinstance(node.value, str) and (found := NAMED.fullmatch(node.value)):
+            self.named.append((found[1], found[2]))
+
+    def visit_Name(self, node: ast.Name) -> None:
+        self.found.add((node.id, ""))
+
+    def visit_Attribute(self, node: ast.Attribute) -> None:
+        parts: list[str] = []
+        inner: ast.expr = node
+        while isinstance(inner, ast.Attribute):
+            parts.insert(0, inner.attr)
+            inner = inner.value
+        if isinstance(inner, ast.Name):
+            self.found.add((inner.id, ".".join(parts)))
+        else:
+            self.visit(inner)
+
+    def visit_If(self, node: ast.If) -> None:
+        for part in [*([] if _left_out(node.test) else node.body), *node.orelse]:
+            self.visit(part)
+        self.visit(node.test)
+
+    def visit_Import(self, node: ast.Import) -> None:
+        for alias in node.names:
+            whole = alias.name if alias.asname else alias.name.partition(".")[0]
+            self.imports[alias.asname or whole] = whole, ""
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        origin = node.module or ""
+        if node.level:
+            up = node.level - self._package
+            above = self._module.rsplit(".", up)[0] if up else self._module
+            origin = f"{above}.{origin}".rstrip(".")
+        for alias in node.names:
+            if alias.name == "*":
+                self.star.append(origin)
+            else:
+                self.imports[alias.asname or alias.name] = origin, alias.name
+
+
+@functools.lru_cache(maxsize=2048)
+def _read(name: str, package: bool, text: str) -> _Module:
+    tree = _Undocumented().visit(ast.parse(text))
+    module = _Module(name, package)
+    for node in tree.body:
+        if isinstance(node, ast.If) and _left_out(node.test) and not node.orelse:
+            continue
+        statement = _Statement(module, node)
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = _Names(name, package)
+            names.visit(node)
+            module.imports |= names.imports
+            module.always += [statement] if names.star else []
+        elif bound := list(_bound(node)):
+            for each in bound:
+                module.defined.setdefault(each, []).append(statement)
+        else:
+            module.always.append(statement)
+            inner = _Names(name, package)
+            inner.visit(node)
+            module.imports |= inner.imports
+            for part in ast.walk(node):
+                for each in _bound(part):
+                    module.defined.setdefault(each, []).append(statement)
+    if "__getattr__" in module.defined:
+        module.lazy = _lazy(tree)
+    return module
+
+
+class _Undocumented(ast.NodeTransformer):
+    """Leaves out strings that are statements: docstrings."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
+        return None if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str) else node
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        super().generic_visit(node)
+        if isinstance(node, ast.stmt) and getattr(node, "body", None) == []:
+            node.body = [ast.Pass()]  # pyright: ignore[reportAttributeAccessIssue]
+        return node
+
+
+def _bound(node: ast.AST) -> Iterator[str]:
+    """Yield the names that a statement which does nothing else binds, or changes in place: `NAMES["x"] = 1`."""
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        yield node.name
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+    if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
+        for target in targets:
+            while isinstance(target, ast.Attribute | ast.Subscript | ast.Starred):
+                target = target.value
+            for part in target.elts if isinstance(target, ast.Tuple | ast.List) else [target]:
+                if isinstance(part, ast.Name):
+                    yield part.id
+
+
+def _left_out(test: ast.expr) -> bool:
+    """Return whether a block under this condition is for type checkers, or for when its module is the program."""
+    text = ast.unparse(test)
+    return text in ("TYPE_CHECKING", "typing.TYPE_CHECKING") or text == "__name__ == '__main__'"
+
+
+def _lazy(tree: ast.Module) -> dict[str, str]:
+    """Return the modules of the names that a `__getattr__` hands on, from a dictionary of strings at the top."""
+    pairs = (
+        (k, v)
+        for node in tree.body
+        for each in ast.walk(node)
+        if isinstance(each, ast.Dict)
+        for k, v in zip(each.keys, each.values, strict=True)
+    )
+    return {
+        key.value: value.value
+        for key, value in pairs
+        if isinstance(key, ast.Constant) and isinstance(value, ast.Constant)
+        if isinstance(key.value, str) and isinstance(value.value, str)
+    }

@@ -1,0 +1,362 @@
+"""The steps of a run: each reads what earlier ones saved, calls a function of its stage, and saves the result.
+
+Arguments are JSON values, so that they name a step's work; folders of other steps are found by the names given.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.federation.strategies import strategy_named
+from flcav.files import write_json
+from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.network.plan import MessageSizes, Price
+from flcav.perception.errors import THRESHOLD, RegistersErrors, load_errors, save_errors
+from flcav.perception.outcomes import interval, measurable, measured, score_on
+from flcav.perception.sharing import shared
+from flcav.perception.tasks import task_named
+from flcav.perception.weights import save_network, to_arrays
+from flcav.pipeline.arms import PlanRule
+from flcav.pipeline.frames import Frames, data_hash, deal_frames, record_frames, town_hashes
+from flcav.pipeline.labels import (
+    KINDS,
+    annotated_samples,
+    frames_near,
+    own_label_threshold,
+    self_labelled_samples,
+)
+from flcav.pipeline.looking import look
+from flcav.pipeline.placing import place_sensors, sites_of, traces_of
+from flcav.pipeline.planning import Frame, asked_of, make_plan, model_mb
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, Federation, Placement, Role, RunRecipe, SplitName, Training
+from flcav.pipeline.results import (
+    ERRORS,
+    LEDGER,
+    OUTCOMES,
+    WEIGHTS,
+    ErrorRegistry,
+    Estimate,
+    Placed,
+    Plan,
+    Pretrained,
+    Round,
+    StageResult,
+    Tested,
+    Watched,
+)
+from flcav.pipeline.stages import (
+    Learning,
+    book_uploads,
+    choose_uploads,
+    clients_of,
+    federate_cloud,
+    federate_edge,
+    purse,
+    region_budget,
+    round_network,
+    stage_network,
+    train_centrally,
+    train_until_level,
+)
+from flcav.pipeline.steps import Work
+
+PROBLEM = "problem.json"
+WATCHED_FRAMES = 30  # validation frames that a network is measured on after each round
+
+Fields = Mapping[str, Any]
+
+
+def record_step(work: Work, fields: Fields, beside: str, places: Sequence[str], version: Mapping[str, str]) -> None:
+    """Record one split, seen by the poles that the steps `places` chose, too; `version` names the town's files."""
+    if town_hashes(fields["town"], Path(beside)) != version:
+        raise InputError(f"{fields['town']}: the town was changed while the run was under way")
+    poles = [pole for step in places for pole in Placed.load(work.inputs[step]).chosen]
+    record_frames(fields, poles, Path(beside), work.folder, work.report).save(work.folder)
+
+
+def deal_step(work: Work, path: str, split: SplitName, role: Role, seed: int, whole: bool, version: str) -> None:
+    """Take one split from a recorded dataset; `version` names its manifest."""
+    if data_hash(Path(path)) != version:
+        raise InputError(f"{path}: the dataset was changed while the run was under way")
+    deal_frames(Path(path), split, role, seed, whole).save(work.folder)
+
+
+def plan_step(work: Work, recipe: Fields, rule: PlanRule, pools: Mapping[str, Sequence[str]], beside: str) -> None:
+    """Allocate both budgets to all tasks; `pools` are the recorded pools by task."""
+    asked_for = RunRecipe.model_validate(recipe)
+    asked, groups = [], _edge_groups(asked_for)
+    for name in asked_for.tasks:
+        task, network = task_named(name), asked_for.tasks[name].network
+        config = Learning(task, network, Training(), 0).fresh().config
+        sizes = [
+            size
+            for step in pools[name]
+            for split in (Frames.open(work.inputs[step]),)
+            for size in shared(task).sample_bytes(split.data, config, split.vehicles)
+        ]
+        messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network))
+        asked.append(asked_of(asked_for, name, messages, len(sizes), Path(beside)))
+    budgets = Price(asked_for.budgets_mb.wireless, asked_for.budgets_mb.wireline)
+    k = asked_for.federation.edge_rounds_per_cloud_round
+    frame = Frame(budgets, asked_for.headroom, asked_for.limits, groups, k)
+    plan, problem = make_plan(tuple(asked), frame, rule)
+    if problem is not None:
+        write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
+    plan.save(work.folder)
+
+
+def pretrain_step(
+    work: Work,
+    task: str,
+    network: str | None,
+    training: Fields,
+    seed: int,
+    budget_mb: tuple[float, float],
+    plan: str,
+    pools: Mapping[str, str],
+    validation: Sequence[str],
+    thresholded: bool,
+) -> None:
+    """Upload the planned samples of a task, train on them, and fix the threshold of own labels."""
+    learning = Learning(task_named(task), network, Training.model_validate(training), seed)
+    own = Plan.load(work.inputs[plan])
+    opened = {region: Frames.open(work.inputs[step]) for region, step in pools.items()}
+    watched = [Frames.open(work.inputs[step]) for step in validation]
+    config = learning.fresh().config
+    chosen = choose_uploads({region: split.vehicles for region, split in opened.items()}, own.tasks[task].samples, seed)
+    book = Ledger(_purse(own, budget_mb, task))
+    samples: list[Any] = []
+    for region, frames in chosen.items():
+        if frames:
+            book_uploads(book, learning.task, config, region, opened[region], frames)
+            samples += _each(learning.task.samples(opened[region].data, config, frames))
+    book.save(work.folder / LEDGER)
+    blocks = train_until_level(learning, samples, watched, work.folder, work.report)
+    trained = stage_network(learning.task, work.folder)
+    Pretrained(
+        task=task,
+        network=network or next(iter(learning.task.configurations)),
+        uploaded=chosen,
+        blocks=blocks,
+        steps=learning.training.block_steps * len(blocks),
+        threshold=own_label_threshold(trained, watched) if thresholded else None,
+    ).save(work.folder)
+
+
+def errors_step(work: Work, task: str, region: str, pretrained: str, registry: str) -> None:
+    """Drive the pretrained network through a region and register what it gets wrong."""
+    learned = task_named(task)
+    if not isinstance(learned, RegistersErrors):
+        raise InputError(f"placement.tasks: the errors of '{task}' have no place in a town")
+    drive = Frames.open(work.inputs[registry])
+    network = stage_network(learned, work.inputs[pretrained])
+    threshold = Pretrained.load(work.inputs[pretrained]).threshold
+    lowest = THRESHOLD if threshold is None else threshold
+    found = learned.register_errors(network, drive.data, drive.vehicles, lowest, work.report)
+    save_errors(found.errors, work.folder / ERRORS)
+    kinds = sorted({error.kind for error in found.errors})
+    counts = {kind: sum(error.kind == kind for error in found.errors) for kind in kinds}
+    ErrorRegistry(region, task, counts, found.dropped).save(work.folder)
+
+
+def place_step(
+    work: Work,
+    region: str,
+    how: Fields,
+    errors: Mapping[str, str],
+    weights: Mapping[str, float],
+    registry: str,
+    edge: str | None,
+) -> None:
+    """Place a region's roadside sensors; `edge`: recorded data, which limits the choice to the poles in it."""
+    drive = Frames.open(work.inputs[registry])
+    sites = sites_of(drive, None if edge is None else Frames.open(work.inputs[edge]))
+    found = {task: load_errors(work.inputs[step] / ERRORS) for task, step in errors.items()}
+    traces = traces_of(drive.data, drive.vehicles)
+    place_sensors(region, Placement.model_validate(how), sites, found, weights, traces).save(work.folder)
+
+
+def edge_step(
+    work: Work,
+    task: str,
+    network: str | None,
+    training: Fields,
+    seed: int,
+    region: str,
+    vehicles: Mapping[str, int],
+    labels: str,
+    federation: Fields,
+    steps: Mapping[str, Any],
+) -> None:
+    """Stage II of a task in a region; `steps` names those it rests on: see `_labelled`."""
+    learning = Learning(task_named(task), network, Training.model_validate(training), seed)
+    own = Plan.load(work.inputs[steps["plan"]]).tasks[task]
+    stage_one = Ledger.load(work.inputs[steps["pretrain"]] / LEDGER)
+    book = Ledger(region_budget(stage_one, vehicles, region))
+    samples, poles = _labelled(work, learning, region, labels, steps, book)
+    start = stage_network(learning.task, work.inputs[steps["pretrain"]])
+    clients = clients_of(learning, start.config, samples)
+    strategy = strategy_named(Federation.model_validate(federation).strategy)
+    losses = federate_edge(learning, start, clients, own.edge_rounds, region, strategy, book, work.folder, work.report)
+    held = sum(len(client.samples) for client in clients.values())
+    StageResult(EDGE, task, region, own.edge_rounds, held, len(clients), poles, losses).save(work.folder)
+
+
+def cloud_step(
+    work: Work,
+    task: str,
+    network: str | None,
+    training: Fields,
+    seed: int,
+    budget_mb: tuple[float, float],
+    labels: str,
+    federation: Fields,
+    regions: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Stage III of a task: the edge servers of all `regions` with the cloud, vehicles with their edge servers."""
+    learning = Learning(task_named(task), network, Training.model_validate(training), seed)
+    first = next(iter(regions.values()))
+    own, how = Plan.load(work.inputs[first["plan"]]), Federation.model_validate(federation)
+    start = stage_network(learning.task, work.inputs[first["pretrain"]])
+    book = Ledger(
+        _purse(own, budget_mb, task), _entries(work, first["pretrain"], *(s["edge"] for s in regions.values()))
+    )
+    servers, held, count, helped = {}, 0, 0, []
+    for region, steps in regions.items():
+        samples, poles = _labelled(work, learning, region, labels, steps)
+        clients = clients_of(learning, start.config, samples)
+        servers[region] = clients, to_arrays(stage_network(learning.task, work.inputs[steps["edge"]]))
+        held += sum(len(client.samples) for client in clients.values())
+        count, helped = count + len(clients), [*helped, *poles]
+    rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
+    strategy = strategy_named(how.strategy)
+    losses = federate_cloud(learning, start, servers, rounds, k, strategy, book, work.folder, work.report)
+    StageResult(CLOUD, task, None, rounds, held, count, tuple(helped), losses).save(work.folder)
+
+
+def central_step(
+    work: Work,
+    task: str,
+    network: str | None,
+    training: Fields,
+    seed: int,
+    region: str,
+    vehicles: int,
+    source: Role,
+    steps: Mapping[str, Any],
+) -> None:
+    """Go on training centrally on ground truth, as many steps as stage II takes in the region.
+
+    `source` "pretrain": on the uploaded samples. "federate": on the frames that the region's vehicles learn from.
+    """
+    learning = Learning(task_named(task), network, Training.model_validate(training), seed)
+    trained = stage_network(learning.task, work.inputs[steps["pretrain"]])
+    if source == "pretrain":
+        uploaded = Pretrained.load(work.inputs[steps["pretrain"]]).uploaded
+        parts = [(Frames.open(work.inputs[steps["pools"][name]]), frames) for name, frames in uploaded.items()]
+    else:
+        split = Frames.open(work.inputs[steps["frames"]])
+        parts = [(split, _grouped(work, split, steps))]
+    samples = [
+        sample for split, frames in parts for sample in _each(learning.task.samples(split.data, trained.config, frames))
+    ]
+    rounds = Plan.load(work.inputs[steps["plan"]]).tasks[task].edge_rounds
+    losses = train_centrally(learning, trained, samples, rounds, vehicles, source)
+    save_network(learning.task, trained, work.folder / WEIGHTS)
+    StageResult(CENTRAL, task, region, rounds, len(samples), 1, (), losses).save(work.folder)
+
+
+def test_step(work: Work, task: str, region: str, trained: str, frames: str, seed: int) -> None:
+    """Measure a step's network on a region's test frames."""
+    learned, split = task_named(task), Frames.open(work.inputs[frames])
+    network, how = stage_network(learned, work.inputs[trained]), measurable(learned)
+    outcomes = how.outcomes(network, split.data, split.vehicles, work.report)
+    outcomes.save(work.folder / OUTCOMES)
+    mean = measured(learned, outcomes)
+    if np.isnan(mean):
+        raise InputError(f"{region}: its {len(split.vehicles)} test frames hold nothing to find; take more scenes")
+    scenes = len({split.data.keys[i].scene for i in split.vehicles})
+    Tested(
+        region=region,
+        task=task,
+        measure=how.measure_name,
+        estimate=Estimate(mean, *interval(learned, outcomes, seed)),
+        numbers=how.numbers(outcomes),
+        frames=len(split.vehicles),
+        scenes=scenes,
+    ).save(work.folder)
+
+
+def rounds_step(work: Work, task: str, region: str, trained: str, start: str, frames: str) -> None:
+    """Measure a federation's network after each round on some of a region's validation frames.
+
+    Of stage II also the pretrained one, as round 0.
+    """
+    learned, split = task_named(task), Frames.open(work.inputs[frames])
+    stage = StageResult.load(work.inputs[trained])
+    count = min(WATCHED_FRAMES, len(split.vehicles))
+    some = [split.vehicles[i] for i in np.linspace(0, len(split.vehicles) - 1, count).astype(int)]
+    first = stage_network(learned, work.inputs[start])
+    config = first.config
+    rounds = [Round(0, score_on(learned, first, split.data, some))] if stage.stage == EDGE else []
+    for number in range(1, stage.rounds + 1):
+        network = round_network(learned, config, work.inputs[trained], number)
+        rounds.append(Round(number, score_on(learned, network, split.data, some)))
+        work.report(number, stage.rounds, "")
+    Watched(stage.stage, task, region, count, tuple(rounds)).save(work.folder)
+
+
+def look_step(work: Work, before: str, after: str, frames: str) -> None:
+    """Look at one test sweep with the networks of two steps."""
+    look(work.inputs[before], work.inputs[after], Frames.open(work.inputs[frames])).save(work.folder)
+
+
+def _labelled(
+    work: Work, learning: Learning, region: str, labels: str, steps: Mapping[str, Any], book: Ledger | None = None
+) -> tuple[Mapping[str, Sequence[Any]], tuple[int, ...]]:
+    """Return each vehicle's labelled samples, and the poles that helped.
+
+    `steps`: "pretrain", the recorded "frames", the arm's "place", and "sites", the places of all arms.
+    """
+    split, kind = Frames.open(work.inputs[steps["frames"]]), KINDS[labels]
+    frames = _grouped(work, split, steps)
+    if not kind.from_detections:
+        config = stage_network(learning.task, work.inputs[steps["pretrain"]]).config
+        return annotated_samples(learning.task, config, split, frames, region), ()
+    poles = Placed.load(work.inputs[steps["place"]]).chosen if kind.from_poles else ()
+    frozen = stage_network(learning.task, work.inputs[steps["pretrain"]])
+    threshold = Pretrained.load(work.inputs[steps["pretrain"]]).threshold
+    assert threshold is not None  # fixed wherever labels come from detections
+    return self_labelled_samples(frozen, threshold, split, frames, poles, region, work.report, book), poles
+
+
+def _grouped(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[int, ...]:
+    """Return the vehicles' frames near a roadside sensor of any arm, so that all arms have the same."""
+    placed = [Placed.load(work.inputs[step]) for step in steps["sites"]]
+    numbers = {pole for each in placed for pole in each.chosen}
+    if not numbers:
+        return split.vehicles
+    sites = sites_of(split, split if steps["recorded"] else None)
+    return frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], steps["group_range_m"])
+
+
+def _edge_groups(recipe: RunRecipe) -> tuple[int, ...]:
+    """Return the number of vehicles of each federating region's edge server."""
+    return tuple(recipe.vehicles(region) for region in recipe.with_role("federate"))
+
+
+def _purse(plan: Plan, budget_mb: tuple[float, float], task: str) -> Budget:
+    planned = {name: (own.wireless_mb, own.wireline_mb) for name, own in plan.tasks.items()}
+    return purse(Budget(*budget_mb), planned, task)
+
+
+def _entries(work: Work, *steps: str) -> list[LedgerEntry]:
+    return [entry for step in steps for entry in Ledger.load(work.inputs[step] / LEDGER).entries]
+
+
+def _each(samples: Sequence[Any]) -> list[Any]:
+    """Return the samples in memory: each is drawn many times."""
+    return [samples[number] for number in range(len(samples))]

@@ -1,0 +1,60 @@
+"""What users bring of their own, named on the command line or in a recipe as `module:NAME`."""
+
+import importlib
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from flcav.config import InputError
+
+
+def load_own(kind: str, name: str, known: Iterable[str], wanted: type) -> Any:
+    """Return the `kind` (a task, a strategy) that `name`, a `module:NAME`, stands for.
+
+    The module is imported with the working directory on the path, as by `python -m`. A class stands for what it makes
+    without arguments. Raises `InputError` for a name without a colon, listing the `known` ones, for a module that is
+    not there or cannot be imported, and for an object without the public members of the protocol `wanted`.
+    """
+    place, colon, attribute = name.partition(":")
+    told = f"{kind} '{name}'"
+    if not colon:
+        raise InputError(f"{told}: choose one of {', '.join(known)}, or name your own as module:NAME")
+    if not (all(part.isidentifier() for part in place.split(".")) and attribute.isidentifier()):
+        raise InputError(f"{told}: a module, a colon and a name in it are wanted, as in my_package.my_module:NAME")
+    module = _imported(place, told)
+    if not hasattr(module, attribute):
+        raise InputError(f"{told}: {module.__file__} has no '{attribute}'")
+    found = getattr(module, attribute)
+    if isinstance(found, type):
+        try:
+            found = found()
+        except Exception as error:
+            raise InputError(f"{told}: makes nothing without arguments ({_said(error)}); name an instance") from None
+    if lacking := [name for name in vars(wanted) if not name.startswith("_") and not hasattr(found, name)]:
+        raise InputError(f"{told}: is no {kind}, it has no {', '.join(lacking)}")
+    return found
+
+
+def _imported(place: str, told: str) -> ModuleType:
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        return importlib.import_module(place)
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{place}.".startswith(f"{error.name}."):
+            raise InputError(f"{told}: no module '{error.name}' in {here} or among what is installed") from None
+        raise InputError(f"{told}: cannot be imported ({_said(error)})") from None
+    except (Exception, SystemExit) as error:
+        raise InputError(f"{told}: cannot be imported ({_said(error)})") from None
+
+
+def _said(error: BaseException) -> str:
+    """Return an exception in words, with the file and line that raised it."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    where = "" if trace is None else f", {Path(trace.tb_frame.f_code.co_filename).name} line {trace.tb_lineno}"
+    return f"{type(error).__name__}: {error}{where}"

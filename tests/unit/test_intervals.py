@@ -1,0 +1,41 @@
+"""Intervals against SciPy's own bootstrap and t test, and against redrawings one by one."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from flcav.intervals import mean_over_seeds, over_scenes
+
+
+def test_the_interval_over_scenes_is_that_of_redrawing_them_one_by_one():
+    rng = np.random.default_rng(0)
+    scenes, right = np.repeat(["b", "a", "c", "d"], [5, 8, 2, 9]), rng.random(24) < 0.7
+    low, high = over_scenes(lambda times: times @ right / times.sum(axis=1), scenes, 400, rng=np.random.default_rng(3))
+    own, one_by_one = np.random.default_rng(3), []
+    for counts in own.multinomial(4, np.full(4, 0.25), size=400):
+        drawn = np.concatenate([np.tile(right[scenes == name], count) for name, count in zip("abcd", counts)])
+        one_by_one.append(drawn.mean())
+    assert (low, high) == pytest.approx(tuple(np.quantile(one_by_one, (0.025, 0.975))), abs=1e-12)
+
+
+def test_scenes_of_one_frame_give_the_bootstrap_of_scipy():
+    values = np.random.default_rng(1).normal(size=60)
+    found = over_scenes(lambda times: times @ values / len(values), np.arange(60), 20_000, rng=np.random.default_rng(2))
+    theirs = stats.bootstrap(
+        (values,), np.mean, n_resamples=20_000, method="percentile", rng=np.random.default_rng(4)
+    ).confidence_interval
+    assert found == pytest.approx((theirs.low, theirs.high), abs=0.01)
+
+
+def test_what_no_redrawing_knows_has_no_interval_and_unknown_ones_are_left_out():
+    rng = np.random.default_rng(0)
+    assert np.isnan(over_scenes(lambda times: np.full(len(times), np.nan), "ab", 50, rng=rng)).all()
+    known = over_scenes(lambda times: np.where(times[:, 0] > 0, 1.0, np.nan), list("ab"), 50, rng=rng)
+    assert known == (1.0, 1.0)
+
+
+def test_means_over_seeds_have_the_interval_of_a_t_test():
+    values = [0.71, 0.78, 0.69, 0.74]
+    wanted = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert mean_over_seeds(values) == pytest.approx({"mean": 0.73, "low": wanted.low, "high": wanted.high})
+    assert mean_over_seeds([0.7]) == {"mean": 0.7, "low": 0.7, "high": 0.7}
