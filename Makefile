@@ -6,7 +6,7 @@ export OMP_NUM_THREADS := 1
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: demo test test-peers check bench format clean
+.PHONY: demo test test-peers lint check bench format clean
 demo: $(STAMP)
 	$(BIN)/flcav demo --out out/demo
 
@@ -17,11 +17,13 @@ test: $(STAMP)
 test-peers: $(STAMP)
 	$(BIN)/python -m pytest -n 0 -rs tests/peers
 
-check: $(STAMP)
+lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/pyright
+
+check: lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 bench: $(STAMP)

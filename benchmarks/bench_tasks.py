@@ -15,10 +15,10 @@ from typing import Any
 import torch
 from cpu_time import cpu_ms
 
-from flcav.cli.tasks import TASKS
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.task import Task, fresh
+from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.training import adamw, step
 from flcav.seeds import stream
 from flcav.sensors.rig import RIGS
@@ -46,7 +46,7 @@ def main(names: list[str]) -> None:
     with tempfile.TemporaryDirectory() as name:
         record(EmbeddedSource(Recipe.model_validate(RECIPE)), Path(name) / "data")
         data = Dataset.open(Path(name) / "data")
-        for task in (TASKS[name] for name in names):
+        for task in map(task_named, names):
             print(f"{task.name}, CPU-ms")
             for network, config in task.configurations.items():
                 time_network(task, network, config, data)

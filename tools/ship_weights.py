@@ -8,8 +8,8 @@ import argparse
 from pathlib import Path
 
 from flcav import perception
-from flcav.cli.tasks import TASKS
 from flcav.perception.card import write_card
+from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import SHIPPED, load_network, read_card, save_network
 
 PACKAGE = Path(perception.__path__[0])
@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("weights", type=Path)
     parser.add_argument("--half", action="store_true")
     arguments = parser.parse_args()
-    task = TASKS[arguments.task]
+    task = task_named(arguments.task)
     network, card = load_network(task, arguments.weights), read_card(arguments.weights)
     out = PACKAGE / task.name / SHIPPED
     out.parent.mkdir(exist_ok=True)

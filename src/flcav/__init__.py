@@ -1,3 +1,51 @@
-"""Design and verify federated learning for connected autonomous vehicle (CAV) perception."""
+"""Design and verify federated learning for connected autonomous vehicle (CAV) perception.
+
+What most programs need is here by name; each package has more of its own. Nothing is imported before it is asked for.
+"""
+
+from typing import TYPE_CHECKING
+
+from flcav.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from flcav.dataset import Dataset, record, validate
+    from flcav.federation import federate
+    from flcav.geometry import Boxes
+    from flcav.network import Ledger, StagePlan, price
+    from flcav.optimization import Problem, allocate, fit, load_problem, place
+    from flcav.perception import TASKS, evaluate, infer, register_errors, task_named, train
+    from flcav.sensors import Frame
+    from flcav.sources import Recipe, load_recipe
+    from flcav.world import Town, Trace, load_town
 
 __version__ = "0.1.0"
+
+PLACES = {
+    "Town": "flcav.world",
+    "Trace": "flcav.world",
+    "load_town": "flcav.world",
+    "Recipe": "flcav.sources",
+    "load_recipe": "flcav.sources",
+    "Frame": "flcav.sensors",
+    "Boxes": "flcav.geometry",
+    "Dataset": "flcav.dataset",
+    "record": "flcav.dataset",
+    "validate": "flcav.dataset",
+    "TASKS": "flcav.perception",
+    "evaluate": "flcav.perception",
+    "infer": "flcav.perception",
+    "register_errors": "flcav.perception",
+    "task_named": "flcav.perception",
+    "train": "flcav.perception",
+    "federate": "flcav.federation",
+    "Ledger": "flcav.network",
+    "StagePlan": "flcav.network",
+    "price": "flcav.network",
+    "Problem": "flcav.optimization",
+    "allocate": "flcav.optimization",
+    "fit": "flcav.optimization",
+    "load_problem": "flcav.optimization",
+    "place": "flcav.optimization",
+}
+__all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
+__getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -5,9 +5,11 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
+
+Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
 
 PIECE_BYTES = 1 << 16
 
@@ -54,7 +56,7 @@ def fill(path: Path, data: bytes | memoryview) -> None:
             file.write(memoryview(data)[start : start + PIECE_BYTES])
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: Json) -> None:
     """Write `value` as indented JSON with sorted keys to `path`, atomically."""
     write_bytes(path, (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
 

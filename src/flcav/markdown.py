@@ -1,10 +1,9 @@
 """Numbers as Markdown."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+def table(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> str:
     """Return a table of `rows` below `header`."""
     lines = [f"| {' | '.join(map(str, line))} |" for line in (header, *rows)]
     lines.insert(1, "|" + "---|" * len(header))

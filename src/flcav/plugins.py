@@ -1,6 +1,7 @@
 """What users bring of their own, named on the command line or in a recipe as `module:NAME`."""
 
 import importlib
+import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,6 +9,8 @@ from types import ModuleType
 from typing import Any
 
 from flcav.config import InputError
+
+PLACE = re.compile(r"\w+(\.\w+)*:\w+")
 
 
 def load_own(kind: str, name: str, known: Iterable[str], wanted: type) -> Any:
@@ -21,7 +24,7 @@ def load_own(kind: str, name: str, known: Iterable[str], wanted: type) -> Any:
     told = f"{kind} '{name}'"
     if not colon:
         raise InputError(f"{told}: choose one of {', '.join(known)}, or name your own as module:NAME")
-    if not (all(part.isidentifier() for part in place.split(".")) and attribute.isidentifier()):
+    if not PLACE.fullmatch(name):
         raise InputError(f"{told}: a module, a colon and a name in it are wanted, as in my_package.my_module:NAME")
     module = _imported(place, told)
     if not hasattr(module, attribute):

@@ -22,6 +22,9 @@ import numpy as np
 from mutations import Rng, link_tree, mutate, odd_number
 
 from flcav.cli.main import run
+from flcav.perception.errors import RegistersErrors
+from flcav.perception.task import Scores
+from flcav.perception.tasks import TASKS, task_named
 
 
 @dataclass(frozen=True)
@@ -69,8 +72,8 @@ FORMATS = {
     **{"kitti": "--min-points #1 --calibration assumed", "yolo": "--labels actors --validation #0.5 --min-pixels #1"},
     **{"coco": "--min-pixels #1", "nuscenes": "--validation #0.5", "opv2v": "--min-points #2", "mcap": ""},
 }
-LEARNERS = {"weather": 0.1, "signs": 1.0, "objects": 1.0, "trajectory": 0.3}
-SCORED = {"weather": "", "signs": "--threshold #0.3", "objects": "--threshold #0.3", "trajectory": ""}
+LEARNERS = dict.fromkeys(TASKS, 1.0) | {"weather": 0.1, "trajectory": 0.3}
+SCORED = {name: "--threshold #0.3" if isinstance(task_named(name), Scores) else "" for name in TASKS}
 FILES = {"weather": "picture.*", "signs": "picture.*", "objects": "cloud.bin"}
 
 
@@ -142,7 +145,7 @@ def calls() -> list[Call]:
                 Call(f"infer {task} {name} --weights {weights} --json", (name, weights), seconds / 3)
                 for name in (f"{FILES[task].partition('.')[0]}.{suffix}" for suffix in suffixes)
             ]
-        if task != "weather":
+        if isinstance(task_named(task), RegistersErrors):
             options = f"--data data/ --weights {weights} --out OUT.csv {SCORED[task]}"
             found.append(Call(f"errors {task} {options}", (*DATASET, weights), seconds))
     weights = "weights/objects.safetensors"

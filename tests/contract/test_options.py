@@ -10,13 +10,16 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.reproduce import Target
-from flcav.cli.tasks import TASKS
+from flcav.cli.reproduce import TARGETS
 from flcav.config import InputError
 from flcav.dataset.formats.export import FORMATS
+from flcav.perception.errors import RegistersErrors
+from flcav.perception.task import Scores
+from flcav.perception.tasks import TASKS, task_named
 
 ALWAYS = "always"
-STUDIES = tuple(target.value for target in Target if target.value not in ("fig1b", "fig3a", "sim-to-real"))
+SCORED = tuple(name for name in TASKS if isinstance(task_named(name), Scores))
+STUDIES = tuple(target for target in TARGETS if target not in ("fig1b", "fig3a", "sim-to-real"))
 TASK_STUDIES = tuple(name for name in STUDIES if name.startswith("task-"))
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
@@ -27,9 +30,11 @@ CHOICES: dict[str, dict[str, str]] = {
     },
     "evaluate": {task: f"{task} --data none" for task in TASKS},
     "infer": {task: f"{task} none" for task in TASKS},
-    "errors": {task: f"{task} --data none --out errors.csv" for task in ("signs", "objects", "trajectory")},
+    "errors": {
+        task: f"{task} --data none --out errors.csv" for task in TASKS if isinstance(task_named(task), RegistersErrors)
+    },
     "fit": {model: f"none --model {model}" for model in ("additive", "effective")},
-    "reproduce": {target.value: f"{target.value} --out out" for target in Target},
+    "reproduce": {target: f"{target} --out out" for target in TARGETS},
 }
 RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads", "--device"), ALWAYS)
 # command -> option -> what of CHOICES takes it; `--out` and `--json` are always taken
@@ -60,11 +65,11 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         **RUNS,
     },
     "evaluate": {"--data": ALWAYS, "--weights": ALWAYS, "--tracks": ("objects",), "--range": ("objects",), **RUNS},
-    "infer": {"--weights": ALWAYS, "--threshold": ("signs", "objects"), "--pictures": ALWAYS, **RUNS},
+    "infer": {"--weights": ALWAYS, "--threshold": SCORED, "--pictures": ALWAYS, **RUNS},
     "errors": {
         "--data": ALWAYS,
         "--weights": ALWAYS,
-        "--threshold": ("signs", "objects"),
+        "--threshold": SCORED,
         "--map": ALWAYS,
         **RUNS,
     },
@@ -90,7 +95,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--weights": ("sim-to-real",),
     },
 }
-LATER = {("place", "range_m"), ("export", "validation"), ("infer", "threshold")}  # are refused by what takes them
+LATER = {("place", "range_m"), ("export", "validation")}  # are refused by what takes them
 VALUES = {
     "--engine": "ray",
     "--stale": "keep",

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-
 from flcav.experiments.demo import demo_protocol, demo_steps
-from flcav.pipeline.steps import Step
+
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
+from flcav.pipeline.steps import Step
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "06_bring_your_own_strategy.py"
 SCHEDULE = Schedule(rounds=3, steps=2, learning_rate=0.1, final_learning_rate=0.05, seed=3)

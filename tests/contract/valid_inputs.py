@@ -14,11 +14,11 @@ from PIL import Image
 from task_drives import HEIGHT, WIDTH, Drives
 
 import flcav.world
-from flcav.cli.tasks import TASKS
 from flcav.dataset.recorder import record
 from flcav.geometry import pose
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import configuration, fresh
+from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import save_network
 from flcav.sensors.frame import Frame, Views
 from flcav.sensors.lens import BODY_FROM_OPTICAL
@@ -175,9 +175,10 @@ def make_inputs(folder: Path) -> None:
     """Write the inputs into the new `folder`."""
     folder.mkdir(parents=True)
     record(AllSensors(spins=2), folder / "data")
-    networks = {name: configuration(task, None) for name, task in TASKS.items()}
+    networks = {name: configuration(task_named(name), None) for name in TASKS}
     networks["signs"] = replace(configuration(SIGNS, "n"), window_px=(WIDTH, HEIGHT))
-    for name, task in TASKS.items():
+    for name in TASKS:
+        task = task_named(name)
         save_network(task, fresh(task, networks[name], 1), folder / "weights" / f"{name}.safetensors")
     shutil.copytree(TOWN, folder / "town")
     for name, values in (("recipe", RECIPE), ("problem", PROBLEM), ("graph", GRAPH), ("progress", PROGRESS)):

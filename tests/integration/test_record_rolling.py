@@ -13,9 +13,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from test_record_sensors import resign
 
 from flcav.cli.main import run
+from flcav.dataset.checks import validate
 from flcav.dataset.frame_checks import check_points
 from flcav.dataset.store import Dataset
-from flcav.dataset.validate import validate
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

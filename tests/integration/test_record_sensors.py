@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 
 from flcav.config import InputError
+from flcav.dataset.checks import validate
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import FILES_SCHEMA, write_table
-from flcav.dataset.validate import validate
 from flcav.files import sha256, write_json
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource

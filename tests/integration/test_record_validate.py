@@ -13,12 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from flcav.config import InputError
+from flcav.dataset.checks import check_order, validate
 from flcav.dataset.layout import FrameKey
 from flcav.dataset.leakage import leaks
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import FILES_SCHEMA, write_table
-from flcav.dataset.validate import check_order, validate
 from flcav.files import sha256, write_json
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

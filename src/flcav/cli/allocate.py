@@ -54,12 +54,12 @@ def allocate(
     from flcav.optimization.baselines import baseline as compared
     from flcav.optimization.budget_sweep import savings
     from flcav.optimization.fleet import allocate_fleet
-    from flcav.optimization.graph import read_graph, read_problem
+    from flcav.optimization.graph import load_problem, read_graph
     from flcav.optimization.replanning import Progress, going_on
     from flcav.sources.recipe import find_recipe
 
     problem = find_recipe(problem)
-    asked = read_problem(problem)
+    asked = load_problem(problem)
     if progress is not None:
         asked = going_on(asked, read_config(Progress, progress))
     try:

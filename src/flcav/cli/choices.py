@@ -1,15 +1,9 @@
 """What commands let one choose from: the help lists it without loading what is chosen."""
 
+from collections.abc import Iterable
 from enum import StrEnum
 
-
-class TaskName(StrEnum):
-    """The tasks, see `flcav.cli.tasks`."""
-
-    weather = "weather"
-    signs = "signs"
-    objects = "objects"
-    trajectory = "trajectory"
+from flcav.perception.tasks import TASKS
 
 
 class Device(StrEnum):
@@ -53,7 +47,10 @@ class Method(StrEnum):
     greedy = "greedy"
 
 
-def listed(choices: type[StrEnum]) -> str:
+def listed(choices: Iterable[str]) -> str:
     """Return the choices in words."""
     *others, last = choices
     return f"{', '.join(others)} or {last}"
+
+
+ANY_TASK = f"{listed(TASKS)}, or one of your own as module:NAME"

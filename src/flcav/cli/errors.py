@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.choices import Device, TaskName, listed
+from flcav.cli.choices import ANY_TASK, Device
 from flcav.cli.options import AGENTS, THREADS
 from flcav.cli.refusals import finite, refuse_unused
 from flcav.threads import use_threads
@@ -25,16 +25,19 @@ def register(app: typer.Typer) -> None:
 
 
 def errors(
-    task: TaskName = typer.Argument(
-        metavar="TASK", help=f"Whose errors: {listed(TaskName)}, of which weather's have no place in a town."
-    ),
+    task: str = typer.Argument(metavar="TASK", help=f"Whose errors: {ANY_TASK}; weather's have no place in a town."),
     data: Path = typer.Option(..., "--data", help="Dataset folder: where the network drives."),
     out: Path = typer.Option(..., "--out", help="The table to write: .csv or .parquet."),
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
-    threshold: float = typer.Option(
-        0.3, "--threshold", min=0.0, max=1.0, callback=finite, help="objects, signs: lowest score of a detection."
+    threshold: float | None = typer.Option(
+        None,
+        "--threshold",
+        min=0.0,
+        max=1.0,
+        callback=finite,
+        help="objects, signs: lowest score of a detection; 0.3 if not given.",
     ),
     map_: Path | None = typer.Option(None, "--map", help="PNG file: the errors in the dataset's town."),
     agents: str | None = AGENTS,
@@ -49,18 +52,17 @@ def errors(
     """
     use_threads(threads)
     from flcav import progress
-    from flcav.cli.tasks import network_of, origin_line, origin_of, task_named
     from flcav.config import InputError
     from flcav.dataset.exchange import check_ending
     from flcav.dataset.store import Dataset
     from flcav.files import check_writable, write_bytes
-    from flcav.perception.agents import choose_frames
-    from flcav.perception.errors import RegistersErrors, save_errors
+    from flcav.perception import networks
+    from flcav.perception.errors import save_errors
+    from flcav.perception.task import Scores
+    from flcav.perception.tasks import task_named
 
     learned = task_named(task)
-    if not isinstance(learned, RegistersErrors):
-        raise InputError(f"task '{task}': its mistakes have no place in a town; choose objects, signs or trajectory")
-    if task == TaskName.trajectory:
+    if not isinstance(learned, Scores):
         refuse_unused(f"errors {task}", "threshold")
     check_ending(out)
     for path in (out, map_):
@@ -70,27 +72,25 @@ def errors(
     town = dataset.town()
     if map_ is not None and town is None:
         raise InputError(f"{data}: its town is not known, so that there is no map of it")
-    network = network_of(learned, weights, device)
-    chosen = choose_frames(learned, network.config, dataset, agents)
-    typer.echo(f"{chosen.sentence}\n{origin_line(origin_of(learned, weights))}")
-    with progress.live(f"errors of {task}") as report:
-        found = learned.register_errors(network, dataset, chosen.frames, threshold, report)
+    with progress.live(f"errors of {learned.name}") as report:
+        found = networks.register_errors(
+            learned, dataset, weights, threshold=threshold, agents=agents, device=device, progress=report
+        )
     save_errors(found.errors, out)
     if map_ is not None and town is not None:
         write_bytes(map_, _draw(town, found))
-    counts = Counter(error.kind for error in found.errors)
-    told = ", ".join(f"{PLURALS[kind]}: {count}" for kind, count in counts.items())
+    if found.chosen is not None:
+        typer.echo(found.chosen.sentence)
+    typer.echo(networks.origin_line(networks.origin_of(learned, weights)))
+    counts = Counter(error.kind for error in found)
+    told = ", ".join(f"{PLURALS.get(kind, kind)}: {count}" for kind, count in counts.items())
     lost = f"; {found.dropped} false positives that point at nothing in the town left out" if found.dropped else ""
     typer.echo(f"{out}: {told or 'no errors'}{lost}")
 
 
 def _draw(town: "Town", found: "Registry") -> bytes:
-    import numpy as np
-
     from flcav.report import style
     from flcav.report.figures import town_map
     from flcav.report.maps import ErrorMap, poles_of
 
-    xyz = np.array([(error.x, error.y, error.z) for error in found.errors]).reshape(-1, 3)
-    kind = np.array([error.kind for error in found.errors], dtype=np.str_)
-    return style.png(town_map(ErrorMap(town, xyz, kind, poles_of(town))))
+    return style.png(town_map(ErrorMap(town, found.positions, found.kinds, poles_of(town))))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.choices import Device, TaskName, listed
+from flcav.cli.choices import ANY_TASK, Device
 from flcav.cli.options import AGENTS, THREADS
 from flcav.threads import use_threads
 
@@ -16,7 +16,7 @@ def register(app: typer.Typer) -> None:
 
 
 def evaluate(
-    task: TaskName = typer.Argument(metavar="TASK", help=f"What was learned: {listed(TaskName)}."),
+    task: str = typer.Argument(metavar="TASK", help=f"What was learned: {ANY_TASK}."),
     data: Path = typer.Option(..., "--data", help="Dataset folder."),
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
@@ -40,31 +40,16 @@ def evaluate(
     """
     use_threads(threads)
     from flcav import progress
-    from flcav.cli.tasks import network_of, origin_line, origin_of, task_named
-    from flcav.config import InputError
-    from flcav.dataset.store import Dataset
-    from flcav.perception.agents import choose_frames
-    from flcav.perception.objects.area import narrowed
-    from flcav.perception.tracking.evaluate import evaluate_tracks, sequences, tracks_lines
+    from flcav.perception import networks
+    from flcav.perception.tasks import task_named
 
-    learner = task_named(task)
-    if tracks and task != "objects":
-        raise InputError(f"--tracks: only objects have tracks, not '{task}'")
-    if within is not None and task != "objects":
-        raise InputError(f"--range: only objects lie in a range, not '{task}'")
-    network = network_of(learner, weights, device)
-    dataset = Dataset.open(data)
-    chosen = choose_frames(learner, network.config, dataset, agents)
-    narrow = {} if within is None else {"asked": narrowed(network.config, within)}
-    if tracks:
-        sequences(dataset, chosen.frames)  # said before the long work
-    with progress.live(f"evaluate {task}") as report:
-        result = learner.evaluate(network, dataset, chosen.frames, **narrow, progress=report)
-    origin = origin_of(learner, weights)
-    lines = [chosen.sentence, origin_line(origin), *learner.evaluation_lines(result)]
-    result = origin | chosen.summary() | result
-    if tracks:
-        with progress.live("follow objects") as report:
-            result["tracks"] = evaluate_tracks(network, dataset, chosen.frames, **narrow, progress=report)
-        lines += tracks_lines(result["tracks"])
-    typer.echo(json.dumps(result, allow_nan=False) if as_json else "\n".join(lines))
+    learned = task_named(task)
+    with progress.live(f"evaluate {learned.name}") as report:
+        found = networks.evaluate(
+            learned, data, weights, agents=agents, within=within, tracks=tracks, device=device, progress=report
+        )
+    origin = networks.origin_of(learned, weights)
+    if as_json:
+        typer.echo(json.dumps(origin | found.chosen.summary() | dict(found.numbers), allow_nan=False))
+        return
+    typer.echo("\n".join([found.chosen.sentence, networks.origin_line(origin), *found.lines]))

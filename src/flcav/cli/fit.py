@@ -12,7 +12,6 @@ from flcav.cli.refusals import finite, refuse_unused
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from flcav.optimization.history import History
     from flcav.optimization.learning_curve import Fit
     from flcav.optimization.problem_file import Learned
 
@@ -65,29 +64,22 @@ def fit(
     """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
     from flcav.cli.tables import read_table
     from flcav.config import InputError
+    from flcav.optimization import learning_curve
     from flcav.optimization.bands import bands, upper_curve
     from flcav.optimization.history import histories
-    from flcav.optimization.learning_curve import fit_additive, fit_effective
     from flcav.optimization.problem_file import learned
 
     if model is Model.additive:
         refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
-
-    def fitted(points: "History") -> "Fit[Any]":
-        samples, edge_rounds, cloud_rounds = points.resources.T
-        columns = (samples, edge_rounds, cloud_rounds, points.accuracy, points.weight)
-        if model is Model.additive:
-            return fit_additive(*columns)
-        if group_samples == 0 and (edge_rounds.any() or cloud_rounds.any()):
-            raise InputError("--model effective needs --group-samples, as the history has rounds")
-        return fit_effective(*columns, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
 
     asked = [_counts(text) for text in at]
     held, unnamed = _held(problem, history.stem)
     answers, shown, found_of = [], [], {}
     for task, points in histories(read_table(history, ()).to_pydict(), str(history), unnamed).items():
         try:
-            found = fitted(points)
+            found = learning_curve.fit(
+                points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta
+            )
         except InputError as error:
             raise InputError(f"{history}: task {task!r}: {error}") from None
         band = bands(found, level=level, repeats=repeats, seed=seed, k=k)
@@ -134,11 +126,11 @@ def _write(problem: Path, held: str | None, found: "Mapping[str, Learned]", k: i
 def _next(problem: Path, tasks: list[str]) -> str:
     """Return what was written, and whether a plan can be made of it."""
     from flcav.config import InputError
-    from flcav.optimization.graph import read_problem
+    from flcav.optimization.graph import load_problem
 
     told = f"{problem}: now has the curve{'s' if len(tasks) > 1 else ''} of {', '.join(tasks)}"
     try:
-        read_problem(problem)
+        load_problem(problem)
     except InputError as error:
         return f"{told}; not yet what `flcav allocate` takes: {str(error).removeprefix(f'{problem}: ')}"
     return f"{told}; next: flcav allocate {problem}"

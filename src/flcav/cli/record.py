@@ -25,19 +25,19 @@ def record(
 ) -> None:
     """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
     from flcav import progress
-    from flcav.config import parse_config, read_config
+    from flcav.config import parse_config
     from flcav.dataset.layout import read_manifest, trace_path
     from flcav.dataset.recorder import record as write
     from flcav.files import check_writable
     from flcav.sources.embedded import EmbeddedSource
-    from flcav.sources.recipe import Recipe, find_recipe
+    from flcav.sources.recipe import Recipe, find_recipe, load_recipe
     from flcav.world.trace import Trace
 
     check_writable(out)
     recipe = find_recipe(recipe)
     changes = {name: value for name, value in (("frames", frames), ("seed", seed)) if value is not None}
-    asked = read_config(Recipe, recipe)
-    source = EmbeddedSource(parse_config(Recipe, asked.model_dump() | changes, str(recipe)), recipe.parent)
+    asked = load_recipe(recipe)
+    source = EmbeddedSource(parse_config(Recipe, asked.model_dump() | changes, str(recipe)))
     with progress.live(f"record {out}") as report:
         written = write(source, out, jobs=jobs, engine=engine, progress=report)
     manifest = read_manifest(out)

@@ -4,28 +4,25 @@ from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 
+import click
 import typer
 
 from flcav.cli.choices import Engine, Stale, listed
 from flcav.cli.interruption import when_interrupted
 from flcav.cli.options import ENGINE, JOBS, STALE
 from flcav.cli.refusals import refuse_unused
+from flcav.experiments.studies import STUDIES
 from flcav.threads import use_threads
 
 
 class Target(StrEnum):
-    """What can be reproduced."""
+    """What can be reproduced beside the tasks' studies."""
 
     demo_arms = "demo-arms"
     fig1b = "fig1b"
     fig3a = "fig3a"
     fig6a_allocation = "fig6a-allocation"
     sim_to_real = "sim-to-real"
-    task_weather = "task-weather"
-    task_signs = "task-signs"
-    task_objects = "task-objects"
-    task_trajectory = "task-trajectory"
-    task_trajectory_cameras = "task-trajectory-cameras"
 
 
 class Scale(StrEnum):
@@ -38,20 +35,23 @@ class Scale(StrEnum):
 
 RUN = ("jobs", "engine", "stale")  # options of what is run as steps
 STUDY = ("seeds", "scale", *RUN)  # of what is run over seeds
-TAKEN: Mapping[Target, tuple[str, ...]] = dict.fromkeys(Target, STUDY) | {
+TASK = "task-"  # before the name of a task's study
+TARGETS: tuple[str, ...] = (*(target.value for target in Target), *(f"{TASK}{name}" for name in STUDIES))
+TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig1b: (),
     Target.fig3a: (),
     Target.sim_to_real: (*RUN, "kitti", "weights"),
     Target.demo_arms: ("seeds", "scale", "jobs"),
     Target.fig6a_allocation: ("seeds", "scale", "jobs"),
 }
-SEEDS = {Target.demo_arms: 5}
+SEEDS: Mapping[str, int] = {Target.demo_arms: 5}
 COMMON_SEEDS = 3
-TASK = "task-"  # before a task's name: its study
 
 
 def reproduce(
-    target: Target = typer.Argument(..., metavar="TARGET", help=f"What to reproduce: {listed(Target)}."),
+    target: str = typer.Argument(
+        ..., metavar="TARGET", click_type=click.Choice(TARGETS), help=f"What to reproduce: {listed(TARGETS)}."
+    ),
     out: Path = typer.Option(..., "--out", help="Folder of the runs; the same command goes on after a stop."),
     seeds: int | None = typer.Option(
         None, "--seeds", min=1, help="Number of seeds, from 1: 5 of demo-arms, 3 of the others if not given."
@@ -69,7 +69,7 @@ def reproduce(
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
     use_threads(1)
-    refuse_unused(f"reproduce {target.value}", *{*STUDY, "kitti", "weights"}.difference(TAKEN[target]))
+    refuse_unused(f"reproduce {target}", *{*STUDY, "kitti", "weights"}.difference(TAKEN[target]))
     if target in (Target.fig1b, Target.fig3a):
         draw = _fig1b if target == Target.fig1b else _fig3a
         draw(out)
@@ -80,8 +80,8 @@ def reproduce(
     count = seeds or SEEDS.get(target, COMMON_SEEDS)
     numbers = range(1, count + 1)
     quick = scale == Scale.quick
-    if target.value.startswith(TASK):
-        _task(target.value, out, numbers, "quick" if quick else "full", jobs, engine, stale)
+    if target.startswith(TASK):
+        _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
         run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
         run(out, count, "quick" if quick else "paper", jobs)
@@ -143,10 +143,10 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int) -> None:
 @when_interrupted()
 def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
-    from flcav.cli.tasks import network_of
     from flcav.config import InputError
     from flcav.experiments.sim_to_real import draw_frame, run_sim_to_real
     from flcav.files import write_bytes, write_json
+    from flcav.perception.networks import network_of
     from flcav.perception.objects.task import OBJECTS
     from flcav.report import style
     from flcav.report.clouds import compare
@@ -169,11 +169,11 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int,
 @when_interrupted()
 def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
-    from flcav.experiments.studies import STUDIES
+    from flcav.experiments.studies import study_named
     from flcav.experiments.task_study import run_study
     from flcav.files import write_bytes, write_json
 
-    study = STUDIES[target.removeprefix(TASK)]
+    study = study_named(target.removeprefix(TASK))
     with live_steps(target) as notify:
         results = run_study(study, out, seeds=seeds, scale=scale, jobs=jobs, notify=notify, stale=stale, engine=engine)
     write_json(out / "result.json", results)

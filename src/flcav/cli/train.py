@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.choices import Device, TaskName, listed
+from flcav.cli.choices import ANY_TASK, Device
 from flcav.cli.interruption import when_interrupted
 from flcav.cli.options import AGENTS, THREADS
 from flcav.threads import use_threads
@@ -16,7 +16,7 @@ def register(app: typer.Typer) -> None:
 
 
 def train(
-    task: TaskName = typer.Argument(metavar="TASK", help=f"What to learn: {listed(TaskName)}."),
+    task: str = typer.Argument(metavar="TASK", help=f"What to learn: {ANY_TASK}."),
     data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
     out: Path = typer.Option(
         ..., "--out", help="Folder of the weights; an interrupted training goes on, a finished one is left alone."
@@ -29,8 +29,7 @@ def train(
     network: str | None = typer.Option(
         None,
         "--network",
-        help="tiny (default) or paper; objects also small; signs n (default) or s; trajectory also tiny-cameras, "
-        "paper-cameras.",
+        help="Which of the task's networks: docs/tasks.md names them; by default its first.",
     ),
     epochs: int = typer.Option(10, "--epochs", min=1, help="Passes through the data."),
     patience: int = typer.Option(5, "--patience", min=1, help="Epochs without a better validation before it stops."),
@@ -46,9 +45,9 @@ def train(
     use_threads(threads)
     from flcav import progress
     from flcav.cli.refusals import refuse_unused
-    from flcav.cli.tasks import task_named
     from flcav.dataset.store import Dataset
     from flcav.perception.device import device_named
+    from flcav.perception.tasks import task_named
     from flcav.perception.training.run import CHECKPOINT, WEIGHTS, Request, prepare, train_prepared
 
     if validation is None:

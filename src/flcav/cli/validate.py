@@ -15,9 +15,9 @@ def validate(
 ) -> None:
     """Check datasets: files, tables, boxes against points and traffic, leakage between splits. Exit 1 on a problem."""
     from flcav import progress
+    from flcav.dataset.checks import validate as problems_of
     from flcav.dataset.layout import read_manifest
     from flcav.dataset.leakage import leaks
-    from flcav.dataset.validate import validate as problems_of
 
     manifests = {folder: read_manifest(folder) for folder in folders}
     problems = leaks({str(folder): manifest for folder, manifest in manifests.items()})

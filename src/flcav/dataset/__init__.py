@@ -1,1 +1,18 @@
 """Recorded frames on disk: write, read, check."""
+
+from typing import TYPE_CHECKING
+
+from flcav.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from flcav.dataset.checks import validate
+    from flcav.dataset.recorder import record
+    from flcav.dataset.store import Dataset
+
+PLACES = {
+    "validate": "flcav.dataset.checks",
+    "record": "flcav.dataset.recorder",
+    "Dataset": "flcav.dataset.store",
+}
+__all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
+__getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -35,6 +35,8 @@ from flcav.dataset.tasks import PAYLOADS, TRAFFIC, parts
 from flcav.dataset.workers import processes
 from flcav.files import sha256, write_bytes, write_json
 from flcav.progress import Report, silent
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
 from flcav.sources.source import Located, Source
 
 ENGINES = {"processes": processes, "ray": ray_cluster}
@@ -42,8 +44,17 @@ HEADER = "recipe.json"
 JOINED = "joined"  # below `.recording`: what becomes of the parts
 
 
-def record(source: Source, out: Path, *, jobs: int = 1, engine: str = "processes", progress: Report = silent) -> bool:
-    """Record `source` into the folder `out` by `jobs` workers of one of ENGINES; returns whether anything was left.
+def record(
+    source: Source | Recipe,
+    out: Path | str,
+    *,
+    jobs: int = 1,
+    engine: str = "processes",
+    progress: Report = silent,
+) -> bool:
+    """Record a source, or what a recipe asks for, into the folder `out` by `jobs` workers of one of ENGINES.
+
+    Returns whether anything was left to record.
 
     False says that `out` already held this very dataset. A folder whose recording was interrupted is finished.
     Raises `InputError` where `out` holds anything else, `OSError` where it cannot be written.
@@ -52,6 +63,9 @@ def record(source: Source, out: Path, *, jobs: int = 1, engine: str = "processes
         raise InputError(f"jobs = {jobs}: must be at least 1")
     if engine not in ENGINES:
         raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
+    if isinstance(source, Recipe):
+        source = EmbeddedSource(source)
+    out = Path(out)
     header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))
     try:
         if not _claim(out, header):

@@ -5,6 +5,7 @@ while they look at it, and what it says. The networks are those that come with t
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -20,20 +21,21 @@ from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.fig1b_layers import LAYERS, given_to, watched
 from flcav.geometry import inverse, transform_points
-from flcav.perception.objects.infer import boxes_of_rows
+from flcav.perception.marks import CloudBoxes, Paths, PictureBoxes
+from flcav.perception.networks import network_of
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.config import STRIDES
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Finding, Task
+from flcav.perception.tasks import task_named
 from flcav.perception.trajectory.rasters import LAYERS as RASTER_LAYERS
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.weather.samples import small
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import load_network, shipped
 from flcav.progress import Report, silent
 from flcav.report import style
 from flcav.report import task_columns as page
-from flcav.report.inference import sign_boxes
+from flcav.report.inference import boxes_in_picture
 from flcav.report.predicted_paths import MAP_COLOURS, paths_on_map
 from flcav.report.sweeps import draw_boxes, draw_points
 from flcav.sensors.rig import RIGS
@@ -59,7 +61,6 @@ RECIPE: Mapping[str, Any] = {
     },
     "weather": "clear",
 }
-TASKS: tuple[Task[Any, Any, Any], ...] = (WEATHER, SIGNS, OBJECTS, TRAJECTORY)
 MAP_M = 50.0  # to either side of the observer
 SCORE = 0.3  # lowest that is shown
 CELL_M = 0.4  # of the voxels drawn: four of the network's, whose own would be too small to see
@@ -78,7 +79,7 @@ def fig1b(out: Path, progress: Report = silent) -> bytes:
 
     Raises `InputError` where one of the tasks has no weights in the package.
     """
-    networks = {task.name: load_network(task, shipped(task)) for task in TASKS}
+    networks = {name: network_of(task_named(name), None) for name in LAYERS}
     record(EmbeddedSource(parse_config(Recipe, dict(RECIPE), "fig1b")), out / "data", progress=progress)
     data = Dataset.open(out / "data")
     number = most_to_see(data)
@@ -127,11 +128,11 @@ def _weather(network: Any, picture: Path) -> page.Column:
 
 def _signs(network: Any, picture: Path) -> page.Column:
     finding, layers = _looked(SIGNS, network, picture)
-    boxes = finding.result["boxes"]
+    (boxes,) = (mark for mark in finding.marks if isinstance(mark, PictureBoxes))
 
     def output(axes: Axes) -> None:
         page.show_picture(axes, finding.seen)
-        sign_boxes(axes, boxes)
+        boxes_in_picture(axes, boxes)
 
     anchors = [size for level in network.config.anchors_px for size in level]
     return page.Column(
@@ -146,7 +147,7 @@ def _signs(network: Any, picture: Path) -> page.Column:
             "sensor": "camera, 45°",
             "processing": f"cells of 8, 16 and {STRIDES[-1]} pixels; nine anchors",
             "network": "YOLOv5-style: CSP, SPPF, PAN",
-            "output": f"boxes with class and score: {len(boxes)}",
+            "output": f"boxes with class and score: {len(boxes.box)}",
         },
     )
 
@@ -154,7 +155,7 @@ def _signs(network: Any, picture: Path) -> page.Column:
 def _objects(network: Any, points: Path) -> page.Column:
     finding, layers = _looked(OBJECTS, network, points)
     cloud, range_m, ground_m = finding.seen, network.config.range_m, network.config.ground_z_m
-    boxes = boxes_of_rows(finding.result["boxes"])
+    (boxes,) = (mark.boxes for mark in finding.marks if isinstance(mark, CloudBoxes))
 
     def output(axes: Axes) -> None:
         draw_points(axes, cloud, ground_m, (range_m[0], range_m[3], range_m[4]))
@@ -183,30 +184,30 @@ def _trajectory(network: Any, data: Dataset, number: int) -> page.Column:
     with watched(LAYERS["trajectory"](network)) as seen, given_to(network.view) as given:
         finding = next(islice(TRAJECTORY.infer(network, data.folder), number, None))
     raster = given[0].raster[0].cpu().numpy()
-    result = finding.result
+    (paths,) = (mark for mark in finding.marks if isinstance(mark, Paths))
     colours = [RASTER_COLOURS.get(name) for name in RASTER_LAYERS]
 
-    def on_map(result: Mapping[str, Any]) -> page.Draw:
+    def on_map(shown: Paths) -> page.Draw:
         def draw(axes: Axes) -> None:
-            paths_on_map(axes, finding.seen, result)
+            paths_on_map(axes, finding.seen, shown)
             axes.set(ylim=(-0.4 * MAP_M, 0.8 * MAP_M), xlim=(-MAP_M, MAP_M), aspect="auto")
 
         return draw
 
-    still = {**result, "agents": [{**agent, "modes": [], "truth": None} for agent in result["agents"]]}
+    still = replace(paths, users=tuple(replace(user, modes=(), truth=None) for user in paths.users))
     return page.Column(
         "Trajectories",
         {
             "sensor": on_map(still),
             "processing": partial(page.show_raster, raster=raster, colours=colours),
             "network": partial(page.show_layers, layers=list(seen.values())),
-            "output": on_map(result),
+            "output": on_map(paths),
         },
         {
             "sensor": "tracks on the map; dashed: constant velocity",
             "processing": f"{len(raster)} layers around one road user, 2 s of past",
             "network": "convolutions, LSTM encoder and decoder",
-            "output": f"{network.config.modes} futures of {result['time_s'][-1]:g} s; black: what came",
+            "output": f"{network.config.modes} futures of {paths.times_s[-1]:g} s; black: what came",
         },
     )
 

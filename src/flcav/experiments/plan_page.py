@@ -100,7 +100,7 @@ def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
     return terms | {name: TERMS[name] for name in used}
 
 
-def _parts(problem: Problem, plan: Allocation) -> list[dict[str, Any]]:
+def _parts(problem: Problem, plan: Allocation) -> list[plan_charts.Part]:
     """Return megabytes by link, task and stage; tasks beyond the `SHOWN` largest are one."""
     ordered = sorted(plan.tasks, key=lambda row: -(row.wireless_mb + row.wireline_mb))
     shown = {row.name for row in ordered[: SHOWN if len(ordered) > SHOWN + 1 else len(ordered)]}

@@ -1,1 +1,26 @@
 """The three training stages over a vehicle-edge-cloud network."""
+
+from typing import TYPE_CHECKING
+
+from flcav.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from flcav.federation.runtimes.metered import Account
+    from flcav.federation.stages import Schedule, federate
+    from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy, strategy_named
+    from flcav.federation.trainable import LocalUpdate, Trainable, Update
+
+PLACES = {
+    "Account": "flcav.federation.runtimes.metered",
+    "Schedule": "flcav.federation.stages",
+    "federate": "flcav.federation.stages",
+    "STRATEGIES": "flcav.federation.strategies",
+    "FedAvg": "flcav.federation.strategies",
+    "Strategy": "flcav.federation.strategies",
+    "strategy_named": "flcav.federation.strategies",
+    "LocalUpdate": "flcav.federation.trainable",
+    "Trainable": "flcav.federation.trainable",
+    "Update": "flcav.federation.trainable",
+}
+__all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
+__getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
-Weights = Mapping[str, NDArray[Any]]  # name -> array, parameters and buffers, in a fixed order
+Weights = Mapping[str, NDArray[np.number]]  # name -> array, parameters and buffers, in a fixed order
 
 
 class Update(Protocol):

@@ -176,8 +176,9 @@ def load(path: Path) -> nx.Graph:
         raise InputError(f"{path}: not a graph in node-link JSON ({error})") from None
 
 
-def read_problem(path: Path) -> Problem:
+def load_problem(path: Path | str) -> Problem:
     """Return the problem in the file at `path`: written as tasks, or as a graph in either form."""
+    path = Path(path)
     graph = read_graph(path)
     return parse_config(Problem, read_yaml(path), str(path)) if graph is None else to_problem(graph)
 

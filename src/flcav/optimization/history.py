@@ -19,6 +19,8 @@ from flcav.optimization.curves import STAGES
 
 Array = NDArray[np.float64]
 
+Table = Mapping[str, Sequence[str | float | None]]  # columns by name
+
 LONG = ("task", "stage", "resource", "accuracy")
 JOINT = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
 LEAST, MOST = 1e-9, 1e9  # of a number that is not 0
@@ -41,7 +43,7 @@ def article_histories() -> dict[str, History]:
         return histories(pyarrow.csv.read_csv(file).to_pydict(), str(ARTICLE), "")
 
 
-def histories(columns: Mapping[str, Sequence[object]], origin: str, unnamed: str) -> dict[str, History]:
+def histories(columns: Table, origin: str, unnamed: str) -> dict[str, History]:
     """Return the history of each task of a table in either form; `unnamed` is the task where no column says it.
 
     Raises `InputError` naming `origin`, the row (from 1), the field and the value.
@@ -71,7 +73,7 @@ def histories(columns: Mapping[str, Sequence[object]], origin: str, unnamed: str
     return found
 
 
-def _with_accuracy(columns: Mapping[str, Sequence[object]], origin: str) -> Mapping[str, Sequence[object]]:
+def _with_accuracy(columns: Table, origin: str) -> Table:
     """Return `columns` with accuracies, from errors where there are none; raises `InputError` if both disagree."""
     if "error" not in columns:
         return columns
@@ -94,7 +96,7 @@ def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
     return np.where(np.arange(3) < number[:, None], largest, own)
 
 
-def _numbers(columns: Mapping[str, Sequence[object]], name: str, origin: str, most: float = MOST) -> Array:
+def _numbers(columns: Table, name: str, origin: str, most: float = MOST) -> Array:
     """Return column `name` as (n,) numbers from 0 to `most`."""
     values = np.empty(len(columns[name]))
     for row, value in enumerate(columns[name]):

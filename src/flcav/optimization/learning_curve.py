@@ -7,7 +7,7 @@ the loss is soft L1 around three standard deviations. `bands` says how far curve
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Any, Generic, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 from flcav.config import InputError
 from flcav.optimization.curve_forms import STEEPEST, AdditiveForm, CurveT, Form, additive_forms, effective_forms
 from flcav.optimization.curves import STAGES, Additive, Decay, Effective
+from flcav.optimization.history import History
 
 Array = NDArray[np.float64]
 
@@ -104,6 +105,29 @@ def fit_power(resource: ArrayLike, accuracy: ArrayLike) -> Decay:
     form = AdditiveForm((0,), False, (), (middle,), (0.0, 0.0, 0.0))
     error = 1 - np.asarray(accuracy, dtype=np.float64)
     return form.curve(_solved(form, spent, error, np.ones(len(error)), False).parameters).pretrain
+
+
+def fit(
+    history: History,
+    *,
+    model: Literal["additive", "effective"] = "additive",
+    group_samples: float = 0.0,
+    k: int = 1,
+    alpha: float = 0.1,
+    beta: float | None = None,
+) -> Fit[Any]:
+    """Return how the error falls with samples and rounds: the learning curve fitted to the history of one task.
+
+    For the other settings, of the effective model, see `fit_effective`. Raises `InputError` where there are too few
+    points, and where the effective model is told nothing of the samples that the rounds are about.
+    """
+    samples, edge_rounds, cloud_rounds = history.resources.T
+    columns = (samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
+    if model == "additive":
+        return fit_additive(*columns)
+    if group_samples == 0 and history.resources[:, 1:].any():
+        raise InputError("--model effective needs --group-samples, as the history has rounds")
+    return fit_effective(*columns, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
 
 
 def fit_additive(

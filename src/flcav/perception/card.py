@@ -1,10 +1,10 @@
 """What one should know of a network before using it: a model card, after Mitchell et al. (FAT* 2019)."""
 
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from flcav import __version__
 from flcav.config import Config
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
@@ -44,7 +44,7 @@ class Card(Config):
     validation: dict[str, Any] | None = None  # entry of the dataset that `metrics` are of
     metrics: dict[str, Any]  # on the validation data; empty where there were none
     licence: str = LICENCE
-    flcav: str = __version__
+    flcav: str = version("flcav")
     torch: str | None = None  # its version; this and the next are None in older cards
     threads: int | None = None  # that a process computed on
     processor: str | None = None  # kind of, see `flcav.perception.device`

@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Generic
 
+import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
@@ -16,7 +17,7 @@ from flcav.perception.weights import from_arrays, to_arrays
 class Trained:
     """What local training produced."""
 
-    weights: dict[str, NDArray[Any]]
+    weights: dict[str, NDArray[np.number]]
     samples: int  # distinct samples trained on
     loss: float  # mean over the steps
 
@@ -37,7 +38,9 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         self.task, self.config, self.samples = task, config, samples
         self.batch = task.practice.batch if batch is None else batch
 
-    def train(self, weights: Mapping[str, NDArray[Any]], *, steps: int, learning_rate: float, seed: int) -> Trained:
+    def train(
+        self, weights: Mapping[str, NDArray[np.number]], *, steps: int, learning_rate: float, seed: int
+    ) -> Trained:
         """Return the weights after `steps` local steps from `weights`; the same arguments give the same result."""
         network = self.task.build(self.config)
         from_arrays(network, weights)

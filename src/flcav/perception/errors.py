@@ -3,18 +3,22 @@
 What a mistake is, each task says in its own `errors.py`; here is how they are kept and handed on.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from flcav.dataset.exchange import write_table
 from flcav.dataset.store import Dataset
 from flcav.progress import Report, silent
+
+if TYPE_CHECKING:
+    from flcav.perception.agents import Chosen
 
 SAME_PLACE_M = 2.0  # false positives of one scene within this of one another are one
 
@@ -45,6 +49,28 @@ class Registry:
 
     errors: tuple[PerceptionError, ...]
     dropped: int = 0  # false positives that point at no place of the town
+    chosen: "Chosen | None" = None  # whose frames, where that is known
+
+    def __len__(self) -> int:
+        return len(self.errors)
+
+    def __iter__(self) -> Iterator[PerceptionError]:
+        return iter(self.errors)
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """Return where the mistakes are, (N, 3) world [m]."""
+        return np.array([(error.x, error.y, error.z) for error in self.errors]).reshape(-1, 3)
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Return what covering each is worth, (N,)."""
+        return np.array([error.weight for error in self.errors], np.float64)
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """Return the kind of each, (N,): miss, false_positive or final_error."""
+        return np.array([error.kind for error in self.errors], np.str_)
 
 
 @runtime_checkable

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
+from flcav.perception.marks import Mark
 from flcav.progress import Report, silent
 from flcav.seeds import child_seed
 
@@ -45,8 +46,9 @@ class Finding:
     """What a network found in one input."""
 
     path: Path  # the input's own
-    seen: NDArray[Any]  # point cloud (N, 4) or image (H, W, 3) u8
+    seen: NDArray[Any]  # picture (H, W, 3) u8, point cloud (N, 4) f32, or map: (3, H, W) bool of road, lane, crossing
     result: dict[str, Any]  # as JSON knows it, without the path
+    marks: tuple[Mark, ...] = ()  # the same, as it is drawn on what was seen
     view: Callable[[], "CameraView | None"] = no_view  # of a camera beside the LiDAR, read when asked for
 
 
@@ -129,6 +131,16 @@ class Calibrates(Protocol):
 
     def calibrate(self, network: Any, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the calibration in the network's configuration from frames of `data` (None: all)."""
+        ...
+
+
+@runtime_checkable
+class Scores(Protocol):
+    """A task whose findings have a score each, in [0, 1]."""
+
+    @property
+    def threshold(self) -> float:
+        """Return the lowest score of what is shown and registered, unless one is told otherwise."""
         ...
 
 

@@ -1,6 +1,7 @@
 """Weights on disk and as arrays: safetensors files that say which network they are of, and how it came about."""
 
 import json
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,14 @@ from flcav.perception.task import ConfigT, NetworkT, Task
 
 PREFIX = "flcav."
 LARGEST = 1e9  # of a weight: larger ones overflow in a few layers
-SHIPPED = "shipped/weights.safetensors"  # in a task's folder; its card lies beside it
+SHIPPED = "shipped/weights.safetensors"  # beside a task's module; its card lies beside it
 COUNTER = "num_batches_tracked"  # of batch normalisation with a fixed momentum, which does not use it
 
 
 def shipped(task: Task[Any, Any, Any]) -> Path:
-    """Return the file of weights that comes with the package; raises `InputError` where `task` has none."""
-    path = Path(__file__).parent / task.name / SHIPPED
+    """Return the file of weights that comes with a task; raises `InputError` where it has none."""
+    module = sys.modules.get(type(task).__module__)
+    path = Path(getattr(module, "__file__", None) or "").parent / SHIPPED
     if not path.is_file():
         raise InputError(f"--weights is missing: no weights for '{task.name}' come with the package, train some first")
     return path
@@ -74,12 +76,12 @@ def load_weights(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path) 
     _fill(network, tensors, path)
 
 
-def to_arrays(network: nn.Module) -> dict[str, NDArray[Any]]:
+def to_arrays(network: nn.Module) -> dict[str, NDArray[np.number]]:
     """Return copies of parameters and buffers by name, without the counters of batch normalisation."""
     return {name: tensor.detach().cpu().numpy().copy() for name, tensor in _learned(network).items()}
 
 
-def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
+def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[np.number]]) -> None:
     """Set parameters and buffers from what `to_arrays` returned; raises `InputError` where they do not fit."""
     state = _learned(network)
     if set(arrays) != set(state):

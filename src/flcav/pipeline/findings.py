@@ -28,7 +28,7 @@ def findings(
 ) -> tuple[Finding, ...]:
     """Return a finding for each difference of the run itself.
 
-    `rules` are the arms' placement rules, `roles` the regions', `caveats` by task what figures after pretraining rest on.
+    `rules` are the arms' placement rules, `roles` the regions', `caveats` by task what FL figures rest on.
     """
     values = {(test.arm, test.stage, test.region, test.task): test for test in tests}
     return tuple(

@@ -1,7 +1,7 @@
 """A plan in pictures: megabytes per link, and error against budget."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TypedDict
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -10,15 +10,22 @@ from matplotlib.patches import Patch
 from flcav.report import style
 from flcav.report.figures import WIDTH
 
-Row = Mapping[str, Any]
-
 TASKS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION, style.RULE)
 SHADES = {"samples": 1.0, "edge rounds": 0.62, "cloud rounds": 0.32}  # opacity by stage
 LINKS = {"both links": style.RULE, "wireless alone": style.BLUE, "wireline alone": style.VERMILLION}
 
 
+class Part(TypedDict):
+    """What a task sends over a link in one stage."""
+
+    link: str
+    task: str
+    stage: str
+    mb: float
+
+
 @style.styled
-def megabytes(parts: Sequence[Row], links: Mapping[str, Row]) -> Figure:
+def megabytes(parts: Sequence[Part], links: Mapping[str, Mapping[str, float]]) -> Figure:
     """Return a bar per link: a part per task (colour) and stage (shade), against the budget [MB]."""
     tasks = list(dict.fromkeys(row["task"] for row in parts))
     colours = dict(zip(tasks, TASKS, strict=False))
@@ -49,7 +56,7 @@ def megabytes(parts: Sequence[Row], links: Mapping[str, Row]) -> Figure:
 
 
 @style.styled
-def best_by_budget(sweep: Mapping[str, Sequence[Row]], measure: str) -> Figure:
+def best_by_budget(sweep: Mapping[str, Sequence[Mapping[str, float]]], measure: str) -> Figure:
     """Return the best objective, called `measure`, at multiples of the budgets, scaled together and one at a time."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
     axes = figure.add_subplot()

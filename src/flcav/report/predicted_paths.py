@@ -3,18 +3,15 @@
 The mode for who wants a single one is the thickest.
 """
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from flcav.perception.task import Finding
-from flcav.perception.trajectory.infer import AROUND_M
+from flcav.perception.marks import Paths, RoadUser
 from flcav.report import style
 
 Array = NDArray[np.float64]
@@ -24,33 +21,17 @@ FAINTEST = 0.15
 PREDICTED, TRUTH, PLAIN = style.BLUE, style.INK, style.ORANGE
 
 
-@style.styled
-def draw_paths(finding: Finding) -> Figure:
-    """Return the map around the observer with the predicted paths of a finding of the trajectory task.
-
-    Ahead of the observer is up.
-    """
-    figure = style.canvas(7.2, 7.9)
-    axes = figure.add_subplot()
-    result = finding.result
-    paths_on_map(axes, finding.seen, result)
-    style.scale_bar(axes, 10)
-    axes.set_title(f"{finding.path.name} · {len(result['agents'])} predicted")
-    style.key(figure, _legend(result["time_s"][-1], bool(result["lights"])))
-    return figure
-
-
-def paths_on_map(axes: Axes, layers: NDArray[np.bool_], result: Mapping[str, Any]) -> None:
-    """Draw the map (layers, H, W) with the paths of a finding on `axes`, see `draw_paths`; agents may have no modes."""
-    axes.set(xlim=(-AROUND_M, AROUND_M), ylim=(-AROUND_M, AROUND_M), aspect="equal")
-    axes.imshow(_ground(layers), extent=(-AROUND_M, AROUND_M, -AROUND_M, AROUND_M), interpolation="antialiased")
-    observer = np.array([result["observer"][name] for name in ("x", "y", "yaw")])
-    for light in result["lights"]:
-        at = _on_page(np.array([[light["x"], light["y"]]]), observer)[0]
-        colour = style.GREEN if light["open"] else style.VERMILLION
+def paths_on_map(axes: Axes, layers: NDArray[np.bool_], paths: Paths) -> None:
+    """Draw the map (layers, H, W) around the observer, and the predicted paths on it; ahead of the observer is up."""
+    reach, observer = paths.reach_m, np.array(paths.observer)
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    axes.imshow(_ground(layers), extent=(-reach, reach, -reach, reach), interpolation="antialiased")
+    for light in paths.lights:
+        at = _on_page(np.array([[light.x, light.y]]), observer)[0]
+        colour = style.GREEN if light.open else style.VERMILLION
         axes.plot(*at, "s", markersize=3.5, color=colour, markeredgewidth=0, zorder=3)
-    for agent in result["agents"]:
-        _draw_agent(axes, agent, observer)
+    for user in paths.users:
+        _draw_user(axes, user, observer)
     axes.plot(0, 0, "^", markersize=6, color=style.INK, markeredgecolor="white", zorder=8)
     style.bare(axes)
 
@@ -62,26 +43,27 @@ def _ground(layers: NDArray[np.bool_]) -> Array:
     return out
 
 
-def _draw_agent(axes: Axes, agent: Mapping[str, Any], observer: Array) -> None:
-    length, width, yaw = agent["length"] / 2, agent["width"] / 2, agent["yaw"]
+def _draw_user(axes: Axes, user: RoadUser, observer: Array) -> None:
+    length, width = user.length / 2, user.width / 2
     corners = np.array([(length, width), (length, -width), (-length, -width), (-length, width)])
-    turn = np.array([(np.cos(yaw), np.sin(yaw)), (-np.sin(yaw), np.cos(yaw))])
-    here = np.array([agent["x"], agent["y"]])
+    turn = np.array([(np.cos(user.yaw), np.sin(user.yaw)), (-np.sin(user.yaw), np.cos(user.yaw))])
+    here = np.array([user.x, user.y])
     outline = _on_page(corners @ turn + here, observer)
     axes.add_patch(Polygon(outline, facecolor="white", edgecolor=style.INK, linewidth=0.8, zorder=4))
 
-    def line(path: Sequence[Sequence[float]], **look: Any) -> Array:
-        points = _on_page(np.array([here, *path]), observer)
+    def line(path: Array, **look: Any) -> Array:
+        points = _on_page(np.concatenate((here[None], path)), observer)
         axes.plot(*points.T, solid_capstyle="round", **look)
         return points[-1]
 
-    line(agent["constant_velocity"], color=PLAIN, linewidth=1.2, linestyle=(0, (2, 1.5)), zorder=5)
-    for number, mode in reversed(list(enumerate(agent["modes"]))):
-        look = {"color": PREDICTED, "alpha": max(FAINTEST, mode["probability"]), "zorder": 6}
-        end = line(mode["path"], linewidth=2.4 if number == 0 else 1.6, **look)
+    if user.constant_velocity is not None:
+        line(user.constant_velocity, color=PLAIN, linewidth=1.2, linestyle=(0, (2, 1.5)), zorder=5)
+    for number, mode in reversed(list(enumerate(user.modes))):
+        look = {"color": PREDICTED, "alpha": max(FAINTEST, mode.probability), "zorder": 6}
+        end = line(mode.path, linewidth=2.4 if number == 0 else 1.6, **look)
         axes.plot(*end, "o", markersize=4, markeredgewidth=0, **look)
-    if agent["truth"] is not None:
-        line(agent["truth"], color=TRUTH, linewidth=1.0, zorder=7)
+    if user.truth is not None:
+        line(user.truth, color=TRUTH, linewidth=1.0, zorder=7)
 
 
 def _on_page(points: Array, observer: Array) -> Array:
@@ -91,14 +73,16 @@ def _on_page(points: Array, observer: Array) -> Array:
     return np.stack((sin * x - cos * y, cos * x + sin * y), axis=1)
 
 
-def _legend(horizon_s: float, lights: bool) -> list[Line2D]:
+def paths_key(paths: Paths) -> list[Line2D]:
+    """Return legend entries of what `paths_on_map` draws."""
+    horizon_s = paths.times_s[-1]
     handles = [
         Line2D([], [], linestyle="none", marker="^", markersize=6, color=style.INK, label="observer"),
         Line2D([], [], color=PREDICTED, linewidth=2.4, marker="o", markersize=4, label=f"predicted, {horizon_s:g} s"),
         Line2D([], [], color=TRUTH, linewidth=1.0, label="truth"),
         Line2D([], [], color=PLAIN, linewidth=1.2, linestyle=(0, (2, 1.5)), label="constant velocity"),
     ]
-    if lights:
+    if paths.lights:
         square: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 4}
         handles.append(Line2D([], [], color=style.GREEN, label="green", **square))
         handles.append(Line2D([], [], color=style.VERMILLION, label="red or amber", **square))

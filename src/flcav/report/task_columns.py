@@ -155,7 +155,7 @@ def show_sweep(axes: Axes, points: NDArray[np.float32], range_m: Sequence[float]
     axes.set(xlim=(-0.8, 0.8), ylim=(-0.76, 0.2))
 
 
-def show_raster(axes: Axes, raster: NDArray[np.float32], colours: Sequence[Any]) -> None:
+def show_raster(axes: Axes, raster: NDArray[np.float32], colours: Sequence[str | tuple[float, ...] | None]) -> None:
     """Draw the layers (L, H, W) of a raster over each other, each in its colour; None leaves one out."""
     picture = np.ones((*raster.shape[1:], 3))
     for layer, colour in zip(raster, colours, strict=True):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError
-from flcav.files import sha256
+from flcav.files import Json, sha256
 from flcav.seeds import child_seed, stream
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
@@ -48,7 +48,7 @@ class EmbeddedSource:
         self._last_trace: tuple[str, Trace] | None = None
         self._last_scene: tuple[str, Scene] | None = None
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Mapping[str, Json]:
         """Return the recipe with every name resolved: the poles, the rigs, what the town was built from."""
         return {
             **self.recipe.model_dump(mode="json"),

@@ -1,5 +1,6 @@
 """What a user asks to have recorded."""
 
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -7,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from flcav.config import Config, InputError, shorten
+from flcav.config import Config, InputError, read_config, shorten
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
+from flcav.world.town import TOWNS
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
 STEP_S = 0.1  # of the traffic
@@ -128,3 +130,16 @@ def find_recipe(path: Path) -> Path:
         return recipe_path(path.relative_to("recipes").with_suffix("").as_posix())
     except InputError:
         return path
+
+
+def load_recipe(path: Path | str) -> Recipe:
+    """Return the recipe in the YAML file at `path`, see docs/recipes.md.
+
+    A town's folder that lies beside the file is named by its whole path. Raises `InputError` naming file, field, value
+    and rule where it is none.
+    """
+    recipe = read_config(Recipe, Path(path))
+    folder = Path(path).absolute().parent / recipe.town
+    if recipe.town in TOWNS or not os.path.isdir(folder):  # noqa: PTH112 - which takes a name that can be none
+        return recipe
+    return recipe.model_copy(update={"town": str(folder)})

@@ -1,8 +1,9 @@
 """Whatever observes traffic: the built-in simulator, another simulator, a log."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
+from flcav.files import Json
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
@@ -14,7 +15,7 @@ class Source(Protocol):
     recorded by several processes a source has to survive pickling.
     """
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Mapping[str, Json]:
         """Return all that decides the frames, as plain JSON values; two equal descriptions give equal frames."""
         ...
 

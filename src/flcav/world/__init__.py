@@ -1,1 +1,18 @@
 """Towns, their traffic, and the rays that see them."""
+
+from typing import TYPE_CHECKING
+
+from flcav.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from flcav.world.town import TOWNS, Town, load_town
+    from flcav.world.trace import Trace
+
+PLACES = {
+    "TOWNS": "flcav.world.town",
+    "Town": "flcav.world.town",
+    "load_town": "flcav.world.town",
+    "Trace": "flcav.world.trace",
+}
+__all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
+__getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -3,15 +3,18 @@
 Lines are in two dimensions; the road surface is at z = 0.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.files import Json
 from flcav.world.roads import LaneKind
 
 Array = NDArray[np.float64]
+Record = Mapping[str, Json]  # of one lane, line, crossing, arrow or polygon
 
 MarkingKind = Literal["solid", "dashed", "stop_line", "yield_line", "edge"]
 ArrowKind = Literal["straight", "left", "right", "straight_left", "straight_right", "left_right", "straight_left_right"]
@@ -76,9 +79,9 @@ class MapLayers:
     crossings: tuple[Crossing, ...]
     arrows: tuple[Arrow, ...]
 
-    def to_records(self) -> dict[str, list[dict[str, Any]]]:
+    def to_records(self) -> dict[str, list[Record]]:
         """Return each layer as a list of plain JSON values, polygons as `{"outline": [[x, y], ...]}`."""
-        out: dict[str, list[dict[str, Any]]] = {}
+        out: dict[str, list[Record]] = {}
         for layer in fields(self):
             rows = getattr(self, layer.name)
             out[layer.name] = [
@@ -87,7 +90,7 @@ class MapLayers:
         return out
 
     @classmethod
-    def from_records(cls, records: dict[str, list[dict[str, Any]]]) -> "MapLayers":
+    def from_records(cls, records: Mapping[str, Sequence[Record]]) -> "MapLayers":
         """Return the map that `to_records` gave."""
         kinds = {"lanes": MapLane, "markings": Marking, "crossings": Crossing, "arrows": Arrow}
         layers: dict[str, Any] = {}
@@ -98,7 +101,7 @@ class MapLayers:
         return cls(**layers)
 
 
-def _plain(row: Any) -> dict[str, Any]:
+def _plain(row: Any) -> Record:
     values = ((field.name, getattr(row, field.name)) for field in fields(row))
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value

@@ -2,20 +2,19 @@
 
 import inspect
 import re
-from collections.abc import Iterator
-from enum import StrEnum
+from collections.abc import Collection, Iterator
+from pathlib import Path
 
 import click
 import pytest
 import typer
 
-from flcav.cli.choices import Device, Engine, Format, Method, TaskName
+from flcav.cli.choices import Device, Engine, Format, Method
 from flcav.cli.main import app, run
-from flcav.cli.tasks import TASKS
 from flcav.dataset.formats.export import FORMATS
 from flcav.dataset.recorder import ENGINES
 from flcav.perception.device import device_named
-from flcav.report.inference import DRAWINGS
+from flcav.perception.tasks import TASKS, task_named
 
 Commands = Iterator[tuple[tuple[str, ...], click.Command]]
 
@@ -82,26 +81,29 @@ def test_what_can_be_chosen_is_listed(path, shown):
 
 
 def test_choices_are_those_that_there_are():
-    for listed, known in ((TaskName, TASKS), (TaskName, DRAWINGS), (Format, FORMATS), (Engine, ENGINES)):
+    for listed, known in ((Format, FORMATS), (Engine, ENGINES)):
         assert [*listed] == [*known]
     for device in Device:
         if device != Device.cuda:
             device_named(device)
 
 
-def test_every_network_is_named(shown):
-    told = shown(("train",), 400)
-    for task in TASKS.values():
-        for name in task.configurations:
-            assert re.search(rf"\b{name}\b", told), name
+def test_tasks_and_networks_are_named(shown):
+    page = (Path(__file__).parents[3] / "docs" / "tasks.md").read_text()
+    for command in ("train", "evaluate", "infer", "errors"):
+        assert "weather, signs, objects or trajectory, or one of your own" in shown((command,), 400)
+    for name in TASKS:
+        (row,) = re.findall(rf"^\| `{name}` \| (?:camera|LiDAR|tracks).*$", page, re.M)
+        assert all(f"`{network}`" in row for network in task_named(name).configurations)
 
 
 @pytest.mark.parametrize(
     ("arguments", "wrong", "choices"),
     [
-        (("train", "poetry", "--data", "d", "--out", "o"), "'TASK'", TaskName),
-        (("evaluate", "poetry", "--data", "d"), "'TASK'", TaskName),
-        (("infer", "poetry", "d"), "'TASK'", TaskName),
+        (("train", "poetry", "--data", "d", "--out", "o"), "task 'poetry'", TASKS),
+        (("evaluate", "poetry", "--data", "d"), "task 'poetry'", TASKS),
+        (("infer", "poetry", "d"), "task 'poetry'", TASKS),
+        (("errors", "poetry", "--data", "d", "--out", "o.csv"), "task 'poetry'", TASKS),
         (("export", "poetry", "d", "--out", "o"), "'FORMAT'", Format),
         (("record", "r", "--out", "o", "--engine", "steam"), "'--engine'", Engine),
         (("infer", "weather", "d", "--device", "steam"), "'--device'", Device),
@@ -109,7 +111,7 @@ def test_every_network_is_named(shown):
         (("export",), "'FORMAT'", Format),
     ],
 )
-def test_a_wrong_choice_is_one_sentence(arguments, wrong, choices: type[StrEnum], capsys):
+def test_a_wrong_choice_is_one_sentence(arguments, wrong, choices: Collection[str], capsys):
     with pytest.raises(SystemExit) as ended:
         run(list(arguments))
     told = capsys.readouterr()

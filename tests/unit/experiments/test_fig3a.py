@@ -2,9 +2,9 @@ import json
 
 import numpy as np
 import pytest
+from flcav.experiments.planning import history_table
 
 from flcav.experiments.fig3a import article_graph, draw_fig3a, fig3a
-from flcav.experiments.planning import history_table
 from flcav.optimization.graph import to_problem
 
 pytestmark = pytest.mark.slow

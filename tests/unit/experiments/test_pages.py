@@ -2,9 +2,9 @@ import json
 from pathlib import Path
 
 import pytest
+from reproduction_pages import TABLES, fill, fill_folder
 
 from flcav.config import InputError
-from flcav.experiments.pages import TABLES, fill, fill_folder
 from flcav.markdown import interval, table
 
 PAGES = [folder for folder in (Path(__file__).parents[3] / "reproductions").iterdir() if folder.name in TABLES]

@@ -12,11 +12,11 @@ from flcav.optimization.allocation import allocate
 from flcav.optimization.budget_sweep import savings
 from flcav.optimization.definitions import STEPS, TERMS
 from flcav.optimization.fleet import allocate_fleet
-from flcav.optimization.graph import read_problem
+from flcav.optimization.graph import load_problem
 from flcav.optimization.problem import Budgets, Limits, Problem, Uplink
 
 RECIPES = Path(__file__).parents[3] / "recipes"
-ONE = read_problem(RECIPES / "allocation" / "objects.yaml")
+ONE = load_problem(RECIPES / "allocation" / "objects.yaml")
 LINKS = {f"car {i}": Uplink(wireless=mbps) for i, mbps in enumerate((12, 9, 15, 3, 10, 11, 8), start=1)}
 FLEET = ONE.model_copy(update={"tasks": (ONE.tasks[0].model_copy(update={"uplink_mbps": LINKS}),), "horizon_s": 1800.0})
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError, parse_config
-from flcav.experiments.studies import STUDIES, weather
+from flcav.experiments.studies import STUDIES, study_named, weather
 from flcav.experiments.task_study import at_scale, run_study, steps_of
 from flcav.perception.training.run import CARD, EVENTS, WEIGHTS
 from flcav.sources.recipe import Recipe
 
-each_study = pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+each_study = pytest.mark.parametrize("study", [study_named(name) for name in STUDIES], ids=STUDIES)
 
 
 @each_study

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flcav.experiments.studies import STUDIES
+from flcav.experiments.studies import study_named
 from flcav.experiments.studies.trajectory import CAMERAS, STUDY
 from flcav.experiments.trajectory_tables import tables
 from flcav.intervals import mean_over_seeds
@@ -60,5 +60,5 @@ def test_errors_have_a_row_for_each_slice_and_predictor():
 
 
 def test_the_picture_shows_every_test():
-    assert STUDIES["trajectory"] is STUDY
+    assert study_named("trajectory") is STUDY
     assert STUDY.draw(results(4.0, 4.1)).startswith(b"\x89PNG")

@@ -7,7 +7,7 @@ import yaml
 
 from flcav.config import InputError, parse_config
 from flcav.optimization.allocation import allocate
-from flcav.optimization.graph import Layers, build, clusters, describe, load, read_problem, save, to_problem
+from flcav.optimization.graph import Layers, build, clusters, describe, load, load_problem, save, to_problem
 from flcav.optimization.vehicles import vehicle_shares
 
 RECIPE = Path(__file__).parents[3] / "recipes" / "graphs" / "three_layers.yaml"
@@ -37,7 +37,7 @@ def test_a_graph_comes_back_from_its_file(tmp_path: Path) -> None:
     again = load(tmp_path / "graph.json")
     assert nx.utils.graphs_equal(again, graph)
     assert describe(again) == layers()
-    assert read_problem(tmp_path / "graph.json") == read_problem(RECIPE) == to_problem(graph)
+    assert load_problem(tmp_path / "graph.json") == load_problem(RECIPE) == to_problem(graph)
 
 
 def test_a_cluster_shares_one_resource_and_weighs_what_its_tasks_weigh() -> None:
@@ -84,7 +84,7 @@ def test_groups_are_the_vehicles_that_hold_every_modality_of_the_network() -> No
 
 
 def test_the_vehicles_of_a_graph_carry_its_plan() -> None:
-    problem = read_problem(RECIPE)
+    problem = load_problem(RECIPE)
     plan = allocate(problem)
     shares = vehicle_shares(problem, plan.tasks)
     for task in plan.tasks:

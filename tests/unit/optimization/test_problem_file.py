@@ -11,7 +11,7 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.optimization.allocation import allocate
 from flcav.optimization.curves import Additive, Decay, Effective
-from flcav.optimization.graph import read_problem
+from flcav.optimization.graph import load_problem
 from flcav.optimization.learning_curve import fit_additive
 from flcav.optimization.problem_file import Learned, learned, new_problem, with_curves
 
@@ -78,7 +78,7 @@ def test_every_problem_of_the_recipes_takes_curves(recipe: Path, tmp_path: Path)
         pytest.skip("no allocation problem")
     text = with_curves(recipe.read_text(), {"objects": OWN}, 1, "p.yaml")
     (tmp_path / "problem.yaml").write_text(text)
-    found = {task.name: task.curve for task in read_problem(tmp_path / "problem.yaml").tasks}["objects"]
+    found = {task.name: task.curve for task in load_problem(tmp_path / "problem.yaml").tasks}["objects"]
     assert isinstance(found, Additive)
     assert found.pretrain.a == pytest.approx(CURVE.pretrain.a, rel=1e-5)
     kept = [line for line in recipe.read_text().splitlines() if "objects" not in line and "curve" not in line]
@@ -116,12 +116,12 @@ def test_a_new_problem_says_what_is_missing_and_is_one_once_it_is_there(tmp_path
     path = tmp_path / "problem.yaml"
     path.write_text(new_problem({"a: #1": OWN, "b": OWN}, 1, "history.csv"))
     with pytest.raises(InputError, match=r"'budgets_mb.wireless' is empty \(and 7 more\)"):
-        read_problem(path)
+        load_problem(path)
     filled = path.read_text().replace("wireless: , wireline: ", "wireless: 4000, wireline: 4000")
     for field, value in (("sample_mb", "1.6"), ("model_mb", "60"), ("edge_groups", "[4, 3]")):
         filled = filled.replace(f"{field}:", f"{field}: {value}")
     path.write_text(filled)
-    found = read_problem(path)
+    found = load_problem(path)
     assert [task.name for task in found.tasks] == ["a: #1", "b"]
     assert found.tasks[0].limits.samples == (50, 800)
     assert allocate(found).warnings == ()
@@ -150,7 +150,7 @@ def test_a_plan_from_the_file_is_that_of_the_curves_that_fit_prints(
         run(asked)
     assert stopped.value.code == 0
     (curve,) = json.loads(capsys.readouterr().out)["curves"]
-    problem = read_problem(path)
+    problem = load_problem(path)
     own = Additive.model_validate({name: curve[name] for name in ("model", "floor", "pretrain", "edge", "cloud")})
     task = problem.tasks[0].model_copy(update={"curve": own})
     (planned,), (expected,) = allocate(problem).tasks, allocate(problem.model_copy(update={"tasks": (task,)})).tasks

@@ -13,10 +13,11 @@ from flcav.dataset.formats.kitti import Calibration
 from flcav.dataset.formats.kitti.export import calibration_lines
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.camera_view import CameraView, kitti_view, recorded_view, view_beside
+from flcav.perception.marks import CloudBoxes
 from flcav.perception.objects.infer import box_rows, boxes_of_rows
 from flcav.perception.task import Finding
 from flcav.report import style
-from flcav.report.inference import draw_objects
+from flcav.report.inference import draw
 from flcav.report.on_picture import ALONG
 from flcav.sensors.calibration import CalibrationError, assume
 from flcav.sensors.frame import Frame
@@ -126,22 +127,24 @@ def finding(*places, view: CameraView | None) -> Finding:
     rows = np.array([(x, y, -1.0, 4.0, 1.6, 1.5, 0.3) for x, y in places]).reshape(-1, 7)
     boxes = Boxes.from_array(rows, "Car", np.full(len(rows), 0.9))
     points = np.pad(np.random.default_rng(0).uniform((1, -9, -2), (40, 9, 1), (500, 3)), ((0, 0), (0, 1)))
-    return Finding(Path("000003.bin"), points.astype(np.float32), {"boxes": box_rows(boxes)}, lambda: view)
+    return Finding(
+        Path("000003.bin"), points.astype(np.float32), {"boxes": box_rows(boxes)}, (CloudBoxes(boxes),), lambda: view
+    )
 
 
 def test_a_picture_is_above_the_cloud_where_there_is_one(folder):
     view = view_beside(folder / "velodyne" / "000003.bin")
-    shown = {len(places): style.png(draw_objects(finding(*places, view=view)), 40) for places in ([], [(12, 0)])}
+    shown = {len(places): style.png(draw(finding(*places, view=view)), 40) for places in ([], [(12, 0)])}
     assert shown[0] != shown[1]
-    assert len(draw_objects(finding((12, 0), view=view)).axes) == 3  # picture, cloud, scale of distances
-    assert len(draw_objects(finding((12, 0), view=None)).axes) == 1
+    assert len(draw(finding((12, 0), view=view)).axes) == 3  # picture, cloud, scale of distances
+    assert len(draw(finding((12, 0), view=None)).axes) == 1
 
 
 def test_boxes_are_drawn_as_far_as_the_camera_can_see_them(folder):
     view = view_beside(folder / "velodyne" / "000003.bin")
 
     def drawn(*place: float) -> int:
-        axes = draw_objects(finding(place, view=view)).axes[0]
+        axes = draw(finding(place, view=view)).axes[0]
         edges = [
             edge for lines in axes.collections if isinstance(lines, LineCollection) for edge in lines.get_segments()
         ]
@@ -154,7 +157,7 @@ def test_boxes_are_drawn_as_far_as_the_camera_can_see_them(folder):
 
 
 def test_far_boxes_are_within_the_picture_from_above():
-    (axes,) = draw_objects(finding((66, -34), view=None)).axes
+    (axes,) = draw(finding((66, -34), view=None)).axes
     assert axes.get_xlim()[1] > 36
     assert axes.get_ylim()[1] > 68
 

@@ -141,7 +141,7 @@ def test_other_bad_input_is_one_sentence(data, weights, tmp_path, capsys):
     (tmp_path / "broken").write_bytes(b"no weights")
     (tmp_path / "empty").mkdir()
     cases = {
-        "'poetry' is not one of 'weather'": ("train", "poetry", "--data", data, "--out", tmp_path / "o"),
+        "task 'poetry': choose one of weather, signs": ("train", "poetry", "--data", data, "--out", tmp_path / "o"),
         "choose one of tiny, small, paper": (
             *("train", "objects", "--data", data, "--out", tmp_path / "o", "--network", "huge"),
         ),
@@ -149,7 +149,7 @@ def test_other_bad_input_is_one_sentence(data, weights, tmp_path, capsys):
         "damaged": ("evaluate", "objects", "--data", data, "--weights", tmp_path / "broken"),
         "neither a dataset": ("infer", "objects", "--weights", weights, tmp_path / "empty"),
         "2.0 is not in the range": ("infer", "objects", "--weights", weights, data, "--threshold", 2),
-        "a score from 0 to 1": ("infer", "objects", "--weights", weights, data, "--threshold", "nan"),
+        "a finite number is wanted": ("infer", "objects", "--weights", weights, data, "--threshold", "nan"),
         "-3 is not in the range": ("train", "objects", "--data", data, "--out", tmp_path / "o", "--seed", -3),
     }
     for sentence, arguments in cases.items():

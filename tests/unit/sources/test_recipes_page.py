@@ -1,11 +1,10 @@
 """docs/recipes.md: nothing is left out, everything is of today, and what it shows can be recorded."""
 
-import importlib.util
 import re
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+import recipes_page
 import yaml
 from pydantic import BaseModel
 
@@ -33,23 +32,13 @@ def models(model: type[BaseModel], found: list[type[BaseModel]]) -> list[type[Ba
 MODELS = models(Recipe, [])
 
 
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("recipes_page", ROOT / "tools" / "recipes_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_page_is_of_today(tool: ModuleType):
-    assert tool.page() == PAGE, "run python tools/recipes_page.py"
+def test_the_page_is_of_today():
+    assert recipes_page.page() == PAGE, "run python tools/recipes_page.py"
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
-def test_every_field_is_on_it_and_explained(model: type[Config], tool: ModuleType):
-    said = tool.comments(model)
+def test_every_field_is_on_it_and_explained(model: type[Config]):
+    said = recipes_page.comments(model)
     for name in model.model_fields:
         assert said[name], f"{model.__name__}.{name} has no comment"
         assert re.search(rf"^\| `{name}` \|.*\| [^|]+ \|$", PAGE, re.MULTILINE) or name == "settings", name

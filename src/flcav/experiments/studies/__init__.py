@@ -1,9 +1,15 @@
-"""The studies of the tasks, by name."""
+"""The studies of the tasks: every module here holds one, called `STUDY`, and gives it its name."""
 
-from flcav.experiments.studies import objects, signs, trajectory, weather
-from flcav.experiments.task_study import Study
+from importlib import import_module
+from pkgutil import iter_modules
+from typing import TYPE_CHECKING
 
-STUDIES: dict[str, Study] = {
-    study.task.name: study for study in (weather.STUDY, signs.STUDY, objects.STUDY, trajectory.STUDY)
-}
-STUDIES["trajectory-cameras"] = trajectory.CAMERAS
+if TYPE_CHECKING:
+    from flcav.experiments.task_study import Study
+
+STUDIES: tuple[str, ...] = tuple(sorted(found.name.replace("_", "-") for found in iter_modules(__path__)))
+
+
+def study_named(name: str) -> "Study":
+    """Return the study of that name, one of `STUDIES`."""
+    return import_module(f"{__name__}.{name.replace('-', '_')}").STUDY

@@ -10,6 +10,7 @@ from torch import Tensor
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
 from flcav.perception.errors import THRESHOLD, Registry
+from flcav.perception.marks import CloudBoxes
 from flcav.perception.metrics import interval_words
 from flcav.perception.objects.area import rules, rules_lines
 from flcav.perception.objects.augment import augment
@@ -39,6 +40,7 @@ class ObjectsTask(ObjectsOutcomes):
     practice = Practice(batch=2, learning_rate=2e-3)
     recording: Mapping[str, Any] = {}
     labels = ("ideal-road", "own-detections")
+    threshold = THRESHOLD
 
     def __init__(self) -> None:
         self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # what was cut out last, and of which samples
@@ -109,12 +111,12 @@ class ObjectsTask(ObjectsOutcomes):
         return float(np.mean(known)) if known else 0.0
 
     def infer(
-        self, network: Second, path: Path, threshold: float = 0.3, frames: Sequence[int] | None = None
+        self, network: Second, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
         """Yield {"boxes": [...]} for each point cloud of `path`, see `infer.point_clouds`."""
         for cloud in point_clouds(path, frames):
             found = detect(network, cloud.points, score_threshold=threshold)
-            yield Finding(cloud.path, cloud.points, {"boxes": box_rows(found)}, cloud.view)
+            yield Finding(cloud.path, cloud.points, {"boxes": box_rows(found)}, (CloudBoxes(found),), cloud.view)
 
     def register_errors(
         self,

@@ -10,6 +10,7 @@ from torch import Tensor
 from flcav.dataset.store import Dataset
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.images import pictures
+from flcav.perception.marks import PictureBoxes
 from flcav.perception.sharing import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
@@ -39,6 +40,7 @@ class SignsTask(SignsOutcomes):
         "weather": {"classes": ["clear", "cloudy", "overcast", "light_rain"]},
     }
     labels = (ANNOTATED,)
+    threshold = THRESHOLD
 
     def build(self, config: SignsConfig) -> SignDetector:
         """Return a fresh network."""
@@ -77,12 +79,14 @@ class SignsTask(SignsOutcomes):
         return result["map50"] or 0.0
 
     def infer(
-        self, network: SignDetector, path: Path, threshold: float = 0.3, frames: Sequence[int] | None = None
+        self, network: SignDetector, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
         """Yield {"boxes": [...]} for each picture of `path`, best first."""
         for origin, rgb in pictures(path, frames):
             found = detect(network, rgb, threshold=threshold)
-            yield Finding(origin, rgb, {"boxes": box_rows(found, network.config.classes)})
+            names = np.array(network.config.classes)[found.label]
+            marks = (PictureBoxes(found.box, names, found.score),)
+            yield Finding(origin, rgb, {"boxes": box_rows(found, network.config.classes)}, marks)
 
     def register_errors(
         self,

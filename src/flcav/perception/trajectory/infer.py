@@ -1,6 +1,7 @@
 """Predictions for the frames of a dataset, as JSON knows them, on the map around who observes."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose, yaw_of
+from flcav.perception.marks import Light, Mode, Paths, RoadUser
 from flcav.perception.task import Finding, of_frames
 from flcav.perception.trajectory.config import FUTURE, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
@@ -47,8 +49,28 @@ def findings(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | Non
         trace = traces[key.scene]
         world_from_agent = data.frame(number).world_from_agent
         observer = np.array([*world_from_agent[:2, 3], yaw_of(world_from_agent)])
-        result = _predicted(network, data, number, trace, observer)
-        yield Finding(path / data.name(number), map_around(roads_of(data), observer), result)
+        found = _predicted(network, data, number, trace, observer)
+        yield Finding(path / data.name(number), map_around(roads_of(data), observer), paths_as_json(found), (found,))
+
+
+def paths_as_json(paths: Paths) -> dict[str, Any]:
+    """Return predicted paths as JSON knows them, see `findings`."""
+    return {
+        "time_s": list(paths.times_s),
+        "observer": dict(zip(("x", "y", "yaw"), paths.observer)),
+        "lights": [asdict(light) for light in paths.lights],
+        "agents": [_user_as_json(user) for user in paths.users],
+    }
+
+
+def _user_as_json(user: RoadUser) -> dict[str, Any]:
+    return {
+        **{"track": user.track, "class": user.label, "x": user.x, "y": user.y, "yaw": user.yaw, "speed": user.speed},
+        **{"length": user.length, "width": user.width},
+        "modes": [{"probability": mode.probability, "path": mode.path.tolist()} for mode in user.modes],
+        "constant_velocity": None if user.constant_velocity is None else user.constant_velocity.tolist(),
+        "truth": None if user.truth is None else user.truth.tolist(),
+    }
 
 
 def map_around(roads: RoadMap, observer: Array) -> NDArray[np.bool_]:
@@ -57,7 +79,7 @@ def map_around(roads: RoadMap, observer: Array) -> NDArray[np.bool_]:
     return rasterise(roads.layers, middle, (2 * AROUND_M, 2 * AROUND_M), PIXEL_M)[list(STATIC_ROWS)]
 
 
-def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Trace, observer: Array) -> dict[str, Any]:
+def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Trace, observer: Array) -> Paths:
     key, config = data.keys[number], network.config
     instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
     if config.cameras:
@@ -68,42 +90,36 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
     columns = present_at(trace, key.time_s, roads_of(data), config.patch, wanted, complete=False)
     count = len(columns["past"])
     columns |= {"scene": np.full(count, key.scene), "frame": np.full(count, number)}
-    agents = []
+    users: list[RoadUser] = []
     if count:
         paths, probabilities = predict(network, Samples(data, columns, config.cameras))
         first = single(paths, probabilities)
         present, plain = columns["pose"], constant_velocity(columns["past"])
         for i, actor in enumerate(columns["actor"]):
-            modes = [
-                {"probability": float(share), "path": _in_world(way, present[i])}
-                for share, way in zip(probabilities[i], paths[i])
-            ]
+            modes = [Mode(float(share), _in_world(way, present[i])) for share, way in zip(probabilities[i], paths[i])]
             truth = columns["future"][i].astype(np.float64)
-            agents.append(
-                {
-                    "track": str(trace.actor[actor]),
-                    "class": str(trace.category[actor]),
-                    **dict(zip(("x", "y", "yaw"), present[i].tolist())),
-                    "speed": float(columns["past"][i, -1, 3]),
-                    **dict(zip(("length", "width"), trace.size[actor, :2].tolist())),
-                    "modes": [modes.pop(first[i]), *sorted(modes, key=lambda mode: -mode["probability"])],
-                    "constant_velocity": _in_world(plain[i], present[i]),
-                    "truth": _in_world(truth, present[i]) if np.isfinite(truth).all() else None,
-                }
+            users.append(
+                RoadUser(
+                    str(trace.actor[actor]),
+                    str(trace.category[actor]),
+                    *present[i].tolist(),
+                    speed=float(columns["past"][i, -1, 3]),
+                    length=float(trace.size[actor, 0]),
+                    width=float(trace.size[actor, 1]),
+                    modes=(modes.pop(first[i]), *sorted(modes, key=lambda mode: -mode.probability)),
+                    constant_velocity=_in_world(plain[i], present[i]),
+                    truth=_in_world(truth, present[i]) if np.isfinite(truth).all() else None,
+                )
             )
-    return {
-        "time_s": list(TIMES_S),
-        "observer": dict(zip(("x", "y", "yaw"), observer.tolist())),
-        "lights": _lights(trace, instant, roads_of(data)),
-        "agents": agents,
-    }
+    x, y, yaw = observer.tolist()
+    return Paths((x, y, yaw), AROUND_M, TIMES_S, tuple(users), _lights(trace, instant, roads_of(data)))
 
 
-def _lights(trace: Trace, instant: int, roads: RoadMap) -> list[dict[str, Any]]:
+def _lights(trace: Trace, instant: int, roads: RoadMap) -> tuple[Light, ...]:
     letters = dict(zip(trace.light.tolist(), trace.light_state[instant].tolist()))
     middles = {name: bar.mean(axis=0).tolist() for name, bar in roads.lights.items() if name in letters}
-    return [{"x": x, "y": y, "open": letters[name] in OPEN} for name, (x, y) in middles.items()]
+    return tuple(Light(x, y, letters[name] in OPEN) for name, (x, y) in middles.items())
 
 
-def _in_world(path: Array, present: Array) -> list[list[float]]:
-    return out_of_frame(path[None], present[None])[0].tolist()
+def _in_world(path: Array, present: Array) -> Array:
+    return out_of_frame(path[None], present[None])[0]

@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from flcav.dataset.store import Dataset
 from flcav.perception.images import pictures
+from flcav.perception.marks import Bars
 from flcav.perception.metrics import interval_words
 from flcav.perception.sharing import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.task import Finding, Practice
@@ -76,7 +77,8 @@ class WeatherTask(WeatherOutcomes):
         for origin, rgb in pictures(path, frames):
             shares = probabilities(network, [small(rgb)])[0]
             rows = {name: float(share) for name, share in zip(classes, shares, strict=True)}
-            yield Finding(origin, rgb, {"class": classes[int(shares.argmax())], "probabilities": rows})
+            result = {"class": classes[int(shares.argmax())], "probabilities": rows}
+            yield Finding(origin, rgb, result, (Bars(rows),))
 
     def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
         """Return accuracy, then recall and confusions class by class."""

@@ -3,12 +3,15 @@
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import ParamSpec, TypeVar
 
 import numba
 
+P = ParamSpec("P")
+T = TypeVar("T")
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+
+def compiled(function: Callable[P, T]) -> Callable[P, T]:
     """Return `function` compiled on its first call, without the interpreter's lock.
 
     The result is kept beside the source, else in the user's cache folder (or in NUMBA_CACHE_DIR, where that is set);
@@ -24,7 +27,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return numba.njit(nogil=True)(function)
 
 
-def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+def inlined(function: Callable[P, T]) -> Callable[P, T]:
     """Return `function` for use inside compiled ones, each of which gets a copy of its body.
 
     A call costs two atomic operations for every array passed, records of arrays included: too much for every pixel.
@@ -32,7 +35,7 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     return numba.njit(nogil=True, inline="always")(function)
 
 
-def _inlined_files(function: Callable[..., Any]) -> set[Path]:
+def _inlined_files(function: Callable[P, T]) -> set[Path]:
     """Return the files of all compiled functions that `function` calls by name, and of those that they call."""
     files: set[Path] = set()
     met, waiting = {function}, [function]

@@ -1,4 +1,4 @@
-"""The tables of a reproduction's page, from its numbers: `python -m flcav.experiments.pages reproductions/NAME`.
+"""The tables of a reproduction's page, from its numbers: python tools/reproduction_pages.py reproductions/NAME.
 
 A page (README.md) marks where they go, `<!-- NAME -->` to `<!-- end -->`; what stands between is replaced by what the
 folder's result.json says. The words around the tables are the authors'.

@@ -1,0 +1,87 @@
+"""Bring your own task: how many road users a LiDAR sweep holds. Commands take it too, in the folder of this file:
+
+flcav train 05_bring_your_own_task:TASK --data DIR --out own --epochs 20
+flcav evaluate 05_bring_your_own_task:TASK --data DIR --weights own/weights.safetensors
+flcav infer 05_bring_your_own_task:TASK DIR --weights own/weights.safetensors --pictures pictures
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from pydantic.dataclasses import dataclass
+from torch import nn
+
+from flcav import Dataset, Recipe, evaluate, record, train
+from flcav.perception import Bars, Finding, Practice
+from flcav.progress import silent
+
+
+@dataclass(frozen=True)
+class Square:  # seen from above, around the sensor
+    cells: int = 24  # on a side
+    reach_m: float = 36.0  # to either side
+
+
+class Counter(nn.Sequential):  # cells (N, H, W) -> logarithm of the expected number (N, 1)
+    def __init__(self, config: Square) -> None:
+        super().__init__(nn.Flatten(), nn.Linear(config.cells**2, 32), nn.ReLU(), nn.Linear(32, 1))
+        self.config = config
+
+    def expected(self, samples):
+        return self(torch.from_numpy(np.stack([cells for cells, _ in samples])))[:, 0].exp()
+
+
+class CountingTask:
+    name, family, configurations = "counting", "counter", {"tiny": Square()}
+    practice = Practice(batch=4, learning_rate=3e-3)
+
+    def build(self, config):
+        return Counter(config)
+
+    def samples(self, data, config, frames=None):
+        return [sample(data.frame(i), config) for i in (range(len(data)) if frames is None else frames)]
+
+    def draw(self, samples, index, config, rng):
+        return samples[index]  # as it is: nothing is augmented
+
+    def loss(self, network, samples):
+        counts = torch.tensor([float(count) for _, count in samples])
+        return nn.functional.poisson_nll_loss(network.expected(samples), counts, log_input=False)
+
+    def evaluate(self, network, data, frames=None, *, progress=silent):
+        samples = self.samples(data, network.config, frames)
+        wrong = network.expected(samples) - torch.tensor([count for _, count in samples])
+        return {"frames": len(samples), "off_by": wrong.abs().mean().item()}
+
+    def score(self, result):
+        return 1 / (1 + result["off_by"])
+
+    def infer(self, network, path, threshold=0.0, frames=None):
+        data = Dataset.open(path)
+        for frame in (data.frame(i) for i in (range(len(data)) if frames is None else frames)):
+            mean = network.expected([sample(frame, network.config)]).detach()
+            shares = torch.distributions.Poisson(mean).log_prob(torch.arange(16.0)).exp().tolist()
+            marks = (Bars({str(count): share for count, share in enumerate(shares)}),)
+            yield Finding(path / frame.key, frame.lidar["lidar"], {"expected": float(mean)}, marks)
+
+    def evaluation_lines(self, result):
+        return [f"{result['frames']} sweeps: off by {result['off_by']:.1f} road users"]
+
+    def finding_lines(self, result):
+        return [f"{result['expected']:.1f} road users"]
+
+
+def sample(frame, config):  # the logarithm of returns by cell, of what stands on the ground; who has five or more
+    raised = frame.lidar["lidar"][frame.lidar["lidar"][:, 2] > -1.5, :2]
+    cells = np.histogram2d(*raised.T, bins=config.cells, range=[(-config.reach_m, config.reach_m)] * 2)[0]
+    return np.log1p(cells).astype(np.float32), int((frame.annotations.returns >= 5).sum())
+
+
+TASK = CountingTask()
+
+if __name__ == "__main__":
+    out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/own_task")
+    record(Recipe(town="grid", cavs=3, spins_per_scene=6, every_s=4.0, warmup_s=40.0), out / "data")
+    print(evaluate(TASK, out / "data", train(TASK, out / "data", out=out / "network", epochs=20).network))

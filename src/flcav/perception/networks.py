@@ -1,0 +1,221 @@
+"""What one does with a task's networks: train one, test it, look with it, register what it gets wrong.
+
+A task is named as on the command line (`flcav.perception.tasks`) or handed over, data are datasets or their folders,
+and a network is one in memory, a file of weights, or, where none is given, the one that comes with the task.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from flcav.config import InputError
+from flcav.dataset.layout import MANIFEST
+from flcav.dataset.store import Dataset
+from flcav.perception.agents import Chosen, choose_frames
+from flcav.perception.card import Card
+from flcav.perception.device import device_named
+from flcav.perception.errors import RegistersErrors, Registry
+from flcav.perception.objects.area import narrowed
+from flcav.perception.objects.task import ObjectsTask
+from flcav.perception.task import Finding, Scores, Task
+from flcav.perception.tasks import TASKS, task_named
+from flcav.perception.tracking.evaluate import evaluate_tracks, sequences, tracks_lines
+from flcav.perception.training.run import WEIGHTS, Request, train_network
+from flcav.perception.weights import load_network, read_card, shipped
+from flcav.progress import Report, silent
+
+Named = str | Task[Any, Any, Any]
+Data = Dataset | Path | str
+Weights = nn.Module | Path | str | None
+
+
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """What a training left."""
+
+    network: nn.Module  # in evaluation mode
+    card: Card  # data, settings, and the numbers on the validation data
+    weights: Path  # file of the network, with the card in its metadata
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How good a network is on a dataset."""
+
+    task: str
+    score: float  # the one number that training raises, in [0, 1]: accuracy, mAP, AP, by task
+    chosen: Chosen  # whose frames
+    numbers: Mapping[str, Any]  # all of the task's, as JSON knows them: docs/tasks.md
+    lines: tuple[str, ...]  # the numbers in words
+
+    def __str__(self) -> str:
+        return "\n".join((self.chosen.sentence, *self.lines))
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What a network finds, input by input, looked for when asked for; one goes through it once."""
+
+    chosen: Mapping[Path, Chosen]  # of the inputs that are datasets: whose frames
+    findings: Iterator[Finding]
+
+    def __iter__(self) -> Iterator[Finding]:
+        return self.findings
+
+
+def train(
+    task: Named,
+    data: Data | Sequence[Data],
+    *,
+    out: Path | str,
+    validation: Data | None = None,
+    network: str | None = None,
+    epochs: int = 10,
+    patience: int = 5,
+    seed: int = 0,
+    device: str = "auto",
+    agents: str | None = None,
+    progress: Report = silent,
+) -> TrainedNetwork:
+    """Train a network on recorded frames with their ground truth; its weights, card and curves are kept in `out`.
+
+    `network` names one of the task's configurations (None: its first). With `validation`, a dataset of other scenes,
+    the best epoch is kept, and training ends after `patience` epochs without a better one. A training that was
+    interrupted goes on; one that is finished is read. Raises `InputError` where task, network, data or agents cannot be
+    used, and where `out` holds weights of other settings.
+    """
+    folders = data if isinstance(data, Sequence) and not isinstance(data, str) else [data]
+    held = None if validation is None else opened(validation)
+    place = device_named(device)
+    request = Request([opened(each) for each in folders], held, network, epochs, patience, seed, place, agents)
+    learned, weights = task_of(task), Path(out) / WEIGHTS
+    card = train_network(learned, request, Path(out), progress)
+    return TrainedNetwork(load_network(learned, weights).to(place), card, weights)
+
+
+def evaluate(
+    task: Named,
+    data: Data,
+    network: Weights = None,
+    *,
+    agents: str | None = None,
+    within: str | None = None,
+    tracks: bool = False,
+    device: str = "auto",
+    progress: Report = silent,
+) -> Evaluation:
+    """Evaluate a network on recorded frames, by the measure of its task.
+
+    Of objects alone: `within`, "AHEAD,SIDE" in metres, asks only for those so near, and `tracks` adds MOTA and AMOTA.
+    Raises `InputError` where task, data, weights or agents cannot be used.
+    """
+    learned = task_of(task)
+    if tracks and not isinstance(learned, ObjectsTask):
+        raise InputError(f"--tracks: only objects have tracks, not '{learned.name}'")
+    if within is not None and not isinstance(learned, ObjectsTask):
+        raise InputError(f"--range: only objects lie in a range, not '{learned.name}'")
+    dataset = opened(data)
+    tested = network_of(learned, network, device)
+    chosen = choose_frames(learned, tested.config, dataset, agents)
+    narrow = {} if within is None else {"asked": narrowed(tested.config, within)}
+    if tracks:
+        sequences(dataset, chosen.frames)  # said before the long work
+    numbers = learned.evaluate(tested, dataset, chosen.frames, **narrow, progress=progress)
+    lines = learned.evaluation_lines(numbers)
+    if tracks:
+        followed = evaluate_tracks(tested, dataset, chosen.frames, **narrow, progress=progress)
+        numbers, lines = {**numbers, "tracks": followed}, [*lines, *tracks_lines(followed)]
+    return Evaluation(learned.name, learned.score(numbers), chosen, numbers, tuple(lines))
+
+
+def infer(
+    task: Named,
+    inputs: Path | str | Sequence[Path | str],
+    network: Weights = None,
+    *,
+    threshold: float | None = None,
+    agents: str | None = None,
+    device: str = "auto",
+) -> Inference:
+    """Return what a network finds in files, folders of them, or dataset folders: point clouds, pictures, by task.
+
+    Findings that score below `threshold` are left out (None: the task's own). Raises `InputError` where task, weights,
+    inputs or agents cannot be used; of a file, when its turn comes.
+    """
+    learned = task_of(task)
+    paths = [Path(inputs)] if isinstance(inputs, Path | str) else list(map(Path, inputs))
+    looking = network_of(learned, network, device)
+    recorded = [path for path in paths if (path / MANIFEST).is_file()]
+    if agents is not None and not recorded:
+        raise InputError(f"--agents {agents}: only datasets have agents, and none is among the inputs")
+    chosen = {path: choose_frames(learned, looking.config, Dataset.open(path), agents) for path in recorded}
+    frames = {path: choice.frames for path, choice in chosen.items()}
+    lowest = threshold_of(learned, threshold)
+    return Inference(chosen, (f for path in paths for f in learned.infer(looking, path, lowest, frames.get(path))))
+
+
+def register_errors(
+    task: Named,
+    data: Data,
+    network: Weights = None,
+    *,
+    threshold: float | None = None,
+    agents: str | None = None,
+    device: str = "auto",
+    progress: Report = silent,
+) -> Registry:
+    """Return what a network gets wrong on recorded frames and where in the town, each object once per scene.
+
+    Detections that score below `threshold` are none (None: the task's own). Raises `InputError` for a task whose
+    mistakes have no place in a town, and where data, weights or agents cannot be used.
+    """
+    learned, dataset = task_of(task), opened(data)
+    if not isinstance(learned, RegistersErrors):
+        able = [name for name in TASKS if isinstance(task_named(name), RegistersErrors)]
+        raise InputError(f"task '{learned.name}': its mistakes have no place in a town; choose {', '.join(able)}")
+    tested = network_of(learned, network, device)
+    chosen = choose_frames(learned, tested.config, dataset, agents)
+    lowest = threshold_of(learned, threshold)
+    return replace(learned.register_errors(tested, dataset, chosen.frames, lowest, progress), chosen=chosen)
+
+
+def task_of(task: Named) -> Task[Any, Any, Any]:
+    """Return the task, by its name where that is what is given; raises `InputError` for an unknown one."""
+    return task_named(task) if isinstance(task, str) else task
+
+
+def opened(data: Data) -> Dataset:
+    """Return the dataset, opened where its folder is what is given; raises `InputError` as `Dataset.open` does."""
+    return data if isinstance(data, Dataset) else Dataset.open(data)
+
+
+def network_of(task: Task[Any, Any, Any], network: Weights, device: str = "cpu") -> Any:
+    """Return the network: one in memory as it is, one in a file of weights on the device, None: the task's own."""
+    if isinstance(network, nn.Module):
+        return network
+    return load_network(task, Path(network or shipped(task))).to(device_named(device))
+
+
+def threshold_of(task: Task[Any, Any, Any], threshold: float | None) -> float:
+    """Return the lowest score of a finding: `threshold`, for None the task's own, 0 where its findings have none."""
+    own = task.threshold if isinstance(task, Scores) else 0.0
+    return own if threshold is None else threshold
+
+
+def origin_of(task: Task[Any, Any, Any], weights: Path | None) -> dict[str, Any]:
+    """Return which network `network_of` loads, as JSON knows it: name and seed (None without a card) and file."""
+    path = weights or shipped(task)
+    try:
+        card = read_card(path)
+    except InputError:
+        return {"network": None, "seed": None, "weights": str(path)}
+    return {"network": card.network, "seed": card.seed, "weights": str(path)}
+
+
+def origin_line(origin: Mapping[str, Any]) -> str:
+    """Return `origin_of` in words."""
+    card = "without a card" if origin["network"] is None else f"{origin['network']}, seed {origin['seed']}"
+    return f"network: {card}, {origin['weights']}"

@@ -1,0 +1,376 @@
+"""Runs at toy scale, as a user has them: run, read, stopped, gone on with, compared; and the studies made of them."""
+
+import html
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
+from flwr.common.serde import recorddict_to_proto
+from PIL import Image
+from safetensors.numpy import load_file
+
+from flcav.cli.main import run as command
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.experiments.demo_arms import ARMS, run_arms
+from flcav.experiments.fig6a_allocation import run_allocation
+from flcav.network.ledger import LINKS, Ledger
+from flcav.pipeline.compare import compare
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.graph import Graph
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, load_run_recipe
+from flcav.pipeline.results import Placed, Pretrained, Run, StageResult, Watched
+from flcav.pipeline.run import RESULTS, SUMMARY, run
+from flcav.report.run_page import write_report
+from flcav.verdicts import verdict
+from flcav.world.town import load_town
+
+pytestmark = pytest.mark.slow
+
+TOY = Path(__file__).parent / "toy.yaml"
+RECIPE = load_run_recipe(TOY)
+GO = """
+import sys
+from pathlib import Path
+from flcav.pipeline.recipe import load_run_recipe
+from flcav.pipeline.run import run
+run(load_run_recipe(Path(sys.argv[1])), sys.argv[2])
+"""
+OWN = """
+from dataclasses import dataclass
+
+@dataclass(frozen=True)
+class Last:
+    def combine(self, start, updates):
+        return updates[-1].weights
+"""
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], dict[str, Any]]:
+    """Return the folder of both comparisons of one seed, and their results."""
+    out = tmp_path_factory.mktemp("toy") / "studies"
+    arms = run_arms(RECIPE, out, seeds=1, jobs=1, notify=lambda *told: None)
+    plans = run_allocation(RECIPE, out, seeds=1, jobs=1, notify=lambda *told: None)
+    return out, arms, plans
+
+
+@pytest.fixture(scope="module")
+def finished(studied: tuple[Path, dict[str, Any], dict[str, Any]]) -> Path:
+    """Return the folder of the run, with its report."""
+    folder = studied[0] / "seed1"
+    write_report(Run.load(folder, RESULTS), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(finished: Path) -> Run:
+    return Run.load(finished, RESULTS)
+
+
+def without(finished: Path, out: Path, unwanted: Callable[[str], bool]) -> Path:
+    """Return a copy of the run's steps in which those of some names have not begun."""
+    shutil.copytree(finished / "work", out / "work", ignore=lambda _, names: [name for name in names if unwanted(name)])
+    return out / "work"
+
+
+def timeless(out: Path) -> dict[str, Any]:
+    return json.loads((out / RESULTS).read_text()) | {"elapsed_s": 0.0}
+
+
+def test_every_arm_region_and_task_has_its_measure(result: Run) -> None:
+    tested = {(test.arm, test.stage, test.region) for test in result.tested}
+    assert {(MAIN, stage, region) for stage in (PRETRAIN, CLOUD) for region in RECIPE.regions} <= tested
+    assert {(MAIN, EDGE, "grid"), (MAIN, EDGE, "ring"), ("densest", EDGE, "grid")} <= tested
+    assert {("more", CENTRAL, "grid"), ("more", CENTRAL, "ring"), ("oracle", CENTRAL, "grid")} <= tested
+    assert ("equal", CLOUD, "suburb") in tested
+    for test in result.tested:
+        low, high = test.result.estimate.low, test.result.estimate.high
+        assert low is not None
+        assert high is not None
+        assert 0 <= low <= test.result.estimate.mean <= high <= 1
+        assert test.result.frames == RECIPE.sized_splits.test.frames
+        assert "AP70" in test.result.numbers
+
+
+def test_sensors_stand_where_most_errors_or_most_traffic_is(result: Run) -> None:
+    (placed,) = (each for each in result.arms[MAIN].placed if each.region == "grid")
+    assert [pole.pole for pole in placed.poles] == load_town("grid").poles.id.tolist()
+    assert placed.covered == max(pole.covered for pole in placed.poles) <= placed.errors
+    assert result.arms["densest"].placed[0].chosen == (placed.densest,)
+
+
+def test_central_arms_take_as_many_steps_as_stage_two_on_their_own_samples(finished: Path, result: Run) -> None:
+    pretrained, plan = result.pretrained[0], result.arms[MAIN].plan.tasks["objects"]
+    more, oracle = (StageResult.load(finished / f"work/grid-central-objects-{arm}") for arm in ("more", "oracle"))
+    edge = StageResult.load(finished / "work/grid-edge-fl-objects")
+    assert more.samples == sum(map(len, pretrained.uploaded.values())) == plan.samples
+    assert oracle.samples == edge.samples
+    assert more.rounds == oracle.rounds == edge.rounds == plan.edge_rounds == 2
+
+
+def test_vehicles_learn_from_what_is_near_a_sensor_of_any_arm(finished: Path, result: Run) -> None:
+    split = Frames.open(finished / "work/grid-edge-objects")
+    places = [Placed.load(folder) for folder in (finished / "work").glob("grid-place*")]
+    poles = load_town("grid").poles
+    sites = [poles.position[poles.id.tolist().index(pole), :2] for placed in places for pole in placed.chosen]
+    near = [
+        i
+        for i in split.vehicles
+        if min(np.hypot(*(split.data.frame(i).world_from_agent[:2, 3] - site)) for site in sites) <= 90
+    ]
+    assert StageResult.load(finished / "work/grid-edge-fl-objects").samples == len(near)
+    assert set(split.poles) == {pole for placed in places for pole in placed.chosen}
+
+
+def test_every_message_is_booked_in_the_bytes_that_flower_sends(finished: Path, result: Run) -> None:
+    folder = finished / "work/grid-edge-fl-objects"
+    weights = load_file(folder / "round1.safetensors")
+    record = ArrayRecord({name: Array(np.ascontiguousarray(value)) for name, value in weights.items()})
+    metrics = MetricRecord({"num-examples": 2, "loss": 0.5})
+    message = len(recorddict_to_proto(RecordDict({"arrays": record, "metrics": metrics})).SerializeToString())
+    book = Ledger.load(finished / "ledgers/main.parquet")
+    ups = [e.bytes for e in book.entries if (e.stage, e.direction) == ("edge", "up")]
+    assert len(ups) == 2 * 3  # rounds x vehicles
+    assert all(abs(size - message) <= 16 for size in ups)
+    assert message / 1e6 == pytest.approx(result.arms[MAIN].plan.tasks["objects"].model_mb, rel=1e-4)
+    clouds = [e for e in book.entries if (e.stage, e.direction, e.link) == ("cloud", "up", "wireline")]
+    assert [e.client for e in clouds] == ["grid", "ring"]
+
+
+def test_road_labels_are_booked_as_downlink(finished: Path) -> None:
+    def told(step: str) -> list[int]:
+        entries = Ledger.load(finished / f"work/{step}/ledger.parquet").entries
+        return [e.bytes for e in entries if (e.stage, e.direction, e.round) == ("edge", "down", 0)]
+
+    held = StageResult.load(finished / "work/grid-edge-fl-objects").samples
+    assert len(told("grid-edge-fl-objects")) == held > 0
+    assert min(told("grid-edge-fl-objects")) > 100
+    assert told("grid-edge-fl-objects-no_pole") == []
+
+
+def test_the_ledger_is_what_crossed_the_links(finished: Path, result: Run) -> None:
+    book, pool = Ledger.load(finished / "ledgers/main.parquet"), Frames.open(finished / "work/suburb-pool-objects")
+    uploaded = result.pretrained[0].uploaded["suburb"]
+    samples = sum(pool.data.payload_bytes(i) for i in uploaded) / 1e6
+    main, model = result.arms[MAIN], result.arms[MAIN].plan.tasks["objects"].model_mb
+    for (link, stage), spent in {
+        ("wireless", "pretrain"): samples,
+        ("wireline", "pretrain"): samples,
+        ("wireless", "edge"): 2 * 3 * model,
+        ("wireline", "edge"): 0.0,
+        ("wireless", "cloud"): 3 * model,
+        ("wireline", "cloud"): 2 * model,
+    }.items():
+        assert book.used_mb(link, stage=stage) == pytest.approx(spent, rel=1e-4)  # type: ignore[arg-type]
+    for link in LINKS:
+        use = main.links[link]
+        assert use.used_mb == sum(e.bytes for e in book.entries if (e.link, e.direction) == (link, "up")) / 1e6
+        assert use.used_mb == pytest.approx(use.planned_mb, rel=1e-3)
+        assert use.used_mb <= use.budget_mb == getattr(RECIPE.budgets_mb, link)
+        assert sum(spent.mb for spent in main.spent if spent.link == link) == pytest.approx(use.used_mb)
+
+
+def test_no_two_splits_share_a_scene(finished: Path) -> None:
+    folders = sorted(finished.glob("work/*/data"))
+    assert len(folders) == 3 + 4 + 4
+    scenes = [{key.scene for key in Dataset.open(folder).keys} for folder in folders]
+    assert not any(a & b for a, b in combinations(scenes, 2))
+
+
+def test_rounds_are_watched_on_validation_frames(finished: Path, result: Run) -> None:
+    graph = Graph(RECIPE, TOY.parent)
+    for step in graph.steps:
+        if step.name.startswith("rounds-"):
+            assert "-validation-" in step.arguments["frames"]
+    assert {(each.stage, each.region) for each in result.watched} == {
+        (s, r) for s in (EDGE, CLOUD) for r in ("grid", "ring")
+    }
+    watched = Watched.load(finished / "work/rounds-grid-edge-fl-objects-grid")
+    assert [each.round for each in watched.rounds] == [0, 1, 2]
+
+
+def test_findings_say_what_their_intervals_say(result: Run) -> None:
+    own = [each for each in result.differences if each.arm == MAIN]
+    assert len(own) == len(result.findings) >= 8
+    for difference, finding in zip(own, result.findings, strict=True):
+        low, high = difference.estimate.low, difference.estimate.high
+        assert low is not None
+        assert high is not None
+        assert finding.verdict == verdict(low, high)
+        if "nothing to compare" not in finding.sentence:
+            assert f"{difference.estimate.mean:+.3f}".replace("-", "−") in finding.sentence
+
+
+def test_the_report_needs_no_other_file(finished: Path, result: Run) -> None:
+    text = (finished / "report.html").read_text()
+    assert all(link.startswith("data:") for link in re.findall(r"""(?:src|href)\s*=\s*["']?([^"'\s>]+)""", text))
+    assert not re.search(r"url\(|@import|<script|<link|<iframe", text)
+    read = html.unescape(re.sub(r"\s+", " ", text))
+    assert all(finding.sentence in read for finding in result.findings)
+    names = {path.stem for path in (finished / "pictures").iterdir()}
+    assert names == {"map_grid", "map_ring", "rounds_objects", "megabytes", "before_after", "overview"}
+    for path in (finished / "pictures").iterdir():
+        with Image.open(path) as picture:
+            assert min(picture.size) > 300
+            colours = picture.convert("RGB").resize((300, 300)).getcolors(90_000)
+            assert colours is not None
+            assert len(colours) > 50, path.name
+
+
+def test_the_run_leaves_history_that_fit_reads(studied: tuple[Path, Any, Any], capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        command(["fit", str(studied[0] / "history.csv"), "--json", "--repeats", "20"])
+    assert not stopped.value.code
+    (curve,) = json.loads(capsys.readouterr().out)["curves"]
+    assert curve["points"] == 1 + 2 + 1  # pretrained, each edge round, each cloud round
+
+
+def test_the_comparison_of_arms_is_that_of_the_run(studied: tuple[Path, dict[str, Any], Any], result: Run) -> None:
+    results = studied[1]
+    (seed,) = results["seeds"]
+    for town, arms in ARMS.items():
+        for name, (arm, stage) in arms.items():
+            test = result.test(arm=arm, stage=stage, region=town, task="objects")
+            assert seed["ap"][town][name]["ap50"] == test.estimate.mean
+    assert set(seed["gap_closed"]) == set(ARMS["grid"]) - {"pretrained", "oracle"}
+    assert len(seed["differences"]) == 4 + 3 + 1
+    assert seed["used_mb"]["edge + cloud FL"]["wireless"] == result.arms[MAIN].links["wireless"].used_mb
+    assert results["summary"]["ap50"]["grid"]["oracle"]["mean"] == seed["ap"]["grid"]["oracle"]["ap50"]
+
+
+def test_the_proof_by_training_compares_two_plans(studied: tuple[Path, Any, dict[str, Any]], result: Run) -> None:
+    (seed,) = studied[2]["seeds"]
+    equal, joint = seed["plans"]["equal-stages"], seed["plans"]["joint"]
+    assert joint["samples"] == result.arms[MAIN].plan.tasks["objects"].samples
+    assert equal["samples"] == result.arms["equal"].plan.tasks["objects"].samples
+    assert seed["predicted"]["joint"] == result.arms[MAIN].plan.tasks["objects"].predicted
+    assert set(seed["realised"]) == set(seed["differences"]) == {"grid", "ring"}
+    assert len(studied[2]["findings"]) == 5
+
+
+def test_a_finished_run_is_not_done_again(finished: Path, tmp_path: Path) -> None:
+    without(finished, tmp_path, lambda name: False)
+    told: list[str] = []
+    run(RECIPE, tmp_path, beside=TOY.parent, notify=lambda step, done, total, note: told.append(note))
+    assert told == ["done before"] * len(Graph(RECIPE, TOY.parent).steps)
+    assert timeless(tmp_path) == timeless(finished)
+    with pytest.raises(InputError, match="another configuration"):
+        run(RECIPE.model_copy(update={"seed": 2}), tmp_path, beside=TOY.parent)
+
+
+def killed_at(sign: Path, out: Path) -> None:
+    """Run the recipe in a process group of its own and kill it once the file `sign` is there."""
+    process = subprocess.Popen([sys.executable, "-c", GO, TOY, out], start_new_session=True)
+    try:
+        while not sign.exists():
+            assert process.poll() is None
+            time.sleep(0.002)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def test_a_run_killed_in_edge_fl_ends_the_same(finished: Path, tmp_path: Path) -> None:
+    first, redone = "grid-edge-fl-objects", ("grid-edge-fl-objects", "cloud-fl-objects")
+    ending = ("equal", "densest", "no_pole", "ring")
+
+    def unwanted(name: str) -> bool:
+        return name == "look" or (any(step in name for step in redone) and not name.endswith(ending))
+
+    work = without(finished, tmp_path, unwanted)
+    killed_at(work / first / "round1.safetensors", tmp_path)
+    assert not (work / first / "done.json").exists()
+    run(RECIPE, tmp_path, beside=TOY.parent)
+    assert timeless(tmp_path) == timeless(finished)
+    for path in (f"{step}/{name}" for step in redone for name in ("weights.safetensors", "ledger.parquet")):
+        assert (work / path).read_bytes() == (finished / "work" / path).read_bytes(), path
+
+
+def test_a_run_killed_in_pretraining_goes_on_from_its_last_block(finished: Path, tmp_path: Path) -> None:
+    work = without(finished, tmp_path, lambda name: name == "pretrain-objects")
+    killed_at(work / "pretrain-objects" / "block1.safetensors", tmp_path)
+    assert not (work / "pretrain-objects" / "done.json").exists()
+    run(RECIPE, tmp_path, beside=TOY.parent)
+    for name in ("weights.safetensors", "ledger.parquet", "result.json"):
+        assert (work / "pretrain-objects" / name).read_bytes() == (
+            finished / "work/pretrain-objects" / name
+        ).read_bytes()
+    assert Pretrained.load(work / "pretrain-objects").steps == 4 * 3
+
+
+def test_runs_are_compared_on_the_same_frames(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "own.py").write_text(OWN)
+    (tmp_path / "own.yaml").write_text(
+        TOY.read_text().split("arms:")[0].replace("placement:", "federation: {strategy: own:Last}\nplacement:")
+    )
+
+    def again(name: str) -> bool:
+        return "-fl-" in name or name == "look" or name.startswith(("test-", "rounds-", "grid-edge", "ring-edge"))
+
+    work = without(finished, tmp_path / "own", again)
+    other = run(load_run_recipe(tmp_path / "own.yaml"), work.parent)
+    rows = compare(finished, work.parent)
+    by_key = {(row.arm, row.stage, row.region): row for row in rows}
+    assert set(by_key) == {(test.arm, test.stage, test.region) for test in other.tested}
+    assert by_key[MAIN, PRETRAIN, "grid"].difference.mean == 0.0
+    edge = by_key[MAIN, EDGE, "grid"]
+    assert edge.second == other.test(stage=EDGE, region="grid", task="objects").estimate.mean
+    assert edge.difference.mean == pytest.approx(edge.second - edge.first)
+    weights = "grid-edge-fl-objects/weights.safetensors"
+    assert (work / weights).read_bytes() != (finished / "work" / weights).read_bytes()
+    with pytest.raises(InputError, match="no finished run"):
+        compare(finished, tmp_path)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_stopped_run_leaves_no_process_behind(number: signal.Signals, tmp_path: Path) -> None:
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from flcav.cli.main import run; run()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "demo", "--out", tmp_path],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while not (tmp_path / "work/suburb-pool-objects/data/.recording").exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # as the terminal does
+    else:
+        process.send_signal(number)  # the parent alone
+    _, said = process.communicate(timeout=30)
+    assert "Traceback" not in said
+    if number == signal.SIGINT:
+        assert process.returncode == 130
+        assert said.endswith("flcav: interrupted; the same command goes on where it stopped\n")
+    for _ in range(300):
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    pytest.fail("processes of a stopped run go on")
+
+
+def test_the_summary_of_seeds_is_beside_them(studied: tuple[Path, Any, Any]) -> None:
+    summary = json.loads((studied[0] / SUMMARY).read_text())
+    assert summary["seeds"] == [1]
+    assert {row["name"] for row in summary["gap_closed"]} >= {"grid, objects: edge FL"}

@@ -1,0 +1,257 @@
+"""What one package of flcav takes from another says what it is: no `Any`, no `object` in signatures between packages.
+
+The syntax tree is read: of every function and class that a module of another first-level folder imports, the public
+parameters, returned values and fields. `ALLOWED` holds what is left, with a reason each, and may only shrink.
+"""
+
+import ast
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import flcav
+
+VAGUE = frozenset({"Any", "object"})
+
+UNCHECKED = "takes what a user's file holds, before it is checked"
+EXTRA = "types of an extra (view, ray) that is not installed where types are checked"
+STEPS = "a step's function, arguments and JSON value: whatever the step is"
+OWN = "what a user's module holds, of the protocol that was asked for"
+DTYPE = "a cloud or a picture: arrays of whatever type of number"
+GENERIC = "the same for every curve, task, network or sample: the parameters play no part"
+MANIFEST = "manifest.json as it is read; a record of its own is wanted"
+STUDY = "a result.json that is written, drawn and tabulated as it is; records are wanted"
+FOUND = "what a task found or was judged by, as JSON; records are wanted"
+ALLOWED: Mapping[str, str] = {
+    "flcav.config:parse_config": UNCHECKED,
+    "flcav.config:read_json": UNCHECKED,
+    "flcav.config:read_yaml": UNCHECKED,
+    "flcav.config:shorten": UNCHECKED,
+    "flcav.dataset.layout:read_manifest": MANIFEST,
+    "flcav.dataset.leakage:leaks": MANIFEST,
+    "flcav.dataset.ray_engine:ray_session": EXTRA,
+    "flcav.dataset.store:Dataset.__init__": MANIFEST,
+    "flcav.experiments.demo_arms:draw_arms": STUDY,
+    "flcav.experiments.demo_arms:run_arms": STUDY,
+    "flcav.experiments.fig3a:draw_fig3a": STUDY,
+    "flcav.experiments.fig3a:fig3a": STUDY,
+    "flcav.experiments.fig6a_allocation:draw_allocation": STUDY,
+    "flcav.experiments.fig6a_allocation:run_allocation": STUDY,
+    "flcav.experiments.sim_to_real:draw_frame": STUDY,
+    "flcav.experiments.sim_to_real:run_sim_to_real": STUDY,
+    "flcav.experiments.task_study:run_study": STUDY,
+    "flcav.optimization.bands:bands": GENERIC,
+    "flcav.optimization.bands:pointwise": GENERIC,
+    "flcav.optimization.bands:upper_curve": GENERIC,
+    "flcav.optimization.problem_file:learned": GENERIC,
+    "flcav.perception.agents:choose_frames": GENERIC,
+    "flcav.perception.errors:RegistersErrors.register_errors": GENERIC,
+    "flcav.perception.objects.infer:box_rows": FOUND,
+    "flcav.perception.objects.infer:boxes_of_rows": FOUND,
+    "flcav.perception.outcomes:Outcomes.arrays": DTYPE,
+    "flcav.perception.outcomes:difference": GENERIC,
+    "flcav.perception.outcomes:interval": GENERIC,
+    "flcav.perception.outcomes:measurable": GENERIC,
+    "flcav.perception.outcomes:measured": GENERIC,
+    "flcav.perception.outcomes:score_on": GENERIC,
+    "flcav.perception.sharing:shared": GENERIC,
+    "flcav.perception.task:Finding.result": FOUND,
+    "flcav.perception.task:Finding.seen": DTYPE,
+    "flcav.perception.task:Task.evaluate": FOUND,
+    "flcav.perception.task:Task.evaluation_lines": FOUND,
+    "flcav.perception.task:Task.finding_lines": FOUND,
+    "flcav.perception.task:Task.score": FOUND,
+    "flcav.perception.task:configuration": GENERIC,
+    "flcav.perception.task:fresh": GENERIC,
+    "flcav.perception.tasks:task_named": GENERIC,
+    "flcav.perception.tracking.evaluate:evaluate_tracks": FOUND,
+    "flcav.perception.tracking.evaluate:tracks_lines": FOUND,
+    "flcav.perception.training.loop:train_steps": GENERIC,
+    "flcav.perception.training.run:prepare": GENERIC,
+    "flcav.perception.training.run:train_network": GENERIC,
+    "flcav.perception.weather.task:over_the_whole_space": FOUND,
+    "flcav.perception.weights:load_network": GENERIC,
+    "flcav.perception.weights:load_weights": GENERIC,
+    "flcav.perception.weights:save_network": GENERIC,
+    "flcav.perception.weights:shipped": GENERIC,
+    "flcav.pipeline.steps.run:run_steps": STEPS,
+    "flcav.pipeline.steps.step:Step.arguments": STEPS,
+    "flcav.pipeline.steps.step:Step.run": STEPS,
+    "flcav.pipeline.steps.step:Work.result": STEPS,
+    "flcav.plugins:load_own": OWN,
+    "flcav.report.clouds:compare": STUDY,
+    "flcav.report.clouds:real_frame": FOUND,
+    "flcav.report.curve_charts:fig3a": STUDY,
+    "flcav.report.figures:arms": STUDY,
+    "flcav.report.html:render": STUDY,
+    "flcav.report.inference:sign_boxes": FOUND,
+    "flcav.report.plans:predicted_and_realised": STUDY,
+    "flcav.report.predicted_paths:paths_on_map": FOUND,
+    "flcav.report.rerun_log:blueprint": EXTRA,
+    "flcav.report.rerun_log:log_scene": EXTRA,
+}
+
+
+@dataclass(frozen=True)
+class Tree:
+    """The modules of a package by dotted name."""
+
+    modules: Mapping[str, ast.Module]
+
+    @cached_property
+    def root(self) -> str:
+        """The package's name."""
+        return min(self.modules, key=len)
+
+    def folder(self, module: str) -> str:
+        """Return the first-level folder, or module, that a module is in."""
+        return module.split(".")[1] if "." in module else ""
+
+    @cached_property
+    def known(self) -> dict[str, dict[str, ast.stmt]]:
+        """By module: the statement that defines or imports each name."""
+        return {module: dict(names(tree)) for module, tree in self.modules.items()}
+
+    def found(self, module: str, name: str) -> tuple[str, ast.stmt] | None:
+        """Return where a name that `module` knows is defined, and its definition; None where that is elsewhere."""
+        node = self.known.get(module, {}).get(name)
+        if not isinstance(node, ast.ImportFrom):
+            return node and (module, node)
+        origin = next(alias.name for alias in node.names if (alias.asname or alias.name) == name)
+        return self.found(node.module or "", origin)
+
+    def crossings(self) -> Iterator[tuple[str, ast.stmt]]:
+        """Yield the definitions that a module of another folder imports, or reaches through a module it imports."""
+        for module, tree in self.modules.items():
+            for node in ast.walk(tree):
+                if not isinstance(node, ast.ImportFrom) or not node.module or not node.module.startswith(self.root):
+                    continue
+                for alias in node.names:
+                    whole = f"{node.module}.{alias.name}"
+                    names = attributes(tree, alias.asname or alias.name) if whole in self.modules else (alias.name,)
+                    for name in names:
+                        found = self.found(whole if whole in self.modules else node.module, name)
+                        if found and self.folder(found[0]) != self.folder(module):
+                            yield found
+
+    def vague(self, module: str, annotation: ast.AST | None) -> bool:
+        """Return whether an annotation in `module` says `Any` or `object`, by itself or through an alias."""
+        for node in ast.walk(annotation) if annotation else ():
+            if (
+                isinstance(node, ast.Constant)
+                and isinstance(node.value, str)
+                and self.vague(module, parsed(node.value))
+            ):
+                return True
+            if isinstance(node, ast.Attribute) and node.attr == "Any":
+                return True
+            if isinstance(node, ast.Name):
+                if node.id in VAGUE:
+                    return True
+                where, alias = self.found(module, node.id) or (module, None)
+                value = alias.value if isinstance(alias, ast.Assign) else None
+                if not isinstance(value, ast.Call) and self.vague(where, value):
+                    return True
+        return False
+
+    def offenders(self) -> set[str]:
+        """Return "module:name" of each function, method or field that crosses folders without saying what it takes."""
+        return {
+            f"{module}:{name}"
+            for module, definition in set(self.crossings())
+            for name, annotations in signatures(definition)
+            if any(self.vague(module, annotation) for annotation in annotations)
+        }
+
+
+def names(tree: ast.Module) -> Iterator[tuple[str, ast.stmt]]:
+    """Yield each name that is defined at the top of a module, or imported anywhere in it, with its statement."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            yield from ((alias.asname or alias.name, node) for alias in node.names)
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name, node
+        if isinstance(node, ast.Assign):
+            yield from ((target.id, node) for target in node.targets if isinstance(target, ast.Name))
+
+
+def parsed(text: str) -> ast.AST | None:
+    """Return an annotation that is written as text; None where it is a word of a Literal."""
+    try:
+        return ast.parse(text, mode="eval")
+    except SyntaxError:
+        return None
+
+
+def attributes(tree: ast.Module, name: str) -> set[str]:
+    """Return what a module reaches through the module it knows by `name`."""
+    return {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == name
+    }
+
+
+def signatures(definition: ast.stmt) -> Iterator[tuple[str, Iterable[ast.expr | None]]]:
+    """Yield what is public of a function or class: names with their annotations."""
+    if isinstance(definition, ast.FunctionDef):
+        yield definition.name, annotations(definition)
+    if isinstance(definition, ast.ClassDef):
+        for node in definition.body:
+            if isinstance(node, ast.FunctionDef) and (not node.name.startswith("_") or node.name == "__init__"):
+                yield f"{definition.name}.{node.name}", annotations(node)
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id[0] != "_":
+                yield f"{definition.name}.{node.target.id}", (node.annotation,)
+
+
+def annotations(function: ast.FunctionDef) -> list[ast.expr | None]:
+    own = function.args
+    taken = (*own.posonlyargs, *own.args, *own.kwonlyargs, *filter(None, (own.vararg, own.kwarg)))
+    return [*(argument.annotation for argument in taken), function.returns]
+
+
+def read(folder: Path) -> Tree:
+    """Return the modules below the folder of a package."""
+    modules = {}
+    for path in sorted(folder.rglob("*.py")):
+        parts = [folder.name, *path.relative_to(folder).with_suffix("").parts]
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        modules[name] = ast.parse(path.read_text(encoding="utf-8"))
+    return Tree(modules)
+
+
+def test_what_crosses_packages_says_what_it_is() -> None:
+    found = read(Path(flcav.__file__).parent).offenders()
+    assert sorted(found - set(ALLOWED)) == [], "give these a record, or the exact type"
+    assert sorted(set(ALLOWED) - found) == [], "these are mended: take them off the list"
+
+
+def test_the_check_sees_aliases_fields_methods_and_modules(tmp_path: Path) -> None:
+    files = {
+        "__init__": "",
+        "low/__init__": "from pkg.low.deep import hidden",
+        "low/deep": """
+from typing import Any
+Row = dict[str, Any]
+class Kept:
+    value: object
+    _own: Any
+    def told(self) -> "list[Row]": ...
+    def exact(self, why: int) -> str: ...
+    def _inner(self) -> Any: ...
+def hidden(**rest: Any) -> int: ...
+def through(rows: list[Row]) -> int: ...
+def local(row: Any) -> int: ...
+""",
+        "low/near": "from pkg.low.deep import local",
+        "high/user": "from pkg.low import deep, hidden\nfrom pkg.low.deep import Kept\ndeep.through([])",
+    }
+    for name, text in files.items():
+        path = tmp_path / "pkg" / f"{name}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    deep = "pkg.low.deep"
+    wanted = {f"{deep}:{name}" for name in ("Kept.value", "Kept.told", "hidden", "through")}
+    assert read(tmp_path / "pkg").offenders() == wanted
