@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from flcav.experiments.recording import record_split
-from flcav.experiments.studies import STUDIES
+from flcav.experiments.studies import STUDIES, study_named
 from flcav.pipeline import work
 from flcav.pipeline.steps.source_hash import PACKAGES, Sources, starts
 
@@ -153,7 +153,7 @@ STEPS = {
     "evaluation": work.test_step,
     "stage II": work.edge_step,
     "stage III": work.cloud_step,
-} | {f"{name}, {part}": getattr(study, part) for name, study in STUDIES.items() for part in ("learn", "test")}
+} | {f"{name}, {part}": getattr(study_named(name), part) for name in STUDIES for part in ("learn", "test")}
 
 
 @pytest.mark.parametrize("run", STEPS.values(), ids=STEPS.keys())
