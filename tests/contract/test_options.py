@@ -20,6 +20,7 @@ from flcav.perception.tasks import TASKS, task_named
 ALWAYS = "always"
 SCORED = tuple(name for name in TASKS if isinstance(task_named(name), Scores))
 STUDIES = tuple(target for target in TARGETS if target not in ("fig1b", "fig3a", "sim-to-real"))
+TASK_STUDIES = tuple(name for name in STUDIES if name.startswith("task-"))
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
     "export": {name: f"{name} none --out out" for name in FORMATS},
@@ -89,12 +90,20 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "reproduce": {
         **dict.fromkeys(("--seeds", "--scale"), STUDIES),
         "--jobs": (*STUDIES, "sim-to-real"),
+        **dict.fromkeys(("--engine", "--stale"), (*TASK_STUDIES, "sim-to-real")),
         "--kitti": ("sim-to-real",),
         "--weights": ("sim-to-real",),
     },
 }
 LATER = {("place", "range_m"), ("export", "validation")}  # are refused by what takes them
-VALUES = {"--labels": "actors", "--calibration": "assumed", "--scale": "quick", "--tracks": None}  # else 0.5 or 1
+VALUES = {
+    "--engine": "ray",
+    "--stale": "keep",
+    "--labels": "actors",
+    "--calibration": "assumed",
+    "--scale": "quick",
+    "--tracks": None,
+}  # else 0.5 or 1
 
 
 def commands(group: click.Group, before: str = "") -> Iterator[tuple[str, click.Command]]:

@@ -26,10 +26,18 @@ class Format(StrEnum):
 
 
 class Engine(StrEnum):
-    """Who records, see `flcav.dataset.recorder`."""
+    """Who works, see `flcav.dataset.recorder` and `flcav.pipeline.steps`."""
 
     processes = "processes"
     ray = "ray"
+
+
+class Stale(StrEnum):
+    """What becomes of what other code did, see `flcav.pipeline.steps`."""
+
+    refuse = "refuse"
+    redo = "redo"
+    keep = "keep"
 
 
 class Method(StrEnum):

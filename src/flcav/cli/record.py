@@ -6,6 +6,7 @@ import typer
 
 from flcav.cli.choices import Engine
 from flcav.cli.interruption import when_interrupted
+from flcav.cli.options import ENGINE
 
 
 def register(app: typer.Typer) -> None:
@@ -20,7 +21,7 @@ def record(
     frames: int | None = typer.Option(None, "--frames", help="Record exactly this many frames instead."),
     seed: int | None = typer.Option(None, "--seed", help="Seed instead of the recipe's."),
     jobs: int = typer.Option(1, "--jobs", help="Workers; the dataset is the same whatever their number."),
-    engine: Engine = typer.Option(Engine.processes, "--engine", help="Who works: processes here, or a cluster by Ray."),
+    engine: Engine = ENGINE,
 ) -> None:
     """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
     from flcav import progress

@@ -7,8 +7,9 @@ from pathlib import Path
 import click
 import typer
 
-from flcav.cli.choices import listed
+from flcav.cli.choices import Engine, Stale, listed
 from flcav.cli.interruption import when_interrupted
+from flcav.cli.options import ENGINE, JOBS, STALE
 from flcav.cli.refusals import refuse_unused
 from flcav.experiments.studies import STUDIES
 from flcav.threads import use_threads
@@ -32,13 +33,16 @@ class Scale(StrEnum):
     full = "full"
 
 
-STUDY = ("seeds", "scale", "jobs")  # options of what is run over seeds
+RUN = ("jobs", "engine", "stale")  # options of what is run as steps
+STUDY = ("seeds", "scale", *RUN)  # of what is run over seeds
 TASK = "task-"  # before the name of a task's study
 TARGETS: tuple[str, ...] = (*(target.value for target in Target), *(f"{TASK}{name}" for name in STUDIES))
 TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig1b: (),
     Target.fig3a: (),
-    Target.sim_to_real: ("jobs", "kitti", "weights"),
+    Target.sim_to_real: (*RUN, "kitti", "weights"),
+    Target.demo_arms: ("seeds", "scale", "jobs"),
+    Target.fig6a_allocation: ("seeds", "scale", "jobs"),
 }
 SEEDS: Mapping[str, int] = {Target.demo_arms: 5}
 COMMON_SEEDS = 3
@@ -55,7 +59,9 @@ def reproduce(
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
     ),
-    jobs: int = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each."),
+    jobs: int = JOBS,
+    engine: Engine = ENGINE,
+    stale: Stale = STALE,
     kitti: Path | None = typer.Option(None, "--kitti", help="sim-to-real: a folder of real frames in KITTI's layout."),
     weights: Path | None = typer.Option(
         None, "--weights", help="sim-to-real: the detector's; by default those of the package."
@@ -69,13 +75,13 @@ def reproduce(
         draw(out)
         return
     if target == Target.sim_to_real:
-        _sim_to_real(out, kitti, weights, jobs)
+        _sim_to_real(out, kitti, weights, jobs, engine, stale)
         return
     count = seeds or SEEDS.get(target, COMMON_SEEDS)
     numbers = range(1, count + 1)
     quick = scale == Scale.quick
     if target.startswith(TASK):
-        _task(target, out, numbers, "quick" if quick else "full", jobs)
+        _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
         run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
         run(out, count, "quick" if quick else "paper", jobs)
@@ -135,7 +141,7 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int) -> None:
 
 
 @when_interrupted()
-def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int) -> None:
+def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.config import InputError
     from flcav.experiments.sim_to_real import draw_frame, run_sim_to_real
@@ -148,7 +154,8 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int)
     if kitti is None:
         raise InputError("--kitti is missing: sim-to-real needs a folder of real frames in KITTI's layout")
     with live_steps(Target.sim_to_real.value) as notify:
-        results = run_sim_to_real(network_of(OBJECTS, weights), kitti, out, jobs=jobs, notify=notify)
+        network = network_of(OBJECTS, weights)
+        results = run_sim_to_real(network, kitti, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     write_json(out / "result.json", results)
     write_bytes(out / "clouds.png", style.png(compare(results["clouds"])))
     for story in results["frames"]:
@@ -160,7 +167,7 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int)
 
 
 @when_interrupted()
-def _task(target: str, out: Path, seeds: range, scale: str, jobs: int) -> None:
+def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.studies import study_named
     from flcav.experiments.task_study import run_study
@@ -168,7 +175,7 @@ def _task(target: str, out: Path, seeds: range, scale: str, jobs: int) -> None:
 
     study = study_named(target.removeprefix(TASK))
     with live_steps(target) as notify:
-        results = run_study(study, out, seeds=seeds, scale=scale, jobs=jobs, notify=notify)
+        results = run_study(study, out, seeds=seeds, scale=scale, jobs=jobs, notify=notify, stale=stale, engine=engine)
     write_json(out / "result.json", results)
     write_bytes(out / f"{study.task.name}.png", study.draw(results))
     for test, numbers in results["summary"].items():

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from flcav.pipeline.steps import Notify
+from flcav.pipeline.steps import FINISHED, Notify
 
 
 @contextlib.contextmanager
@@ -29,7 +29,7 @@ def live_steps(title: str) -> Iterator[Notify]:
             if step not in rows:
                 rows[step] = bars.add_task(f"  {step}", total=None, note="")
             bars.update(rows[step], completed=done, total=max(total, 1), note=note)
-            if note in ("done", "done before"):
+            if note in FINISHED:
                 finished += 1
                 bars.update(rows[step], visible=False)
                 bars.update(whole, note=f"{finished} steps done, {step} {note}")

@@ -5,6 +5,7 @@ the additive form that plans are made from.
 """
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import parse_config
-from flcav.dataset.layout import package_versions
 from flcav.optimization.bands import Bands, bands
 from flcav.optimization.curves import Additive
 from flcav.optimization.graph import Layers, build
 from flcav.optimization.history import History, article_histories
 from flcav.optimization.learning_curve import Fit, fit_additive
 from flcav.pipeline.planning import history_of
+from flcav.pipeline.provenance import provenance
 from flcav.report import curve_charts, style
 
 Array = NDArray[np.float64]
@@ -32,7 +33,7 @@ LEVEL = 0.95  # of the bands
 def fig3a() -> dict[str, Any]:
     """Return the curves, points and bands, and how near the fits come to the printed constants."""
     article = {task: _article_curve(points, PRINTED[task]) for task, points in article_histories().items()}
-    results = {"article": article, "own": _own_curves(), "level": LEVEL, "versions": package_versions()}
+    results = {"article": article, "own": _own_curves(), "level": LEVEL, "provenance": asdict(provenance())}
     return results | {"findings": _findings(results)}
 
 

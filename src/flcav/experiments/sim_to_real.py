@@ -5,6 +5,7 @@ has its beams alone, on Lambertian surfaces. The detector is the one that comes 
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import LOWEST_SCORE, OVERLAPS, number_or_none, of_class
 from flcav.perception.objects.infer import box_rows
 from flcav.perception.objects.model import Second
+from flcav.pipeline.provenance import provenance
 from flcav.pipeline.steps import Notify, Step, run_steps
 from flcav.report import style
 from flcav.report.clouds import real_frame
@@ -45,10 +47,19 @@ SHOWN = 0.3  # score from which a detection counts as found in the lists of fram
 NEUTRAL = {"Van": "Car", "Truck": "Car", "Tram": "Car", "Misc": "Car", "Person_sitting": "Pedestrian"}
 
 
-def run_sim_to_real(network: Second, kitti: Path, out: Path, *, jobs: int, notify: Notify) -> dict[str, Any]:
+def run_sim_to_real(
+    network: Second,
+    kitti: Path,
+    out: Path,
+    *,
+    jobs: int,
+    notify: Notify,
+    stale: str = "refuse",
+    engine: str = "processes",
+) -> dict[str, Any]:
     """Return the comparison of clouds, and the detections of `network` in the frames of the folder `kitti`.
 
-    Raises `InputError` where that is no KITTI folder.
+    Frames are recorded in `out`, as `run_steps` does. Raises `InputError` where that is no KITTI folder.
     """
     folder = KittiFolder.open(kitti)
     real = [folder.frame(number) for number in range(len(folder))]
@@ -56,12 +67,12 @@ def run_sim_to_real(network: Second, kitti: Path, out: Path, *, jobs: int, notif
         Step(name.replace(" ", "-"), record_split, {"recipe": {**RECIPE, "vehicle_rig": rig}})
         for name, rig in RIGS.items()
     ]
-    run_steps(steps, out, jobs=jobs, notify=notify)
+    run_steps(steps, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     clouds = {REAL: describe((frame.points, of_class(frame.objects.boxes, "Car")) for frame in real)}
     for name, step in zip(RIGS, steps, strict=True):
         data = Dataset.open(out / step.name / DATA)
         clouds[name] = describe(labelled(data, number) for number in range(len(data)))
-    return {"clouds": clouds, **detections(network, real)}
+    return {"clouds": clouds, **detections(network, real), "provenance": asdict(provenance(RECIPE["seed"]))}
 
 
 def labelled(data: Dataset, number: int) -> Labelled:

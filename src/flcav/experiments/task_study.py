@@ -4,18 +4,18 @@ The epoch that is kept is chosen on the validation frames; the test frames are u
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError, read_yaml
-from flcav.dataset.layout import package_versions
 from flcav.dataset.store import Dataset
 from flcav.experiments.recording import opened, record_split
 from flcav.intervals import mean_over_seeds
 from flcav.perception.task import Task
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
+from flcav.pipeline.provenance import provenance
 from flcav.pipeline.steps import Notify, Step, Work, run_steps
 from flcav.sources.recipe import recipe_path
 
@@ -27,7 +27,10 @@ VALIDATION = "validation"
 
 @dataclass(frozen=True)
 class Study:
-    """What is recorded, trained and tested; functions are module-level ones, since steps run in other processes."""
+    """What is recorded, trained and tested; functions are module-level ones, since steps run in other processes.
+
+    Fields that two studies are not compared by are of no step: what they reach makes none stale.
+    """
 
     task: Task[Any, Any, Any]
     network: str  # name of the configuration
@@ -36,8 +39,8 @@ class Study:
     tests: Mapping[str, RecipeFields]  # by name
     epochs: int
     patience: int
-    numbers: Callable[[Result], Mapping[str, float]]  # those of a test that are averaged over seeds
-    draw: Callable[[Mapping[str, Any]], bytes]  # results -> PNG
+    numbers: Callable[[Result], Mapping[str, float]] = field(compare=False)  # those of a test that are averaged
+    draw: Callable[[Mapping[str, Any]], bytes] = field(compare=False)  # results -> PNG
     extra: Mapping[str, Callable[[Any, Dataset], dict[str, Any]]] = field(default_factory=dict)  # by name of the test
     quick_scenes: int = 2  # of every recipe at the quick scale
     quick_epochs: int = 1
@@ -66,14 +69,22 @@ def recipe_of(name: str) -> RecipeFields:
 
 
 def run_study(
-    study: Study, out: Path, *, seeds: Sequence[int], scale: str = "full", jobs: int, notify: Notify
+    study: Study,
+    out: Path,
+    *,
+    seeds: Sequence[int],
+    scale: str = "full",
+    jobs: int,
+    notify: Notify,
+    stale: str = "refuse",
+    engine: str = "processes",
 ) -> dict[str, Any]:
-    """Run what of the study is not done yet in `out`; return its numbers: of every seed, and their means.
+    """Run what of the study is not done yet in `out`, as `run_steps`; return its numbers: of seeds, and their means.
 
     Raises `InputError` for an unknown scale, and where `out` holds another study.
     """
     study = at_scale(study, scale)
-    values = run_steps(steps_of(study, seeds), out, jobs=jobs, notify=notify)
+    values = run_steps(steps_of(study, seeds), out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     runs = [{"seed": seed, "card": values[_seed_step(seed)], "tests": values[_tested_step(seed)]} for seed in seeds]
     return {
         "task": study.task.name,
@@ -84,7 +95,7 @@ def run_study(
         "recipes": {"train": list(study.train), VALIDATION: study.validation, "tests": dict(study.tests)},
         "seeds": runs,
         "summary": {name: _mean([run["tests"][name] for run in runs], study.numbers) for name in study.tests},
-        "versions": package_versions(),
+        "provenance": asdict(provenance()),
     }
 
 

@@ -1,14 +1,22 @@
+import importlib
+import json
 import os
+import platform
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 
+import flcav
 from flcav.config import InputError
+from flcav.pipeline.provenance import checkout
 from flcav.pipeline.steps import Step, Work, run_side_by_side, run_steps
 
 
@@ -21,6 +29,10 @@ def count(work: Work, start: int) -> int:
 def add(work: Work, names: list[str]) -> int:
     work.report(1, 2, "halfway")
     return sum(work.result(name) for name in names)
+
+
+def seeded(work: Work, recipe: dict[str, int]) -> int:
+    return recipe["seed"]
 
 
 def fail(work: Work) -> None:
@@ -106,6 +118,204 @@ def test_records_among_the_arguments_are_told_apart_by_class_and_fields():
     assert len({Step("a", refuse, {"setting": setting}).fingerprint({}) for setting in settings}) == len(settings)
     with pytest.raises(TypeError, match="neither a JSON value nor a dataclass"):
         Step("a", refuse, {"setting": object()}).fingerprint({})
+
+
+CODE = """
+from pathlib import Path
+RATE = 2
+def learn(work):
+    kept = work.folder / "kept"
+    kept.write_text((kept.read_text() if kept.exists() else "") + str(RATE))
+    if (work.folder.parent / "stop").exists():
+        raise ValueError("stopped")
+    return RATE
+def look(work):
+    return 10 * work.result("learn")
+def apart(work):
+    return 7
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Return a module of a user's own, whose source a test can change."""
+    (tmp_path / "own_steps.py").write_text(CODE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "own_steps", raising=False)
+    return importlib.import_module("own_steps")
+
+
+def changed(own: ModuleType, rate: int) -> None:
+    assert own.__file__
+    Path(own.__file__).write_text(CODE.replace("RATE = 2", f"RATE = {rate}  # a comment"))
+    shutil.rmtree(Path(own.__file__).parent / "__pycache__", ignore_errors=True)
+
+
+def chain(own: ModuleType) -> list[Step]:
+    return [Step("apart", own.apart, {}), Step("learn", own.learn, {}), Step("look", own.look, {}, needs=("learn",))]
+
+
+def told(steps: list[Step], folder: Path, **how: Any) -> list[str]:
+    said = []
+    run_steps(steps, folder, jobs=1, notify=lambda name, done, total, note: said.append(f"{name} {note}"), **how)
+    return [each for each in said if not each.endswith(" ")]
+
+
+def kept(folder: Path) -> dict[str, Any]:
+    return {path.parent.name: json.loads(path.read_text()) for path in folder.glob("[a-z]*/done.json")}
+
+
+REFUSED = (
+    "out: did learn by other code (own_steps changed), look on top of other code; choose another folder, or --stale "
+    "redo to do that again, or --stale keep to take it as it is"
+)
+
+
+def test_what_other_code_did_is_refused_and_named(own, tmp_path):
+    out = tmp_path / "out"
+    told(chain(own), out)
+    before = kept(out)
+    changed(own, 2)  # a comment
+    assert told(chain(own), out) == ["apart done before", "learn done before", "look done before"]
+    changed(own, 3)
+    with pytest.raises(InputError) as refusal:
+        told(chain(own), out)
+    assert str(refusal.value).endswith(REFUSED)
+    assert kept(out) == before
+    with pytest.raises(InputError, match="another configuration"):
+        told([Step("apart", own.apart, {"more": 1})], out, stale="redo")
+    with pytest.raises(InputError, match="stale 'perhaps': choose one of refuse, redo, keep"):
+        told(chain(own), out, stale="perhaps")
+
+
+def test_what_other_code_did_is_done_again_with_all_that_is_built_on_it(own, tmp_path):
+    out = tmp_path / "out"
+    told(chain(own), out)
+    changed(own, 3)
+    assert told(chain(own), out, stale="redo") == ["apart done before", "learn done", "look done"]
+    assert {name: each["value"] for name, each in kept(out).items()} == {"apart": 7, "learn": 3, "look": 30}
+    assert (out / "learn" / "kept").read_text() == "3"  # from an empty folder
+    assert sorted(path.name for path in out.iterdir()) == ["apart", "learn", "look"]
+    assert told(chain(own), out) == ["apart done before", "learn done before", "look done before"]
+
+
+def test_what_other_code_did_is_kept_and_stays_known_as_such(own, tmp_path):
+    out = tmp_path / "out"
+    told(chain(own)[:2], out)
+    changed(own, 3)
+    assert told(chain(own), out, stale="keep") == ["apart done before", "learn kept, of other code", "look done"]
+    assert kept(out)["look"]["value"] == 20
+    with pytest.raises(InputError, match=r"learn by other code .own_steps changed., look on top of other code"):
+        told(chain(own), out)
+    changed(own, 2)  # as it was, and what was built on it
+    assert told(chain(own), out) == ["apart done before", "learn done before", "look done before"]
+
+
+def test_what_other_code_began_is_not_gone_on_with_unasked(own, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "stop").touch()
+    with pytest.raises(ValueError, match="stopped"):
+        told(chain(own), out)
+    (out / "stop").unlink()
+    changed(own, 3)
+    with pytest.raises(InputError, match="learn by other code"):
+        told(chain(own), out)
+    told(chain(own), out, stale="keep")
+    assert (out / "learn" / "kept").read_text() == "23"
+    with pytest.raises(InputError, match="learn by other code"):
+        told(chain(own), out)
+    told(chain(own), out, stale="redo")
+    assert (out / "learn" / "kept").read_text() == "3"
+
+
+def test_a_link_to_what_other_code_did_is_removed_and_what_it_leads_to_is_not(own, tmp_path):
+    out, linking = tmp_path / "out", tmp_path / "linking"
+    told(chain(own), out)
+    linking.mkdir()
+    (linking / "learn").symlink_to(out / "learn", target_is_directory=True)
+    changed(own, 3)
+    told(chain(own), linking, stale="redo")
+    assert kept(linking)["look"]["value"] == 30
+    assert kept(out)["look"]["value"] == 20
+
+
+def test_a_kill_while_steps_are_removed_leaves_none_that_looks_finished(own, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    told(chain(own), out)
+    changed(own, 3)
+
+    def killed(folder: Path, **how: Any) -> None:
+        if folder.name == ".learn.old" and folder.exists():
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            told(chain(own), out, stale="redo")
+    assert not (out / "learn").exists()
+    with pytest.raises(InputError, match="did look on top of other code"):
+        told(chain(own), out)
+    assert told(chain(own), out, stale="redo") == ["apart done before", "learn done", "look done"]
+    assert sorted(path.name for path in out.iterdir()) == ["apart", "learn", "look"]
+
+
+def test_folders_of_before_code_was_recorded_are_read_as_asked(own, tmp_path):
+    out = tmp_path / "out"
+    told(chain(own), out)
+    for path in out.glob("*/*.json"):
+        values = json.loads(path.read_text())
+        path.write_text(json.dumps({name: values[name] for name in ("fingerprint", "value") if name in values}))
+    with pytest.raises(InputError, match=r"did apart, learn, look by code that was not recorded; choose"):
+        told(chain(own), out)
+    assert told(chain(own), out, stale="keep") == [f"{name} kept, of other code" for name in ("apart", "learn", "look")]
+    with pytest.raises(InputError, match="another configuration"):
+        told([Step("apart", own.apart, {"more": 1})], out, stale="keep")
+
+
+@pytest.mark.parametrize("text", ["[1]", '{"value": 1}', "{", ""])
+def test_a_record_that_is_none_is_refused(tmp_path, text):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "done.json").write_text(text)
+    with pytest.raises(InputError, match=r"done\.json"):
+        run_steps(STEPS, tmp_path, jobs=1, notify=quiet)
+
+
+def test_a_finished_step_says_by_what_it_was_made(tmp_path):
+    run_steps(
+        [Step("a", count, {"start": 1}), Step("c", seeded, {"recipe": {"seed": 5}})], tmp_path, jobs=1, notify=quiet
+    )
+    one, other = (kept(tmp_path)[name]["provenance"] for name in "ac")
+    assert (one.pop("seed"), other.pop("seed")) == (None, 5)
+    assert one == other
+    assert one["threads"] == 1
+    assert one["versions"].items() >= {"flcav": flcav.__version__, "python": platform.python_version()}.items()
+    assert {"numpy", "torch", "flwr", "scipy"} <= one["versions"].keys()
+    assert platform.machine() in one["processor"]
+
+
+def test_the_revision_is_that_of_the_checkout_that_holds_the_folder(tmp_path):
+    def git(*arguments: str) -> str:
+        names = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        return subprocess.run(
+            ["git", *names, *arguments], cwd=tmp_path, check=True, capture_output=True, text=True
+        ).stdout
+
+    folder, beside = tmp_path / "package", tmp_path / "beside"
+    for each in (folder, beside):
+        each.mkdir()
+        (each / "file.py").write_text("1")
+    assert checkout(folder) == (None, False)
+    checkout.cache_clear()
+    git("init", "-q")
+    git("add", "package")
+    git("commit", "-qm", "first")
+    assert checkout(folder) == (git("rev-parse", "HEAD").strip(), False)
+    assert checkout(beside) == (None, False)  # within a checkout, and not of it
+    (folder / "file.py").write_text("2")
+    checkout.cache_clear()
+    assert checkout(folder) == (git("rev-parse", "HEAD").strip(), True)
+    checkout.cache_clear()
 
 
 def test_a_failing_step_ends_the_run_and_keeps_what_was_finished(tmp_path):

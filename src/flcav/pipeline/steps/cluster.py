@@ -55,7 +55,7 @@ class _Cluster:
     @contextlib.contextmanager
     def hands(self, folder: Path, jobs: int) -> Iterator[Hands]:
         """Yield `jobs` actors; raises `OSError` where one was killed, or runs another flcav than this machine."""
-        remote = self._ray.remote(num_cpus=1, max_concurrency=2)(_Worker)  # it works, and is heard
+        remote = self._ray.remote(num_cpus=1, max_concurrency=3)(_Worker)  # it works, is heard, and told to leave
         actors = [remote.remote() for _ in range(jobs)]
         self._actors += actors
         reports: Queue[Any] = Queue()
@@ -77,7 +77,8 @@ class _Cluster:
         self._leave(self._actors)
 
     def _leave(self, actors: Iterable[Any]) -> None:
-        self._ray.wait(left := [actor.leave.remote() for actor in actors], num_returns=len(left), timeout=LEAVING_S)
+        if left := [actor.leave.remote() for actor in actors]:
+            self._ray.wait(left, num_returns=len(left), timeout=LEAVING_S)
         for actor in actors:
             self._ray.kill(actor)
 

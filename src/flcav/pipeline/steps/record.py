@@ -9,14 +9,14 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from flcav.config import InputError, read_json
 from flcav.files import write_json
 
 DONE, STARTED = "done.json", "started.json"
-Stale = Literal["refuse", "redo", "keep"]  # what becomes of steps that other code began or finished
-STALE: tuple[Stale, ...] = ("refuse", "redo", "keep")
+Stale = str  # one of STALE
+STALE = ("refuse", "redo", "keep")  # what becomes of steps that other code began or finished
 NAMED = 3  # steps, and modules, that a sentence names
 
 

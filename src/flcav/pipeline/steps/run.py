@@ -21,7 +21,7 @@ from typing import Any
 from flcav.config import InputError, read_json
 from flcav.files import write_json
 from flcav.pipeline.steps.engines import Engine, Processes
-from flcav.pipeline.steps.record import DONE, Record, Stale, aside, held_in, refusal, remove, value_of
+from flcav.pipeline.steps.record import DONE, STALE, Record, aside, held_in, refusal, remove, value_of
 from flcav.pipeline.steps.source_hash import Sources, starts
 from flcav.pipeline.steps.step import DONE_BEFORE, DONE_NOW, KEPT, Notify, Step
 
@@ -51,7 +51,7 @@ def run_steps(
     *,
     jobs: int,
     notify: Notify,
-    stale: Stale = "refuse",
+    stale: str = "refuse",
     engine: str = "processes",
 ) -> dict[str, Any]:
     """Run `steps` (in an order where each comes after what it needs) and return their values by name.
@@ -73,7 +73,7 @@ def run_side_by_side(
     *,
     jobs: int,
     notify: Notify,
-    stale: Stale = "refuse",
+    stale: str = "refuse",
     engine: str = "processes",
     names: Mapping[Path, str] | None = None,
 ) -> dict[Path, dict[str, Any]]:
@@ -120,7 +120,7 @@ def _opened(engine: str, jobs: int) -> contextlib.AbstractContextManager[Engine]
     return ENGINES[engine](jobs)
 
 
-def _planned(steps: Sequence[Step], folder: Path, notify: Notify, stale: Stale, sources: Sources) -> _Plan:
+def _planned(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Plan:
     """Return what of `steps` is left to do; raises `InputError` as `run_steps` does."""
     records, kept = _settled(steps, folder, stale, sources)
     values: dict[str, Any] = {}
@@ -148,8 +148,10 @@ def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify) -> None:
                 notify(step.name, 1, 1, DONE_NOW)
 
 
-def _settled(steps: Sequence[Step], folder: Path, stale: Stale, sources: Sources) -> tuple[dict[str, Record], set[str]]:
+def _settled(steps: Sequence[Step], folder: Path, stale: str, sources: Sources) -> tuple[dict[str, Record], set[str]]:
     """Return the records by which steps are to be done, or are, and the steps that are kept though stale."""
+    if stale not in STALE:
+        raise InputError(f"stale '{stale}': choose one of {', '.join(STALE)}")
     records: dict[str, Record] = {}
     outdated: dict[str, tuple[Record, Record]] = {}
     for step in steps:

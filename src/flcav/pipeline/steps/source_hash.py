@@ -5,13 +5,15 @@ binds: a function, a class, a constant. It reaches those that it mentions, throu
 within itself, and through packages that only hand names on, to the module that defines them. Formatting, comments and
 docstrings do not count, nor do imports for type checkers, and code that runs only where a module is the program.
 
-Not seen are names looked up by strings (but those of a module's `__getattr__`, see `_lazy`), data files, and other
-packages: their versions are in `flcav.pipeline.provenance`.
+A string `module:NAME` is taken for that name, and so are those of a module's `__getattr__` (see `_lazy`). Not seen are
+other names looked up by strings, data files, and other packages: their versions are in `flcav.pipeline.provenance`.
 """
 
 import ast
 import functools
 import hashlib
+import importlib.util
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
@@ -24,6 +26,7 @@ import flcav
 Place = tuple[str, str]  # module, name that a statement at its top binds; WHOLE: all of them
 Target = tuple[str, str]  # module, dotted name in it, "" for the module itself
 WHOLE = "*"
+NAMED = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)")  # how tables, recipes and options name what is of a module
 PACKAGES = {"flcav": Path(flcav.__file__).parent}
 
 
@@ -63,7 +66,7 @@ class Sources:
                 found[name].add(statement)
                 for target, as_written in statement.mentions:
                     places = list(self._resolve(target))
-                    if not places:
+                    if as_written and not places:
                         others.setdefault(name, set()).add(f"{as_written}: {target}")
                     left += [place for place in places if place not in seen]
                     seen.update(places)
@@ -106,6 +109,8 @@ class Sources:
             folder = self._packages[top].joinpath(*parts)
             return next((path for path in (folder / "__init__.py", folder.with_suffix(".py")) if path.is_file()), None)
         loaded = getattr(sys.modules.get(name), "__file__", None) or ""
+        if not loaded and not parts and name != "__main__" and (spec := importlib.util.find_spec(name)) is not None:
+            loaded = spec.origin or ""
         foreign = top in sys.stdlib_module_names - {"__main__"} or "site-packages" in loaded
         return None if foreign or not loaded.endswith(".py") else Path(loaded)
 
@@ -122,6 +127,9 @@ def starts(value: Any) -> Iterator[Place]:
     elif isinstance(value, FunctionType | type):
         name = value.__qualname__.partition(".")[0]
         yield value.__module__, WHOLE if name == "<lambda>" else name
+    elif isinstance(value, str):
+        if found := NAMED.fullmatch(value):
+            yield found[1], found[2]
     elif isinstance(value, Mapping):
         yield from starts(tuple(value.values()))
     elif isinstance(value, list | tuple | set | frozenset):
@@ -157,7 +165,7 @@ class _Statement:
         """What it mentions of its module and of others, with the name that this has here."""
         names = _Names(self.module.name, self.module.package)
         names.visit(self.node)
-        found = [((module, ""), module) for module in names.star]
+        found = [((module, ""), module) for module in names.star] + [(target, "") for target in names.named]
         for root, rest in sorted(names.found):
             for imports in (names.imports, self.module.imports):
                 if root in imports:
@@ -193,6 +201,11 @@ class _Names(ast.NodeVisitor):
         self.found: set[tuple[str, str]] = set()
         self.imports: dict[str, Target] = {}
         self.star: list[str] = []
+        self.named: list[Target] = []
+
+    def visit_Constant(self, node: ast.Constant) -> None:
+        if isinstance(node.value, str) and (found := NAMED.fullmatch(node.value)):
+            self.named.append((found[1], found[2]))
 
     def visit_Name(self, node: ast.Name) -> None:
         self.found.add((node.id, ""))
