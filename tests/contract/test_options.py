@@ -20,7 +20,6 @@ from flcav.perception.tasks import TASKS, task_named
 ALWAYS = "always"
 SCORED = tuple(name for name in TASKS if isinstance(task_named(name), Scores))
 STUDIES = tuple(target for target in TARGETS if target not in ("fig1b", "fig3a", "sim-to-real"))
-TASK_STUDIES = tuple(name for name in STUDIES if name.startswith("task-"))
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
     "export": {name: f"{name} none --out out" for name in FORMATS},
@@ -39,7 +38,9 @@ CHOICES: dict[str, dict[str, str]] = {
 RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads", "--device"), ALWAYS)
 # command -> option -> what of CHOICES takes it; `--out` and `--json` are always taken
 TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
-    "demo": {"--seed": ALWAYS, "--jobs": ALWAYS},
+    "run": dict.fromkeys(("--jobs", "--seeds", "--engine", "--stale"), ALWAYS),
+    "demo": dict.fromkeys(("--seed", "--recipe", "--jobs", "--engine", "--stale"), ALWAYS),
+    "compare": {},
     "towns list": {},
     "towns show": {"--poles": ALWAYS},
     "towns import": {},
@@ -90,7 +91,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "reproduce": {
         **dict.fromkeys(("--seeds", "--scale"), STUDIES),
         "--jobs": (*STUDIES, "sim-to-real"),
-        **dict.fromkeys(("--engine", "--stale"), (*TASK_STUDIES, "sim-to-real")),
+        **dict.fromkeys(("--engine", "--stale"), (*STUDIES, "sim-to-real")),
         "--kitti": ("sim-to-real",),
         "--weights": ("sim-to-real",),
     },

@@ -41,8 +41,6 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig1b: (),
     Target.fig3a: (),
     Target.sim_to_real: (*RUN, "kitti", "weights"),
-    Target.demo_arms: ("seeds", "scale", "jobs"),
-    Target.fig6a_allocation: ("seeds", "scale", "jobs"),
 }
 SEEDS: Mapping[str, int] = {Target.demo_arms: 5}
 COMMON_SEEDS = 3
@@ -84,7 +82,7 @@ def reproduce(
         _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
         run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
-        run(out, count, "quick" if quick else "paper", jobs)
+        run(out, count, "quick" if quick else "paper", jobs, engine, stale)
     typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
 
 
@@ -112,13 +110,14 @@ def _fig3a(out: Path) -> None:
 
 
 @when_interrupted()
-def _demo_arms(out: Path, seeds: int, scale: str, jobs: int) -> None:
+def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.demo_arms import draw_arms, run_arms, study_recipe
     from flcav.files import write_bytes, write_json
 
     with live_steps(Target.demo_arms.value) as notify:
-        results = run_arms(study_recipe("arms", scale), out, seeds=seeds, jobs=jobs, notify=notify)
+        recipe = study_recipe("arms", scale)
+        results = run_arms(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     write_json(out / "result.json", results)
     write_bytes(out / "arms.png", draw_arms(results))
     for arm, closed in results["summary"]["gap_closed"].items():
@@ -126,14 +125,15 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int) -> None:
 
 
 @when_interrupted()
-def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int) -> None:
+def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.demo_arms import study_recipe
     from flcav.experiments.fig6a_allocation import draw_allocation, run_allocation
     from flcav.files import write_bytes, write_json
 
     with live_steps(Target.fig6a_allocation.value) as notify:
-        results = run_allocation(study_recipe("allocation", scale), out, seeds=seeds, jobs=jobs, notify=notify)
+        recipe = study_recipe("allocation", scale)
+        results = run_allocation(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     write_json(out / "result.json", results)
     write_bytes(out / "plans.png", draw_allocation(results))
     for finding in results["findings"]:

@@ -2,32 +2,21 @@
 
 import dataclasses
 import json
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.choices import Engine, listed
+from flcav.cli.choices import Engine, Stale
 from flcav.cli.interruption import when_interrupted
+from flcav.cli.options import ENGINE, JOBS, STALE
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
     from flcav.pipeline.results import Run, Summary
 
 
-class Stale(StrEnum):
-    """What becomes of steps that other code began or finished."""
-
-    refuse = "refuse"
-    redo = "redo"
-    keep = "keep"
-
-
-JOBS = typer.Option(2, "--jobs", min=1, help="Workers, of one thread each; the results are the same.")
 SEEDS = typer.Option(1, "--seeds", min=1, help="Number of seeds, from the recipe's on; above 1, a folder each.")
-ENGINE = typer.Option(Engine.processes, "--engine", help="Who works: processes here, or a cluster by Ray.")
-STALE = typer.Option(Stale.refuse, "--stale", help=f"Steps that other code began or finished: {listed(Stale)}.")
 AS_JSON = typer.Option(False, "--json", help="Print one JSON object instead of sentences.")
 
 
@@ -60,10 +49,11 @@ def demo(
     seed: int | None = typer.Option(None, "--seed", min=0, help="Seed of traffic, sensors and training, if not 1."),
     recipe: Path = typer.Option(Path("recipes/runs/demo.yaml"), "--recipe", help="Another run recipe."),
     jobs: int = JOBS,
+    engine: Engine = ENGINE,
     stale: Stale = STALE,
 ) -> None:
     """Run recipes/runs/demo.yaml: pretraining, a roadside sensor, edge FL and cloud FL on three towns."""
-    _run(recipe, seed, out, jobs, 1, Engine.processes, stale, False, "demo")
+    _run(recipe, seed, out, jobs, 1, engine, stale, False, "demo")
 
 
 def _run(

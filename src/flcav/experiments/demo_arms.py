@@ -5,17 +5,18 @@ seed, intervals redraw test scenes; over seeds, they are Student's t, so they ho
 """
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from flcav.config import read_config
-from flcav.dataset.layout import package_versions
 from flcav.intervals import mean_over_seeds
 from flcav.pipeline.findings import in_words
+from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Run
 from flcav.pipeline.run import run_seeds
-from flcav.pipeline.steps import Notify
+from flcav.pipeline.steps import Notify, Stale
 from flcav.report import figures, style
 from flcav.sources.recipe import recipe_path
 
@@ -52,15 +53,24 @@ def study_recipe(name: str, scale: str) -> RunRecipe:
     return recipe if scale == "paper" else recipe.model_copy(update={"size": "demo"})
 
 
-def run_arms(recipe: RunRecipe, out: Path, *, seeds: int, jobs: int, notify: Notify) -> dict[str, Any]:
+def run_arms(
+    recipe: RunRecipe,
+    out: Path,
+    *,
+    seeds: int,
+    jobs: int,
+    notify: Notify,
+    stale: Stale = "refuse",
+    engine: str = "processes",
+) -> dict[str, Any]:
     """Run or finish all arms of each seed in folders below `out` and return the results."""
-    runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify)
+    runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     rows = [one_seed(run) for run in runs]
     return {
         "recipe": recipe.model_dump(mode="json", exclude={"seed"}),
         "seeds": rows,
         "summary": summarise(rows),
-        "versions": package_versions(),
+        "provenance": asdict(provenance()),
         "note": "road labels come from an ideal road detector: arms with a pole are upper bounds",
     }
 

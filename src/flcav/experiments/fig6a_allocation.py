@@ -7,19 +7,20 @@ training reached.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flcav.dataset.layout import package_versions
 from flcav.experiments.fig6a_findings import EQUAL, JOINT, TOWN, allocation_findings
 from flcav.intervals import mean_over_seeds
 from flcav.pipeline.planning import history_of
+from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Run
 from flcav.pipeline.run import run_seeds
-from flcav.pipeline.steps import Notify
+from flcav.pipeline.steps import Notify, Stale
 from flcav.report import plans, style
 
 TASK = "objects"
@@ -29,16 +30,25 @@ STAGES = (PRETRAIN, EDGE, CLOUD)
 COUNTS = ("samples", "edge_rounds", "cloud_rounds")
 
 
-def run_allocation(recipe: RunRecipe, out: Path, *, seeds: int, jobs: int, notify: Notify) -> dict[str, Any]:
+def run_allocation(
+    recipe: RunRecipe,
+    out: Path,
+    *,
+    seeds: int,
+    jobs: int,
+    notify: Notify,
+    stale: Stale = "refuse",
+    engine: str = "processes",
+) -> dict[str, Any]:
     """Run or finish both plans of each seed in folders below `out` and return the results."""
-    runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify)
+    runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     rows = [one_seed(run) for run in runs]
     results = {
         "recipe": recipe.model_dump(mode="json", exclude={"seed"}),
         "history": _history_ranges(),
         "seeds": rows,
         "summary": summarise(rows),
-        "versions": package_versions(),
+        "provenance": asdict(provenance()),
         "note": "road labels come from an ideal road detector: AP after edge FL and cloud FL is an upper bound",
     }
     return results | {"findings": allocation_findings(results)}
