@@ -19,7 +19,7 @@ drive 11 "$scenes" learn
 drive 12 $((scenes / 2 + 1)) look
 flcav record learn.yaml --out data/learn
 flcav record look.yaml --out data/look
-flcav train objects --network tiny --data data/learn --epochs $((steps / 35 + 1)) --out network
+flcav train objects --network tiny --data data/learn --epochs $((steps / 12 + 1)) --out network
 flcav errors objects --weights network/weights.safetensors --data data/look --out errors.csv --map errors.png
 
 echo "== Where a roadside sensor would help most"
@@ -57,7 +57,6 @@ tasks:
     sample_mb: $(weighs sample_mb)
     model_mb: $(weighs model_mb)
     edge_groups: [2, 2]
-    limits: {samples: [10, $((scenes * 12))], edge_rounds: [1, 3], cloud_rounds: [1, 2]}
 YAML
 flcav fit run/history.csv --problem problem.yaml
 flcav allocate problem.yaml --baseline equal-stages --out plan.html
