@@ -8,6 +8,9 @@ import pytest
 from make_history import Chosen, main
 
 from flcav.config import InputError
+from flcav.perception.trajectory.config import CONFIGURATIONS
+from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.planning import history_of
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe, Split, Splits, Training, load_run_recipe
@@ -62,6 +65,14 @@ def test_three_tasks_share_a_plan_and_a_ledger(tmp_path: Path) -> None:
         assert use.used_mb <= use.budget_mb
         for task in ("weather", "trajectory"):  # what a message weighs was known beforehand
             assert spent[task] == pytest.approx(getattr(main.plan.tasks[task], f"{link}_mb"), rel=0.3)
+    pool = Frames.open(tmp_path / "work/suburb-pool-trajectory")
+    weighs: dict[tuple[str, int], set[int]] = {}
+    for i, size in zip(
+        pool.vehicles, TRAJECTORY.sample_bytes(pool.data, CONFIGURATIONS["tiny"], pool.vehicles), strict=True
+    ):
+        weighs.setdefault((pool.data.keys[i].scene, pool.data.keys[i].index), set()).add(size)
+    assert all(len(sizes) == 1 for sizes in weighs.values())  # all four vehicles of an instant would send it
+    assert any(sizes != {0} for sizes in weighs.values())
     read = Run.load(tmp_path, RESULTS)
     assert page(read) == page(result)  # in the recipe's order, not in that of the alphabet
     assert "trajectory" in write_report(read, tmp_path).read_text()
@@ -89,11 +100,24 @@ def test_a_history_is_made_by_plans_chosen_by_hand(tmp_path: Path) -> None:
     recipe = shrunk("three_tasks").model_dump(mode="json")
     (tmp_path / "few.yaml").write_text(json.dumps(recipe))
     out, runs = tmp_path / "weather.csv", tmp_path / "runs"
-    main([str(tmp_path / "few.yaml"), "weather", "101:4,2,1", "102:2,0,0", "--runs", str(runs), "--out", str(out)])
+    main(
+        [
+            str(tmp_path / "few.yaml"),
+            "weather",
+            "101:4,2,1",
+            "102:2,0,0",
+            "--runs",
+            str(runs),
+            "--out",
+            str(out),
+            "--jobs",
+            "1",
+        ]
+    )
     made = history_of("weather", "weather.csv", tmp_path)
     assert made.resources.tolist() == [[4, 0, 0], [4, 1, 0], [4, 2, 0], [4, 2, 1], [2, 0, 0]]
     assert (made.weight == 1).all()  # validation frames
     with pytest.raises(InputError, match="'101:4' is no plan"):
         Chosen.read("101:4")
     with pytest.raises(InputError, match="'signs' is none of the recipe's tasks"):
-        main([str(tmp_path / "few.yaml"), "signs", "101:4,2,1", "--runs", str(runs), "--out", str(out)])
+        main([str(tmp_path / "few.yaml"), "signs", "101:4,2,1", "--runs", str(runs), "--out", str(out), "--jobs", "1"])
