@@ -19,7 +19,7 @@ from flcav.pipeline.planning import history_of
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Run
-from flcav.pipeline.run import run_seeds
+from flcav.pipeline.running import run_seeds
 from flcav.pipeline.steps import Notify, Stale
 from flcav.report import plans, style
 

@@ -147,7 +147,7 @@ class Placement(Config):
     count: int = Field(default=1, ge=1, le=100)  # per region
     range_m: float = Field(default=40.0, gt=0, le=1000)
     group_range_m: float = Field(default=60.0, gt=0, le=10_000)  # a group: vehicles this near to a sensor of any arm
-    tasks: tuple[str, ...] = ("objects",)  # whose errors count
+    tasks: tuple[str, ...] = ()  # whose errors count; if not given, objects where they are learned
 
 
 class Federation(Config):
@@ -198,11 +198,15 @@ class RunRecipe(Config):
 
     @model_validator(mode="before")
     @classmethod
-    def _empty_tasks(cls, values: Any) -> Any:
-        if isinstance(values, dict) and isinstance(values.get("tasks"), dict):
-            tasks = {name: {} if task is None else task for name, task in values["tasks"].items()}
-            return values | {"tasks": tasks}
-        return values
+    def _filled(cls, values: Any) -> Any:
+        """Take a task without fields for one of defaults, and place by the errors of objects where they are learned."""
+        if not isinstance(values, dict) or not isinstance(values.get("tasks"), dict):
+            return values
+        tasks = {name: {} if task is None else task for name, task in values["tasks"].items()}
+        placement = values.get("placement", {})
+        if isinstance(placement, dict) and "tasks" not in placement:
+            placement = placement | {"tasks": ["objects"] if "objects" in tasks else []}
+        return values | {"tasks": tasks, "placement": placement}
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
