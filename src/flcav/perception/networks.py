@@ -227,17 +227,24 @@ def threshold_of(task: Task[Any, Any, Any], threshold: float | None) -> float:
     return own if threshold is None else threshold
 
 
-def origin_of(task: Task[Any, Any, Any], weights: Path | None) -> dict[str, Any]:
-    """Return which network `network_of` loads, as JSON knows it: name and seed (None without a card) and file."""
+@dataclass(frozen=True)
+class Origin:
+    """Which network `network_of` loads."""
+
+    network: str | None  # name of the configuration; None without a card, as the seed is
+    seed: int | None
+    weights: str  # the file
+
+    def __str__(self) -> str:
+        card = "without a card" if self.network is None else f"{self.network}, seed {self.seed}"
+        return f"network: {card}, {self.weights}"
+
+
+def origin_of(task: Task[Any, Any, Any], weights: Path | None) -> Origin:
+    """Return which network `network_of` loads."""
     path = weights or shipped(task)
     try:
         card = read_card(path)
     except InputError:
-        return {"network": None, "seed": None, "weights": str(path)}
-    return {"network": card.network, "seed": card.seed, "weights": str(path)}
-
-
-def origin_line(origin: Mapping[str, Any]) -> str:
-    """Return `origin_of` in words."""
-    card = "without a card" if origin["network"] is None else f"{origin['network']}, seed {origin['seed']}"
-    return f"network: {card}, {origin['weights']}"
+        return Origin(None, None, str(path))
+    return Origin(card.network, card.seed, str(path))
