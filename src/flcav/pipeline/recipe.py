@@ -179,7 +179,17 @@ class Arm(Config):
 class RunRecipe(Config):
     """One run of the three stages: pretraining, edge FL, cloud FL (Wang et al., IEEE Network 37(3), 2023).
 
-    A seed names its traffic, its sensors' noise and its networks' weights.
+    A seed names its traffic, its sensors' noise and its networks' weights. docs/runs.md has every field. Raises
+    pydantic's `ValidationError` for what cannot be run; `load_run_recipe` makes one sentence of it.
+
+    >>> from flcav import RunRecipe
+    >>> recipe = RunRecipe.model_validate({
+    ...     "tasks": {"objects": {"history": "objects"}},
+    ...     "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate", "vehicles": 3}},
+    ...     "budgets_mb": {"wireless": 100, "wireline": 80},
+    ... })
+    >>> recipe.with_role("federate"), recipe.vehicles("grid"), recipe.placement.rule
+    (('grid',), 3, 'vrcsp')
     """
 
     seed: int = Field(default=1, ge=0, lt=2**31)
@@ -293,9 +303,14 @@ SIZES: Mapping[str, tuple[Splits, Training]] = {
 }
 
 
-def load_run_recipe(path: Path) -> RunRecipe:
+def load_run_recipe(path: Path | str) -> RunRecipe:
     """Return the run recipe (YAML) at `path`; raises `InputError` naming the field, the value and what is allowed.
 
-    Towns, datasets and histories that it names by a path are looked for beside it.
+    Towns, datasets and histories that it names by a path are looked for in the folder that `run` is told.
+
+    >>> import flcav
+    >>> demo = flcav.load_run_recipe("recipes/runs/demo.yaml")
+    >>> demo.budgets_mb.wireless, list(demo.arms)
+    (180.0, ['densest'])
     """
-    return parse_config(RunRecipe, read_yaml(path), str(path))
+    return parse_config(RunRecipe, read_yaml(Path(path)), str(path))
