@@ -80,6 +80,8 @@ def run(
     ('accuracy', 2, True)
     """
     out = Path(out)
+    if (out / RESULTS).exists():
+        Run.load(out, RESULTS)  # of this version, or there is nothing here to go on with
     graph, clock = Graph(recipe, Path(beside or ".")), stopwatch(out / WORK)
 
     def timed(step: str, done: int, total: int, note: str) -> None:
