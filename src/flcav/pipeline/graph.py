@@ -7,10 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.pipeline.arms import Names, Setting, settings_of
 from flcav.pipeline.frames import data_hash, recording_fields, town_hashes
 from flcav.pipeline.labels import KINDS, labels_of
+from flcav.pipeline.places import find_place
 from flcav.pipeline.planning import history_text
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, SPLITS_OF, Region, RunRecipe, SplitName
 from flcav.pipeline.steps import Step
@@ -118,9 +119,9 @@ class Graph:
 
     def _folder_of(self, region: Region, split: SplitName) -> Path:
         named = region.data[split] if isinstance(region.data, Mapping) else str(region.data)
-        found = next((place / named for place in (self.beside, Path.cwd()) if (place / named).is_dir()), None)
-        if found is None:
-            raise InputError(f"regions: there is no dataset {(self.beside / named)}")
+        found = find_place(named, self.beside)
+        if found is None or not found.is_dir():
+            raise InputError(f"regions: there is no dataset folder {shorten(named)} in {self.beside}")
         return found.absolute()
 
     def _histories(self) -> dict[str, str]:

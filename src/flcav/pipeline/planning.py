@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow.csv
 
-from flcav.config import InputError, parse_config
+from flcav.config import InputError, parse_config, shorten
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.files import atomic_path
 from flcav.network.ledger import BYTES_PER_MB
@@ -25,6 +25,7 @@ from flcav.optimization.problem import Problem
 from flcav.perception.task import Task, configuration, fresh
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
+from flcav.pipeline.places import find_place
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
 from flcav.pipeline.results import Plan, TaskPlan
 
@@ -144,16 +145,15 @@ def history_text(task: str, name: str, beside: Path) -> str:
 
     Raises `InputError` where there is none, or no rows of the task in it.
     """
-    packaged = HISTORIES / f"{name}.csv"
-    if packaged.is_file():
-        text = packaged.read_text(encoding="utf-8")
+    known = sorted(entry.name.removesuffix(".csv") for entry in HISTORIES.iterdir() if ".csv" in entry.name)
+    if name in known:
+        text = (HISTORIES / f"{name}.csv").read_text(encoding="utf-8")
     else:
-        path = next((place / name for place in (beside, Path.cwd()) if (place / name).is_file()), None)
-        if path is None:
-            known = sorted(entry.name.removesuffix(".csv") for entry in HISTORIES.iterdir() if ".csv" in entry.name)
+        path = find_place(name, beside)
+        if path is None or not path.is_file():
             raise InputError(
-                f"tasks.{task}.history: '{name}' is no history of the package ({', '.join(known)}), and there is no "
-                f"file {(beside / name).absolute()}"
+                f"tasks.{task}.history: {shorten(name)} is no history of the package ({', '.join(known)}), and no file "
+                f"beside the recipe, in {beside.absolute()}"
             )
         try:
             text = path.read_text(encoding="utf-8")

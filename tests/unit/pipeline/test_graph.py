@@ -107,7 +107,7 @@ def test_recordings_of_an_own_town_name_its_files(tmp_path: Path) -> None:
     changed = {name for name in before if before[name] != after[name]}
     assert {"own-validation-objects", "own-test-objects"} <= changed
     assert {"suburb-pool-objects", "pretrain-objects"}.isdisjoint(changed)
-    with pytest.raises(InputError, match="no town of flcav, and there is no folder"):
+    with pytest.raises(InputError, match="none of flcav, and there is no folder"):
         steps_of(recipe_of(regions=regions), tmp_path / "elsewhere")
 
 
@@ -120,7 +120,7 @@ def test_recordings_of_an_own_town_name_its_files(tmp_path: Path) -> None:
         ({"tasks": {"signs": {"history": "objects"}}}, "has no rows of 'signs'"),
         (
             {"regions": {"a": {"role": "pretrain", "data": "none"}, "grid": {"role": "federate"}}},
-            "regions: there is no dataset",
+            "regions: there is no dataset folder",
         ),
     ],
 )
