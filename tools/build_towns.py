@@ -2,9 +2,10 @@
 
 Run with an environment that has `eclipse-sumo` (the extra `towns`):
 
-    python tools/build_towns.py            # writes src/flcav/world/towns/<name>/town.net.xml
+    python tools/build_towns.py  # writes src/flcav/world/towns/<name>/town.net.xml, and recipes/maps/quarter.xodr
 
-The nets are committed; a town's other properties stand in `town.yaml` beside its net. Right-hand traffic. An edge lists
+The nets are committed; a town's other properties stand in `town.yaml` beside its net. The quarter is a map (OpenDRIVE)
+to be imported: streets alone, without sidewalks or crossings, as maps often are. Right-hand traffic. An edge lists
 its lanes from the kerb to the middle: sidewalk, bicycle lane, parking lane (closed to all traffic), driving lanes.
 """
 
@@ -14,6 +15,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -21,6 +23,7 @@ from xml.sax.saxutils import quoteattr
 import sumo  # pyright: ignore[reportMissingImports]  (scratch environment only)
 
 TOWNS = Path(__file__).parents[1] / "src/flcav/world/towns"
+MAPS = Path(__file__).parents[1] / "recipes/maps"
 Point = tuple[float, float]
 
 
@@ -120,24 +123,26 @@ class Sketch:
             "connection": ("connections", self.connections),
         }
         with tempfile.TemporaryDirectory() as folder:
-            command = [str(Path(sumo.SUMO_HOME) / "bin/netconvert"), "--output-file", str(out)]
+            command = [str(Path(sumo.SUMO_HOME) / "bin/netconvert"), *self._format(out)]
             for option, (tag, rows) in parts.items():
                 path = Path(folder) / f"{tag}.xml"
                 path.write_text(f"<{tag}>\n" + "\n".join(rows) + f"\n</{tag}>\n")
                 command += [f"--{option}-files", str(path)]
             command += ["--offset.disable-normalization", "true", "--no-turnarounds", "true"]
-            command += [
-                "--crossings.guess",
-                "true",
-                "--crossings.guess.speed-threshold",
-                "20",
-                "--walkingareas",
-                "true",
-            ]
             command += ["--junctions.corner-detail", "8", "--junctions.internal-link-detail", "12"]
             command += ["--tls.default-type", "static", "--tls.cycle.time", "60", "--output.street-names", "false"]
             subprocess.run(command, check=True)
-        out.write_text(re.sub(r"<!--.*?-->\s*", "", out.read_text(), flags=re.DOTALL))
+        text = re.sub(r"<!--.*?-->\s*", "", out.read_text(), flags=re.DOTALL)
+        if out.suffix == ".xodr":
+            text = re.sub(r"\n\s+", "\n", re.sub(r' date="[^"]*"', "", text))  # half as large without indents
+        out.write_text(text)
+
+    def _format(self, out: Path) -> list[str]:
+        """Return netconvert's options for an OpenDRIVE map or a net with crossings, as the name `out` ends."""
+        if out.suffix == ".xodr":
+            return ["--opendrive-output", str(out)]
+        crossings = ["--crossings.guess", "true", "--crossings.guess.speed-threshold", "20", "--walkingareas", "true"]
+        return ["--output-file", str(out), *crossings]
 
 
 def on_circle(centre: Point, radius: float, bearing: float) -> Point:
@@ -305,6 +310,37 @@ def arterial() -> Sketch:
     return town
 
 
+def quarter() -> Sketch:
+    """A main street with two lights, crossed by narrow streets, two of them curved; no dead ends."""
+    town = Sketch({"main": Profile(1, 3.4, 0, 0, 0, 13.89, 3), "side": Profile(1, 3.0, 0, 0, 0, 8.33, 1)})
+    town.node("a1", (-95, 0), "traffic_light")
+    town.node("a2", (10, 8), "traffic_light")
+    others: dict[str, Point] = {
+        "a3": (110, 0),
+        "b1": (-95, -90),
+        "b2": (15, -95),
+        "c2": (5, 95),
+        "west": (-180, -6),
+        "mill": (-170, -100),
+        "hill": (-105, 90),
+    }
+    for name, at in others.items():
+        town.node(name, at)
+    for start, end in ("west", "a1"), ("a1", "a2"), ("a2", "a3"):
+        town.street(start, end, "main")
+    around = ("west", "mill", "b1", "b2", "a2", "c2", "hill", "a1", "b1")
+    for start, end in pairwise(around):
+        town.street(start, end, "side")
+    x0, y0 = others["a3"]
+    for start in "c2", "b2":  # a quarter of an ellipse each
+        x, y = others[start]
+        bends = [math.radians(angle) for angle in range(8, 90, 8)]
+        via = tuple((x + (x0 - x) * math.sin(bend), y0 + (y - y0) * math.cos(bend)) for bend in bends)
+        town.street(start, "a3", "side", via)
+    return town
+
+
 if __name__ == "__main__":
     for name, sketch in {"suburb": suburb(), "grid": grid(), "ring": ring(), "arterial": arterial()}.items():
         sketch.build(TOWNS / name / "town.net.xml")
+    quarter().build(MAPS / "quarter.xodr")

@@ -1,7 +1,8 @@
 """The tables of a reproduction's page, from its numbers: python tools/reproduction_pages.py reproductions/NAME.
 
 A page (README.md) marks where they go, `<!-- NAME -->` to `<!-- end -->`; what stands between is replaced by what the
-folder's result.json says. The words around the tables are the authors'.
+folder's result.json says, or its results.json, where the page is of a run (`flcav run`). The words around the tables
+are the authors'.
 """
 
 import json
@@ -17,12 +18,15 @@ from flcav.experiments import (
     fig3a_tables,
     fig6a_tables,
     objects_tables,
+    run_tables,
     signs_tables,
     sim_to_real_tables,
     trajectory_tables,
     weather_tables,
 )
 from flcav.files import write_bytes
+from flcav.pipeline.results import Run
+from flcav.pipeline.running import RESULTS
 
 Tables = Mapping[str, str]
 TABLES: dict[str, Callable[[Mapping[str, Any]], Tables]] = {
@@ -51,10 +55,16 @@ def fill(page: str, tables: Tables) -> str:
     return _SPAN.sub(filled, page)
 
 
+def tables_of(folder: Path) -> Tables:
+    """Return the tables of a reproduction, by name."""
+    if (folder / RESULTS).is_file():
+        return run_tables.tables(Run.load(folder, RESULTS))
+    return TABLES[folder.name](json.loads((folder / "result.json").read_text(encoding="utf-8")))
+
+
 def fill_folder(folder: Path) -> str:
-    """Return the page of a reproduction as its result.json has it."""
-    results = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    return fill((folder / "README.md").read_text(encoding="utf-8"), TABLES[folder.name](results))
+    """Return the page of a reproduction as its numbers have it."""
+    return fill((folder / "README.md").read_text(encoding="utf-8"), tables_of(folder))
 
 
 def main(folders: Sequence[str]) -> None:

@@ -56,9 +56,9 @@ def fill(path: Path, data: bytes | memoryview) -> None:
             file.write(memoryview(data)[start : start + PIECE_BYTES])
 
 
-def write_json(path: Path, value: Json) -> None:
-    """Write `value` as indented JSON with sorted keys to `path`, atomically."""
-    write_bytes(path, (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
+def write_json(path: Path, value: Json, *, sort: bool = True) -> None:
+    """Write `value` as indented JSON to `path`, atomically; with sorted keys, or in their own order."""
+    write_bytes(path, (json.dumps(value, indent=1, sort_keys=sort, allow_nan=False) + "\n").encode())
 
 
 def sha256(path: Path) -> str:

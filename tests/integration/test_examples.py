@@ -1,7 +1,9 @@
 """Every example runs as it stands, and is short."""
 
+import os
 import re
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -18,7 +20,7 @@ def run(name: str, *arguments: object, monkeypatch: pytest.MonkeyPatch) -> None:
     runpy.run_path(str(EXAMPLES / name), run_name="__main__")
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("0*")), ids=lambda path: path.name)
 def test_an_example_is_short(path: Path):
     assert len(path.read_text().splitlines()) <= 90
 
@@ -85,3 +87,24 @@ def test_bring_your_own_strategy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert own.startswith("LossWeighted(power=2.0)")
     nights = [float(line.rsplit(" ", 1)[1]) for line in (fedavg, own)]
     assert nights[1] > nights[0]  # what few have seen
+
+
+@pytest.mark.slow
+def test_the_loop(tmp_path: Path):
+    pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
+    shown = (EXAMPLES.parent / "docs" / "loop.md").read_text()
+    names = ("towns import", "record", "train", "errors", "towns show", "place", "run", "fit", "allocate")
+    assert all(f"$ flcav {name} " in shown for name in names)
+    found = {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "SCENES": "1", "STEPS": "2"}
+    command = ["bash", EXAMPLES / "07_the_loop.sh", EXAMPLES.parent / "recipes/maps/quarter.xodr", tmp_path / "loop"]
+    done = subprocess.run(command, env=os.environ | found, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    assert "13 candidate poles of mine" in done.stdout
+    assert re.search(r"cover \d+ of \d+ errors, weight \d+ \(optimal\)", done.stdout)
+    history = (tmp_path / "loop/run/history.csv").read_text().splitlines()
+    assert len(history) == 1 + 1 + 3 + 2  # pretrained, each edge round, each cloud round
+    assert "optimal (proven" in done.stdout
+    for name in ("errors.png", "placed.png", "run/pictures/map_mine.png"):
+        with Image.open(tmp_path / "loop" / name) as picture:
+            assert min(picture.size) > 300
+    assert "<html" in (tmp_path / "loop/plan.html").read_text()

@@ -2,13 +2,23 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
+SMALL = """
+size: toy
+tasks: {objects: {network: tiny, history: objects}}
+regions: {suburb: {role: pretrain}, grid: {role: federate}}
+budgets_mb: {wireless: 40, wireline: 30}
+limits: {samples: [20, null]}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -50,3 +60,36 @@ def test_the_wheel_holds_what_the_checkout_holds(installed: Path, tmp_path: Path
         files = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
         missing = [str(path) for path in files if not (installed / "flcav" / into / path.relative_to(folder)).exists()]
         assert not missing
+
+
+def started(site: Path, command: list[str | Path], cwd: Path, sign: Path) -> None:
+    """Start a command in `cwd`, and kill it and its children once the file `sign` is there."""
+    said = cwd / "said.txt"
+    with said.open("w") as file:
+        process = subprocess.Popen(
+            command, cwd=cwd, env=os.environ | {"PYTHONPATH": str(site)}, stderr=file, start_new_session=True
+        )
+    try:
+        until = time.monotonic() + 300
+        while not sign.exists():
+            assert process.poll() is None, said.read_text()
+            assert time.monotonic() < until
+            time.sleep(0.02)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@pytest.mark.slow
+def test_the_demo_starts_without_a_checkout(installed: Path, tmp_path: Path):
+    flcav = installed / "bin" / "flcav"
+    started(
+        installed, [flcav, "demo", "--out", "own"], tmp_path, tmp_path / "own/work/suburb-pool-objects/data/.recording"
+    )
+    (tmp_path / "small.yaml").write_text(SMALL)
+    planned = tmp_path / "small/work/plan/done.json"
+    started(installed, [flcav, "demo", "--recipe", "small.yaml", "--out", "small"], tmp_path, planned)
+    (plan,) = json.loads((planned.parent / "result.json").read_text())["tasks"].values()
+    assert 20 <= plan["samples"] <= 24
+    assert plan["predicted"] is not None  # by the history that the wheel brings

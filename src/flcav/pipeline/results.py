@@ -21,8 +21,8 @@ class Saved:
     """A dataclass that is kept as JSON in a folder."""
 
     def save(self, folder: Path, name: str = RESULT) -> None:
-        """Write the record to `folder`, atomically."""
-        write_json(folder / name, self.as_json())
+        """Write the record to `folder`, atomically; tasks and regions stay in their order."""
+        write_json(folder / name, self.as_json(), sort=False)
 
     def as_json(self) -> dict[str, Any]:
         """Return the record as JSON has it."""
@@ -275,6 +275,10 @@ class ArmResult:
     stages: tuple[StageResult, ...]
     links: Mapping[str, LinkUse]
     spent: tuple[Spent, ...]
+
+    def sent_mb(self, task: str, link: str) -> float:
+        """Return what went up for a task over a link in all stages [MB]."""
+        return sum(row.mb for row in self.spent if (row.task, row.link) == (task, link))
 
 
 @dataclass(frozen=True)

@@ -69,6 +69,7 @@ def page(run: Run) -> dict[str, Any]:
         "placed": main.placed,
         "plan": main.plan,
         "links": main.links,
+        "sent": {link: [main.sent_mb(task, link) for task in recipe.tasks] for link in main.links},
         "gap_closed": run.gap_closed,
         "differences": run.differences,
         "caveats": run.caveats,

@@ -1,14 +1,15 @@
-import json
 from pathlib import Path
 
 import pytest
-from reproduction_pages import TABLES, fill, fill_folder
+from reproduction_pages import TABLES, fill, fill_folder, tables_of
 
 from flcav.config import InputError
 from flcav.markdown import interval, table
 
-PAGES = [folder for folder in (Path(__file__).parents[3] / "reproductions").iterdir() if folder.name in TABLES]
-MADE = [folder for folder in PAGES if (folder / "result.json").exists()]
+REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"
+RUNS = sorted((REPRODUCTIONS / "runs").glob("*"))
+PAGES = [*(folder for folder in REPRODUCTIONS.iterdir() if folder.name in TABLES), *RUNS]
+MADE = [*(folder for folder in PAGES if (folder / "result.json").exists()), *RUNS]
 
 
 @pytest.mark.parametrize("folder", MADE, ids=lambda folder: folder.name)
@@ -27,9 +28,8 @@ def test_pages_have_the_fixed_form(folder: Path) -> None:
 
 def test_every_table_is_on_its_page() -> None:
     for folder in MADE:
-        results = json.loads((folder / "result.json").read_text())
         page = (folder / "README.md").read_text()
-        assert all(f"<!-- {name} -->" in page for name in TABLES[folder.name](results)), folder.name
+        assert all(f"<!-- {name} -->" in page for name in tables_of(folder)), folder.name
 
 
 def test_filling_replaces_what_stood_there_and_names_what_is_not_known() -> None:

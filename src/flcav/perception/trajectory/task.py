@@ -80,11 +80,15 @@ class TrajectoryTask(TrajectoryOutcomes):
         return metrics(paths, probabilities, samples.columns)
 
     def sample_bytes(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> list[int]:
-        """Return the bytes of each frame's tracks, past and future in float32; the map is known to everybody."""
+        """Return the bytes of each frame's tracks, past and future in float32; the map is known to everybody.
+
+        With rasters, those who observe the same instant each send all of it.
+        """
         columns = samples_of(data, config, frames).columns
         each = 4 * int(np.prod(columns["past"].shape[1:]) + np.prod(columns["future"].shape[1:]))
-        counts = Counter(columns["frame"].tolist())
-        return [each * counts[i] for i in frames]
+        keys = [i if config.cameras else (data.keys[i].scene, data.keys[i].index) for i in range(len(data))]
+        counts = Counter(keys[i] for i in columns["frame"].tolist())
+        return [each * counts[keys[i]] for i in frames]
 
     def score(self, result: Mapping[str, Any]) -> float:
         """Return 1 / (1 + the mean of the likeliest and the best mode's final error in metres)."""

@@ -1,0 +1,80 @@
+"""The tables on the page of a run, from its results."""
+
+from flcav.markdown import bullets, table
+from flcav.network.ledger import LINKS
+from flcav.pipeline.findings import in_words
+from flcav.pipeline.recipe import MAIN
+from flcav.pipeline.results import Estimate, Run
+
+
+def tables(run: Run) -> dict[str, str]:
+    """Return Markdown by name: findings, tests, differences, plan, budgets, sensors."""
+    return {
+        "findings": bullets(f"*{each.question}* **{each.verdict}**. {each.sentence}" for each in run.findings),
+        "tests": _tests(run),
+        "differences": _differences(run),
+        "plan": _plan(run),
+        "budgets": _budgets(run),
+        "sensors": _sensors(run),
+    }
+
+
+def _tests(run: Run) -> str:
+    """Return each task's measure in every region, a column per arm and stage."""
+    columns = list(dict.fromkeys(in_words(test.arm, test.stage) for test in run.tested))
+    rows = []
+    for task in run.recipe.tasks:
+        for region, own in run.recipe.regions.items():
+            tests = [test for test in run.tested if (test.task, test.region) == (task, region)]
+            reached = {in_words(test.arm, test.stage): _told(test.result.estimate) for test in tests}
+            one = tests[0].result
+            place = [task, f"{region} ({own.role})", one.measure, f"{one.frames} / {one.scenes}"]
+            rows.append([*place, *(reached.get(column, "") for column in columns)])
+    return table(("task", "region (role)", "measure", "frames / scenes", *columns), rows)
+
+
+def _differences(run: Run) -> str:
+    rows = [[each.name, _told(each.estimate, sign=True)] for each in run.differences]
+    return table(("region, task: after - before", "difference"), rows)
+
+
+def _plan(run: Run) -> str:
+    rows = []
+    for task, own in run.arms[MAIN].plan.tasks.items():
+        source = "fixed by hand" if own.predicted is None else f"planned: {own.predicted['cloud']:.3f}"
+        counts = (own.samples, own.edge_rounds, own.cloud_rounds)
+        sizes = (f"{mb:.3f}" for mb in (own.sample_mb, own.model_mb))
+        rows.append([task, *counts, *sizes, f"{own.wireless_mb:.1f}", f"{own.wireline_mb:.1f}", source])
+    header = ("samples", "edge rounds", "cloud rounds", "sample MB", "network MB", "wireless MB", "wireline MB")
+    return table(("task", *header, "predicted"), rows)
+
+
+def _budgets(run: Run) -> str:
+    """Return what went up over both links: the whole ledger, and each task's part of it."""
+    main, rows = run.arms[MAIN], []
+    for link in LINKS:
+        use = main.links[link]
+        whole = (f"{mb:.1f}" for mb in (use.budget_mb, use.planned_mb, use.used_mb))
+        rows.append([link, *whole, *(f"{main.sent_mb(task, link):.1f}" for task in main.plan.tasks)])
+    return table(("uplink", "budget MB", "planned MB", "used MB", *main.plan.tasks), rows)
+
+
+def _sensors(run: Run) -> str:
+    rows = [
+        [
+            each.region,
+            len(each.poles),
+            ", ".join(map(str, each.chosen)),
+            f"{each.covered} of {each.errors}",
+            each.densest,
+        ]
+        for each in run.arms[MAIN].placed
+    ]
+    return table(("region", "candidate poles", "chosen", "errors covered", "densest traffic"), rows)
+
+
+def _told(value: Estimate, *, sign: bool = False) -> str:
+    form = "+.3f" if sign else ".3f"
+    if value.low is None or value.high is None:
+        return f"{value.mean:{form}}"
+    return f"{value.mean:{form}} ({value.low:{form}} to {value.high:{form}})"

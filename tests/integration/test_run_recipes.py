@@ -1,0 +1,99 @@
+"""The recipes of runs that come with flcav, each run as it stands but for its size."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from make_history import Chosen, main
+
+from flcav.config import InputError
+from flcav.pipeline.graph import Graph
+from flcav.pipeline.planning import history_of
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe, Split, Splits, Training, load_run_recipe
+from flcav.pipeline.results import Run
+from flcav.pipeline.running import RESULTS, run
+from flcav.report.run_page import page, write_report
+from flcav.world.opendrive.importing import import_town
+
+pytestmark = pytest.mark.slow
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+TINY = Splits(
+    pool=Split(scenes=1, spins=5, cavs=4),
+    validation=Split(scenes=1, spins=1, cavs=1),
+    registry=Split(scenes=1, spins=1, cavs=2),
+    edge=Split(scenes=1, spins=1, cavs=1),
+    test=Split(scenes=2, spins=1, cavs=2),
+)
+QUICK = Training(block_steps=1, max_blocks=1, patience=1, cooldown=(), local_steps=1)
+
+
+def shrunk(name: str) -> RunRecipe:
+    """Return a recipe of a run with little to record and to train."""
+    asked = load_run_recipe(RECIPES / "runs" / f"{name}.yaml").model_dump(exclude={"splits", "training"})
+    for task in asked["tasks"].values():
+        task["training"] = None
+        if task["plan"]:
+            task["plan"] = {"samples": 4, "edge_rounds": 1, "cloud_rounds": 1}
+    del asked["regions"]["ring"]
+    for region in asked["regions"].values():
+        region["vehicles"] = 1 if region["role"] == "federate" else None
+    limits = {"samples": (20, None), "edge_rounds": (1, 1), "cloud_rounds": (1, 1)}
+    placement = asked["placement"] | {"group_range_m": 400.0}
+    return RunRecipe.model_validate(
+        asked | {"splits": TINY, "training": QUICK, "limits": limits, "placement": placement}
+    )
+
+
+def test_three_tasks_share_a_plan_and_a_ledger(tmp_path: Path) -> None:
+    recipe = shrunk("three_tasks")
+    result = run(recipe, tmp_path)
+    main = result.arms[MAIN]
+    assert list(main.plan.tasks) == ["objects", "weather", "trajectory"]
+    assert [plan.predicted is None for plan in main.plan.tasks.values()] == [False, True, True]
+    tested = {(test.task, test.region, test.stage) for test in result.tested}
+    assert {(task, region, PRETRAIN) for task in recipe.tasks for region in recipe.regions} <= tested
+    assert {(task, "grid", stage) for task in recipe.tasks for stage in (EDGE, CLOUD)} <= tested
+    for link, use in main.links.items():
+        spent = {task: main.sent_mb(task, link) for task in recipe.tasks}
+        assert all(mb > 0 for mb in spent.values())
+        assert sum(spent.values()) == pytest.approx(use.used_mb)
+        assert use.used_mb <= use.budget_mb
+        for task in ("weather", "trajectory"):  # what a message weighs was known beforehand
+            assert spent[task] == pytest.approx(getattr(main.plan.tasks[task], f"{link}_mb"), rel=0.3)
+    read = Run.load(tmp_path, RESULTS)
+    assert page(read) == page(result)  # in the recipe's order, not in that of the alphabet
+    assert "trajectory" in write_report(read, tmp_path).read_text()
+    assert {"rounds_objects.png", "rounds_weather.png", "rounds_trajectory.png", "before_after.png"} <= {
+        path.name for path in (tmp_path / "pictures").iterdir()
+    }
+
+
+def test_a_town_from_a_map_federates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
+    path = RECIPES / "runs/imported_town.yaml"
+    recipe = load_run_recipe(path)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="there is no folder"):
+        Graph(recipe, path.parent)
+    shown = re.search(r"flcav towns import (\S+) --out (\S+)", path.read_text())
+    assert shown is not None
+    import_town(RECIPES.parent / shown[1], tmp_path / shown[2])
+    steps = {step.name: step for step in Graph(recipe, path.parent).steps}  # `test_the_loop` runs such ones
+    assert set(steps["mine-edge-objects"].arguments["version"]) == {"town.net.xml", "town.yaml"}
+    assert "test-cloud-fl-objects-ring" in steps
+
+
+def test_a_history_is_made_by_plans_chosen_by_hand(tmp_path: Path) -> None:
+    recipe = shrunk("three_tasks").model_dump(mode="json")
+    (tmp_path / "few.yaml").write_text(json.dumps(recipe))
+    out, runs = tmp_path / "weather.csv", tmp_path / "runs"
+    main([str(tmp_path / "few.yaml"), "weather", "101:4,2,1", "102:2,0,0", "--runs", str(runs), "--out", str(out)])
+    made = history_of("weather", "weather.csv", tmp_path)
+    assert made.resources.tolist() == [[4, 0, 0], [4, 1, 0], [4, 2, 0], [4, 2, 1], [2, 0, 0]]
+    assert (made.weight == 1).all()  # validation frames
+    with pytest.raises(InputError, match="'101:4' is no plan"):
+        Chosen.read("101:4")
+    with pytest.raises(InputError, match="'signs' is none of the recipe's tasks"):
+        main([str(tmp_path / "few.yaml"), "signs", "101:4,2,1", "--runs", str(runs), "--out", str(out)])
