@@ -18,7 +18,7 @@ from typing import NamedTuple, Self
 from flcav.config import InputError
 from flcav.pipeline.planning import append_points
 from flcav.pipeline.recipe import RunRecipe, load_run_recipe
-from flcav.pipeline.run import points_of, run
+from flcav.pipeline.running import points_of, run
 
 AMPLE_MB = 1e6
 

@@ -26,7 +26,7 @@ from flcav.experiments import (
 )
 from flcav.files import write_bytes
 from flcav.pipeline.results import Run
-from flcav.pipeline.run import RESULTS
+from flcav.pipeline.running import RESULTS
 
 Tables = Mapping[str, str]
 TABLES: dict[str, Callable[[Mapping[str, Any]], Tables]] = {

@@ -15,7 +15,7 @@ from flcav.pipeline.graph import Graph
 from flcav.pipeline.planning import history_of
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe, Split, Splits, Training, load_run_recipe
 from flcav.pipeline.results import Run
-from flcav.pipeline.run import RESULTS, run
+from flcav.pipeline.running import RESULTS, run
 from flcav.report.run_page import page, write_report
 from flcav.world.opendrive.importing import import_town
 

@@ -27,12 +27,12 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.demo_arms import ARMS, run_arms
 from flcav.experiments.fig6a_allocation import run_allocation
 from flcav.network.ledger import LINKS, Ledger
-from flcav.pipeline.compare import compare
+from flcav.pipeline.comparing import compare
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, load_run_recipe
 from flcav.pipeline.results import Placed, Pretrained, Run, StageResult, Watched
-from flcav.pipeline.run import RESULTS, SUMMARY, run
+from flcav.pipeline.running import RESULTS, SUMMARY, run
 from flcav.report.run_page import write_report
 from flcav.verdicts import verdict
 from flcav.world.town import load_town
@@ -45,7 +45,7 @@ GO = """
 import sys
 from pathlib import Path
 from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.run import run
+from flcav.pipeline.running import run
 run(load_run_recipe(Path(sys.argv[1])), sys.argv[2])
 """
 OWN = """

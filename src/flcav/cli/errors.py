@@ -81,7 +81,7 @@ def errors(
         write_bytes(map_, _draw(town, found))
     if found.chosen is not None:
         typer.echo(found.chosen.sentence)
-    typer.echo(networks.origin_line(networks.origin_of(learned, weights)))
+    typer.echo(networks.origin_of(learned, weights))
     counts = Counter(error.kind for error in found)
     told = ", ".join(f"{PLURALS.get(kind, kind)}: {count}" for kind, count in counts.items())
     lost = f"; {found.dropped} false positives that point at nothing in the town left out" if found.dropped else ""

@@ -50,6 +50,6 @@ def evaluate(
         )
     origin = networks.origin_of(learned, weights)
     if as_json:
-        typer.echo(json.dumps(origin | found.chosen.summary() | dict(found.numbers), allow_nan=False))
+        typer.echo(json.dumps(vars(origin) | found.chosen.summary() | dict(found.numbers), allow_nan=False))
         return
-    typer.echo("\n".join([found.chosen.sentence, networks.origin_line(origin), *found.lines]))
+    typer.echo("\n".join([found.chosen.sentence, str(origin), *found.lines]))

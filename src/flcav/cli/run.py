@@ -71,8 +71,8 @@ def _run(
     from flcav.cli.steps import live_steps
     from flcav.files import check_writable
     from flcav.pipeline.recipe import load_run_recipe
-    from flcav.pipeline.run import run as run_one
-    from flcav.pipeline.run import run_seeds
+    from flcav.pipeline.running import run as run_one
+    from flcav.pipeline.running import run_seeds
     from flcav.report.run_page import write_report
     from flcav.sources.recipe import find_recipe
 
@@ -116,7 +116,7 @@ def compare(
     as_json: bool = AS_JSON,
 ) -> None:
     """Compare two runs: differences, second minus first, of every test that both made on the same frames."""
-    from flcav.pipeline.compare import compare as compare_runs
+    from flcav.pipeline.comparing import compare as compare_runs
 
     rows = compare_runs(first, second)
     if as_json:

@@ -24,6 +24,10 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
     """Return the problems of the dataset in the folder `path`, one sentence each; none is the good case.
 
     Raises `InputError` where there is no finished dataset at all.
+
+    >>> from flcav import validate
+    >>> validate("data")
+    []
     """
     folder = Path(path)
     manifest = read_manifest(folder)

@@ -58,6 +58,11 @@ def record(
 
     False says that `out` already held this very dataset. A folder whose recording was interrupted is finished.
     Raises `InputError` where `out` holds anything else, `OSError` where it cannot be written.
+
+    >>> from flcav import Recipe, record
+    >>> recipe = Recipe(town="ring", cavs=1, spins_per_scene=1, warmup_s=5.0)
+    >>> record(recipe, "ring"), record(recipe, "ring")
+    (True, False)
     """
     if jobs < 1:
         raise InputError(f"jobs = {jobs}: must be at least 1")

@@ -33,7 +33,15 @@ Value = TypeVar("Value")
 
 
 class Dataset:
-    """A dataset folder: tables in memory, what sensors measured is read when asked for."""
+    """A dataset folder: tables in memory, what sensors measured is read when asked for.
+
+    >>> from flcav import Dataset
+    >>> data = Dataset.open("data")
+    >>> len(data), data.name(0)
+    (4, 'grid-0-000_0000_cav0')
+    >>> data.select(agents=["cav1"])  # numbers of its frames
+    [1, 3]
+    """
 
     def __init__(
         self,

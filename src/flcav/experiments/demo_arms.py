@@ -15,7 +15,7 @@ from flcav.pipeline.findings import in_words
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Run
-from flcav.pipeline.run import run_seeds
+from flcav.pipeline.running import run_seeds
 from flcav.pipeline.steps import Notify, Stale
 from flcav.report import figures, style
 from flcav.sources.recipe import recipe_path

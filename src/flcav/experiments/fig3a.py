@@ -6,7 +6,6 @@ the additive form that plans are made from.
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import networkx as nx
@@ -63,7 +62,7 @@ def _line(fit: Fit, found: Bands | None, where: Array) -> dict[str, list[float]]
 
 def _own_curves() -> dict[str, Any]:
     """Return a line per number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
-    history = history_of("objects", "objects", Path())
+    history = history_of("objects")
     samples, edge_rounds, cloud_rounds = history.resources.T
     fit = fit_additive(samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
     points = np.column_stack((history.resources, history.accuracy)).tolist()

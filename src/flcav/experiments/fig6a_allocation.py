@@ -19,7 +19,7 @@ from flcav.pipeline.planning import history_of
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Run
-from flcav.pipeline.run import run_seeds
+from flcav.pipeline.running import run_seeds
 from flcav.pipeline.steps import Notify, Stale
 from flcav.report import plans, style
 
@@ -98,7 +98,7 @@ def _difference(estimate: Any) -> dict[str, float]:
 
 def _history_ranges() -> dict[str, list[float]]:
     """Return the least and the most of each count in the history that both plans were predicted from."""
-    columns = history_of(TASK, TASK, Path()).resources.T
+    columns = history_of(TASK).resources.T
     return {name: [float(column.min()), float(column.max())] for name, column in zip(COUNTS, columns, strict=True)}
 
 

@@ -58,7 +58,23 @@ def federate(
 
     `strategy` makes each round's weights of its clients' updates. Every message is booked on `account`; raises
     `BudgetExceeded` where one cannot be paid, `ClientFailed` where a client raised, `InputError` without clients. To
-    resume, pass the same strategy, and the weights and the number of the last round that `on_round` was given.
+    resume, pass the same strategy, and the weights and the number of the last round that `on_round` was given. With the
+    default it is federated averaging (McMahan et al., AISTATS 2017, algorithm 1).
+
+    >>> import numpy as np
+    >>> from flcav import Ledger, federate
+    >>> from flcav.federation import Account, LocalUpdate, Schedule
+    >>> from flcav.network import Budget
+    >>> class Vehicle:  # of a task: flcav.perception.TaskClient
+    ...     def __init__(self, samples):
+    ...         self.samples = samples
+    ...     def train(self, weights, *, steps, learning_rate, seed):
+    ...         return LocalUpdate({"w": weights["w"] + self.samples}, self.samples, loss=0.0)
+    >>> ledger = Ledger(Budget(wireless_mb=1.0, wireline_mb=0.0))
+    >>> schedule = Schedule(rounds=1, steps=1, learning_rate=0.1, final_learning_rate=0.1, seed=0)
+    >>> vehicles = {"cav0": Vehicle(1), "cav1": Vehicle(3)}
+    >>> federate(vehicles, {"w": np.zeros(2)}, schedule, Account(ledger, "edge", "toy", "wireless")).weights["w"]
+    array([2.5, 2.5])
     """
     if not clients:
         raise InputError("a federation of 0 clients: nobody trains")

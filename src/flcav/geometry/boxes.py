@@ -11,7 +11,15 @@ from flcav.geometry.poses import Array, transform_points, wrap_angle, yaw_of
 
 @dataclass(frozen=True)
 class Boxes:
-    """N upright 3D boxes in one frame (which one is said by whoever hands them over)."""
+    """N upright 3D boxes in one frame (which one is said by whoever hands them over).
+
+    Raises ValueError where the arrays do not fit together.
+
+    >>> from flcav import Boxes
+    >>> cars = Boxes.from_array([[10.0, 2.0, 0.8, 4.4, 1.8, 1.6, 0.0]], "Car")
+    >>> cars.corners()[0, 0]  # bottom, front left
+    array([12.2,  2.9,  0. ])
+    """
 
     center: Array  # (N, 3) geometric centre x, y, z [m]
     size: Array  # (N, 3) length along x, width along y, height along z of the box's own frame [m]

@@ -58,7 +58,19 @@ class LedgerEntry:
 
 
 class Ledger:
-    """The entries of one run under one budget. Its whole state is `budget` and `entries`."""
+    """The entries of one run under one budget. Its whole state is `budget` and `entries`.
+
+    >>> from flcav import Ledger
+    >>> from flcav.network import Budget, LedgerEntry
+    >>> ledger = Ledger(Budget(wireless_mb=2.0, wireline_mb=0.0))
+    >>> update = LedgerEntry("edge", "objects", "wireless", "up", round=1, client="grid/cav0", bytes=1_300_000)
+    >>> ledger.enter(update)
+    >>> ledger.left_mb("wireless")
+    0.7
+    >>> ledger.enter(update)
+    Traceback (most recent call last):
+    flcav.network.ledger.BudgetExceeded: wireless uplink budget exceeded: ...
+    """
 
     def __init__(self, budget: Budget, entries: Iterable[LedgerEntry] = ()) -> None:
         """Start from `entries`, each entered in turn; raises `BudgetExceeded` where they do not fit."""

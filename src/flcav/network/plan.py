@@ -13,7 +13,13 @@ class MessageSizes:
 
 @dataclass(frozen=True)
 class StagePlan:
-    """How much of each training stage one task takes."""
+    """How much of each training stage one task takes (Wang et al., IEEE Network 37(3), 2023).
+
+    >>> from flcav import StagePlan
+    >>> plan = StagePlan(samples=200, edge_rounds=6, cloud_rounds=3, edge_groups=(4, 3))
+    >>> sum(plan.edge_groups)  # vehicles
+    7
+    """
 
     samples: int  # stage I: labelled samples uploaded vehicle -> edge -> cloud
     edge_rounds: int  # stage II rounds, in every region
@@ -35,6 +41,12 @@ def price(plan: StagePlan, sizes: MessageSizes) -> Price:
 
     wireless = samples * sample + (edge_rounds + k * cloud_rounds) * vehicles * model;
     wireline = samples * sample + cloud_rounds * edge_servers * model.
+
+    >>> from flcav import StagePlan, price
+    >>> from flcav.network import MessageSizes
+    >>> plan = StagePlan(samples=200, edge_rounds=6, cloud_rounds=3, edge_groups=(4, 3))
+    >>> price(plan, MessageSizes(sample_mb=0.5, model_mb=1.0))
+    Price(wireless_mb=163.0, wireline_mb=106.0)
     """
     wireless_rounds = plan.edge_rounds + plan.edge_rounds_per_cloud_round * plan.cloud_rounds
     uploaded = plan.samples * sizes.sample_mb

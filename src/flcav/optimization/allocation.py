@@ -83,7 +83,12 @@ def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
     Robust plans minimise the upper bands of the curves. `marginal_error_per_gb` is the derivative of the optimum over
     quantities that need not be whole, times 1000 MB: a price at these budgets, no forecast of what 1000 MB more bring,
     for which see `budget_sweep.savings`. Raises `Infeasible`, naming the budget, the least that the limits allow, and
-    by how much that is over.
+    by how much that is over. MLGRA of Wang et al., IEEE Network 37(3), 2023, solved exactly.
+
+    >>> from flcav import allocate, load_problem
+    >>> plan = allocate(load_problem("recipes/allocation/objects.yaml"))
+    >>> plan.status, plan.tasks[0].name, plan.used_mb.wireless_mb <= 4000
+    ('optimal', 'objects', True)
     """
     asked = resolved(problem)
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)

@@ -177,7 +177,14 @@ def load(path: Path) -> nx.Graph:
 
 
 def load_problem(path: Path | str) -> Problem:
-    """Return the problem in the file at `path`: written as tasks, or as a graph in either form."""
+    """Return the problem in the YAML or JSON file at `path`: written as tasks, or as a graph in either form.
+
+    Raises `InputError` naming file, field, value and rule where it is none. See docs/allocation.md.
+
+    >>> from flcav import load_problem
+    >>> len(load_problem("recipes/allocation/three_tasks.yaml").tasks)
+    3
+    """
     path = Path(path)
     graph = read_graph(path)
     return parse_config(Problem, read_yaml(path), str(path)) if graph is None else to_problem(graph)

@@ -120,6 +120,12 @@ def fit(
 
     For the other settings, of the effective model, see `fit_effective`. Raises `InputError` where there are too few
     points, and where the effective model is told nothing of the samples that the rounds are about.
+
+    >>> from flcav import fit
+    >>> from flcav.optimization import article_histories  # the points of Wang et al., Fig. 3a
+    >>> found = fit(article_histories()["objects"])
+    >>> found.points, float(found.curve.error(2500, 0, 0)) < float(found.curve.error(50, 0, 0))
+    (5, True)
     """
     samples, edge_rounds, cloud_rounds = history.resources.T
     columns = (samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)

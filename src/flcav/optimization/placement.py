@@ -50,7 +50,13 @@ def place(
 ) -> Placement:
     """Return which `count` of the poles (P, 3) cover most of the weight (E,) of the errors (E, 3), all in metres.
 
-    Without `weight` each error weighs 1. Among equal choices earlier poles are preferred. Raises `InputError`.
+    Without `weight` each error weighs 1. Among equal choices earlier poles are preferred. Raises `InputError` for rows
+    that are no places, and for a range, a count or a method that cannot be.
+
+    >>> from flcav import place
+    >>> placed = place([[0, 0, 1], [5, 0, 1], [90, 0, 1]], poles=[[0, 9, 3], [90, 9, 3]], range_m=40, count=1)
+    >>> placed.chosen, placed.covered, placed.optimal
+    ((0,), 2, True)
     """
     places, sites = _points(errors, "errors"), _points(poles, "poles")
     weights = np.ones(len(places)) if weight is None else np.asarray(weight, dtype=np.float64)

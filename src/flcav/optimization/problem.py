@@ -154,7 +154,18 @@ class Budgets(Quantities):
 
 
 class Problem(Quantities):
-    """How to split the budgets of both links over tasks and stages."""
+    """How to split the budgets of both links over tasks and stages.
+
+    Fields are checked as a problem is made, by pydantic, whose ValidationError names the field.
+
+    >>> from flcav import Problem
+    >>> curve = {"model": "additive", "floor": 0.05, "pretrain": {"a": 0.51, "b": 0.1}}
+    >>> limits = {"samples": (100, 5000), "edge_rounds": (0, 0), "cloud_rounds": (0, 0)}
+    >>> sizes = {"sample_mb": 1.6, "model_mb": 60, "edge_groups": (4,)}
+    >>> task = {"name": "objects", **sizes, "limits": limits, "curve": curve}
+    >>> Problem(budgets_mb={"wireless": 4000, "wireline": 4000}, tasks=[task]).tasks[0].limits.samples
+    (100, 5000)
+    """
 
     budgets_mb: Budgets
     edge_rounds_per_cloud_round: Count = 1  # k: each cloud round runs, and pays, k edge rounds in every region

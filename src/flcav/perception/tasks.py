@@ -1,4 +1,9 @@
-"""The perception tasks by name: those of the package, the one list of them, and a user's own."""
+"""The perception tasks by name: `TASKS`, the one list of those of the package, and a user's own.
+
+>>> from flcav import TASKS
+>>> list(TASKS)
+['weather', 'signs', 'objects', 'trajectory']
+"""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -21,6 +26,10 @@ def task_named(name: str) -> "Task[Any, Any, Any]":
     """Return the task of that name, one of `TASKS`, or a user's own as `module:NAME`.
 
     Raises `InputError` for an unknown name, and where the user's module is not there or holds no task of that name.
+
+    >>> from flcav import task_named
+    >>> list(task_named("objects").configurations)  # networks, the default first
+    ['tiny', 'small', 'paper']
     """
     if name in TASKS:
         module, _, attribute = TASKS[name].partition(":")

@@ -1,1 +1,24 @@
 """The system: a run recipe in, typed results out, through the three stages of training."""
+
+from typing import TYPE_CHECKING
+
+from flcav.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from flcav.pipeline.comparing import Compared, compare
+    from flcav.pipeline.recipe import RunRecipe, load_run_recipe
+    from flcav.pipeline.results import Run, Summary
+    from flcav.pipeline.running import run, run_seeds
+
+PLACES = {
+    "Compared": "flcav.pipeline.comparing",
+    "Run": "flcav.pipeline.results",
+    "RunRecipe": "flcav.pipeline.recipe",
+    "Summary": "flcav.pipeline.results",
+    "compare": "flcav.pipeline.comparing",
+    "load_run_recipe": "flcav.pipeline.recipe",
+    "run": "flcav.pipeline.running",
+    "run_seeds": "flcav.pipeline.running",
+}
+__all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
+__getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.config import InputError, parse_config
+from flcav.config import InputError, parse_config, shorten
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
@@ -15,6 +15,7 @@ from flcav.files import sha256
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.sharing import shared
 from flcav.perception.tasks import task_named
+from flcav.pipeline.places import find_place
 from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName
 from flcav.pipeline.results import Recorded
 from flcav.progress import Report
@@ -127,9 +128,11 @@ def town_hashes(town: str, beside: Path) -> dict[str, str]:
     """Return what names the version of a town that does not come with flcav: its files and their SHA-256."""
     if town in TOWNS:
         return {}
-    folder = next((place / town for place in (beside, Path.cwd()) if (place / town).is_dir()), None)
+    folder = find_place(town, beside)
     if folder is None:
-        raise InputError(f"region '{town}': no town of flcav, and there is no folder {(beside / town).absolute()}")
+        raise InputError(
+            f"region's town {shorten(town)}: none of flcav, and there is no folder of that name in {beside}"
+        )
     return {path.name: sha256(path) for path in sorted(folder.iterdir()) if path.is_file()}
 
 

@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.pipeline.arms import Names, Setting, settings_of
 from flcav.pipeline.frames import data_hash, recording_fields, town_hashes
 from flcav.pipeline.labels import KINDS, labels_of
+from flcav.pipeline.places import find_place
+from flcav.pipeline.planning import history_text
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, SPLITS_OF, Region, RunRecipe, SplitName
 from flcav.pipeline.steps import Step
 from flcav.pipeline.work import (
@@ -111,15 +113,21 @@ class Graph:
         helped = any(KINDS[arm.labels[task]].from_poles for arm in self.settings.values())
         seen = list(places) if helped else []
         version = town_hashes(fields["town"], self.beside)
-        arguments = {"fields": fields, "beside": str(self.beside), "places": seen, "version": version}
+        beside = str(self.beside) if version else ""  # a town that comes with flcav is beside no recipe
+        arguments = {"fields": fields, "beside": beside, "places": seen, "version": version}
         return _step(name, record_step, arguments, seen)
 
     def _folder_of(self, region: Region, split: SplitName) -> Path:
         named = region.data[split] if isinstance(region.data, Mapping) else str(region.data)
-        found = next((place / named for place in (self.beside, Path.cwd()) if (place / named).is_dir()), None)
-        if found is None:
-            raise InputError(f"regions: there is no dataset {(self.beside / named)}")
+        found = find_place(named, self.beside)
+        if found is None or not found.is_dir():
+            raise InputError(f"regions: there is no dataset folder {shorten(named)} in {self.beside}")
         return found.absolute()
+
+    def _histories(self) -> dict[str, str]:
+        """Return the learning history of each task that has one, as text: another text, another plan."""
+        own = {name: task.history for name, task in self.recipe.tasks.items()}
+        return {name: history_text(name, history, self.beside) for name, history in own.items() if history is not None}
 
     def _learning(self, task: str) -> dict[str, Any]:
         own = self.recipe.tasks[task]
@@ -138,7 +146,7 @@ class Graph:
         asked = recipe.model_dump(mode="json", exclude={"arms", "splits", "training", "recording", "placement"})
         asked["placement"] = {"tasks": []}  # has no part in the plan, and its default asks for objects
         asked["federation"] = {"edge_rounds_per_cloud_round": recipe.federation.edge_rounds_per_cloud_round}
-        planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "beside": str(self.beside)}
+        planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "histories": self._histories()}
         plan = names.plan(arm.name)
         self._add(_step(plan, plan_step, planned, [step for steps in pools.values() for step in steps]))
         for task in recipe.tasks:

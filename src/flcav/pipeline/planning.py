@@ -1,6 +1,7 @@
 """The plan: how many samples and rounds of each task both uplink budgets buy, by what earlier runs learned."""
 
 import csv
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow.csv
 
-from flcav.config import InputError, parse_config
+from flcav.config import InputError, parse_config, shorten
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.files import atomic_path
 from flcav.network.ledger import BYTES_PER_MB
@@ -24,7 +25,8 @@ from flcav.optimization.problem import Problem
 from flcav.perception.task import Task, configuration, fresh
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits, RunRecipe
+from flcav.pipeline.places import find_place
+from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
 from flcav.pipeline.results import Plan, TaskPlan
 
 HISTORIES = resources.files("flcav.pipeline") / "histories"
@@ -138,38 +140,44 @@ def model_mb(task: Task[Any, Any, Any], network: str | None) -> float:
     return update_bytes(to_arrays(fresh(task, configuration(task, network), 0))) / BYTES_PER_MB
 
 
-def history_of(task: str, name: str, beside: Path) -> History:
-    """Return a task's learning history: one of the package by its name, or a table (CSV) beside the recipe.
+def history_text(task: str, name: str, beside: Path) -> str:
+    """Return a task's learning history, a CSV table: one of the package by its name, or a file beside the recipe.
 
-    Raises `InputError` where there is none, or none of this task in it.
+    Raises `InputError` where there is none, or no rows of the task in it.
     """
-    packaged = HISTORIES / f"{name}.csv"
-    if packaged.is_file():
-        with packaged.open("rb") as file:
-            table = pyarrow.csv.read_csv(file)
+    known = sorted(entry.name.removesuffix(".csv") for entry in HISTORIES.iterdir() if ".csv" in entry.name)
+    if name in known:
+        text = (HISTORIES / f"{name}.csv").read_text(encoding="utf-8")
     else:
-        path = next((place / name for place in (beside, Path.cwd()) if (place / name).is_file()), None)
-        if path is None:
-            known = sorted(entry.name.removesuffix(".csv") for entry in HISTORIES.iterdir() if ".csv" in entry.name)
+        path = find_place(name, beside)
+        if path is None or not path.is_file():
             raise InputError(
-                f"tasks.{task}.history: '{name}' is no history of the package ({', '.join(known)}), and there is no "
-                f"file {(beside / name).absolute()}"
+                f"tasks.{task}.history: {shorten(name)} is no history of the package ({', '.join(known)}), and no file "
+                f"beside the recipe, in {beside.absolute()}"
             )
         try:
-            table = pyarrow.csv.read_csv(path)
-        except pyarrow.ArrowInvalid as error:
+            text = path.read_text(encoding="utf-8")
+        except ValueError as error:
             raise InputError(f"{path}: not a CSV table ({error})") from None
-    found = histories(table.to_pydict(), name, task)
+    parse_history(task, text, name)
+    return text
+
+
+def parse_history(task: str, text: str, origin: str) -> History:
+    """Return the task's points of a history's text; raises `InputError` naming `origin` where there are none."""
+    try:
+        table = pyarrow.csv.read_csv(io.BytesIO(text.encode()))
+    except pyarrow.ArrowInvalid as error:
+        raise InputError(f"{origin}: not a CSV table ({error})") from None
+    found = histories(table.to_pydict(), origin, task)
     if task not in found:
-        raise InputError(f"tasks.{task}.history: {name} has no rows of '{task}', but of {', '.join(found)}")
+        raise InputError(f"tasks.{task}.history: {origin} has no rows of '{task}', but of {', '.join(found)}")
     return found[task]
 
 
-def asked_of(recipe: RunRecipe, task: str, sizes: MessageSizes, pool: int, beside: Path) -> Asked:
-    """Return what a task's plan rests on."""
-    own = recipe.tasks[task]
-    history = None if own.history is None else history_of(task, own.history, beside)
-    return Asked(task, own.weight, sizes, pool, history, own.plan)
+def history_of(name: str) -> History:
+    """Return the history of the package for the task of that name."""
+    return parse_history(name, history_text(name, name, Path()), name)
 
 
 def append_points(path: Path, points: list[Mapping[str, Any]]) -> None:

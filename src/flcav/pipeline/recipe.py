@@ -147,7 +147,7 @@ class Placement(Config):
     count: int = Field(default=1, ge=1, le=100)  # per region
     range_m: float = Field(default=40.0, gt=0, le=1000)
     group_range_m: float = Field(default=60.0, gt=0, le=10_000)  # a group: vehicles this near to a sensor of any arm
-    tasks: tuple[str, ...] = ("objects",)  # whose errors count
+    tasks: tuple[str, ...] = ()  # whose errors count; if not given, objects where they are learned
 
 
 class Federation(Config):
@@ -179,7 +179,17 @@ class Arm(Config):
 class RunRecipe(Config):
     """One run of the three stages: pretraining, edge FL, cloud FL (Wang et al., IEEE Network 37(3), 2023).
 
-    A seed names its traffic, its sensors' noise and its networks' weights.
+    A seed names its traffic, its sensors' noise and its networks' weights. docs/runs.md has every field. Raises
+    pydantic's `ValidationError` for what cannot be run; `load_run_recipe` makes one sentence of it.
+
+    >>> from flcav import RunRecipe
+    >>> recipe = RunRecipe.model_validate({
+    ...     "tasks": {"objects": {"history": "objects"}},
+    ...     "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate", "vehicles": 3}},
+    ...     "budgets_mb": {"wireless": 100, "wireline": 80},
+    ... })
+    >>> recipe.with_role("federate"), recipe.vehicles("grid"), recipe.placement.rule
+    (('grid',), 3, 'vrcsp')
     """
 
     seed: int = Field(default=1, ge=0, lt=2**31)
@@ -198,11 +208,15 @@ class RunRecipe(Config):
 
     @model_validator(mode="before")
     @classmethod
-    def _empty_tasks(cls, values: Any) -> Any:
-        if isinstance(values, dict) and isinstance(values.get("tasks"), dict):
-            tasks = {name: {} if task is None else task for name, task in values["tasks"].items()}
-            return values | {"tasks": tasks}
-        return values
+    def _filled(cls, values: Any) -> Any:
+        """Take a task without fields for one of defaults, and place by the errors of objects where they are learned."""
+        if not isinstance(values, dict) or not isinstance(values.get("tasks"), dict):
+            return values
+        tasks = {name: {} if task is None else task for name, task in values["tasks"].items()}
+        placement = values.get("placement", {})
+        if isinstance(placement, dict) and "tasks" not in placement:
+            placement = placement | {"tasks": ["objects"] if "objects" in tasks else []}
+        return values | {"tasks": tasks, "placement": placement}
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -289,9 +303,14 @@ SIZES: Mapping[str, tuple[Splits, Training]] = {
 }
 
 
-def load_run_recipe(path: Path) -> RunRecipe:
+def load_run_recipe(path: Path | str) -> RunRecipe:
     """Return the run recipe (YAML) at `path`; raises `InputError` naming the field, the value and what is allowed.
 
-    Towns, datasets and histories that it names by a path are looked for beside it.
+    Towns, datasets and histories that it names by a path are looked for in the folder that `run` is told.
+
+    >>> import flcav
+    >>> demo = flcav.load_run_recipe("recipes/runs/demo.yaml")
+    >>> demo.budgets_mb.wireless, list(demo.arms)
+    (180.0, ['densest'])
     """
-    return parse_config(RunRecipe, read_yaml(path), str(path))
+    return parse_config(RunRecipe, read_yaml(Path(path)), str(path))

@@ -37,7 +37,8 @@ class Saved:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
             raise InputError(
-                f"{folder / name}: not a result of this version of flcav (field '{where}': {first['msg']}); run it anew"
+                f"{folder / name}: not a result of this version of flcav (field '{where}': {first['msg']}); run it "
+                "anew, in another folder"
             ) from None
 
 

@@ -30,7 +30,7 @@ from flcav.pipeline.labels import (
 )
 from flcav.pipeline.looking import look
 from flcav.pipeline.placing import place_sensors, sites_of, traces_of
-from flcav.pipeline.planning import Frame, asked_of, make_plan, model_mb
+from flcav.pipeline.planning import Asked, Frame, make_plan, model_mb, parse_history
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, Federation, Placement, Role, RunRecipe, SplitName, Training
 from flcav.pipeline.results import (
     ERRORS,
@@ -84,8 +84,10 @@ def deal_step(work: Work, path: str, split: SplitName, role: Role, seed: int, wh
     deal_frames(Path(path), split, role, seed, whole).save(work.folder)
 
 
-def plan_step(work: Work, recipe: Fields, rule: PlanRule, pools: Mapping[str, Sequence[str]], beside: str) -> None:
-    """Allocate both budgets to all tasks; `pools` are the recorded pools by task."""
+def plan_step(
+    work: Work, recipe: Fields, rule: PlanRule, pools: Mapping[str, Sequence[str]], histories: Mapping[str, str]
+) -> None:
+    """Allocate both budgets to all tasks; `pools` are the recorded pools, `histories` their tables, by task."""
     asked_for = RunRecipe.model_validate(recipe)
     asked, groups = [], _edge_groups(asked_for)
     for name in asked_for.tasks:
@@ -98,7 +100,9 @@ def plan_step(work: Work, recipe: Fields, rule: PlanRule, pools: Mapping[str, Se
             for size in shared(task).sample_bytes(split.data, config, split.vehicles)
         ]
         messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network))
-        asked.append(asked_of(asked_for, name, messages, len(sizes), Path(beside)))
+        own = asked_for.tasks[name]
+        history = parse_history(name, histories[name], name) if name in histories else None
+        asked.append(Asked(name, own.weight, messages, len(sizes), history, own.plan))
     budgets = Price(asked_for.budgets_mb.wireless, asked_for.budgets_mb.wireline)
     k = asked_for.federation.edge_rounds_per_cloud_round
     frame = Frame(budgets, asked_for.headroom, asked_for.limits, groups, k)

@@ -18,7 +18,7 @@ from flcav.pipeline.graph import LOOK
 from flcav.pipeline.labels import labels_of
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results import ERRORS, LinkUse, Looked, Placed, Run, Seen
-from flcav.pipeline.run import WORK
+from flcav.pipeline.running import WORK
 from flcav.report import figures, html, maps, style, sweeps
 from flcav.report.charts import STAGES, Row
 

@@ -82,7 +82,15 @@ class Annotations:
 
 @dataclass(frozen=True)
 class Frame:
-    """Everything one agent observes at one LiDAR spin."""
+    """Everything one agent observes at one LiDAR spin.
+
+    >>> from flcav import Dataset, Frame
+    >>> frame: Frame = Dataset.open("data").frame(0)
+    >>> frame.agent, frame.lidar["lidar"].shape[1], frame.images["front"].rgb.shape
+    ('cav0', 4, (96, 160, 3))
+    >>> len(frame.annotations.boxes) == len(frame.annotations.returns)  # ground truth: a box per actor, world frame
+    True
+    """
 
     scene: str  # one scene is one traffic run; frames of different scenes share no traffic
     index: int  # spin number within the scene; agents of one scene share it

@@ -60,6 +60,12 @@ class Recipe(Config):
 
     A scene is one run with its own traffic and its own parked cars; in it, every agent observes
     `spins_per_scene` spins, `every_s` apart, after `warmup_s` in which the town fills.
+    Fields are checked as a recipe is made, by pydantic, whose ValidationError names the field.
+
+    >>> from flcav import Recipe
+    >>> recipe = Recipe(town="grid", seed=1, scenes=6, cavs=4, poles="all")
+    >>> recipe.scenes * recipe.spins_per_scene * recipe.cavs  # frames of the vehicles
+    240
     """
 
     town: str  # the name of a town, or the folder of one
@@ -137,6 +143,10 @@ def load_recipe(path: Path | str) -> Recipe:
 
     A town's folder that lies beside the file is named by its whole path. Raises `InputError` naming file, field, value
     and rule where it is none.
+
+    >>> from flcav import load_recipe
+    >>> load_recipe("recipes/suburb.yaml").town
+    'suburb'
     """
     recipe = read_config(Recipe, Path(path))
     folder = Path(path).absolute().parent / recipe.town

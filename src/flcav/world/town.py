@@ -44,7 +44,13 @@ class Signs:
 
 @dataclass(frozen=True)
 class Town:
-    """A town's static content. World frame: ENU, metres, z = 0 is the road surface."""
+    """A town's static content. World frame: ENU, metres, z = 0 is the road surface.
+
+    >>> from flcav import Town, load_town
+    >>> town: Town = load_town("suburb")
+    >>> town.poles.position.shape  # candidate sites of roadside sensors: x, y, z [m]
+    (4, 3)
+    """
 
     name: str
     net: Path  # the SUMO net file (.net.xml)
@@ -68,6 +74,13 @@ def load_town(name: str | Path, beside: Path | None = None) -> Town:
 
     A folder is looked for in the folder `beside`, where one is given, and then in the working directory. The same files
     give the same town. Raises `InputError` for an unknown name and for files that do not fit together.
+
+    >>> from flcav import load_town
+    >>> load_town("grid").poles.id
+    array([1, 2, 3, 4, 5, 6, 7, 8, 9])
+    >>> load_town("atlantis")
+    Traceback (most recent call last):
+    flcav.config.InputError: unknown town 'atlantis'; known towns: ...
     """
     folder = name if isinstance(name, Path) else _folder(name, beside)
     parameters = read_config(TownParameters, folder / "town.yaml")

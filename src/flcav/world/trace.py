@@ -37,7 +37,13 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class Trace:
-    """T instants of A actors; an actor's pose is its ground centre, world frame."""
+    """A traffic run: T instants of A actors; an actor's pose is its ground centre, world frame.
+
+    >>> from flcav import Dataset, Trace
+    >>> trace: Trace = Dataset.open("data").trace("grid-0-000")
+    >>> trace.position.shape == (len(trace.time_s), len(trace.actor), 3)
+    True
+    """
 
     town: str
     time_s: Array  # (T,)

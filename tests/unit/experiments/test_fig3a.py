@@ -1,5 +1,4 @@
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ def test_bands_hold_their_curve_and_curves_rise(results: dict) -> None:
 
 def test_every_point_of_our_own_history_is_drawn(results: dict) -> None:
     drawn = sum(len(line["points"]) for line in results["own"]["lines"])
-    assert drawn == len(history_of("objects", "objects", Path()).accuracy)
+    assert drawn == len(history_of("objects").accuracy)
 
 
 def test_the_figure_is_drawn_from_what_the_file_holds(results: dict) -> None:

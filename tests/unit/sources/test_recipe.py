@@ -5,7 +5,7 @@ import pytest
 
 from flcav.config import InputError, parse_config, read_config
 from flcav.sensors.rig import RIGS
-from flcav.sources.recipe import Recipe, find_recipe, recipe_path
+from flcav.sources.recipe import Recipe, find_recipe, load_recipe, recipe_path
 from flcav.world.town import load_town
 
 RECIPES = Path(__file__).parents[3] / "recipes"
@@ -97,3 +97,15 @@ def test_a_users_own_file_is_never_replaced(tmp_path: Path, monkeypatch: pytest.
     own.write_text("town: ring")
     for path in (own, Path("objects.yaml"), Path("mine/objects.yaml"), Path("recipes/none.yaml"), Path("recipes")):
         assert find_recipe(path) == path
+
+
+def test_a_town_beside_a_recipe_s_file_is_found_from_anywhere(tmp_path, monkeypatch):
+    (tmp_path / "there" / "mine").mkdir(parents=True)
+    for name in ("mine", "grid", "elsewhere"):
+        (tmp_path / "there" / f"{name}.yaml").write_text(f"town: {name}\n")
+    monkeypatch.chdir(tmp_path)
+    assert load_recipe("there/mine.yaml").town == str(tmp_path / "there" / "mine")
+    assert load_recipe("there/grid.yaml").town == "grid"
+    assert load_recipe("there/elsewhere.yaml").town == "elsewhere"  # a folder of the working directory, or none
+    with pytest.raises(InputError, match=r"there/none\.yaml: no such file"):
+        load_recipe("there/none.yaml")

@@ -11,7 +11,7 @@ from flcav.intervals import mean_over_seeds
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.results import OUTCOMES, Estimate, Run, Test
-from flcav.pipeline.run import RESULTS, WORK, seed_folders
+from flcav.pipeline.running import RESULTS, WORK, seed_folders
 from flcav.verdicts import UNDECIDED, verdict
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task

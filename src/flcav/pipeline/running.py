@@ -62,8 +62,26 @@ def run(
     Towns, datasets and histories are looked for in `beside` (None: the working directory). `jobs` workers of one thread
     each; `engine` and `stale` are those of `run_steps`. Raises `InputError` where something of the recipe cannot be
     used, or `out` holds another run, or one by other code that is refused.
+
+    >>> import flcav
+    >>> few = {"scenes": 2, "spins": 1, "cavs": 1}
+    >>> recipe = flcav.RunRecipe.model_validate({
+    ...     "splits": dict.fromkeys(("pool", "validation", "registry", "edge", "test"), few),
+    ...     "training": {"block_steps": 1, "max_blocks": 1, "cooldown": (), "local_steps": 1},
+    ...     "tasks": {"weather": {"plan": {"samples": 2, "edge_rounds": 1, "cloud_rounds": 1}}},
+    ...     "regions": {"suburb": {"role": "pretrain"}, "ring": {"role": "federate"}},
+    ...     "budgets_mb": {"wireless": 9, "wireline": 9},
+    ...     "placement": {"rule": "none"},
+    ...     "recording": {"warmup_s": 5.0, "weather": "clear"},
+    ... })
+    >>> result = flcav.run(recipe, "out/run")
+    >>> test = result.test(stage="cloud", region="ring", task="weather")
+    >>> test.measure, test.frames, result.arms["main"].links["wireless"].used_mb < 9
+    ('accuracy', 2, True)
     """
     out = Path(out)
+    if (out / RESULTS).exists():
+        Run.load(out, RESULTS)  # of this version, or there is nothing here to go on with
     graph, clock = Graph(recipe, Path(beside or ".")), stopwatch(out / WORK)
 
     def timed(step: str, done: int, total: int, note: str) -> None:

@@ -1,0 +1,94 @@
+"""Sentences of a run, from its numbers."""
+
+from dataclasses import replace
+
+import pytest
+
+from flcav.pipeline import results
+from flcav.pipeline.findings import findings
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.pipeline.results import ArmResult, Difference, Estimate, Placed, Plan
+from flcav.pipeline.running import gap_closed, gaps_closed
+from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
+
+CAVEAT = "ideal road detector, upper bound"
+MEANS = {
+    (MAIN, PRETRAIN): 0.412,
+    (MAIN, EDGE): 0.503,
+    (MAIN, CLOUD): 0.495,
+    ("densest", EDGE): 0.544,
+    ("oracle", CENTRAL): 0.612,
+}
+
+
+def result_of(arm: str, stage: str, mean: float) -> results.Test:
+    found = results.Tested("grid", "objects", "AP50", Estimate(mean), {}, 96, 8)
+    return results.Test(arm, stage, "grid", "objects", "test", found)
+
+
+TESTS = [result_of(*key, mean) for key, mean in MEANS.items()]
+
+
+def arm(*poles: int) -> ArmResult:
+    return ArmResult(Plan("joint", {}), (Placed("grid", "vrcsp", poles, 9, 3, 40.0, ()),), (), {}, ())
+
+
+def difference(stage: str, before: tuple[str, str], mean: float, low: float, high: float) -> Difference:
+    return Difference("", MAIN, stage, *before, "grid", "objects", Estimate(mean, low, high))
+
+
+def told(*differences: Difference, densest: int = 8):
+    arms, rules = {MAIN: arm(2), "densest": arm(densest)}, {MAIN: "vrcsp", "densest": "densest"}
+    return findings(differences, TESTS, arms, rules, {"grid": "federate"}, {"objects": CAVEAT})
+
+
+def test_each_finding_tells_its_own_numbers_frames_and_verdict() -> None:
+    edge, cloud, pole = told(
+        difference(EDGE, (MAIN, PRETRAIN), 0.091, 0.055, 0.127),
+        difference(CLOUD, (MAIN, EDGE), -0.008, -0.027, 0.012),
+        difference(EDGE, ("densest", EDGE), -0.041, -0.06, -0.02),
+    )
+    assert [edge.verdict, cloud.verdict, pole.verdict] == [HELD, UNDECIDED, NOT_HELD]
+    assert "0.412 (pretrained) and 0.503 (edge FL): +0.091, 95 % interval +0.055 to +0.127" in edge.sentence
+    assert "held in this run" in edge.sentence
+    assert "0.503 (edge FL) and 0.495 (edge + cloud FL): −0.008" in cloud.sentence
+    assert "contains 0, so this run does not decide" in cloud.sentence
+    assert "0.544 (edge FL (densest)) and 0.503 (edge FL)" in pole.sentence
+    assert pole.question == "Does the placed pole beat the pole with the densest traffic?"
+    for finding in (edge, cloud, pole):
+        assert "96 test frames of 8 scenes" in finding.sentence
+        assert CAVEAT in finding.sentence
+
+
+def test_a_densest_pole_that_was_chosen_leaves_nothing_to_compare() -> None:
+    (pole,) = told(difference(EDGE, ("densest", EDGE), 0.0, 0.0, 0.0), densest=2)
+    assert pole.verdict == UNDECIDED
+    assert "nothing to compare" in pole.sentence
+
+
+def test_one_scene_decides_nothing() -> None:
+    alone = replace(difference(EDGE, (MAIN, PRETRAIN), 0.1, 0.0, 0.0), estimate=Estimate(0.1))
+    (edge,) = told(alone)
+    assert edge.verdict == UNDECIDED
+    assert "too few scenes" in edge.sentence
+
+
+def test_the_gap_is_the_way_from_pretraining_to_ground_truth() -> None:
+    assert gap_closed(0.4, 0.5, 0.6) == pytest.approx(0.5)
+    assert gap_closed(0.4, 0.6, 0.6) == pytest.approx(1.0)
+    assert gap_closed(0.4, 0.3, 0.6) == pytest.approx(-0.5)
+
+
+def test_gaps_are_closed_of_every_stage_where_there_is_an_oracle() -> None:
+    from test_recipe import parsed
+
+    recipe = parsed(arms={"densest": {}, "oracle": {"central": "federate"}})
+    closed = gaps_closed(TESTS, recipe)
+    assert closed["grid, objects: edge FL"] == pytest.approx((0.503 - 0.412) / (0.612 - 0.412))
+    assert closed["grid, objects: edge FL (densest)"] == pytest.approx((0.544 - 0.412) / 0.2)
+    assert set(closed) == {
+        "grid, objects: edge FL",
+        "grid, objects: edge + cloud FL",
+        "grid, objects: edge FL (densest)",
+    }
+    assert gaps_closed(TESTS, parsed()) == {}

@@ -1,0 +1,129 @@
+"""The steps of a run: their order, and what arms share."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flcav.config import InputError
+from flcav.pipeline.graph import Graph
+from flcav.pipeline.recipe import MAIN, RunRecipe, load_run_recipe
+from flcav.sources.recipe import recipe_path
+
+OBJECTS = {"objects": {"history": "objects"}}
+SEVERAL = {
+    "objects": {"history": "objects"},
+    **{name: {"plan": {"samples": 20, "edge_rounds": 1, "cloud_rounds": 1}} for name in ("signs", "trajectory")},
+}
+
+
+def recipe_of(**changes: Any) -> RunRecipe:
+    return RunRecipe.model_validate(
+        {
+            "tasks": OBJECTS,
+            "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate"}, "arterial": {"role": "unseen"}},
+            "budgets_mb": {"wireless": 200, "wireline": 200},
+            **changes,
+        }
+    )
+
+
+def steps_of(recipe: RunRecipe, beside: Path = Path()) -> dict[str, str]:
+    """Return each step's fingerprint."""
+    found: dict[str, str] = {}
+    for step in Graph(recipe, beside).steps:
+        assert step.name not in found
+        found[step.name] = step.fingerprint(found)
+    return found
+
+
+@pytest.mark.parametrize("name", ["demo", "arms", "allocation"])
+def test_every_step_comes_after_what_it_needs(name: str) -> None:
+    before: set[str] = set()
+    for step in Graph(load_run_recipe(recipe_path(f"runs/{name}")), Path()).steps:
+        assert set(step.needs) <= before, step.name
+        before.add(step.name)
+
+
+def test_an_arm_adds_what_it_does_differently_and_no_more() -> None:
+    plain = steps_of(recipe_of())
+    armed = steps_of(recipe_of(arms={"densest": {"placement": {"rule": "densest"}}}))
+    assert set(armed) - set(plain) == {
+        "grid-place-densest",
+        "grid-edge-fl-objects-densest",
+        "cloud-fl-objects-densest",
+        "test-grid-edge-fl-objects-densest-grid",
+        *(f"test-cloud-fl-objects-densest-{region}" for region in ("suburb", "grid", "arterial")),
+    }
+    assert {name for name in plain if plain[name] == armed[name]} >= {"plan", "pretrain-objects", "grid-place"}
+
+
+def test_another_plan_shares_recordings_that_no_plan_decides() -> None:
+    armed = recipe_of(arms={"equal": {"plan": "equal-stages"}})
+    names = Graph(armed, Path()).names
+    assert names.pretrain("equal", "objects") == "pretrain-objects-equal"
+    assert names.recording("grid", "test", "objects") == "grid-test-objects"
+    (edge,) = (step for step in Graph(armed, Path()).steps if step.name == "grid-edge-objects")
+    assert set(edge.needs) == {"grid-place", "grid-place-equal"}
+
+
+def test_other_labels_of_one_task_leave_the_other_tasks_as_they_are() -> None:
+    recipe = recipe_of(tasks=SEVERAL, arms={"own": {"labels": {"objects": "own-detections"}}})
+    names = Graph(recipe, Path()).names
+    assert names.edge("own", "grid", "objects") != names.edge(MAIN, "grid", "objects")
+    assert names.edge("own", "grid", "signs") == names.edge(MAIN, "grid", "signs")
+
+
+def test_no_task_trains_on_what_it_is_tested_on() -> None:
+    for step in Graph(recipe_of(tasks=SEVERAL), Path()).steps:
+        tested = [need for need in step.needs if "-test-" in need]
+        assert not tested or step.name.startswith("test-") or step.name == "look"
+
+
+def test_each_task_is_recorded_as_it_needs() -> None:
+    fields = {
+        step.name: step.arguments["fields"]
+        for step in Graph(recipe_of(tasks=SEVERAL), Path()).steps
+        if step.name.endswith(("-pool-objects", "-pool-signs", "-pool-trajectory"))
+    }
+    objects, signs, trajectory = (fields[f"suburb-pool-{task}"] for task in SEVERAL)
+    assert "vehicle_rig" not in objects
+    assert "cameras" in signs["vehicle_rig"]
+    assert trajectory["every_s"] == 0.5
+    assert trajectory["spins_per_scene"] * 0.5 > objects["spins_per_scene"] * 4.0 - 4.0
+    assert objects["seed"] == signs["seed"]  # the same traffic
+
+
+def test_recordings_of_an_own_town_name_its_files(tmp_path: Path) -> None:
+    source = Path(recipe_path("grid")).parents[1] / "src/flcav/world/towns/grid"
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for path in source.iterdir():
+        (mine / path.name).write_bytes(path.read_bytes())
+    regions = {"suburb": {"role": "pretrain"}, "grid": {"role": "federate"}, "own": {"town": "mine", "role": "unseen"}}
+    before = steps_of(recipe_of(regions=regions), tmp_path)
+    (mine / "town.yaml").write_text((mine / "town.yaml").read_text() + "\n# changed\n")
+    after = steps_of(recipe_of(regions=regions), tmp_path)
+    changed = {name for name in before if before[name] != after[name]}
+    assert {"own-validation-objects", "own-test-objects"} <= changed
+    assert {"suburb-pool-objects", "pretrain-objects"}.isdisjoint(changed)
+    with pytest.raises(InputError, match="none of flcav, and there is no folder"):
+        steps_of(recipe_of(regions=regions), tmp_path / "elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"tasks": {"radar": {"history": "objects"}}}, "task 'radar'"),
+        ({"tasks": {"objects": {"history": "objects", "labels": "annotated"}}}, "'annotated' is none of ideal-road"),
+        ({"tasks": {"objects": {"history": "none.csv"}}}, "'none.csv' is no history of the package"),
+        ({"tasks": {"signs": {"history": "objects"}}}, "has no rows of 'signs'"),
+        (
+            {"regions": {"a": {"role": "pretrain", "data": "none"}, "grid": {"role": "federate"}}},
+            "regions: there is no dataset folder",
+        ),
+    ],
+)
+def test_what_cannot_be_found_is_said_before_anything_runs(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        Graph(recipe_of(**changes), Path())

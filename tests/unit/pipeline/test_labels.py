@@ -1,0 +1,65 @@
+"""Labels without ground truth: from which score on, near which sensors, and what the road's cost."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from flcav.config import InputError
+from flcav.geometry import Boxes
+from flcav.perception.objects.evaluate import Asked
+from flcav.pipeline import labels
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.labels import KINDS, frames_near, labels_of, own_label_threshold
+
+
+def cars(*places: tuple[float, float]) -> Boxes:
+    """Return cars ahead at x with a score."""
+    rows = [(x, 0.0, 0.0, 4.0, 2.0, 1.6, 0.0) for x, _ in places]
+    return Boxes.from_array(np.array(rows).reshape(-1, 7), "Car", [score for _, score in places])
+
+
+@pytest.mark.parametrize(
+    ("scores_of_hits", "scores_of_misses", "threshold"),
+    [
+        ([0.9, 0.8, 0.7], [], 0.7),
+        ([0.9 - i / 100 for i in range(9)], [0.5], 0.5),  # 9 of 10 are right
+        ([0.9 - i / 100 for i in range(9)], [0.5, 0.4], 0.5),
+        ([0.9, 0.8], [0.85], 0.9),
+        ([0.8], [0.9], 1.0),  # nothing is sure enough
+        ([], [], 1.0),
+    ],
+)
+def test_own_labels_start_where_nine_of_ten_are_right(
+    scores_of_hits: list[float], scores_of_misses: list[float], threshold: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hits = [(10.0 * i, score) for i, score in enumerate(scores_of_hits, start=1)]
+    misses = [(-10.0 * i, score) for i, score in enumerate(scores_of_misses, start=1)]
+    truth = Asked("s", cars(*hits), Boxes.empty(), Boxes.empty())
+    monkeypatch.setattr(labels, "asked_of", lambda frame, config: truth)
+    monkeypatch.setattr(labels, "detect_all", lambda network, clouds: [cars(*hits, *misses)])
+    data = SimpleNamespace(frame=lambda i: SimpleNamespace(lidar={"lidar": None}, key="k"))
+    split = Frames(cast(Any, data), (0,), {})
+    assert own_label_threshold(cast(Any, SimpleNamespace(config=None)), [split]) == threshold
+
+
+def test_groups_are_the_vehicles_within_range_of_a_sensor() -> None:
+    def frame(i: int) -> Any:
+        pose = np.eye(4)
+        pose[0, 3] = 10.0 * i
+        return SimpleNamespace(world_from_agent=pose)
+
+    split = Frames(cast(Any, SimpleNamespace(frame=frame)), tuple(range(10)), {})
+    sites = np.array([[0.0, 0.0], [70.0, 0.0]])
+    assert frames_near(split, sites, 15.0) == (0, 1, 6, 7, 8)
+    assert frames_near(split, sites[:1], 35.0) == (0, 1, 2, 3)
+    assert frames_near(split, sites[:0], 1.0) == split.vehicles
+
+
+def test_every_kind_but_a_vehicles_own_says_that_it_is_an_upper_bound() -> None:
+    assert all("upper bound" in kind.caveat for name, kind in KINDS.items() if name != "own-detections")
+    assert labels_of("objects", None) == "ideal-road"
+    assert labels_of("trajectory", None) == "future"
+    with pytest.raises(InputError, match="labels of 'weather': 'ideal-road' is none of annotated"):
+        labels_of("weather", "ideal-road")

@@ -1,0 +1,129 @@
+"""The plan of a run: both budgets, all tasks."""
+
+import json
+
+import numpy as np
+import pytest
+from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
+from flwr.common.serde import recorddict_to_proto
+
+from flcav.config import InputError
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.stages import Schedule, federate
+from flcav.federation.trainable import LocalUpdate
+from flcav.network.ledger import Budget, Ledger
+from flcav.network.plan import MessageSizes, Price, price
+from flcav.optimization.allocation import Infeasible
+from flcav.optimization.history import History
+from flcav.perception.objects.model import second_tiny
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.weights import to_arrays
+from flcav.pipeline.planning import Asked, Frame, append_points, history_of, make_plan, model_mb, parse_history
+from flcav.pipeline.recipe import FixedPlan, Limits
+
+SIZES = MessageSizes(sample_mb=0.4, model_mb=1.4)
+LIMITS = Limits(edge_rounds=(1, 12), cloud_rounds=(1, 6))
+
+
+def frame(wireless: float = 90.0, wireline: float = 60.0) -> Frame:
+    return Frame(Price(wireless, wireline), 0.02, LIMITS, (4, 3), 1)
+
+
+def history() -> History:
+    counts = np.array([(s, e, c) for s in (80, 160, 320) for e in (0, 2, 6) for c in (0, 1, 3)], dtype=float)
+    samples, edge, cloud = counts.T
+    error = 2.0 * samples**-0.3 * 0.8 + 0.2 * (edge + 1) ** -0.7 + 0.1 * (cloud + 1) ** -0.7 - 0.1
+    return History(counts, 1 - error.clip(0.01, 0.99), np.ones(len(counts)))
+
+
+def asked(name: str = "objects", pool: int = 400, weight: float = 1.0, fixed: FixedPlan | None = None) -> Asked:
+    return Asked(name, weight, SIZES, pool, None if fixed else history(), fixed)
+
+
+def test_the_plans_price_leaves_the_headroom() -> None:
+    plan = make_plan((asked(),), frame(), "joint")[0].tasks["objects"]
+    cost = price(frame().stage_plan(plan.samples, plan.edge_rounds, plan.cloud_rounds), SIZES)
+    assert (plan.wireless_mb, plan.wireline_mb) == pytest.approx((cost.wireless_mb, cost.wireline_mb))
+    assert cost.wireless_mb <= 0.98 * 90
+    assert cost.wireline_mb <= 0.98 * 60
+
+
+def test_both_budgets_bind() -> None:
+    def counts(*budgets: float) -> list[int]:
+        plan = make_plan((asked(),), frame(*budgets), "joint")[0].tasks["objects"]
+        return [plan.samples, plan.edge_rounds, plan.cloud_rounds]
+
+    once, twice = counts(90, 60), counts(180, 120)
+    assert all(more >= less for more, less in zip(twice, once, strict=True))
+    assert twice != once
+
+
+def test_tasks_share_both_budgets_and_fixed_plans_are_paid_first() -> None:
+    fixed = FixedPlan(samples=50, edge_rounds=2, cloud_rounds=1)
+    both = make_plan((asked(), asked("signs", fixed=fixed)), frame(), "joint")[0]
+    alone = make_plan((asked(),), frame(), "joint")[0]
+    assert (both.tasks["signs"].samples, both.tasks["signs"].edge_rounds) == (50, 2)
+    assert both.tasks["signs"].predicted is None
+    assert sum(task.wireless_mb for task in both.tasks.values()) <= 0.98 * 90
+    assert both.tasks["objects"].wireless_mb < alone.tasks["objects"].wireless_mb
+    two = make_plan((asked(weight=3.0), asked("weather")), frame(180, 120), "joint")[0]
+    assert two.tasks["objects"].wireless_mb > two.tasks["weather"].wireless_mb
+    with pytest.raises(InputError, match="fixed plans take"):
+        make_plan((asked("signs", fixed=FixedPlan(samples=300, edge_rounds=2, cloud_rounds=1)),), frame(), "joint")
+    with pytest.raises(InputError, match="the pools hold 20"):
+        make_plan((asked("signs", pool=20, fixed=fixed),), frame(), "joint")
+
+
+def test_the_curve_predicts_every_stage() -> None:
+    predicted = make_plan((asked(),), frame(), "joint")[0].tasks["objects"].predicted
+    assert predicted is not None
+    assert predicted["pretrain"] < predicted["edge"] < predicted["cloud"]
+    equal = make_plan((asked(),), frame(), "equal-stages")[0].tasks["objects"].predicted
+    assert equal is not None
+    assert equal["cloud"] <= predicted["cloud"] + 1e-9
+
+
+def test_a_small_pool_limits_the_samples() -> None:
+    assert make_plan((asked(pool=24),), frame(), "joint")[0].tasks["objects"].samples == 24
+
+
+def test_budgets_below_the_least_plan_are_refused() -> None:
+    with pytest.raises(Infeasible, match="wireless"):
+        make_plan((asked(),), frame(10.0), "joint")
+
+
+def test_a_models_size_is_what_flower_sends() -> None:
+    weights = to_arrays(second_tiny())
+    record = ArrayRecord({name: Array(np.ascontiguousarray(value)) for name, value in weights.items()})
+    content = RecordDict({"arrays": record, "metrics": MetricRecord({"num-examples": 12, "loss": 0.345})})
+    sent = len(recorddict_to_proto(content).SerializeToString())
+    assert model_mb(OBJECTS, "tiny") == pytest.approx(sent / 1e6, rel=1e-4)
+
+    class Echo:
+        def train(self, weights, *, steps, learning_rate, seed):
+            return LocalUpdate(weights, 12, 0.345)
+
+    book = Ledger(Budget(10, 0))
+    federate({"v": Echo()}, weights, Schedule(1, 1, 1e-3, 1e-3, 0), Account(book, "edge", "t", "wireless"))
+    assert book.used_mb("wireless") == pytest.approx(sent / 1e6, rel=1e-4)
+
+
+def test_the_committed_history_falls_with_every_resource() -> None:
+    known = history_of("objects")
+    assert len(known.accuracy) >= 6
+    problem = make_plan((Asked("objects", 1.0, SIZES, 400, known, None),), frame(), "joint")[1]
+    assert problem is not None
+    curve = problem.tasks[0].curve
+    here = float(curve.error(200, 2, 1, 1))
+    assert 0 < here < 1
+    for more in ((400, 2, 1), (200, 4, 1), (200, 2, 3)):
+        assert curve.error(*more, 1) <= here
+
+
+def test_points_are_added_once_and_read_again(tmp_path) -> None:
+    point = {"task": "t", "samples": 8, "edge_rounds": 1, "cloud_rounds": 0, "accuracy": ".5", "weight": 9, "run": "a"}
+    for _ in range(2):
+        append_points(tmp_path / "history.csv", [point, point | {"edge_rounds": 2, "accuracy": ".6"}])
+    found = parse_history("t", (tmp_path / "history.csv").read_text(), "history.csv")
+    assert found.resources.tolist() == [[8, 1, 0], [8, 2, 0]]
+    assert json.dumps(found.accuracy.tolist()) == "[0.5, 0.6]"

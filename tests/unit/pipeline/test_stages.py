@@ -1,0 +1,181 @@
+"""Stages as functions: when training is over, what a kill leaves, who pays, how many steps a control takes."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.perception.objects.task import OBJECTS
+from flcav.pipeline import stages
+from flcav.pipeline.recipe import Training
+from flcav.pipeline.stages import (
+    Federating,
+    Learning,
+    choose_uploads,
+    next_rate,
+    purse,
+    region_budget,
+    round_path,
+    train_centrally,
+)
+
+TRAINING = Training(max_blocks=6, patience=2, min_gain=0.01, cooldown=(0.3, 0.05))
+START = {"w": np.zeros(3, dtype=np.float32), "count": np.array(0, dtype=np.int64)}
+STAGE_ONE = LedgerEntry("pretrain", "t", "wireless", "up", 0, "suburb/cav0", 4_000_000)
+ROAD = LedgerEntry("edge", "t", "wireless", "down", 0, "grid/cav0", 900)
+SCHEDULE = Schedule(rounds=3, steps=4, learning_rate=0.1, final_learning_rate=0.05, seed=5)
+
+
+def rates(scores: list[float], training: Training = TRAINING) -> list[float | None]:
+    """Return the rate of each block of a training whose validation reaches `scores`, and what comes after it."""
+    return [next_rate(scores[:block], training) for block in range(len(scores) + 1)]
+
+
+def test_training_cools_down_once_validation_has_levelled_off() -> None:
+    assert rates([0.1, 0.2, 0.205, 0.209, 0.3, 0.3]) == [1, 1, 1, 1, 0.3, 0.05, None]
+
+
+def test_a_late_gain_within_the_patience_goes_on_at_the_full_rate() -> None:
+    assert rates([0.1, 0.2, 0.2, 0.25, 0.25, 0.25]) == [1, 1, 1, 1, 1, 1, 0.3]
+
+
+def test_the_cooldown_comes_after_the_last_block_too() -> None:
+    scores = [0.1 * block for block in range(1, 9)]  # never levels off
+    assert rates(scores) == [1] * 6 + [0.3, 0.05, None]
+
+
+def test_fewer_blocks_than_the_patience_needs() -> None:
+    assert rates([0.5, 0.5, 0.5], TRAINING.model_copy(update={"max_blocks": 1})) == [1, 0.3, 0.05, None]
+
+
+def test_without_a_cooldown_training_ends_level() -> None:
+    assert rates([0.5, 0.5, 0.5], TRAINING.model_copy(update={"cooldown": ()})) == [1, 1, 1, None]
+
+
+class Walk:
+    """A client whose weights walk at random: any other round, seed, start or rate ends elsewhere."""
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        stride = np.random.default_rng(seed).normal(size=3) * learning_rate * steps
+        moved = (0.9 * weights["w"] + stride).astype(np.float32)
+        return LocalUpdate({"w": moved, "count": weights["count"] + np.int64(steps)}, 3, 0.5)
+
+
+def edge(folder: Path) -> tuple[Weights, Ledger]:
+    """Federate as stage II does: the road's views are booked before the rounds."""
+    book = Ledger(Budget(1.0, 0.0))
+    book.enter(ROAD)
+    federating = Federating(OBJECTS, folder, book, lambda done, total, note="": None)
+    start, done = federating.resume(START)
+    clients = {f"grid/cav{i}": Walk() for i in range(2)}
+    account = Account(book, "edge", "t", "wireless")
+    federate(clients, start, SCHEDULE, account, done=done, on_round=federating.keeping(SCHEDULE.rounds))
+    assert len(federating.losses) == SCHEDULE.rounds
+    return load_file(round_path(folder, SCHEDULE.rounds)), book
+
+
+def cloud(folder: Path) -> tuple[Weights, Ledger]:
+    """Federate as stage III does: on top of what was spent before, edge servers nested below the cloud."""
+    book = Ledger(Budget(10.0, 1.0), [STAGE_ONE, ROAD])
+    federating = Federating(OBJECTS, folder, book, lambda done, total, note="": None)
+    start, done = federating.resume(START)
+    servers: dict[str, Trainable] = {}
+    for town, own in (("grid", 1.0), ("ring", -1.0)):
+        vehicles = {f"{town}/cav{i}": Walk() for i in range(2)}
+        model = {"w": np.full(3, own, dtype=np.float32), "count": START["count"]}
+        servers[town] = EdgeServer(vehicles, 2, Account(book, "cloud", "t", "wireless"), model, cloud_rounds_done=done)
+    account = Account(book, "cloud", "t", "wireline")
+    federate(servers, start, SCHEDULE, account, done=done, on_round=federating.keeping(SCHEDULE.rounds))
+    return load_file(round_path(folder, SCHEDULE.rounds)), book
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("stage", [edge, cloud])
+def test_a_federation_killed_at_any_write_ends_the_same(
+    stage: Callable[[Path], tuple[Weights, Ledger]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fresh(name: str) -> Path:
+        (tmp_path / name).mkdir()
+        return tmp_path / name
+
+    weights, book = stage(fresh("whole"))
+    writes, last = 0, 0
+
+    def dying(write: Callable[..., None]) -> Callable[..., None]:
+        def counted(*arguments: object) -> None:
+            nonlocal writes
+            writes += 1
+            if writes == last:
+                raise Killed
+            write(*arguments)
+
+        return counted
+
+    with monkeypatch.context() as patched:
+        patched.setattr(stages, "write_bytes", dying(stages.write_bytes))
+        patched.setattr(stages, "write_json", dying(stages.write_json))
+        patched.setattr(Ledger, "save", dying(Ledger.save))
+        stage(fresh("counted"))
+        total = writes
+        for last in range(1, total + 1):
+            folder, writes = fresh(str(last)), 0
+            with pytest.raises(Killed):
+                stage(folder)
+            found, resumed = stage(folder)
+            assert all(np.array_equal(found[name], weights[name]) for name in weights), last
+            assert resumed.entries == book.entries, last
+    assert total >= 3 * SCHEDULE.rounds
+
+
+def test_regions_share_what_stage_one_left_by_their_vehicles() -> None:
+    stage_one = Ledger(Budget(11.0, 5.0), [STAGE_ONE])
+    shares = [region_budget(stage_one, {"grid": 4, "ring": 3}, town) for town in ("grid", "ring")]
+    assert [share.wireless_mb for share in shares] == pytest.approx([4.0, 3.0])
+    assert [share.wireline_mb for share in shares] == [0.0, 0.0]  # stage II has no business there
+
+
+def test_tasks_share_both_budgets_as_planned_and_never_more() -> None:
+    whole = Budget(100.0, 50.0)
+    assert purse(whole, {"a": (30.0, 20.0)}, "a") == whole
+    planned = {"a": (10.0, 10.0), "b": (20.0, 0.0), "c": (7.1, 3.3)}
+    parts = [purse(whole, planned, task) for task in planned]
+    assert sum(part.bytes_on("wireless") for part in parts) <= whole.bytes_on("wireless")
+    assert sum(part.bytes_on("wireline") for part in parts) <= whole.bytes_on("wireline")
+    assert parts[1].wireless_mb == pytest.approx(100 * 20 / 37.1, abs=1e-5)
+
+
+def test_a_central_control_takes_the_steps_of_all_vehicles_at_the_same_rates(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[dict[str, Any]] = []
+
+    def counted(task: Any, network: Any, samples: Any, **how: Any) -> float:
+        taken.append(how)
+        return 0.5
+
+    monkeypatch.setattr(stages, "train_steps", counted)
+    learning = Learning(OBJECTS, "tiny", Training(local_steps=16), 3)
+    losses = train_centrally(learning, None, [1, 2, 3], rounds=5, clients=4, name="federate")
+    edge = learning.schedule(5, 16, "edge", "grid")
+    assert losses == (0.5,) * 5
+    assert [how["steps"] for how in taken] == [4 * 16] * 5
+    assert [how["learning_rate"] for how in taken] == [edge.work(number).learning_rate for number in range(1, 6)]
+    assert taken[0]["learning_rate"] == pytest.approx(1e-3)
+    assert taken[-1]["learning_rate"] == pytest.approx(2e-4)
+
+
+def test_uploads_are_drawn_over_all_pools_and_by_the_seed() -> None:
+    pools = {"a": range(10, 20), "b": range(5)}
+    chosen = choose_uploads(pools, 9, seed=1)
+    assert sum(map(len, chosen.values())) == 9
+    assert all(set(frames) <= set(pools[region]) for region, frames in chosen.items())
+    assert chosen == choose_uploads(pools, 9, seed=1) != choose_uploads(pools, 9, seed=2)
+    assert cast(Any, choose_uploads(pools, 15, seed=1)) == {"a": tuple(range(10, 20)), "b": tuple(range(5))}
