@@ -9,7 +9,7 @@ from make_history import Chosen, main
 
 from flcav.config import InputError
 from flcav.pipeline.graph import Graph
-from flcav.pipeline.planning import history_of
+from flcav.pipeline.planning import parse_history
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe, Split, Splits, Training, load_run_recipe
 from flcav.pipeline.results import Run
 from flcav.pipeline.running import RESULTS, run
@@ -90,7 +90,7 @@ def test_a_history_is_made_by_plans_chosen_by_hand(tmp_path: Path) -> None:
     (tmp_path / "few.yaml").write_text(json.dumps(recipe))
     out, runs = tmp_path / "weather.csv", tmp_path / "runs"
     main([str(tmp_path / "few.yaml"), "weather", "101:4,2,1", "102:2,0,0", "--runs", str(runs), "--out", str(out)])
-    made = history_of("weather", "weather.csv", tmp_path)
+    made = parse_history("weather", out.read_text(), "weather.csv")
     assert made.resources.tolist() == [[4, 0, 0], [4, 1, 0], [4, 2, 0], [4, 2, 1], [2, 0, 0]]
     assert (made.weight == 1).all()  # validation frames
     with pytest.raises(InputError, match="'101:4' is no plan"):
