@@ -12,7 +12,7 @@ from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
-from flcav.pipeline.planning import history_of
+from flcav.pipeline.planning import parse_history
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe, Split, Splits, Training, load_run_recipe
 from flcav.pipeline.results import Run
 from flcav.pipeline.running import RESULTS, run
@@ -100,6 +100,7 @@ def test_a_history_is_made_by_plans_chosen_by_hand(tmp_path: Path) -> None:
     recipe = shrunk("three_tasks").model_dump(mode="json")
     (tmp_path / "few.yaml").write_text(json.dumps(recipe))
     out, runs = tmp_path / "weather.csv", tmp_path / "runs"
+<<<<<<< HEAD
     main(
         [
             str(tmp_path / "few.yaml"),
@@ -115,6 +116,10 @@ def test_a_history_is_made_by_plans_chosen_by_hand(tmp_path: Path) -> None:
         ]
     )
     made = history_of("weather", "weather.csv", tmp_path)
+=======
+    main([str(tmp_path / "few.yaml"), "weather", "101:4,2,1", "102:2,0,0", "--runs", str(runs), "--out", str(out)])
+    made = parse_history("weather", out.read_text(), "weather.csv")
+>>>>>>> main
     assert made.resources.tolist() == [[4, 0, 0], [4, 1, 0], [4, 2, 0], [4, 2, 1], [2, 0, 0]]
     assert (made.weight == 1).all()  # validation frames
     with pytest.raises(InputError, match="'101:4' is no plan"):
