@@ -100,7 +100,6 @@ def test_a_history_is_made_by_plans_chosen_by_hand(tmp_path: Path) -> None:
     recipe = shrunk("three_tasks").model_dump(mode="json")
     (tmp_path / "few.yaml").write_text(json.dumps(recipe))
     out, runs = tmp_path / "weather.csv", tmp_path / "runs"
-<<<<<<< HEAD
     main(
         [
             str(tmp_path / "few.yaml"),
@@ -115,11 +114,7 @@ def test_a_history_is_made_by_plans_chosen_by_hand(tmp_path: Path) -> None:
             "1",
         ]
     )
-    made = history_of("weather", "weather.csv", tmp_path)
-=======
-    main([str(tmp_path / "few.yaml"), "weather", "101:4,2,1", "102:2,0,0", "--runs", str(runs), "--out", str(out)])
     made = parse_history("weather", out.read_text(), "weather.csv")
->>>>>>> main
     assert made.resources.tolist() == [[4, 0, 0], [4, 1, 0], [4, 2, 0], [4, 2, 1], [2, 0, 0]]
     assert (made.weight == 1).all()  # validation frames
     with pytest.raises(InputError, match="'101:4' is no plan"):
