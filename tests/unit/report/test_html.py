@@ -83,7 +83,7 @@ def test_an_interval_that_one_scene_leaves_unknown_is_said() -> None:
 def test_verdicts_stand_at_their_findings() -> None:
     text = render(results(), PICTURES)
     told = Page(text).text
-    assert "undecided Does cloud help? What cloud did." in told
+    assert "undecided grid, objects Does cloud help? What cloud did." in told
     assert told.count("What pole did.") == 1
     assert '<span class="badge did-not-hold">did not hold</span>' in text
 
