@@ -49,7 +49,7 @@ RECORDED = {
 @pytest.mark.parametrize("name", STUDIES)
 def test_what_a_study_records_stays_what_its_committed_figures_are_of(name):
     """A recipe that changes, changes the frames, and the steps' fingerprints: run the study anew, then write both."""
-    study = STUDIES[name]
+    study = study_named(name)
     recipes = {"train": list(study.train), "validation": study.validation, "tests": dict(study.tests)}
     assert hashlib.sha256(json.dumps(recipes, sort_keys=True).encode()).hexdigest()[:16] == RECORDED[name]
 
