@@ -331,10 +331,10 @@ def test_a_full_disk_while_a_picture_is_written(data: Path, tmp_path: Path) -> N
 
 
 def test_a_demo_into_the_folder_of_another(tmp_path: Path) -> None:
-    step = tmp_path / "work" / "suburb-pool"
+    step = tmp_path / "work" / "suburb-pool-objects"
     step.mkdir(parents=True)
     (step / "done.json").write_text(json.dumps({"fingerprint": "of another seed", "value": {}}))
     done = shell("demo", "--out", tmp_path)
     assert done.returncode == 2
     assert one_sentence(done.stderr).startswith(f"{tmp_path / 'work'}: holds the steps of another")
-    assert left_in(tmp_path) == ["work/suburb-pool/done.json"]
+    assert left_in(tmp_path) == ["work/suburb-pool-objects/done.json"]

@@ -80,7 +80,7 @@ def test_the_gap_is_the_way_from_pretraining_to_ground_truth() -> None:
 
 
 def test_gaps_are_closed_of_every_stage_where_there_is_an_oracle() -> None:
-    from test_recipe import parsed
+    from test_run_recipe import parsed
 
     recipe = parsed(arms={"densest": {}, "oracle": {"central": "federate"}})
     closed = gaps_closed(TESTS, recipe)
