@@ -14,7 +14,6 @@ from flcav.world.weather import WeatherSchedule
 
 MAIN = "main"  # the arm that the recipe itself describes
 PRETRAIN, EDGE, CLOUD, CENTRAL = "pretrain", "edge", "cloud", "central"
-SPLITS = ("pool", "validation", "registry", "edge", "test")
 
 Role = Literal["pretrain", "federate", "unseen"]
 SplitName = Literal["pool", "validation", "registry", "edge", "test"]

@@ -52,9 +52,14 @@ class Learning:
         """Return the samples of a step."""
         return self.training.batch or self.task.practice.batch
 
+    @property
+    def config(self) -> Any:
+        """Return the network's configuration."""
+        return configuration(self.task, self.network)
+
     def fresh(self) -> Any:
         """Return a network with weights drawn from the seed."""
-        return fresh(self.task, configuration(self.task, self.network), self.seed)
+        return fresh(self.task, self.config, self.seed)
 
     def schedule(self, rounds: int, steps: int, *names: str) -> Schedule:
         """Return what clients do in `rounds` rounds of `steps` local steps."""

@@ -17,6 +17,7 @@ from flcav.network.plan import MessageSizes, Price
 from flcav.perception.errors import THRESHOLD, RegistersErrors, load_errors, save_errors
 from flcav.perception.outcomes import interval, measurable, measured, score_on
 from flcav.perception.sharing import shared
+from flcav.perception.task import configuration
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule
@@ -92,7 +93,7 @@ def plan_step(
     asked, groups = [], _edge_groups(asked_for)
     for name in asked_for.tasks:
         task, network = task_named(name), asked_for.tasks[name].network
-        config = Learning(task, network, Training(), 0).fresh().config
+        config = configuration(task, network)
         sizes = [
             size
             for step in pools[name]
@@ -129,7 +130,7 @@ def pretrain_step(
     own = Plan.load(work.inputs[plan])
     opened = {region: Frames.open(work.inputs[step]) for region, step in pools.items()}
     watched = [Frames.open(work.inputs[step]) for step in validation]
-    config = learning.fresh().config
+    config = learning.config
     chosen = choose_uploads({region: split.vehicles for region, split in opened.items()}, own.tasks[task].samples, seed)
     book = Ledger(_purse(own, budget_mb, task))
     samples: list[Any] = []

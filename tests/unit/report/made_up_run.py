@@ -73,7 +73,7 @@ def run() -> Run:
         pretrained=(Pretrained("objects", "tiny", {"suburb": (0,)}, (Block(1.0, 2.0, 0.4),), 100, 0.5),),
         watched=(),
         tested=tuple(
-            Test(MAIN, stage, town, "objects", "test", tested(town, mean))
+            Test(MAIN, stage, town, "objects", "test", result_of(town, mean))
             for town, means in MEANS.items()
             for stage, mean in zip((PRETRAIN, EDGE, CLOUD), means, strict=True)
         ),
@@ -93,12 +93,12 @@ def run() -> Run:
     )  # fmt: skip
 
 
-def tested(town: str, mean: float) -> Tested:
+def result_of(town: str, mean: float) -> Tested:
     estimate = Estimate(mean, mean - 0.041, mean + 0.038)
     return Tested(town, "objects", "AP50", estimate, {"AP70": mean - 0.19, "right headings": 0.96}, 96, 8)
 
 
-def tests() -> list[dict[str, Any]]:
+def chart_rows() -> list[dict[str, Any]]:
     """Return the tested rows of a chart."""
     return [
         {"stage": stage, "town": town, "score": mean, "low": mean - 0.041, "high": mean + 0.038}

@@ -11,7 +11,7 @@ from matplotlib.text import Text
 
 from flcav.report import figures, style
 
-TESTED, ROUNDS = made_up_run.tests(), made_up_run.rounds()
+TESTED, ROUNDS = made_up_run.chart_rows(), made_up_run.rounds()
 BUDGETS, SENT = made_up_run.BUDGETS, made_up_run.sent()
 ARMS = [
     {"arm": arm, "town": town, "ap50": ap50, "low": ap50 - 0.03, "high": ap50 + 0.04}
