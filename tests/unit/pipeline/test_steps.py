@@ -18,6 +18,7 @@ import flcav
 from flcav.config import InputError
 from flcav.pipeline.provenance import checkout
 from flcav.pipeline.steps import Step, Work, run_side_by_side, run_steps
+from flcav.pipeline.steps.step import DONE_NOW
 
 
 def count(work: Work, start: int) -> int:
@@ -91,6 +92,20 @@ def test_steps_run_once_and_hand_their_values_on(tmp_path):
 def test_a_step_computes_on_one_thread(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     assert run_steps([Step("threads", count_threads, {})], tmp_path, jobs=1, notify=quiet) == {"threads": 1}
+
+
+def test_what_most_others_wait_for_comes_first(tmp_path):
+    steps = [
+        Step("alone", count, {"start": 1}, ()),
+        Step("first", count, {"start": 1}, ()),
+        Step("second", add, {"names": ["first"]}, ("first",)),
+        Step("third", add, {"names": ["second"]}, ("second",)),
+    ]
+    done: list[str] = []
+    run_steps(
+        steps, tmp_path, jobs=1, notify=lambda name, now, total, note: done.append(name) if note == DONE_NOW else None
+    )
+    assert done == ["first", "second", "alone", "third"]  # as many wait for "alone" as for "third"
 
 
 def test_a_folder_of_another_configuration_is_refused(tmp_path):

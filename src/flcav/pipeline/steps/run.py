@@ -132,7 +132,7 @@ def _planned(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, so
 
 
 def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify) -> None:
-    waiting, values = plan.waiting, plan.values
+    waiting, values = _most_waited_for_first(plan.waiting), plan.values
     with workers.hands(plan.folder, jobs) as hands:
         running: dict[Future[Any], Step] = {}
         while waiting or running:
@@ -146,6 +146,16 @@ def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify) -> None:
                 step = running.pop(future)
                 values[step.name] = future.result()
                 notify(step.name, 1, 1, DONE_NOW)
+
+
+def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
+    """Return the steps, those first on which most others rest, directly or through others: they hold up the run."""
+    rests: dict[str, set[str]] = {step.name: set() for step in steps}
+    for step in reversed(steps):
+        for name in step.needs:
+            if name in rests:
+                rests[name] |= {step.name} | rests[step.name]
+    return sorted(steps, key=lambda step: -len(rests[step.name]))
 
 
 def _settled(steps: Sequence[Step], folder: Path, stale: str, sources: Sources) -> tuple[dict[str, Record], set[str]]:
