@@ -1,12 +1,17 @@
-"""One SUMO run in a process of its own: `python -m flcav.world.sumo_process JOB.json OUT.npz`.
+"""What the process beside this one does that simulates traffic, see `flcav.world.sumo`.
 
-libsumo holds one simulation per process, and a second start silently replaces the first; so nobody imports it but here.
+Each line that it reads names a folder with job.json; when out.npz and said.txt lie there, it answers with an exit code.
+libsumo holds one simulation per process, and a second start silently replaces the first; so nobody imports it but here,
+and each simulation is a fork of this process: loading libsumo takes longer than a minute of traffic.
 """
 
 import json
+import os
+import signal
 import sys
+import traceback
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -91,7 +96,32 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
     )
 
 
-if __name__ == "__main__":
-    job = json.loads(Path(sys.argv[1]).read_text())
-    asked = [Scenario.model_validate(scenario) for scenario in job["scenarios"]]
-    run(Path(job["net"]), Path(job["routes"]), job["seed"], job["steps"], Path(sys.argv[2]), asked)
+def serve() -> None:
+    """Simulate the jobs whose folders are read, until there are no more."""
+    import libsumo  # noqa: F401 - for the forks
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # is the matter of the process that asks, which ends this one
+    for line in sys.stdin:
+        fork = os.fork()
+        if not fork:
+            _simulate(Path(line.rstrip("\n")))
+        print(os.waitstatus_to_exitcode(os.waitpid(fork, 0)[1]), flush=True)
+
+
+def _simulate(folder: Path) -> NoReturn:
+    """Do the job in the folder, and end this process; what it and SUMO say goes into said.txt."""
+    code = 1
+    try:
+        with (folder / "said.txt").open("w") as said:
+            os.dup2(said.fileno(), sys.stdout.fileno())
+            os.dup2(said.fileno(), sys.stderr.fileno())
+        job = json.loads((folder / "job.json").read_text())
+        scenarios = [Scenario.model_validate(scenario) for scenario in job["scenarios"]]
+        run(Path(job["net"]), Path(job["routes"]), job["seed"], job["steps"], folder / "out.npz", scenarios)
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)

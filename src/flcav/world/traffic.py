@@ -1,8 +1,6 @@
 """Traffic of a town by SUMO: everything that moves, and what is parked beside it, as a `Trace`."""
 
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +19,7 @@ from flcav.world.parking import Parked, park
 from flcav.world.roads import read_net
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.shapes import SHAPES
+from flcav.world.sumo import simulate_in
 from flcav.world.sumo_process import STEP_S
 from flcav.world.surfaces import footprint
 from flcav.world.town import KERB_M, Town
@@ -74,16 +73,15 @@ def _run(
 ) -> dict[str, NDArray]:
     with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
         folder = Path(name)
-        routes, job, out = folder / "routes.rou.xml", folder / "job.json", folder / "out.npz"
-        routes.write_text(demand, encoding="utf-8")
+        (folder / "routes.rou.xml").write_text(demand, encoding="utf-8")
         asked = [scenario.model_dump() for scenario in scenarios]
-        values = {"net": str(net), "routes": str(routes), "seed": seed, "steps": steps.tolist(), "scenarios": asked}
-        job.write_text(json.dumps(values))
-        command = [sys.executable, "-m", "flcav.world.sumo_process", str(job), str(out)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise RuntimeError(f"SUMO failed on {net}: {(done.stderr or done.stdout).strip()[-500:]}")
-        with np.load(out) as arrays:
+        values = {"net": str(net), "routes": str(folder / "routes.rou.xml"), "seed": seed, "steps": steps.tolist()}
+        (folder / "job.json").write_text(json.dumps(values | {"scenarios": asked}))
+        try:
+            simulate_in(folder)
+        except RuntimeError as error:
+            raise RuntimeError(f"SUMO failed on {net}: {error}") from None
+        with np.load(folder / "out.npz") as arrays:
             return dict(arrays)
 
 

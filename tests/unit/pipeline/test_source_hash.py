@@ -214,3 +214,8 @@ def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches
     ran = set(done.stdout.split())
     assert len(ran) > 30
     assert ran <= Sources().hashes(starts(record_split)).keys()
+
+
+def test_a_recording_reaches_what_drives_the_traffic_in_a_process_beside_it():
+    reached = Sources().hashes(starts(record_split))
+    assert {"flcav.world.sumo_process", "flcav.world.walking", "flcav.world.scenarios.director"} <= reached.keys()
