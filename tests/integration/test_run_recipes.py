@@ -13,7 +13,19 @@ from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.planning import parse_history
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe, Split, Splits, Training, load_run_recipe
+from flcav.pipeline.recipe import (
+    CLOUD,
+    EDGE,
+    MAIN,
+    PRETRAIN,
+    SPLITS_OF,
+    Role,
+    RunRecipe,
+    Split,
+    Splits,
+    Training,
+    load_run_recipe,
+)
 from flcav.pipeline.results import Run
 from flcav.pipeline.running import RESULTS, run
 from flcav.report.run_page import page, write_report
@@ -49,9 +61,16 @@ def shrunk(name: str) -> RunRecipe:
     )
 
 
-def test_three_tasks_share_a_plan_and_a_ledger(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def three_tasks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
+    """Return the folder of a run of three tasks, and what it gave."""
+    folder = tmp_path_factory.mktemp("runs") / "three_tasks"
+    return folder, run(shrunk("three_tasks"), folder)
+
+
+def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) -> None:
     recipe = shrunk("three_tasks")
-    result = run(recipe, tmp_path)
+    folder, result = three_tasks
     main = result.arms[MAIN]
     assert list(main.plan.tasks) == ["objects", "weather", "trajectory"]
     assert [plan.predicted is None for plan in main.plan.tasks.values()] == [False, True, True]
@@ -65,7 +84,7 @@ def test_three_tasks_share_a_plan_and_a_ledger(tmp_path: Path) -> None:
         assert use.used_mb <= use.budget_mb
         for task in ("weather", "trajectory"):  # what a message weighs was known beforehand
             assert spent[task] == pytest.approx(getattr(main.plan.tasks[task], f"{link}_mb"), rel=0.3)
-    pool = Frames.open(tmp_path / "work/suburb-pool-trajectory")
+    pool = Frames.open(folder / "work/suburb-pool-trajectory")
     weighs: dict[tuple[str, int], set[int]] = {}
     for i, size in zip(
         pool.vehicles, TRAJECTORY.sample_bytes(pool.data, CONFIGURATIONS["tiny"], pool.vehicles), strict=True
@@ -73,11 +92,11 @@ def test_three_tasks_share_a_plan_and_a_ledger(tmp_path: Path) -> None:
         weighs.setdefault((pool.data.keys[i].scene, pool.data.keys[i].index), set()).add(size)
     assert all(len(sizes) == 1 for sizes in weighs.values())  # all four vehicles of an instant would send it
     assert any(sizes != {0} for sizes in weighs.values())
-    read = Run.load(tmp_path, RESULTS)
+    read = Run.load(folder, RESULTS)
     assert page(read) == page(result)  # in the recipe's order, not in that of the alphabet
-    assert "trajectory" in write_report(read, tmp_path).read_text()
+    assert "trajectory" in write_report(read, folder).read_text()
     assert {"rounds_objects.png", "rounds_weather.png", "rounds_trajectory.png", "before_after.png"} <= {
-        path.name for path in (tmp_path / "pictures").iterdir()
+        path.name for path in (folder / "pictures").iterdir()
     }
 
 
@@ -96,28 +115,35 @@ def test_a_town_from_a_map_federates(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "test-cloud-fl-objects-ring" in steps
 
 
-def test_a_history_is_made_by_plans_chosen_by_hand(tmp_path: Path) -> None:
+def test_a_history_is_made_of_recorded_datasets_by_plans_chosen_by_hand(
+    three_tasks: tuple[Path, Run], tmp_path: Path
+) -> None:
+    before = three_tasks[0] / "work"
+
+    def recorded(region: str, role: Role) -> dict[str, str]:
+        of = {split: "objects" if split == "registry" else "weather" for split in SPLITS_OF[role]}  # as recorded
+        return {split: str(before / f"{region}-{split}-{task}/data") for split, task in of.items()}
+
     recipe = shrunk("three_tasks").model_dump(mode="json")
+    roles: dict[str, Role] = {"suburb": "pretrain", "grid": "federate"}
+    recipe["regions"] = {region: {"role": role, "data": recorded(region, role)} for region, role in roles.items()}
+    recipe["tasks"] = {"weather": recipe["tasks"]["weather"]}
+    recipe["placement"] = {"rule": "none", "tasks": [], "group_range_m": 400.0}
     (tmp_path / "few.yaml").write_text(json.dumps(recipe))
     out, runs = tmp_path / "weather.csv", tmp_path / "runs"
-    main(
-        [
-            str(tmp_path / "few.yaml"),
-            "weather",
-            "101:4,2,1",
-            "102:2,0,0",
-            "--runs",
-            str(runs),
-            "--out",
-            str(out),
-            "--jobs",
-            "1",
-        ]
-    )
+    asked = ["--runs", str(runs), "--out", str(out), "--jobs", "1"]
+    main([str(tmp_path / "few.yaml"), "weather", "101:4,2,1", "102:2,0,0", *asked])
     made = parse_history("weather", out.read_text(), "weather.csv")
     assert made.resources.tolist() == [[4, 0, 0], [4, 1, 0], [4, 2, 0], [4, 2, 1], [2, 0, 0]]
     assert (made.weight == 1).all()  # validation frames
+    result = Run.load(runs / "101-4-2-1", RESULTS)
+    assert {(test.region, test.stage) for test in result.tested} == {
+        *((region, stage) for region in roles for stage in (PRETRAIN, CLOUD)),
+        ("grid", EDGE),
+    }
+    dealt = Frames.open(runs / "101-4-2-1/work/grid-edge-weather")
+    assert dealt.vehicles == Frames.open(before / "grid-edge-weather").vehicles
     with pytest.raises(InputError, match="'101:4' is no plan"):
         Chosen.read("101:4")
     with pytest.raises(InputError, match="'signs' is none of the recipe's tasks"):
-        main([str(tmp_path / "few.yaml"), "signs", "101:4,2,1", "--runs", str(runs), "--out", str(out), "--jobs", "1"])
+        main([str(tmp_path / "few.yaml"), "signs", "101:4,2,1", *asked])

@@ -4,7 +4,7 @@ Format: https://sumo.dlr.de/docs/Networks/SUMO_Road_Networks.html
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 
 Array = NDArray[np.float64]
 
@@ -119,14 +119,25 @@ def _net(root: ElementTree.Element) -> RoadNet:
         for row in root.iterfind("junction")
         if row.attrib["type"] != "internal"
     }
-    circling = (row.attrib["nodes"].split() for row in root.iterfind("roundabout"))
+    circling = [name for row in root.iterfind("roundabout") for name in row.attrib["nodes"].split()]
     states: dict[str, str] = {}
     for row in root.iterfind("connection"):
         edge = edges[row.attrib["from"]]
         if edge.function == "normal" and edge.lanes[int(row.attrib["fromLane"])].kind == "driving":
             states[edge.id] = states.get(edge.id, "") + row.attrib["state"]
     connections = tuple(_connection(row) for row in root.iterfind("connection"))
-    return RoadNet(edges, junctions, frozenset(name for names in circling for name in names), states, connections)
+    ends = [name for edge in edges.values() if edge.function == "normal" for name in (edge.start, edge.end)]
+    _refuse_unknown("junction", [*ends, *circling], junctions)
+    lanes = {lane.id for edge in edges.values() for lane in edge.lanes}
+    led = [name for each in connections for name in (each.start, each.end, each.via) if name]
+    _refuse_unknown("lane", led, lanes)
+    return RoadNet(edges, junctions, frozenset(circling), states, connections)
+
+
+def _refuse_unknown(what: str, named: Iterable[str], known: Container[str]) -> None:
+    for name in named:
+        if name not in known:
+            raise ValueError(f"no {what} has the id {shorten(name)}")
 
 
 def _connection(row: ElementTree.Element) -> Connection:

@@ -1,6 +1,7 @@
 """The towns, against what shapely says of their polygons."""
 
 import pickle
+import re
 import shutil
 from pathlib import Path
 
@@ -201,4 +202,22 @@ def test_a_file_that_is_no_net_is_named(tmp_path: Path, text: str) -> None:
     shutil.copytree(load_town("ring").net.parent, folder)
     (folder / "town.net.xml").write_text(text)
     with pytest.raises(InputError, match="not a SUMO net"):
+        load_town(folder)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "change", "message"),
+    [
+        (r'(<edge id="[^:"]+" from="[^"]+" to=)"[^"]+"', r'\1"cav9"', "no junction has the id 'cav9'"),
+        (r'(<connection [^>]*toLane=)"\d+"', r'\1"77"', "no lane has the id '.*_77'"),
+        (r'(<connection [^>]*via=)"[^"]+"', r'\1":none_0"', "no lane has the id ':none_0'"),
+    ],
+)
+def test_what_a_net_names_is_in_it(tmp_path: Path, pattern: str, change: str, message: str) -> None:
+    folder = tmp_path / "mine"
+    shutil.copytree(load_town("ring").net.parent, folder)
+    text, count = re.subn(pattern, change, (folder / "town.net.xml").read_text(), count=1)
+    assert count == 1
+    (folder / "town.net.xml").write_text(text)
+    with pytest.raises(InputError, match=message):
         load_town(folder)
