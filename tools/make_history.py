@@ -5,7 +5,7 @@
 
 A plan is SEED:SAMPLES,EDGE_ROUNDS,CLOUD_ROUNDS. Take other seeds than those of the figures that are planned by the
 history, a much and a little pretrained network, and each with rounds and without. Towns, sizes and training are the
-recipe's, the budgets as large as the plans need. The table is what a recipe's `history:` names: a file beside it, or,
+recipe's but for test frames, which a history has no part of; the budgets are as large as the plans need. The table is what a recipe's `history:` names: a file beside it, or,
 put into src/flcav/pipeline/histories, one of the package. The same command goes on where it was stopped.
 """
 
@@ -49,10 +49,12 @@ def recipe_of(recipe: RunRecipe, task: str, chosen: Chosen) -> RunRecipe:
     asked = recipe.model_dump(mode="json")
     plan = {"samples": chosen.samples, "edge_rounds": chosen.edge_rounds, "cloud_rounds": chosen.cloud_rounds}
     placed = {} if task in recipe.placement.tasks else {"rule": "none", "tasks": []}
+    splits = recipe.sized_splits.model_dump(mode="json") | {"test": {"scenes": 1, "spins": 1, "cavs": 1}}
     return RunRecipe.model_validate(
         asked
         | {
             "seed": chosen.seed,
+            "splits": splits,
             "tasks": {task: asked["tasks"][task] | {"history": None, "plan": plan}},
             "budgets_mb": {"wireless": AMPLE_MB, "wireline": AMPLE_MB},
             "placement": asked["placement"] | placed,
