@@ -5,8 +5,9 @@
 
 A plan is SEED:SAMPLES,EDGE_ROUNDS,CLOUD_ROUNDS. Take other seeds than those of the figures that are planned by the
 history, a much and a little pretrained network, and each with rounds and without. Towns, sizes and training are the
-recipe's but for test frames, which a history has no part of; the budgets are as large as the plans need. The table is what a recipe's `history:` names: a file beside it, or,
-put into src/flcav/pipeline/histories, one of the package. The same command goes on where it was stopped.
+recipe's but for test frames, which a history has no part of; the budgets are as large as the plans need. The table is
+what a recipe's `history:` names: a file beside it, or, put into src/flcav/pipeline/histories, one of the package. The
+same command goes on where it was stopped.
 """
 
 import argparse
