@@ -143,6 +143,21 @@ def test_fit_on_the_articles_points_prints_its_curves_bands_and_warnings(capsys)
     assert "signs" in capsys.readouterr().out
 
 
+def test_numbers_too_different_for_the_solver_are_refused_in_a_sentence(tmp_path, capsys):
+    limits = {name: [0, 9] for name in ("edge_rounds", "cloud_rounds")} | {"samples": [40, 400]}
+    shared = {"model_mb": 5.0, "limits": limits, "edge_groups": [3]}
+    slow = {"model": "additive", "floor": 0.02, "pretrain": {"a": 2.0, "b": 0.4}}
+    fast = {"model": "effective", "floor": 0.0, "a": 8.0, "b": 0.6, "alpha": 0.1, "beta": 2**64, "group_samples": 700}
+    tasks = [{"name": "slow", "weight": 0.6, "sample_mb": 1.0, "curve": slow} | shared]
+    tasks += [{"name": "fast", "weight": 0.4, "sample_mb": 0.5, "curve": fast} | shared]
+    problem = {"budgets_mb": {"wireless": 900.0, "wireline": 900.0}, "tasks": tasks}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(problem))
+    assert called("allocate", tmp_path / "problem.yaml", "--baseline", "article") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("flcav: the solver fails on numbers of such different sizes")
+    assert said.count("\n") == 1
+
+
 @pytest.mark.parametrize("name", ["equal-stages", "equal-tasks", "max-throughput", "article"])
 def test_a_baseline_stands_beside_the_optimum(name, capsys):
     assert called("allocate", RECIPES[0], "--baseline", name, "--json") == 0

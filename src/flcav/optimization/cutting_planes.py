@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from scipy.sparse import coo_array, csr_array
 
+from flcav.optimization.instance import variables
+
 Array = NDArray[np.float64]
 
 LARGE = 1e4  # the objective in the solver's eyes, whose tolerances are absolute, around 1e-6
@@ -74,7 +76,7 @@ class Cuts:
         matrix, limit = self._rows()
         bounds = np.stack((self._low(), self._high()), axis=1)
         result = linprog(self._objective(), A_ub=matrix, b_ub=limit, bounds=bounds, method="highs")
-        return result.x[: len(self.program.low)], float(result.fun) / self._scale
+        return variables(result)[: len(self.program.low)], float(result.fun) / self._scale
 
     def solve(self, gap: float) -> tuple[Array, float]:
         """Return the optimum over whole x to a relative `gap`, and the proven bound."""
@@ -87,7 +89,7 @@ class Cuts:
             constraints=LinearConstraint(matrix, ub=limit),  # pyright: ignore[reportArgumentType]
             options={"mip_rel_gap": gap},
         )
-        return np.round(result.x[: len(self.program.low)]), float(result.mip_dual_bound) / self._scale
+        return np.round(variables(result)[: len(self.program.low)]), float(result.mip_dual_bound) / self._scale
 
     def _objective(self) -> Array:
         return np.r_[np.zeros(len(self.program.low)), np.ones(len(self.program.terms))]

@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.curves import Additive, Effective
 from flcav.optimization.effective import EffectiveTasks, effective_tasks
@@ -15,6 +16,13 @@ from flcav.optimization.rounding import outermost
 from flcav.optimization.separable import BUDGET_SLACK, Separable, room
 
 Array = NDArray[np.float64]
+
+
+def variables(result: OptimizeResult) -> Array:
+    """Return the variables of a linear program's optimum; raises `InputError` where the solver found none."""
+    if result.x is None:
+        raise InputError(f"the solver fails on numbers of such different sizes: {shorten(result.message)}")
+    return result.x
 
 
 class Infeasible(InputError):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from flcav.optimization.cutting_planes import Program, outer_approximation
-from flcav.optimization.instance import Instance
+from flcav.optimization.instance import Instance, variables
 from flcav.optimization.rounding import fill, trim
 from flcav.optimization.separable import Separable, newton_step, relax
 from flcav.optimization.terms import terms_of
@@ -101,9 +101,10 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
         rows.append(np.r_[1.0, (instance.budget - x @ instance.cost) * largest])
         values.append(instance.error(x))
         model = linprog([-1.0, 0, 0], A_ub=np.array(rows), b_ub=values, bounds=[(None, None), (0, 1), (0, 1)])
+        weights = variables(model)[1:]
         if -model.fun - max(proven) <= 0.02 * gap * (max(proven) + instance.floor):
             break
-        multipliers.append(model.x[1:] * largest)
+        multipliers.append(weights * largest)
     order = np.argsort(-np.array(proven))
     yield from ((multipliers[i], proven[i]) for i in islice(order, CORRECTIONS))
 
