@@ -185,7 +185,8 @@ def _show(answers: list[dict[str, Any]], fits: list["Fit[Any]"]) -> None:
     rounds = "t rounds" if isinstance(fits[0].curve, Effective) else "y edge, z cloud rounds"
     table = Table("task", f"error after x samples, {rounds}", "rmse", "R²", "points")
     for answer, fit in zip(answers, fits):
-        table.add_row(answer["task"], str(fit.curve), f"{fit.rmse:.4f}", f"{fit.r_squared:.3f}", str(fit.points))
+        explained = "–" if fit.r_squared is None else f"{fit.r_squared:.3f}"
+        table.add_row(answer["task"], str(fit.curve), f"{fit.rmse:.4f}", explained, str(fit.points))
     console.print(table)
     for answer in answers:
         for row in answer["asked"]:

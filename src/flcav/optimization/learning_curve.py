@@ -36,11 +36,11 @@ class Fit(Generic[CurveT]):
     fitted: "Fitted[CurveT] | None" = None
 
     @property
-    def r_squared(self) -> float:
-        """Return the share of the variance of the accuracy that the curve explains; 0 without the points."""
-        if self.fitted is None:
-            return 0.0
-        return 1 - self.rmse**2 / max(float(np.var(self.fitted.error)), 1e-18)
+    def r_squared(self) -> float | None:
+        """Return the share of the variance of the accuracy that the curve explains; None where none is known to be."""
+        if self.fitted is None or np.ptp(self.fitted.error) == 0:
+            return None
+        return 1 - self.rmse**2 / float(np.var(self.fitted.error))
 
     @property
     def measured(self) -> dict[str, float]:
@@ -67,7 +67,9 @@ class Fit(Generic[CurveT]):
             for stage, decay in decays
             if decay.b > 0.5 * STEEPEST
         ]
-        if self.r_squared < 0.5:
+        if self.r_squared is None:
+            said.append("the accuracy is the same at all points: nothing is known of what more would bring")
+        elif self.r_squared < 0.5:
             said.append(f"the curve explains {max(self.r_squared, 0):.0%} of the variance of the accuracy")
         return tuple(said)
 

@@ -24,6 +24,13 @@ def test_the_articles_points_give_its_constants(name):
     assert whole.floor == 0
 
 
+def test_a_history_that_never_changes_explains_nothing():
+    samples = np.array([50.0, 100.0, 200.0, 400.0])
+    fit = fit_additive(samples, np.zeros(4), np.zeros(4), np.full(4, 0.5))
+    assert fit.r_squared is None
+    assert "the same at all points" in " ".join(fit.warnings)
+
+
 def test_effective_samples_are_recovered_up_to_what_can_be_told():
     samples, edge, cloud, _, noise = history()
     n = 0.1 * samples + 0.3 * 800 * (1 - 1 / (edge + 2 * cloud + 1))
