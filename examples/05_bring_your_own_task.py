@@ -1,9 +1,7 @@
 """Bring your own task: how many road users a LiDAR sweep holds. Commands take it too, in the folder of this file:
-
 flcav train 05_bring_your_own_task:TASK --data DIR --out own --epochs 20
 flcav evaluate 05_bring_your_own_task:TASK --data DIR --weights own/weights.safetensors
-flcav infer 05_bring_your_own_task:TASK DIR --weights own/weights.safetensors --pictures pictures
-"""
+flcav infer 05_bring_your_own_task:TASK DIR --weights own/weights.safetensors --pictures pictures"""
 
 import sys
 from pathlib import Path
@@ -11,11 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from pydantic.dataclasses import dataclass
-from torch import nn
 
 from flcav import Dataset, Recipe, evaluate, record, train
-from flcav.perception import Bars, Finding, Practice
-from flcav.progress import silent
+from flcav.perception import Bars, Evaluated, Finding, Practice, Result
 
 
 @dataclass(frozen=True)
@@ -24,21 +20,38 @@ class Square:  # seen from above, around the sensor
     reach_m: float = 36.0  # to either side
 
 
-class Counter(nn.Sequential):  # cells (N, H, W) -> logarithm of the expected number (N, 1)
+class Counter(torch.nn.Sequential):  # cells (N, H, W) -> logarithm of the expected number (N, 1)
     def __init__(self, config: Square) -> None:
-        super().__init__(nn.Flatten(), nn.Linear(config.cells**2, 32), nn.ReLU(), nn.Linear(32, 1))
+        super().__init__(
+            torch.nn.Flatten(), torch.nn.Linear(config.cells**2, 32), torch.nn.ReLU(), torch.nn.Linear(32, 1)
+        )
         self.config = config
 
     def expected(self, samples):
         return self(torch.from_numpy(np.stack([cells for cells, _ in samples])))[:, 0].exp()
 
 
-class CountingTask:
-    name, family, configurations = "counting", "counter", {"tiny": Square()}
-    practice = Practice(batch=4, learning_rate=3e-3)
+@dataclass(frozen=True)
+class Counted(Evaluated):
+    frames: int
+    off_by: float
 
-    def build(self, config):
-        return Counter(config)
+    @property
+    def score(self):
+        return 1 / (1 + self.off_by)
+
+    def lines(self):
+        return [f"{self.frames} sweeps: off by {self.off_by:.1f} road users"]
+
+
+@dataclass(frozen=True)
+class Count(Result):
+    expected: float  # road users
+
+
+class CountingTask:
+    name, family, configurations, practice = "counting", "counter", {"tiny": Square()}, Practice(4, learning_rate=3e-3)
+    build = Counter
 
     def samples(self, data, config, frames=None):
         return [sample(data.frame(i), config) for i in (range(len(data)) if frames is None else frames)]
@@ -48,29 +61,19 @@ class CountingTask:
 
     def loss(self, network, samples):
         counts = torch.tensor([float(count) for _, count in samples])
-        return nn.functional.poisson_nll_loss(network.expected(samples), counts, log_input=False)
+        return torch.nn.functional.poisson_nll_loss(network.expected(samples), counts, log_input=False)
 
-    def evaluate(self, network, data, frames=None, *, progress=silent):
+    def evaluate(self, network, data, frames=None, **progress):
         samples = self.samples(data, network.config, frames)
         wrong = network.expected(samples) - torch.tensor([count for _, count in samples])
-        return {"frames": len(samples), "off_by": wrong.abs().mean().item()}
-
-    def score(self, result):
-        return 1 / (1 + result["off_by"])
+        return Counted(len(samples), wrong.abs().mean().item())
 
     def infer(self, network, path, threshold=0.0, frames=None):
         data = Dataset.open(path)
         for frame in (data.frame(i) for i in (range(len(data)) if frames is None else frames)):
-            mean = network.expected([sample(frame, network.config)]).detach()
-            shares = torch.distributions.Poisson(mean).log_prob(torch.arange(16.0)).exp().tolist()
-            marks = (Bars({str(count): share for count, share in enumerate(shares)}),)
-            yield Finding(path / frame.key, frame.lidar["lidar"], {"expected": float(mean)}, marks)
-
-    def evaluation_lines(self, result):
-        return [f"{result['frames']} sweeps: off by {result['off_by']:.1f} road users"]
-
-    def finding_lines(self, result):
-        return [f"{result['expected']:.1f} road users"]
+            law = torch.distributions.Poisson(network.expected([sample(frame, network.config)]).detach())
+            shares = {str(count): share.item() for count, share in enumerate(law.log_prob(torch.arange(16.0)).exp())}
+            yield Finding(path / frame.key, frame.lidar["lidar"], Count(law.mean.item()), (Bars(shares),))
 
 
 def sample(frame, config):  # the logarithm of returns by cell, of what stands on the ground; who has five or more

@@ -51,7 +51,7 @@ def main(out: Path) -> None:
         account = Account(Ledger(Budget(wireless_mb=10.0, wireline_mb=0.0)), "edge", WEATHER.name, "wireless")
         update = federate(clients, to_arrays(network), SCHEDULE, account, strategy=strategy)
         from_arrays(network, update.weights)
-        recall = WEATHER.evaluate(network, data, data.select(agents=["cav2"]))["recall"]
+        recall = WEATHER.evaluate(network, data, data.select(agents=["cav2"])).recall
         print(f"{strategy}: a third vehicle's pictures, recall", ", ".join(f"{k} {v:.2f}" for k, v in recall.items()))
 
 

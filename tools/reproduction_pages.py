@@ -5,14 +5,13 @@ folder's result.json says, or its results.json, where the page is of a run (`flc
 are the authors'.
 """
 
-import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
-from flcav.config import InputError
+from flcav.config import InputError, read_json
 from flcav.experiments import (
     arms_tables,
     fig3a_tables,
@@ -24,21 +23,41 @@ from flcav.experiments import (
     trajectory_tables,
     weather_tables,
 )
-from flcav.files import write_bytes
+from flcav.experiments.demo_arms import ArmsResult
+from flcav.experiments.fig3a import Fig3a
+from flcav.experiments.fig6a_results import AllocationResult
+from flcav.experiments.sim_to_real import SimToReal
+from flcav.experiments.studies import objects, signs, trajectory, weather
+from flcav.experiments.task_study import EvaluationT, Study, StudyResult, results_of_json
+from flcav.files import Json, write_bytes
 from flcav.pipeline.results import Run
 from flcav.pipeline.running import RESULTS
+from flcav.records import of_json
 
 Tables = Mapping[str, str]
-TABLES: dict[str, Callable[[Mapping[str, Any]], Tables]] = {
-    "demo": arms_tables.tables,
-    "fig3a": fig3a_tables.tables,
-    "fig6a-allocation": fig6a_tables.tables,
-    "sim-to-real": sim_to_real_tables.tables,
-    "task-objects": objects_tables.tables,
-    "task-signs": signs_tables.tables,
-    "task-trajectory": trajectory_tables.tables,
-    "task-trajectory-cameras": trajectory_tables.tables,
-    "task-weather": weather_tables.tables,
+T = TypeVar("T")
+
+
+def _told(kind: type[T], tables: Callable[[T], Tables]) -> Callable[[Json, str], Tables]:
+    return lambda values, origin: tables(of_json(kind, values, origin))
+
+
+def _of_study(
+    study: Study[EvaluationT], tables: Callable[[StudyResult[EvaluationT]], Tables]
+) -> Callable[[Json, str], Tables]:
+    return lambda values, origin: tables(results_of_json(study, values, origin))
+
+
+TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: of what its result.json holds, and its path
+    "demo": _told(ArmsResult, arms_tables.tables),
+    "fig3a": _told(Fig3a, fig3a_tables.tables),
+    "fig6a-allocation": _told(AllocationResult, fig6a_tables.tables),
+    "sim-to-real": _told(SimToReal, sim_to_real_tables.tables),
+    "task-objects": _of_study(objects.STUDY, objects_tables.tables),
+    "task-signs": _of_study(signs.STUDY, signs_tables.tables),
+    "task-trajectory": _of_study(trajectory.STUDY, trajectory_tables.tables),
+    "task-trajectory-cameras": _of_study(trajectory.CAMERAS, trajectory_tables.tables),
+    "task-weather": _of_study(weather.STUDY, weather_tables.tables),
 }
 _SPAN = re.compile(r"<!-- (?P<name>[a-z ]+) -->\n.*?<!-- end -->", re.DOTALL)
 
@@ -59,7 +78,8 @@ def tables_of(folder: Path) -> Tables:
     """Return the tables of a reproduction, by name."""
     if (folder / RESULTS).is_file():
         return run_tables.tables(Run.load(folder, RESULTS))
-    return TABLES[folder.name](json.loads((folder / "result.json").read_text(encoding="utf-8")))
+    path = folder / "result.json"
+    return TABLES[folder.name](read_json(path), str(path))
 
 
 def fill_folder(folder: Path) -> str:

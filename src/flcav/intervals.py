@@ -5,6 +5,7 @@ Bootstrap", 1993, ch. 13: percentile intervals). Seeds differ in training and tr
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,30 @@ from scipy.special import stdtrit
 CONFIDENCE = 0.95
 REDRAWS = 1000
 TAILS = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its 95 % interval, which is None where one scene or one seed leaves it unknown."""
+
+    mean: float
+    low: float | None
+    high: float | None
+
+    def told(self, *, sign: bool = False) -> str:
+        """Return "mean (low to high)", with their signs if asked; the mean alone where the interval is unknown."""
+        form = "+.3f" if sign else ".3f"
+        if self.low is None or self.high is None:
+            return f"{self.mean:{form}}"
+        return f"{self.mean:{form}} ({self.low:{form}} to {self.high:{form}})"
+
+
+@dataclass(frozen=True)
+class MeanOverSeeds(Estimate):
+    """A mean over seeds with Student's 95 % interval, which has no width of a single one."""
+
+    low: float
+    high: float
 
 
 def over_scenes(
@@ -37,10 +62,10 @@ def over_scenes(
     return float(low), float(high)
 
 
-def mean_over_seeds(values: Sequence[float]) -> dict[str, float]:
-    """Return mean, low and high of `values`, one per seed: Student's 95 % interval, without width for a single one."""
+def mean_over_seeds(values: Sequence[float]) -> MeanOverSeeds:
+    """Return the mean of `values`, one per seed."""
     array = np.asarray(values, dtype=np.float64)
     half = 0.0
     if len(array) > 1:
         half = float(stdtrit(len(array) - 1, TAILS[1]) * array.std(ddof=1) / np.sqrt(len(array)))
-    return {"mean": float(array.mean()), "low": float(array.mean()) - half, "high": float(array.mean()) + half}
+    return MeanOverSeeds(float(array.mean()), float(array.mean()) - half, float(array.mean()) + half)

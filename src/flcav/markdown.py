@@ -1,6 +1,6 @@
 """Numbers as Markdown."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> str:
@@ -13,12 +13,6 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> str:
 def bullets(lines: Iterable[str]) -> str:
     """Return a list of `lines`."""
     return "\n".join(f"- {line}" for line in lines)
-
-
-def interval(value: Mapping[str, float], *, sign: bool = False) -> str:
-    """Return mean, low and high, with their signs if asked."""
-    mean, low, high = (f"{value[key]:{'+' if sign else ''}.3f}" for key in ("mean", "low", "high"))
-    return f"{mean} ({low} to {high})"
 
 
 def signed(value: float, digits: int = 3) -> str:

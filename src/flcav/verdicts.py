@@ -1,14 +1,14 @@
 """What an interval decides, and the words for it on every page."""
 
-from collections.abc import Mapping
-
-from flcav.markdown import interval
+from flcav.intervals import MeanOverSeeds
 
 HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
 
 
-def verdict(low: float, high: float) -> str:
-    """Return what the interval [low, high] of a difference says of the claim that it is positive."""
+def verdict(low: float | None, high: float | None) -> str:
+    """Return what the interval [low, high] of a difference says of the claim that it is positive; None: no interval."""
+    if low is None or high is None:
+        return UNDECIDED
     if low > 0:
         return HELD
     return NOT_HELD if high < 0 else UNDECIDED
@@ -25,16 +25,16 @@ def verdict_words(decided: str, runs: int = 1) -> str:
     }[decided]
 
 
-def aim_sentence(aim: str, wanted: float, reached: Mapping[str, float], seeds: int, *, at_most: bool = False) -> str:
+def aim_sentence(aim: str, wanted: float, reached: MeanOverSeeds, seeds: int, *, at_most: bool = False) -> str:
     """Return "*aim*: **verdict**, mean (low to high) over so many seeds", without a full stop.
 
-    Reached, or not, where the whole interval of `reached` (mean, low, high) says so; else undecided. The aim is to come
+    Reached, or not, where the whole interval of `reached` says so; else undecided. The aim is to come
     to `wanted` or above, or where `at_most`, to it or below.
     """
-    low, high = reached["low"], reached["high"]
+    low, high = reached.low, reached.high
     good, bad = (high <= wanted, low > wanted) if at_most else (low >= wanted, high < wanted)
     said = "reached" if good else "not reached" if bad else UNDECIDED
-    over = f"{interval(reached)} over {seeds} seeds" if seeds > 1 else f"{reached['mean']:.3f} of one seed"
+    over = f"{reached.told()} over {seeds} seeds" if seeds > 1 else f"{reached.mean:.3f} of one seed"
     return f"*{aim}*: **{said}**, {over}"
 
 

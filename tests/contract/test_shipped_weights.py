@@ -1,6 +1,7 @@
 """Weights that come with the package: small, loadable, and their cards say how they came about."""
 
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 
@@ -10,6 +11,7 @@ from flcav.config import InputError
 from flcav.perception.card import LICENCE
 from flcav.perception.networks import network_of
 from flcav.perception.tasks import TASKS, task_named
+from flcav.perception.training.settings import settings_of
 from flcav.perception.weights import SHIPPED, read_card, shipped, to_arrays
 
 EACH_MB, ALL_MB = 4.0, 12.0
@@ -39,10 +41,11 @@ def test_they_load_and_their_card_says_how_they_came_about(task):
     assert card.licence == LICENCE
     assert card.seed >= 0
     assert card.samples > 0
-    assert card.training["epochs"] > 0
-    assert all(entry["recipe"]["town"] and entry["frames"] > 0 for entry in card.data)
+    assert settings_of(card).epochs > 0
+    assert all(entry.recipe["town"] and entry.frames > 0 for entry in card.data)
     assert card.data
-    assert 0 < task.score(card.metrics) <= 1
+    evaluation = get_type_hints(task.evaluate)["return"]
+    assert 0 < evaluation.of_json(card.metrics, "card").score <= 1
     assert path.with_name("card.md").read_text(encoding="utf-8") == card.markdown()
 
 

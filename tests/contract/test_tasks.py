@@ -104,7 +104,7 @@ def test_a_gpu_trains_evaluates_and_goes_on_to_the_same_weights(task, data, samp
     train(task, again, samples[task.name], steps=2, batch=2, seed=3, checkpointing=checkpointing)
     assert np.isfinite(history.losses).all()
     assert same(network, again)
-    assert np.isfinite(task.score(task.evaluate(network, data)))
+    assert np.isfinite(task.evaluate(network, data).score)
 
 
 class Killed(Exception):
@@ -181,16 +181,22 @@ def test_two_clients_federate(task, samples):
     assert np.isfinite(result.loss)
 
 
+def assert_comes_back(result):
+    values = result.as_json()
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+    assert type(result).of_json(values, "test") == result
+
+
 @each_task
 def test_evaluations_and_findings_are_json_and_words_and_pictures(task, data):
     network = fresh(task, small(task), 1)
     result = task.evaluate(network, data, [0, 3])
-    assert json.loads(json.dumps(result, allow_nan=False)) == result
-    assert 0 <= task.score(result) <= 1
-    assert all(isinstance(line, str) for line in task.evaluation_lines(result))
+    assert_comes_back(result)
+    assert 0 <= result.score <= 1
+    assert all(isinstance(line, str) for line in result.lines())
     finding = next(iter(task.infer(network, data.folder, 0.0)))
-    assert json.loads(json.dumps(finding.result, allow_nan=False)) == finding.result
-    assert task.finding_lines(finding.result)
+    assert_comes_back(finding.result)
+    assert finding.result.lines()
     assert finding.marks
     picture = style.png(draw(finding), dpi=40)
     assert picture.startswith(b"\x89PNG")
@@ -216,7 +222,7 @@ def test_a_whole_training_leaves_weights_with_their_card_and_curves(task, data, 
     monkeypatch.setattr(type(task), "configurations", {"small": small(task)})
     card = train_network(task, Request([data, data], data, epochs=1, seed=2), tmp_path)
     assert (card.task, card.network, card.seed, card.samples) == (task.name, "small", 2, 12)
-    assert card.metrics == task.evaluate(load_network(task, tmp_path / "weights.safetensors"), data)
+    assert card.metrics == task.evaluate(load_network(task, tmp_path / "weights.safetensors"), data).as_json()
     with safe_open(tmp_path / "weights.safetensors", framework="pt") as file:
         assert json.loads(file.metadata()[CARD_KEY]) == json.loads(card.model_dump_json())
     assert (tmp_path / "card.md").read_text() == card.markdown()
@@ -332,5 +338,5 @@ def test_a_picture_of_the_whole_space_counts_as_of_the_nearest_class(tmp_path):
     data, network = Dataset.open(tmp_path), fresh(WEATHER, small(WEATHER), 1)
     with pytest.raises(InputError, match="no picture in any of the weathers clear"):
         WEATHER.evaluate(network, data)
-    nearest = over_the_whole_space(network, data)["nearest"]
-    assert nearest["pictures"] == sum(nearest["confusion"][1]) == 6
+    nearest = over_the_whole_space(network, data)
+    assert nearest.pictures == sum(nearest.confusion[1]) == 6

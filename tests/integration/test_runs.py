@@ -24,8 +24,9 @@ from safetensors.numpy import load_file
 from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.experiments.demo_arms import ARMS, run_arms
+from flcav.experiments.demo_arms import ARMS, ArmsResult, run_arms
 from flcav.experiments.fig6a_allocation import run_allocation
+from flcav.experiments.fig6a_results import AllocationResult
 from flcav.network.ledger import LINKS, Ledger
 from flcav.pipeline.comparing import compare
 from flcav.pipeline.frames import Frames
@@ -39,6 +40,7 @@ from flcav.world.town import load_town
 
 pytestmark = pytest.mark.slow
 
+Studied = tuple[Path, ArmsResult, AllocationResult]
 TOY = Path(__file__).parent / "toy.yaml"
 RECIPE = load_run_recipe(TOY)
 GO = """
@@ -59,7 +61,7 @@ class Last:
 
 
 @pytest.fixture(scope="module")
-def studied(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], dict[str, Any]]:
+def studied(tmp_path_factory: pytest.TempPathFactory) -> Studied:
     """Return the folder of both comparisons of one seed, and their results."""
     out = tmp_path_factory.mktemp("toy") / "studies"
     arms = run_arms(RECIPE, out, seeds=1, jobs=1, notify=lambda *told: None)
@@ -68,7 +70,7 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
 
 
 @pytest.fixture(scope="module")
-def finished(studied: tuple[Path, dict[str, Any], dict[str, Any]]) -> Path:
+def finished(studied: Studied) -> Path:
     """Return the folder of the run, with its report."""
     folder = studied[0] / "seed1"
     write_report(Run.load(folder, RESULTS), folder)
@@ -239,27 +241,27 @@ def test_the_run_leaves_history_that_fit_reads(studied: tuple[Path, Any, Any], c
     assert curve["points"] == 1 + 2 + 1  # pretrained, each edge round, each cloud round
 
 
-def test_the_comparison_of_arms_is_that_of_the_run(studied: tuple[Path, dict[str, Any], Any], result: Run) -> None:
+def test_the_comparison_of_arms_is_that_of_the_run(studied: Studied, result: Run) -> None:
     results = studied[1]
-    (seed,) = results["seeds"]
+    (seed,) = results.seeds
     for town, arms in ARMS.items():
         for name, (arm, stage) in arms.items():
             test = result.test(arm=arm, stage=stage, region=town, task="objects")
-            assert seed["ap"][town][name]["ap50"] == test.estimate.mean
-    assert set(seed["gap_closed"]) == set(ARMS["grid"]) - {"pretrained", "oracle"}
-    assert len(seed["differences"]) == 4 + 3 + 1
-    assert seed["used_mb"]["edge + cloud FL"]["wireless"] == result.arms[MAIN].links["wireless"].used_mb
-    assert results["summary"]["ap50"]["grid"]["oracle"]["mean"] == seed["ap"]["grid"]["oracle"]["ap50"]
+            assert seed.ap[town][name].ap50 == test.estimate.mean
+    assert set(seed.gap_closed) == set(ARMS["grid"]) - {"pretrained", "oracle"}
+    assert len(seed.differences) == 4 + 3 + 1
+    assert seed.used_mb["edge + cloud FL"]["wireless"] == result.arms[MAIN].links["wireless"].used_mb
+    assert results.summary.ap50["grid"]["oracle"].mean == seed.ap["grid"]["oracle"].ap50
 
 
-def test_the_proof_by_training_compares_two_plans(studied: tuple[Path, Any, dict[str, Any]], result: Run) -> None:
-    (seed,) = studied[2]["seeds"]
-    equal, joint = seed["plans"]["equal-stages"], seed["plans"]["joint"]
-    assert joint["samples"] == result.arms[MAIN].plan.tasks["objects"].samples
-    assert equal["samples"] == result.arms["equal"].plan.tasks["objects"].samples
-    assert seed["predicted"]["joint"] == result.arms[MAIN].plan.tasks["objects"].predicted
-    assert set(seed["realised"]) == set(seed["differences"]) == {"grid", "ring"}
-    assert len(studied[2]["findings"]) == 5
+def test_the_proof_by_training_compares_two_plans(studied: Studied, result: Run) -> None:
+    (seed,) = studied[2].seeds
+    equal, joint = seed.plans["equal-stages"], seed.plans["joint"]
+    assert joint.samples == result.arms[MAIN].plan.tasks["objects"].samples
+    assert equal.samples == result.arms["equal"].plan.tasks["objects"].samples
+    assert seed.predicted["joint"] == result.arms[MAIN].plan.tasks["objects"].predicted
+    assert set(seed.realised) == set(seed.differences) == {"grid", "ring"}
+    assert len(studied[2].findings) == 5
 
 
 def test_a_finished_run_is_not_done_again(finished: Path, tmp_path: Path) -> None:

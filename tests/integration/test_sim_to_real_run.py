@@ -63,7 +63,7 @@ def test_it_runs_with_the_shipped_weights(
     returns = len(np.fromfile(kitti / "training" / "velodyne" / f"{name}.bin", np.float32)) / 4
     assert all(clouds[each]["returns"] > 0 for each in clouds)
     assert clouds["KITTI"]["returns"] <= returns
-    assert set(TABLES["sim-to-real"](results)) == {"detections", "cars", "clouds"}
+    assert set(TABLES["sim-to-real"](results, "result.json")) == {"detections", "cars", "clouds"}
     assert (tmp_path / "clouds.png").read_bytes()[:4] == (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
     if made == "real":
         assert scores["Car", "3d", 0.5]["found"] >= labels.count("Car") / 2

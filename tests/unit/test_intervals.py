@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flcav.intervals import mean_over_seeds, over_scenes
+from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds, over_scenes
 
 
 def test_the_interval_over_scenes_is_that_of_redrawing_them_one_by_one():
@@ -37,5 +37,12 @@ def test_what_no_redrawing_knows_has_no_interval_and_unknown_ones_are_left_out()
 def test_means_over_seeds_have_the_interval_of_a_t_test():
     values = [0.71, 0.78, 0.69, 0.74]
     wanted = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
-    assert mean_over_seeds(values) == pytest.approx({"mean": 0.73, "low": wanted.low, "high": wanted.high})
-    assert mean_over_seeds([0.7]) == {"mean": 0.7, "low": 0.7, "high": 0.7}
+    found = mean_over_seeds(values)
+    assert (found.mean, found.low, found.high) == pytest.approx((0.73, wanted.low, wanted.high))
+    assert mean_over_seeds([0.7]) == MeanOverSeeds(0.7, 0.7, 0.7)
+
+
+def test_an_estimate_is_told_with_its_interval_where_it_has_one():
+    assert Estimate(0.1, -0.2, 0.4).told() == "0.100 (-0.200 to 0.400)"
+    assert Estimate(0.1, -0.2, 0.4).told(sign=True) == "+0.100 (-0.200 to +0.400)"
+    assert Estimate(0.1, None, None).told() == "0.100"

@@ -1,5 +1,6 @@
 import pytest
 
+from flcav.intervals import MeanOverSeeds
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, aim_sentence, signed, verdict, verdict_words
 
 
@@ -11,13 +12,13 @@ from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, aim_sentence, signed, verd
     ],
 )  # fmt: skip
 def test_the_whole_interval_decides(low, high, at_most, verdict):
-    reached = {"mean": (low + high) / 2, "low": low, "high": high}
+    reached = MeanOverSeeds((low + high) / 2, low, high)
     said = aim_sentence("AP of 0.85", 0.85, reached, 3, at_most=at_most)
-    assert said == f"*AP of 0.85*: **{verdict}**, {reached['mean']:.3f} ({low:.3f} to {high:.3f}) over 3 seeds"
+    assert said == f"*AP of 0.85*: **{verdict}**, {reached.mean:.3f} ({low:.3f} to {high:.3f}) over 3 seeds"
 
 
 def test_one_seed_has_no_interval():
-    reached = {"mean": 0.9, "low": 0.9, "high": 0.9}
+    reached = MeanOverSeeds(0.9, 0.9, 0.9)
     assert aim_sentence("AP", 0.85, reached, 1) == "*AP*: **reached**, 0.900 of one seed"
 
 
@@ -33,6 +34,10 @@ def test_one_seed_has_no_interval():
 )
 def test_only_an_interval_without_zero_decides(low: float, high: float, said: str) -> None:
     assert verdict(low, high) == said
+
+
+def test_without_an_interval_nothing_is_decided() -> None:
+    assert verdict(None, None) == UNDECIDED
 
 
 def test_the_words_say_of_how_many_runs():

@@ -60,19 +60,20 @@ def infer(
     if not isinstance(learned, Scores):
         refuse_unused(f"infer {task}", "threshold")
     found = networks.infer(learned, inputs, weights, threshold=threshold, agents=agents, device=device)
-    results = []
+    findings = []
     for number, finding in enumerate(found):
-        results.append({"path": str(finding.path), **finding.result})
+        findings.append((str(finding.path), finding.result))
         if pictures is not None:
             _draw(finding, pictures / f"{number:05d}_{finding.path.stem}.png")
     if as_json:
         datasets = [{"path": str(path), **choice.summary()} for path, choice in found.chosen.items()]
+        results = [{"path": path, **result.as_json()} for path, result in findings]
         typer.echo(json.dumps({"datasets": datasets, "inputs": results}, allow_nan=False))
         return
     for path, choice in found.chosen.items():
         typer.echo(f"{path}: {choice.sentence}")
-    for result in results:
-        typer.echo("\n  ".join([f"{result['path']}:", *learned.finding_lines(result)]))
+    for path, result in findings:
+        typer.echo("\n  ".join([f"{path}:", *result.lines()]))
 
 
 def _draw(finding: "Finding", path: Path) -> None:

@@ -103,9 +103,9 @@ def _fig3a(out: Path) -> None:
     from flcav.files import write_bytes, write_json
 
     results = fig3a()
-    write_json(out / "result.json", results)
+    write_json(out / "result.json", results.as_json())
     write_bytes(out / "fig3a.png", draw_fig3a(results))
-    for sentence in results["findings"]:
+    for sentence in results.findings:
         typer.echo(sentence)
 
 
@@ -118,10 +118,10 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
     with live_steps(Target.demo_arms.value) as notify:
         recipe = study_recipe("arms", scale)
         results = run_arms(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    write_json(out / "result.json", results)
+    write_json(out / "result.json", results.as_json())
     write_bytes(out / "arms.png", draw_arms(results))
-    for arm, closed in results["summary"]["gap_closed"].items():
-        typer.echo(f"{arm}: closes {closed['mean']:.2f} of the gap ({closed['low']:.2f} to {closed['high']:.2f})")
+    for arm, closed in results.summary.gap_closed.items():
+        typer.echo(f"{arm}: closes {closed.mean:.2f} of the gap ({closed.low:.2f} to {closed.high:.2f})")
 
 
 @when_interrupted()
@@ -134,10 +134,10 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
     with live_steps(Target.fig6a_allocation.value) as notify:
         recipe = study_recipe("allocation", scale)
         results = run_allocation(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    write_json(out / "result.json", results)
+    write_json(out / "result.json", results.as_json())
     write_bytes(out / "plans.png", draw_allocation(results))
-    for finding in results["findings"]:
-        typer.echo(f"{finding['question']} {finding['verdict']}. {finding['sentence']}")
+    for finding in results.findings:
+        typer.echo(f"{finding.question} {finding.verdict}. {finding.sentence}")
 
 
 @when_interrupted()
@@ -156,31 +156,31 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int,
     with live_steps(Target.sim_to_real.value) as notify:
         network = network_of(OBJECTS, weights)
         results = run_sim_to_real(network, kitti, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    write_json(out / "result.json", results)
-    write_bytes(out / "clouds.png", style.png(compare(results["clouds"])))
-    for story in results["frames"]:
-        write_bytes(out / f"{story['frame']}.png", draw_frame(kitti, story))
-    for row in results["scores"]:
-        if row["targets"]:
-            found = f"{row['found']} of {row['targets']} found, {row['false_positives']} false"
-            typer.echo(f"{row['class']} {row['kind']} at IoU {row['iou']}: {found}, AP {row['ap']:.3f}")
+    write_json(out / "result.json", results.as_json())
+    write_bytes(out / "clouds.png", style.png(compare(results.clouds)))
+    for story in results.frames:
+        write_bytes(out / f"{story.frame}.png", draw_frame(kitti, story))
+    for row in results.scores:
+        if row.targets:
+            found = f"{row.found} of {row.targets} found, {row.false_positives} false"
+            typer.echo(f"{row.label} {row.kind} at IoU {row.iou}: {found}, AP {row.ap:.3f}")
 
 
 @when_interrupted()
 def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.studies import study_named
-    from flcav.experiments.task_study import run_study
+    from flcav.experiments.task_study import results_as_json, run_study
     from flcav.files import write_bytes, write_json
 
     study = study_named(target.removeprefix(TASK))
     with live_steps(target) as notify:
         results = run_study(study, out, seeds=seeds, scale=scale, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    write_json(out / "result.json", results)
+    write_json(out / "result.json", results_as_json(study, results))
     write_bytes(out / f"{study.task.name}.png", study.draw(results))
-    for test, numbers in results["summary"].items():
+    for test, numbers in results.summary.items():
         for name, value in numbers.items():
-            typer.echo(f"{test}, {name}: {value['mean']:.3f} ({value['low']:.3f} to {value['high']:.3f})")
+            typer.echo(f"{test}, {name}: {value.told()}")
 
 
 def register(app: typer.Typer) -> None:

@@ -67,8 +67,9 @@ def train(
             return
         typer.echo("\n".join(prepared.lines()))
         with progress.live(f"train {task}") as report:
-            card = train_prepared(prepared, report)
-    told = f"{out / WEIGHTS}: trained on {card.samples} samples, {card.training['steps']} steps"
-    typer.echo(f"{told}, mean loss of the last epoch {card.training['loss']:.3f}")
-    if card.metrics:
-        typer.echo("\n".join(["on the validation data:", *learner.evaluation_lines(card.metrics)]))
+            trained = train_prepared(prepared, report)
+    card = trained.card
+    told = f"{out / WEIGHTS}: trained on {card.samples} samples, {card.learning.steps} steps"
+    typer.echo(f"{told}, mean loss of the last epoch {card.learning.loss:.3f}")
+    if trained.evaluation is not None:
+        typer.echo("\n".join(["on the validation data:", *trained.evaluation.lines()]))

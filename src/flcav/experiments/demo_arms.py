@@ -4,19 +4,21 @@ Every arm takes as many optimiser steps as the vehicles of stage II take togethe
 seed, intervals redraw test scenes; over seeds, they are Student's t, so they hold what training and traffic vary too.
 """
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 from flcav.config import read_config
-from flcav.intervals import mean_over_seeds
+from flcav.files import Json
+from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
 from flcav.pipeline.findings import in_words
-from flcav.pipeline.provenance import provenance
+from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results import Run
+from flcav.pipeline.results import Pole, Run
 from flcav.pipeline.running import run_seeds
 from flcav.pipeline.steps import Notify, Stale
+from flcav.records import LEFT_OUT, Record
 from flcav.report import figures, style
 from flcav.sources.recipe import recipe_path
 
@@ -47,6 +49,81 @@ COMPARED = (  # (after, before): claims of the article and controls
 )
 
 
+@dataclass(frozen=True)
+class Reached:
+    """AP of a network, at IoU 0.5 with its interval over test scenes, and at 0.7."""
+
+    ap50: float
+    ap50_low: float | None
+    ap50_high: float | None
+    ap70: float | None
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How much of each stage was planned."""
+
+    samples: int
+    edge_rounds: int
+    cloud_rounds: int
+
+
+@dataclass(frozen=True)
+class Pretraining:
+    """How stage I went."""
+
+    steps: int
+    threshold: float | None  # from which score on its detections serve as labels
+    curve: tuple[Mapping[str, float], ...]  # of every `Block`
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a region's roadside sensor stands."""
+
+    chosen: int
+    densest: int  # pole of the densest traffic
+    coverage: tuple[Pole, ...]
+    errors: int
+    covered: int
+    range_m: float
+
+
+@dataclass(frozen=True)
+class ArmsSeed:
+    """What one seed came to; by town: by arm, as `ARMS` calls them."""
+
+    seed: int
+    plan: Counts
+    pretraining: Pretraining
+    placement: Mapping[str, Placement]  # by town
+    ap: Mapping[str, Mapping[str, Reached]]  # by town and arm
+    differences: Mapping[str, Estimate]  # "town: after - before", over test scenes
+    gap_closed: Mapping[str, float]  # by arm
+    used_mb: Mapping[str, Mapping[str, float]]  # by arm and link
+
+
+@dataclass(frozen=True)
+class ArmsSummary:
+    """Means over seeds."""
+
+    ap50: Mapping[str, Mapping[str, MeanOverSeeds]]  # by town and arm
+    ap70: Mapping[str, Mapping[str, MeanOverSeeds]]
+    differences: Mapping[str, MeanOverSeeds]
+    gap_closed: Mapping[str, MeanOverSeeds]
+
+
+@dataclass(frozen=True)
+class ArmsResult(Record):
+    """The numbers of the comparison of arms."""
+
+    seeds: tuple[ArmsSeed, ...]
+    summary: ArmsSummary
+    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: not in results of before
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    note: str = "road labels come from an ideal road detector: arms with a pole are upper bounds"
+
+
 def study_recipe(name: str, scale: str) -> RunRecipe:
     """Return the committed recipe of a comparison: "paper" as it stands, "quick" of the demo's size."""
     recipe = read_config(RunRecipe, recipe_path(f"runs/{name}"))
@@ -62,20 +139,14 @@ def run_arms(
     notify: Notify,
     stale: Stale = "refuse",
     engine: str = "processes",
-) -> dict[str, Any]:
+) -> ArmsResult:
     """Run or finish all arms of each seed in folders below `out` and return the results."""
     runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    rows = [one_seed(run) for run in runs]
-    return {
-        "recipe": recipe.model_dump(mode="json", exclude={"seed"}),
-        "seeds": rows,
-        "summary": summarise(rows),
-        "provenance": asdict(provenance()),
-        "note": "road labels come from an ideal road detector: arms with a pole are upper bounds",
-    }
+    rows = tuple(one_seed(run) for run in runs)
+    return ArmsResult(rows, summarise(rows), recipe.model_dump(mode="json", exclude={"seed"}), provenance())
 
 
-def one_seed(run: Run) -> dict[str, Any]:
+def one_seed(run: Run) -> ArmsSeed:
     """Return what the page tells of a seed."""
     main, pretrained = run.arms[MAIN], run.pretrained[0]
     own, plan = main.links, main.plan.tasks[TASK]
@@ -85,7 +156,7 @@ def one_seed(run: Run) -> dict[str, Any]:
         for each in run.differences
     }
     differences = {
-        f"{town}: {after} - {before}": vars(found[town, *arms[after], *arms[before]])
+        f"{town}: {after} - {before}": found[town, *arms[after], *arms[before]]
         for town, arms in ARMS.items()
         for after, before in COMPARED
         if {after, before} <= set(arms)
@@ -95,61 +166,53 @@ def one_seed(run: Run) -> dict[str, Any]:
         for arm, stage in ARMS["grid"].items()
         if (name := f"grid, {TASK}: {in_words(*stage)}") in run.gap_closed
     }
-    return {
-        "seed": run.recipe.seed,
-        "plan": {name: getattr(plan, name) for name in ("samples", "edge_rounds", "cloud_rounds")},
-        "pretraining": {
-            "steps": pretrained.steps,
-            "threshold": pretrained.threshold,
-            "curve": [vars(block) for block in pretrained.blocks],
-        },
-        "placement": {placed.region: _placed(run, placed.region) for placed in main.placed},
-        "ap": ap,
-        "differences": differences,
-        "gap_closed": closed,
-        "used_mb": {"edge + cloud FL": {link: use.used_mb for link, use in own.items()}},
-    }
+    curve = tuple(vars(block) for block in pretrained.blocks)
+    return ArmsSeed(
+        seed=run.recipe.seed,
+        plan=Counts(plan.samples, plan.edge_rounds, plan.cloud_rounds),
+        pretraining=Pretraining(pretrained.steps, pretrained.threshold, curve),
+        placement={placed.region: _placed(run, placed.region) for placed in main.placed},
+        ap=ap,
+        differences=differences,
+        gap_closed=closed,
+        used_mb={"edge + cloud FL": {link: use.used_mb for link, use in own.items()}},
+    )
 
 
-def _tested(run: Run, town: str, arm: str, stage: str) -> dict[str, float | None]:
+def _tested(run: Run, town: str, arm: str, stage: str) -> Reached:
     test = run.test(arm=arm, stage=stage, region=town, task=TASK)
-    estimate, more = test.estimate, test.numbers
-    return {"ap50": estimate.mean, "ap50_low": estimate.low, "ap50_high": estimate.high, "ap70": more["AP70"]}
+    return Reached(test.estimate.mean, test.estimate.low, test.estimate.high, test.numbers["AP70"])
 
 
-def _placed(run: Run, town: str) -> dict[str, Any]:
+def _placed(run: Run, town: str) -> Placement:
     placed = next(each for each in run.arms[MAIN].placed if each.region == town)
-    coverage = [{"pole": pole.pole, "covered": pole.covered, "actors": pole.actors} for pole in placed.poles]
-    more = {"errors": placed.errors, "covered": placed.covered, "range_m": placed.range_m}
-    return {"chosen": placed.chosen[0], "densest": placed.densest, "coverage": coverage, **more}
+    return Placement(placed.chosen[0], placed.densest, placed.poles, placed.errors, placed.covered, placed.range_m)
 
 
-def summarise(seeds: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
     """Return means over seeds with their 95 % intervals."""
-    first = seeds[0]
-    return {
-        **{
-            number: {
-                town: {arm: mean_over_seeds([seed["ap"][town][arm][number] for seed in seeds]) for arm in arms}
-                for town, arms in first["ap"].items()
-            }
-            for number in ("ap50", "ap70")
+
+    def means(number: Callable[[Reached], float | None]) -> dict[str, dict[str, MeanOverSeeds]]:
+        return {
+            town: {arm: mean_over_seeds([_known(number(seed.ap[town][arm])) for seed in seeds]) for arm in arms}
+            for town, arms in seeds[0].ap.items()
+        }
+
+    return ArmsSummary(
+        ap50=means(lambda reached: reached.ap50),
+        ap70=means(lambda reached: reached.ap70),
+        differences={
+            name: mean_over_seeds([seed.differences[name].mean for seed in seeds]) for name in seeds[0].differences
         },
-        "differences": {
-            name: mean_over_seeds([seed["differences"][name]["mean"] for seed in seeds])
-            for name in first["differences"]
-        },
-        "gap_closed": {
-            arm: mean_over_seeds([seed["gap_closed"][arm] for seed in seeds]) for arm in first["gap_closed"]
-        },
-    }
+        gap_closed={arm: mean_over_seeds([seed.gap_closed[arm] for seed in seeds]) for arm in seeds[0].gap_closed},
+    )
 
 
-def draw_arms(results: dict[str, Any]) -> bytes:
+def _known(number: float | None) -> float:
+    assert number is not None  # every town has cars to find
+    return number
+
+
+def draw_arms(results: ArmsResult) -> bytes:
     """Return the forest plot of all arms' AP over seeds as a PNG."""
-    rows = [
-        {"arm": arm, "town": town, "ap50": ap["mean"], "low": ap["low"], "high": ap["high"]}
-        for town, arms in results["summary"]["ap50"].items()
-        for arm, ap in arms.items()
-    ]
-    return style.png(figures.arms(rows))
+    return style.png(figures.arms(results.summary.ap50))

@@ -21,7 +21,7 @@ from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.fig1b_layers import LAYERS, given_to, watched
 from flcav.geometry import inverse, transform_points
-from flcav.perception.marks import CloudBoxes, Paths, PictureBoxes
+from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
 from flcav.perception.networks import network_of
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.config import STRIDES
@@ -108,14 +108,14 @@ def most_to_see(data: Dataset) -> int:
 
 def _weather(network: Any, picture: Path) -> page.Column:
     finding, layers = _looked(WEATHER, network, picture)
-    probabilities = finding.result["probabilities"]
+    (bars,) = (mark for mark in finding.marks if isinstance(mark, Bars))
     return page.Column(
         "Weather",
         {
             "sensor": partial(page.show_picture, picture=finding.seen),
             "processing": partial(page.show_picture, picture=small(finding.seen), smooth=False),
             "network": partial(page.show_layers, layers=layers),
-            "output": partial(page.show_probabilities, probabilities=probabilities),
+            "output": partial(page.show_probabilities, probabilities=bars.share),
         },
         {
             "sensor": "camera, 90°",

@@ -5,8 +5,8 @@ the additive form that plans are made from.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import networkx as nx
 import numpy as np
@@ -19,7 +19,8 @@ from flcav.optimization.graph import Layers, build
 from flcav.optimization.history import History, article_histories
 from flcav.optimization.learning_curve import Fit, fit_additive
 from flcav.pipeline.planning import history_of
-from flcav.pipeline.provenance import provenance
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.records import LEFT_OUT, Record
 from flcav.report import curve_charts, style
 
 Array = NDArray[np.float64]
@@ -29,38 +30,97 @@ NEAR = 0.03  # relative: how near to the printed constants a plain least-squares
 LEVEL = 0.95  # of the bands
 
 
-def fig3a() -> dict[str, Any]:
-    """Return the curves, points and bands, and how near the fits come to the printed constants."""
+@dataclass(frozen=True)
+class Constants:
+    """The two of the article's form accuracy = 1 - a x^(-b)."""
+
+    a: float
+    b: float
+
+
+@dataclass(frozen=True)
+class ArticleCurve:
+    """The curve of one of the article's tasks, refitted to its points."""
+
+    points: tuple[tuple[float, float], ...]  # samples, accuracy
+    fitted: Additive
+    printed: Constants
+    off: Constants  # fitted / printed - 1
+    rmse: float  # of accuracy
+    resource: tuple[float, ...]  # samples, where the next three are
+    accuracy: tuple[float, ...]
+    low: tuple[float, ...]  # band
+    high: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class OwnLine:
+    """A section of our own curve: of one number of samples, along a run's rounds."""
+
+    samples: int
+    accuracy: tuple[float, ...]  # at each of `OwnCurves.route`
+    low: tuple[float, ...]  # band
+    high: tuple[float, ...]
+    points: tuple[tuple[int, float], ...]  # place in the route, accuracy
+
+
+@dataclass(frozen=True)
+class OwnCurves:
+    """The curve of our own history."""
+
+    route: tuple[tuple[int, int], ...]  # edge rounds, cloud rounds
+    curve: Additive
+    rmse: float
+    lines: tuple[OwnLine, ...]
+
+
+@dataclass(frozen=True)
+class Fig3a(Record):
+    """The curves with their points and bands, and how near the fits come to the printed constants."""
+
+    article: Mapping[str, ArticleCurve]  # by task
+    own: OwnCurves
+    findings: tuple[str, ...]
+    level: float = LEVEL  # of the bands
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # not in results of before
+
+
+def fig3a() -> Fig3a:
+    """Return the numbers of the figure."""
     article = {task: _article_curve(points, PRINTED[task]) for task, points in article_histories().items()}
-    results = {"article": article, "own": _own_curves(), "level": LEVEL, "provenance": asdict(provenance())}
-    return results | {"findings": _findings(results)}
+    own = _own_curves()
+    return Fig3a(article, own, _findings(article, own), provenance=provenance())
 
 
-def _article_curve(points: History, printed: tuple[float, float]) -> dict[str, Any]:
+def _article_curve(points: History, printed: tuple[float, float]) -> ArticleCurve:
     samples, edge_rounds, cloud_rounds = points.resources.T
     fit = fit_additive(samples, edge_rounds, cloud_rounds, points.accuracy)
     assert isinstance(fit.curve, Additive)
     decay = fit.curve.pretrain
     grid = np.geomspace(samples.min(), samples.max(), 60)
-    return {
-        "points": np.column_stack((samples, points.accuracy)).tolist(),
-        "fitted": fit.curve.model_dump(),
-        "printed": dict(zip("ab", printed, strict=True)),
-        "off": {"a": decay.a / printed[0] - 1, "b": decay.b / printed[1] - 1},
-        "rmse": fit.rmse,
-        "resource": grid.tolist(),
-        **_line(fit, bands(fit, level=LEVEL), np.column_stack((grid, np.zeros_like(grid), np.zeros_like(grid)))),
-    }
+    where = np.column_stack((grid, np.zeros_like(grid), np.zeros_like(grid)))
+    accuracy, low, high = _line(fit, bands(fit, level=LEVEL), where)
+    return ArticleCurve(
+        points=tuple(zip(samples.tolist(), points.accuracy.tolist(), strict=True)),
+        fitted=fit.curve,
+        printed=Constants(*printed),
+        off=Constants(decay.a / printed[0] - 1, decay.b / printed[1] - 1),
+        rmse=fit.rmse,
+        resource=tuple(grid.tolist()),
+        accuracy=accuracy,
+        low=low,
+        high=high,
+    )
 
 
-def _line(fit: Fit, found: Bands | None, where: Array) -> dict[str, list[float]]:
-    """Return the accuracy at `where` (n, 3), and its band."""
+def _line(fit: Fit[Additive], found: Bands | None, where: Array) -> tuple[tuple[float, ...], ...]:
+    """Return the accuracy at `where` (n, 3), and the low and high end of its band."""
     accuracy = 1 - fit.curve.error(*where.T)
     low, high = (accuracy, accuracy) if found is None else (1 - error for error in found.between(where)[::-1])
-    return {"accuracy": accuracy.tolist(), "low": low.tolist(), "high": high.tolist()}
+    return tuple(tuple(each.tolist()) for each in (accuracy, low, high))
 
 
-def _own_curves() -> dict[str, Any]:
+def _own_curves() -> OwnCurves:
     """Return a line per number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
     history = history_of("objects")
     samples, edge_rounds, cloud_rounds = history.resources.T
@@ -70,35 +130,27 @@ def _own_curves() -> dict[str, Any]:
     route = [(e, 0) for e in range(int(edge_rounds.max()) + 1)]
     route += [(int(edge_rounds.max()), c) for c in range(1, int(cloud_rounds.max()) + 1)]
     place = {each: number for number, each in enumerate(route)}
-    return {
-        "route": route,
-        "curve": fit.curve.model_dump(),
-        "rmse": fit.rmse,
-        "lines": [
-            {
-                "samples": int(count),
-                **_line(fit, found, np.array([(count, *each) for each in route], dtype=np.float64)),
-                "points": [(place[int(e), int(c)], float(y)) for x, e, c, y in points if x == count],
-            }
-            for count in np.unique(samples)
-        ],
-    }
+    lines = []
+    for count in np.unique(samples):
+        accuracy, low, high = _line(fit, found, np.array([(count, *each) for each in route], dtype=np.float64))
+        own = tuple((place[int(e), int(c)], float(y)) for x, e, c, y in points if x == count)
+        lines.append(OwnLine(int(count), accuracy, low, high, own))
+    return OwnCurves(tuple(route), fit.curve, fit.rmse, tuple(lines))
 
 
-def _findings(results: Mapping[str, Any]) -> list[str]:
+def _findings(article: Mapping[str, ArticleCurve], own: OwnCurves) -> tuple[str, ...]:
     """Return what the numbers say, in sentences."""
-    off = {(task, name): value for task, each in results["article"].items() for name, value in each["off"].items()}
+    off = {(task, name): value for task, each in article.items() for name, value in vars(each.off).items()}
     (task, name), worst = max(off.items(), key=lambda item: abs(item[1]))
     near = all(abs(value) <= NEAR for value in off.values())
-    own = results["own"]
-    points = sum(len(line["points"]) for line in own["lines"])
-    counts = ", ".join(str(line["samples"]) for line in own["lines"])
-    return [
+    points = sum(len(line.points) for line in own.lines)
+    counts = ", ".join(str(line.samples) for line in own.lines)
+    return (
         f"Refitted to the article's points, a and b come {'' if near else 'not '}within {NEAR:.0%} of the printed "
         f"constants; the farthest is {name} of {task}, {worst:+.1%} off.",
-        f"Our own history has {points} points at {len(own['lines'])} sample sizes ({counts}); its curve is off them by "
-        f"{own['rmse']:.3f} AP50 (root mean square).",
-    ]
+        f"Our own history has {points} points at {len(own.lines)} sample sizes ({counts}); its curve is off them by "
+        f"{own.rmse:.3f} AP50 (root mean square).",
+    )
 
 
 def article_graph() -> nx.Graph:
@@ -128,10 +180,26 @@ def article_graph() -> nx.Graph:
     return build(parse_config(Layers, values, "the article's graph"))
 
 
-def _effective(a: float, b: float, group_samples: int) -> dict[str, Any]:
+def _effective(a: float, b: float, group_samples: int) -> dict[str, str | float]:
     return {"model": "effective", "a": a, "b": b, "alpha": 0.1, "beta": 0.5, "group_samples": group_samples}
 
 
-def draw_fig3a(results: Mapping[str, Any]) -> bytes:
+def draw_fig3a(results: Fig3a) -> bytes:
     """Return the figure as a PNG: the graph on the left, the article's curves, our own."""
-    return style.png(curve_charts.fig3a(results, article_graph()))
+    article = [
+        curve_charts.Curve(
+            f"{task}\n1 − {each.fitted.pretrain.a:.3g}·x$^{{-{each.fitted.pretrain.b:.2g}}}$",
+            each.resource,
+            each.accuracy,
+            each.low,
+            each.high,
+            each.points,
+        )
+        for task, each in results.article.items()
+    ]
+    places = range(len(results.own.route))
+    own = [
+        curve_charts.Curve(f"{line.samples}\nsamples", places, line.accuracy, line.low, line.high, line.points)
+        for line in results.own.lines
+    ]
+    return style.png(curve_charts.fig3a(article, own, results.own.route, article_graph()))

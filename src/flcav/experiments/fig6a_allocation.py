@@ -6,15 +6,25 @@ poles, as the errors of its own pretrained network ask. What the curve predicts 
 training reached.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from flcav.experiments.fig6a_findings import EQUAL, JOINT, TOWN, allocation_findings
-from flcav.intervals import mean_over_seeds
+from flcav.experiments.fig6a_findings import allocation_findings
+from flcav.experiments.fig6a_results import (
+    COUNTS,
+    EQUAL,
+    JOINT,
+    TOWN,
+    AllocationResult,
+    AllocationSeed,
+    AllocationSummary,
+    Planned,
+    Reached,
+)
+from flcav.intervals import Estimate, mean_over_seeds
 from flcav.pipeline.planning import history_of
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
@@ -27,7 +37,6 @@ TASK = "objects"
 PLANS = (EQUAL, JOINT)
 ARM_OF = {EQUAL: "equal", JOINT: MAIN}
 STAGES = (PRETRAIN, EDGE, CLOUD)
-COUNTS = ("samples", "edge_rounds", "cloud_rounds")
 
 
 def run_allocation(
@@ -39,22 +48,16 @@ def run_allocation(
     notify: Notify,
     stale: Stale = "refuse",
     engine: str = "processes",
-) -> dict[str, Any]:
+) -> AllocationResult:
     """Run or finish both plans of each seed in folders below `out` and return the results."""
     runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    rows = [one_seed(run) for run in runs]
-    results = {
-        "recipe": recipe.model_dump(mode="json", exclude={"seed"}),
-        "history": _history_ranges(),
-        "seeds": rows,
-        "summary": summarise(rows),
-        "provenance": asdict(provenance()),
-        "note": "road labels come from an ideal road detector: AP after edge FL and cloud FL is an upper bound",
-    }
-    return results | {"findings": allocation_findings(results)}
+    rows = tuple(one_seed(run) for run in runs)
+    asked = recipe.model_dump(mode="json", exclude={"seed"})
+    results = AllocationResult(_history_ranges(), rows, summarise(rows), recipe=asked, provenance=provenance())
+    return replace(results, findings=allocation_findings(results))
 
 
-def one_seed(run: Run) -> dict[str, Any]:
+def one_seed(run: Run) -> AllocationSeed:
     """Return what the page tells of a seed."""
     towns = run.recipe.with_role("federate")
     arms = {name: run.arms[arm] for name, arm in ARM_OF.items()}
@@ -65,73 +68,97 @@ def one_seed(run: Run) -> dict[str, Any]:
         if (each.arm, each.before_arm) == (MAIN, ARM_OF[EQUAL])
     }
     predicted = {name: dict(plan.predicted or {}) for name, plan in plan_of.items()}
-    return {
-        "seed": run.recipe.seed,
-        "plans": {
-            name: {count: getattr(plan, count) for count in COUNTS}
-            | {"wireless_mb": plan.wireless_mb, "wireline_mb": plan.wireline_mb}
-            | {"predicted_error": 1 - predicted[name][CLOUD]}
+    return AllocationSeed(
+        seed=run.recipe.seed,
+        plans={
+            name: Planned(
+                plan.samples,
+                plan.edge_rounds,
+                plan.cloud_rounds,
+                plan.wireless_mb,
+                plan.wireline_mb,
+                predicted_error=1 - predicted[name][CLOUD],
+            )
             for name, plan in plan_of.items()
         },
-        "predicted": predicted,
-        "realised": {
+        predicted=predicted,
+        realised={
             town: {
-                name: {stage: {"ap50": _ap50(run, arm, stage, town)} for stage in STAGES}
-                for name, arm in ARM_OF.items()
+                name: {stage: Reached(_ap50(run, arm, stage, town)) for stage in STAGES} for name, arm in ARM_OF.items()
             }
             for town in towns
         },
-        "differences": {town: {stage: _difference(found.get((town, stage))) for stage in STAGES} for town in towns},
-        "poles": {name: {placed.region: placed.chosen[0] for placed in arm.placed} for name, arm in arms.items()},
-        "ledger": {name: {link: vars(use) for link, use in arm.links.items()} for name, arm in arms.items()},
-    }
+        differences={town: {stage: _difference(found.get((town, stage))) for stage in STAGES} for town in towns},
+        poles={name: {placed.region: placed.chosen[0] for placed in arm.placed} for name, arm in arms.items()},
+        ledger={name: arm.links for name, arm in arms.items()},
+    )
 
 
 def _ap50(run: Run, arm: str, stage: str, town: str) -> float:
     return run.test(arm=arm, stage=stage, region=town, task=TASK).estimate.mean
 
 
-def _difference(estimate: Any) -> dict[str, float]:
+def _difference(estimate: Estimate | None) -> Estimate:
     """Return a difference; none where both plans are the same and share their steps."""
-    return {"mean": 0.0, "low": 0.0, "high": 0.0} if estimate is None else vars(estimate)
+    return Estimate(0.0, 0.0, 0.0) if estimate is None else estimate
 
 
-def _history_ranges() -> dict[str, list[float]]:
+def _history_ranges() -> dict[str, tuple[float, float]]:
     """Return the least and the most of each count in the history that both plans were predicted from."""
     columns = history_of(TASK).resources.T
-    return {name: [float(column.min()), float(column.max())] for name, column in zip(COUNTS, columns, strict=True)}
+    return {name: (float(column.min()), float(column.max())) for name, column in zip(COUNTS, columns, strict=True)}
 
 
-def summarise(seeds: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def summarise(seeds: Sequence[AllocationSeed]) -> AllocationSummary:
     """Return means over seeds with their 95 % intervals; differences are joint minus equal stages, paired by seed."""
 
-    towns = tuple(seeds[0]["realised"])
+    towns = tuple(seeds[0].realised)
 
     def realised(town: str, name: str, stage: str) -> list[float]:
-        return [seed["realised"][town][name][stage]["ap50"] for seed in seeds]
+        return [seed.realised[town][name][stage].ap50 for seed in seeds]
 
     def predicted(name: str, stage: str) -> list[float]:
-        return [seed["predicted"][name][stage] for seed in seeds]
+        return [seed.predicted[name][stage] for seed in seeds]
 
-    return {
-        "predicted": {name: {stage: float(np.mean(predicted(name, stage))) for stage in STAGES} for name in PLANS},
-        "realised": {
+    return AllocationSummary(
+        predicted={name: {stage: float(np.mean(predicted(name, stage))) for stage in STAGES} for name in PLANS},
+        realised={
             town: {name: {stage: mean_over_seeds(realised(town, name, stage)) for stage in STAGES} for name in PLANS}
             for town in towns
         },
-        "predicted_difference": {
+        predicted_difference={
             stage: float(np.mean(np.subtract(predicted(JOINT, stage), predicted(EQUAL, stage)))) for stage in STAGES
         },
-        "realised_difference": {
+        realised_difference={
             town: {
                 stage: mean_over_seeds(np.subtract(realised(town, JOINT, stage), realised(town, EQUAL, stage)).tolist())
                 for stage in STAGES
             }
             for town in towns
         },
-    }
+    )
 
 
-def draw_allocation(results: Mapping[str, Any]) -> bytes:
+def draw_allocation(results: AllocationResult) -> bytes:
     """Return predicted and realised AP of both plans, and their paired differences, as a PNG."""
-    return style.png(plans.predicted_and_realised(results, TOWN))
+    summary, seeds = results.summary, results.seeds
+    ap = {
+        name: {
+            stage: plans.StageReached(
+                summary.predicted[name][stage],
+                summary.realised[TOWN][name][stage],
+                tuple(seed.realised[TOWN][name][stage].ap50 for seed in seeds),
+            )
+            for stage in STAGES
+        }
+        for name in PLANS
+    }
+    differences = {
+        stage: plans.StageReached(
+            summary.predicted_difference[stage],
+            summary.realised_difference[TOWN][stage],
+            tuple(seed.differences[TOWN][stage].mean for seed in seeds),
+        )
+        for stage in STAGES
+    }
+    return style.png(plans.predicted_and_realised(ap, differences, TOWN))

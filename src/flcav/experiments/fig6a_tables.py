@@ -1,20 +1,17 @@
 """The tables on the page of the proof by training, from its numbers."""
 
-from collections.abc import Mapping
-from typing import Any
-
-from flcav.experiments.fig6a_findings import EQUAL, JOINT, STAGE_NAMES, TOWN
-from flcav.markdown import bullets, interval, signed, table
+from flcav.experiments.fig6a_findings import STAGE_NAMES
+from flcav.experiments.fig6a_results import EQUAL, JOINT, TOWN, AllocationResult
+from flcav.markdown import bullets, signed, table
 
 NAMES = {EQUAL: "equal stages", JOINT: "joint"}
 
 
-def tables(results: Mapping[str, Any]) -> dict[str, str]:
+def tables(results: AllocationResult) -> dict[str, str]:
     """Return Markdown by name: findings, plans, accuracy, differences, megabytes."""
     return {
         "findings": bullets(
-            f"*{finding['question']}* **{finding['verdict']}.** {finding['sentence']}"
-            for finding in results["findings"]
+            f"*{finding.question}* **{finding.verdict}.** {finding.sentence}" for finding in results.findings
         ),
         "plans": _plans(results),
         "accuracy": _accuracy(results),
@@ -23,48 +20,48 @@ def tables(results: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _plans(results: Mapping[str, Any]) -> str:
+def _plans(results: AllocationResult) -> str:
     rows = []
-    for seed in results["seeds"]:
-        for name, plan in seed["plans"].items():
-            counts = [plan[count] for count in ("samples", "edge_rounds", "cloud_rounds")]
-            poles = " / ".join(str(pole) for pole in seed["poles"][name].values())
-            rows.append([seed["seed"], NAMES[name], *counts, f"{1 - plan['predicted_error']:.3f}", poles])
+    for seed in results.seeds:
+        for name, plan in seed.plans.items():
+            counts = plan.counts.values()
+            poles = " / ".join(str(pole) for pole in seed.poles[name].values())
+            rows.append([seed.seed, NAMES[name], *counts, f"{1 - plan.predicted_error:.3f}", poles])
     header = ("seed", "plan", "samples", "edge rounds", "cloud rounds", "predicted AP50", "poles, grid / ring")
     return table(header, rows)
 
 
-def _accuracy(results: Mapping[str, Any]) -> str:
-    summary = results["summary"]
+def _accuracy(results: AllocationResult) -> str:
+    summary = results.summary
     rows = [
-        [stage, NAMES[name], f"{summary['predicted'][name][key]:.3f}"]
-        + [interval(summary["realised"][town][name][key]) for town in summary["realised"]]
+        [stage, NAMES[name], f"{summary.predicted[name][key]:.3f}"]
+        + [summary.realised[town][name][key].told() for town in summary.realised]
         for key, stage in STAGE_NAMES.items()
         for name in (EQUAL, JOINT)
     ]
-    return table(("after", "plan", f"predicted on {TOWN}", *(f"AP50 on {t}" for t in summary["realised"])), rows)
+    return table(("after", "plan", f"predicted on {TOWN}", *(f"AP50 on {t}" for t in summary.realised)), rows)
 
 
-def _differences(results: Mapping[str, Any]) -> str:
-    summary = results["summary"]
+def _differences(results: AllocationResult) -> str:
+    summary = results.summary
     rows = []
-    for town, stages in summary["realised_difference"].items():
+    for town, stages in summary.realised_difference.items():
         for key, stage in STAGE_NAMES.items():
-            predicted = signed(summary["predicted_difference"][key]) if town == TOWN else ""
-            own = [seed["differences"][town][key] for seed in results["seeds"]]
-            per_seed = ", ".join(interval(each, sign=True) for each in own)
-            rows.append([town, stage, predicted, interval(stages[key], sign=True), per_seed])
+            predicted = signed(summary.predicted_difference[key]) if town == TOWN else ""
+            own = [seed.differences[town][key] for seed in results.seeds]
+            per_seed = ", ".join(each.told(sign=True) for each in own)
+            rows.append([town, stage, predicted, stages[key].told(sign=True), per_seed])
     header = ("joint - equal stages on", "after", "predicted", "trained, over seeds", "each seed, over its test scenes")
     return table(header, rows)
 
 
-def _megabytes(results: Mapping[str, Any]) -> str:
+def _megabytes(results: AllocationResult) -> str:
     rows = [
-        [seed["seed"], NAMES[name], link]
-        + [f"{row[key]:.1f}" for key in ("budget_mb", "planned_mb", "used_mb")]
-        + [signed(row["used_mb"] - row["planned_mb"], 2)]
-        for seed in results["seeds"]
-        for name, book in seed["ledger"].items()
+        [seed.seed, NAMES[name], link]
+        + [f"{mb:.1f}" for mb in (row.budget_mb, row.planned_mb, row.used_mb)]
+        + [signed(row.used_mb - row.planned_mb, 2)]
+        for seed in results.seeds
+        for name, book in seed.ledger.items()
         for link, row in book.items()
     ]
     return table(("seed", "plan", "uplink", "budget MB", "planned MB", "sent MB", "sent - planned"), rows)

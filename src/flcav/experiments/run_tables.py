@@ -4,7 +4,7 @@ from flcav.markdown import bullets, table
 from flcav.network.ledger import LINKS
 from flcav.pipeline.findings import in_words
 from flcav.pipeline.recipe import MAIN
-from flcav.pipeline.results import Estimate, Run
+from flcav.pipeline.results import Run
 
 
 def tables(run: Run) -> dict[str, str]:
@@ -26,7 +26,7 @@ def _tests(run: Run) -> str:
     for task in run.recipe.tasks:
         for region, own in run.recipe.regions.items():
             tests = [test for test in run.tested if (test.task, test.region) == (task, region)]
-            reached = {in_words(test.arm, test.stage): _told(test.result.estimate) for test in tests}
+            reached = {in_words(test.arm, test.stage): test.result.estimate.told() for test in tests}
             one = tests[0].result
             place = [task, f"{region} ({own.role})", one.measure, f"{one.frames} / {one.scenes}"]
             rows.append([*place, *(reached.get(column, "") for column in columns)])
@@ -34,7 +34,7 @@ def _tests(run: Run) -> str:
 
 
 def _differences(run: Run) -> str:
-    rows = [[each.name, _told(each.estimate, sign=True)] for each in run.differences]
+    rows = [[each.name, each.estimate.told(sign=True)] for each in run.differences]
     return table(("region, task: after - before", "difference"), rows)
 
 
@@ -71,10 +71,3 @@ def _sensors(run: Run) -> str:
         for each in run.arms[MAIN].placed
     ]
     return table(("region", "candidate poles", "chosen", "errors covered", "densest traffic"), rows)
-
-
-def _told(value: Estimate, *, sign: bool = False) -> str:
-    form = "+.3f" if sign else ".3f"
-    if value.low is None or value.high is None:
-        return f"{value.mean:{form}}"
-    return f"{value.mean:{form}} ({value.low:{form}} to {value.high:{form}})"

@@ -1,21 +1,28 @@
 """The tables on the page of the sign task's study."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Sequence
 
-from flcav.experiments.task_study import training_rows
+from flcav.experiments.task_study import StudyResult, training_rows
 from flcav.markdown import bullets, table
+from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
 from flcav.verdicts import aim_sentence
 
 WANTED = 0.75  # mAP50 on scenes that were not learned from
 
 
-def tables(results: Mapping[str, Any]) -> dict[str, str]:
+def tables(results: StudyResult[SignsEvaluation]) -> dict[str, str]:
     """Return the page's tables by name, from what `run_study` returned."""
+    tested = [results.tested(test) for test in results.summary]
     return {
         "findings": bullets(_findings(results)),
-        "classes": table(("class", *_heads(results)), _rows(results, "classes", "ap50")),
-        "sizes": table(("root of the box's area", *_heads(results)), _rows(results, "sizes", "map50")),
+        "classes": table(
+            ("class", *_heads(results)),
+            _rows([[found.classes for found in seeds] for seeds in tested]),
+        ),
+        "sizes": table(
+            ("root of the box's area", *_heads(results)),
+            _rows([[found.sizes for found in seeds] for seeds in tested]),
+        ),
         "training": table(
             ("seed", "pictures", "steps", "validation mAP50 after each epoch; the network of the best is kept"),
             training_rows(results),
@@ -23,37 +30,38 @@ def tables(results: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def name_of(part: Mapping[str, Any]) -> str:
-    """Return what a row of `classes` or of `sizes` is about."""
-    if "class" in part:
-        return part["class"].replace("_", " ")
-    return f"{part['from_px']:g} px on" if part["to_px"] is None else f"{part['from_px']:g} to {part['to_px']:g} px"
+def name_of(row: ClassPrecision | SizePrecision) -> str:
+    """Return what the row is about."""
+    if isinstance(row, ClassPrecision):
+        return row.label.replace("_", " ")
+    return f"{row.from_px:g} px on" if row.to_px is None else f"{row.from_px:g} to {row.to_px:g} px"
 
 
-def _findings(results: Mapping[str, Any]) -> list[str]:
-    seeds = len(results["seeds"])
+def _findings(results: StudyResult[SignsEvaluation]) -> list[str]:
+    seeds = len(results.seeds)
     said = []
-    for test, means in results["summary"].items():
+    for test, means in results.summary.items():
         aim = aim_sentence(f"mAP50 of {WANTED} on {test}", WANTED, means["mAP50"], seeds)
-        said.append(f"{aim}; mAP50-95 {means['mAP50-95']['mean']:.3f}.")
+        said.append(f"{aim}; mAP50-95 {means['mAP50-95'].mean:.3f}.")
     return said
 
 
-def _heads(results: Mapping[str, Any]) -> list[str]:
-    return [head for test in results["summary"] for head in (f"{test}: to find", "AP50")]
+def _heads(results: StudyResult[SignsEvaluation]) -> list[str]:
+    return [head for test in results.summary for head in (f"{test}: to find", "AP50")]
 
 
-def _rows(results: Mapping[str, Any], part: str, measure: str) -> list[list[str]]:
+def _rows(tests: Sequence[Sequence[Sequence[ClassPrecision | SizePrecision]]]) -> list[list[str]]:
+    """Return a row per class or size; `tests`: of each test, of each seed, their average precision."""
     rows = []
-    for number, named in enumerate(_tested(results, next(iter(results["summary"])))[0][part]):
+    for number, named in enumerate(tests[0][0]):
         row = [name_of(named)]
-        for test in results["summary"]:
-            of_seeds = [tested[part][number] for tested in _tested(results, test)]
-            known = [one[measure] for one in of_seeds if one[measure] is not None]
-            row += [str(of_seeds[0]["targets"]), f"{sum(known) / len(known):.3f}" if known else ""]
+        for seeds in tests:
+            own = [rows[number] for rows in seeds]
+            known = [value for each in own if (value := _precision(each)) is not None]
+            row += [str(own[0].targets), f"{sum(known) / len(known):.3f}" if known else ""]
         rows.append(row)
     return rows
 
 
-def _tested(results: Mapping[str, Any], test: str) -> list[Mapping[str, Any]]:
-    return [seed["tests"][test] for seed in results["seeds"]]
+def _precision(row: ClassPrecision | SizePrecision) -> float | None:
+    return row.ap50 if isinstance(row, ClassPrecision) else row.map50

@@ -5,9 +5,9 @@ has its beams alone, on Lambertian surfaces. The detector is the one that comes 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -21,12 +21,14 @@ from flcav.perception.metrics import average_precision, match
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import LOWEST_SCORE, OVERLAPS, number_or_none, of_class
-from flcav.perception.objects.infer import box_rows
+from flcav.perception.objects.infer import ObjectFound, box_rows, boxes_of_rows
 from flcav.perception.objects.model import Second
-from flcav.pipeline.provenance import provenance
+from flcav.perception.ops.rotated import Kind
+from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps import Notify, Step, run_steps
+from flcav.records import LEFT_OUT, Class, Record
 from flcav.report import style
-from flcav.report.clouds import real_frame
+from flcav.report.clouds import CloudNumbers, real_frame
 
 RECIPE: dict[str, Any] = {
     "town": "suburb",
@@ -47,6 +49,46 @@ SHOWN = 0.3  # score from which a detection counts as found in the lists of fram
 NEUTRAL = {"Van": "Car", "Truck": "Car", "Tram": "Car", "Misc": "Car", "Person_sitting": "Pedestrian"}
 
 
+@dataclass(frozen=True)
+class RealScore:
+    """What was found of one class in real frames, under one measure of overlap."""
+
+    label: Class
+    kind: Kind
+    iou: float
+    targets: int
+    found: int  # those that score `SHOWN` or more, as `false_positives`
+    false_positives: int
+    ap: float | None  # None without targets
+
+
+@dataclass(frozen=True)
+class LabelledCar:
+    """A labelled car of a real frame."""
+
+    distance_m: float
+    found_at: tuple[float, ...]  # limits of IoU
+
+
+@dataclass(frozen=True)
+class Story:
+    """What was found and missed in a real frame; the labels stay where they are: they are KITTI's."""
+
+    frame: str
+    boxes: tuple[ObjectFound, ...]
+    cars: tuple[LabelledCar, ...]
+
+
+@dataclass(frozen=True)
+class SimToReal(Record):
+    """The comparison of clouds, and the detections in real frames."""
+
+    clouds: Mapping[str, CloudNumbers]  # by where they are from
+    scores: tuple[RealScore, ...]
+    frames: tuple[Story, ...]
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # not in results of before
+
+
 def run_sim_to_real(
     network: Second,
     kitti: Path,
@@ -56,7 +98,7 @@ def run_sim_to_real(
     notify: Notify,
     stale: str = "refuse",
     engine: str = "processes",
-) -> dict[str, Any]:
+) -> SimToReal:
     """Return the comparison of clouds, and the detections of `network` in the frames of the folder `kitti`.
 
     Frames are recorded in `out`, as `run_steps` does. Raises `InputError` where that is no KITTI folder.
@@ -72,7 +114,7 @@ def run_sim_to_real(
     for name, step in zip(RIGS, steps, strict=True):
         data = Dataset.open(out / step.name / DATA)
         clouds[name] = describe(labelled(data, number) for number in range(len(data)))
-    return {"clouds": clouds, **detections(network, real), "provenance": asdict(provenance(RECIPE["seed"]))}
+    return SimToReal(clouds, *detections(network, real), provenance(RECIPE["seed"]))
 
 
 def labelled(data: Dataset, number: int) -> Labelled:
@@ -82,7 +124,7 @@ def labelled(data: Dataset, number: int) -> Labelled:
     return frame.lidar[LIDAR], boxes[np.isin(boxes.label, ("car", "van"))]
 
 
-def detections(network: Second, frames: Sequence[KittiFrame]) -> dict[str, Any]:
+def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[RealScore, ...], tuple[Story, ...]]:
     """Return AP per class, kind of overlap and IoU over real frames, and of each frame what was found and missed.
 
     As on KITTI, vans and the like are neutral, and so is whatever a frame's image does not show.
@@ -95,12 +137,11 @@ def detections(network: Second, frames: Sequence[KittiFrame]) -> dict[str, Any]:
         neutral = [_neutral(frame, name) for frame in frames]
         for kind, overlap in OVERLAPS:
             matches = match(own, targets, neutral, overlap, kind)
-            row = {"class": name, "kind": kind, "iou": overlap, "targets": int(matches.targets.sum())}
             hits = int(matches.hit[matches.score >= SHOWN].sum())
             wrong = int((~matches.hit[matches.score >= SHOWN]).sum())
             ap = number_or_none(average_precision(matches))
-            scores.append(row | {"found": hits, "false_positives": wrong, "ap": ap})
-    return {"scores": scores, "frames": [_story(frame, boxes) for frame, boxes in zip(frames, found, strict=True)]}
+            scores.append(RealScore(name, kind, overlap, int(matches.targets.sum()), hits, wrong, ap))
+    return tuple(scores), tuple(map(_story, frames, found))
 
 
 def shown(boxes: Boxes, frame: KittiFrame) -> Boxes:
@@ -108,12 +149,13 @@ def shown(boxes: Boxes, frame: KittiFrame) -> Boxes:
     return boxes[kitti_view(frame.image, frame.calibration).shows(boxes.center)]
 
 
-def draw_frame(kitti: Path, story: Mapping[str, Any]) -> bytes:
+def draw_frame(kitti: Path, story: Story) -> bytes:
     """Return the picture of one frame of the results: its cloud from above and its image, with boxes."""
     folder = KittiFolder.open(kitti)
-    frame = folder.frame(folder.names.index(story["frame"]))
+    frame = folder.frame(folder.names.index(story.frame))
     view = kitti_view(frame.image, frame.calibration)
-    return style.png(real_frame(frame.points, view, of_class(frame.objects.boxes, "Car"), story))
+    cars, hit = of_class(frame.objects.boxes, "Car"), np.array([0.5 in car.found_at for car in story.cars], dtype=bool)
+    return style.png(real_frame(story.frame, frame.points, view, cars, hit, boxes_of_rows(story.boxes)))
 
 
 def _neutral(frame: KittiFrame, name: str) -> Boxes:
@@ -121,19 +163,16 @@ def _neutral(frame: KittiFrame, name: str) -> Boxes:
     return boxes[np.array([NEUTRAL.get(str(label)) == name for label in boxes.label], dtype=bool)]
 
 
-def _story(frame: KittiFrame, found: Boxes) -> dict[str, Any]:
-    """Return the frame's found boxes, and of its labelled cars the distance and the IoU limits at which each was found.
-
-    The labels themselves stay where they are: they are KITTI's.
-    """
+def _story(frame: KittiFrame, found: Boxes) -> Story:
+    """Return the frame's found boxes, and of each labelled car its distance and the limits of IoU it was found at."""
     boxes = frame.objects.boxes
     cars = of_class(boxes, "Car")
     score = found.score if found.score is not None else np.ones(len(found))
     found = found[score >= SHOWN]
     distances = np.hypot(cars.center[:, 0], cars.center[:, 1]).round(1).tolist()
-    targets: list[dict[str, Any]] = [{"distance_m": distance, "found_at": []} for distance in distances]
-    for overlap in (0.5, 0.7):
-        for target in assign_targets(of_class(found, "Car"), cars, overlap):
-            if target >= 0:
-                targets[target]["found_at"].append(overlap)
-    return {"frame": frame.name, "boxes": box_rows(found), "cars": targets}
+    hit = {overlap: assign_targets(of_class(found, "Car"), cars, overlap).tolist() for overlap in (0.5, 0.7)}
+    labelled = tuple(
+        LabelledCar(distance, tuple(overlap for overlap, targets in hit.items() if number in targets))
+        for number, distance in enumerate(distances)
+    )
+    return Story(frame.name, box_rows(found), labelled)

@@ -4,29 +4,69 @@ The epoch that is kept is chosen on the validation frames; the test frames are u
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Generic, TypeVar
 
 from flcav.config import InputError, read_yaml
 from flcav.dataset.store import Dataset
 from flcav.experiments.recording import opened, record_split
-from flcav.intervals import mean_over_seeds
-from flcav.perception.task import Task
+from flcav.files import Json
+from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.perception.card import Card
+from flcav.perception.task import Evaluated, Task
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
-from flcav.pipeline.provenance import provenance
+from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps import Notify, Step, Work, run_steps
+from flcav.records import LEFT_OUT, of_json, to_json
 from flcav.sources.recipe import recipe_path
 
-RecipeFields = Mapping[str, Any]  # of a `Recipe`, as YAML has it
-Result = Mapping[str, Any]  # of `Task.evaluate`, and the extra numbers
+RecipeFields = Mapping[str, Json]  # of a `Recipe`, as YAML has it
+EvaluationT = TypeVar("EvaluationT", bound=Evaluated)
 SCALES = ("full", "quick")
 VALIDATION = "validation"
 
 
 @dataclass(frozen=True)
-class Study:
+class SeedResult(Generic[EvaluationT]):
+    """What one seed came to."""
+
+    seed: int
+    card: Card
+    tests: Mapping[str, EvaluationT]  # by name
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What was recorded."""
+
+    train: tuple[RecipeFields, ...]
+    validation: RecipeFields
+    tests: Mapping[str, RecipeFields]  # by name
+
+
+@dataclass(frozen=True)
+class StudyResult(Generic[EvaluationT]):
+    """The numbers of a study: of its seeds, and their means."""
+
+    task: str
+    network: str
+    scale: str
+    epochs: int
+    patience: int
+    recipes: Recorded
+    seeds: tuple[SeedResult[EvaluationT], ...]
+    summary: Mapping[str, Mapping[str, MeanOverSeeds]]  # test -> name of a number
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # always there, but in results of before
+
+    def tested(self, test: str) -> list[EvaluationT]:
+        """Return the evaluations of a test, one per seed."""
+        return [seed.tests[test] for seed in self.seeds]
+
+
+@dataclass(frozen=True)
+class Study(Generic[EvaluationT]):
     """What is recorded, trained and tested; functions are module-level ones, since steps run in other processes.
 
     Fields that two studies are not compared by are of no step: what they reach makes none stale.
@@ -39,26 +79,29 @@ class Study:
     tests: Mapping[str, RecipeFields]  # by name
     epochs: int
     patience: int
-    numbers: Callable[[Result], Mapping[str, float]] = field(compare=False)  # those of a test that are averaged
-    draw: Callable[[Mapping[str, Any]], bytes] = field(compare=False)  # results -> PNG
-    extra: Mapping[str, Callable[[Any, Dataset], dict[str, Any]]] = field(default_factory=dict)  # by name of the test
+    evaluation: type[EvaluationT] = field(compare=False)  # what the task returns
+    numbers: Callable[[EvaluationT], Mapping[str, float]] = field(compare=False)  # those of a test that are averaged
+    draw: Callable[[StudyResult[EvaluationT]], bytes] = field(compare=False)  # -> PNG
+    extra: Mapping[str, Callable[[EvaluationT, Any, Dataset], EvaluationT]] = field(default_factory=dict)  # by test
     quick_scenes: int = 2  # of every recipe at the quick scale
     quick_epochs: int = 1
 
-    def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> dict[str, Any]:
+    def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> Json:
         """Train one seed, going on where an interrupted run left off; return its card."""
         data = [opened(work, step) for step in _training_steps(self)]
         request = Request(data, opened(work, VALIDATION), network, epochs, patience, seed)
         return train_network(self.task, request, work.folder, work.report).model_dump(mode="json")
 
-    def test(self, work: Work, *, seed: int) -> dict[str, Any]:
+    def test(self, work: Work, *, seed: int) -> Json:
         """Return what the network of one seed reaches on each test."""
         network = load_network(self.task, work.inputs[_seed_step(seed)] / WEIGHTS)
         return {name: self._tested(name, network, opened(work, _test_step(name)), work) for name in self.tests}
 
-    def _tested(self, name: str, network: Any, data: Dataset, work: Work) -> dict[str, Any]:
+    def _tested(self, name: str, network: Any, data: Dataset, work: Work) -> Mapping[str, Json]:
         result = self.task.evaluate(network, data, progress=work.report)
-        return result | (self.extra[name](network, data) if name in self.extra else {})
+        assert isinstance(result, self.evaluation)
+        more = self.extra.get(name)
+        return (more(result, network, data) if more else result).as_json()
 
 
 def recipe_of(name: str) -> RecipeFields:
@@ -69,7 +112,7 @@ def recipe_of(name: str) -> RecipeFields:
 
 
 def run_study(
-    study: Study,
+    study: Study[EvaluationT],
     out: Path,
     *,
     seeds: Sequence[int],
@@ -78,34 +121,43 @@ def run_study(
     notify: Notify,
     stale: str = "refuse",
     engine: str = "processes",
-) -> dict[str, Any]:
+) -> StudyResult[EvaluationT]:
     """Run what of the study is not done yet in `out`, as `run_steps`; return its numbers: of seeds, and their means.
 
     Raises `InputError` for an unknown scale, and where `out` holds another study.
     """
     study = at_scale(study, scale)
     values = run_steps(steps_of(study, seeds), out, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    runs = [{"seed": seed, "card": values[_seed_step(seed)], "tests": values[_tested_step(seed)]} for seed in seeds]
-    return {
-        "task": study.task.name,
-        "network": study.network,
-        "scale": scale,
-        "epochs": study.epochs,
-        "patience": study.patience,
-        "recipes": {"train": list(study.train), VALIDATION: study.validation, "tests": dict(study.tests)},
-        "seeds": runs,
-        "summary": {name: _mean([run["tests"][name] for run in runs], study.numbers) for name in study.tests},
-        "provenance": asdict(provenance()),
-    }
+    runs = tuple(_seed_result(study, seed, values) for seed in seeds)
+    return StudyResult(
+        study.task.name,
+        study.network,
+        scale,
+        study.epochs,
+        study.patience,
+        Recorded(study.train, study.validation, study.tests),
+        runs,
+        {name: _means([study.numbers(run.tests[name]) for run in runs]) for name in study.tests},
+        provenance(),
+    )
 
 
-def training_rows(results: Mapping[str, Any]) -> list[tuple[int, int, int, str]]:
+def results_as_json(study: Study[EvaluationT], results: StudyResult[EvaluationT]) -> Json:
+    """Return the results of a study as JSON has them."""
+    return to_json(results, _kind(study))
+
+
+def results_of_json(study: Study[EvaluationT], values: Json, origin: str) -> StudyResult[EvaluationT]:
+    """Return what `results_as_json` returned as a record again; raises `InputError` where it is no such."""
+    return of_json(_kind(study), values, origin)
+
+
+def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int, str]]:
     """Return of each seed of a study's results: its number, samples, steps, and the score after each epoch."""
     rows = []
-    for run in results["seeds"]:
-        card = run["card"]
-        scores = ", ".join(f"{score:.2f}" for score in card["training"]["scores"])
-        rows.append((run["seed"], card["samples"], card["training"]["steps"], scores))
+    for run in results.seeds:
+        scores = ", ".join(f"{score:.2f}" for score in run.card.learning.scores)
+        rows.append((run.seed, run.card.samples, run.card.learning.steps, scores))
     return rows
 
 
@@ -117,7 +169,9 @@ def at_scale(study: Study, scale: str) -> Study:
         return study
 
     def few(recipe: RecipeFields) -> RecipeFields:
-        return {**recipe, "scenes": min(recipe["scenes"], study.quick_scenes)}
+        scenes = recipe["scenes"]
+        assert isinstance(scenes, int)
+        return {**recipe, "scenes": min(scenes, study.quick_scenes)}
 
     return replace(
         study,
@@ -156,6 +210,16 @@ def _tested_step(seed: int) -> str:
     return f"seed-{seed}-tested"
 
 
-def _mean(results: Sequence[Result], numbers: Callable[[Result], Mapping[str, float]]) -> dict[str, dict[str, float]]:
-    rows = [numbers(result) for result in results]
+def _seed_result(study: Study[EvaluationT], seed: int, values: Mapping[str, Any]) -> SeedResult[EvaluationT]:
+    tests = values[_tested_step(seed)]
+    evaluations = {name: study.evaluation.of_json(tests[name], f"test on {name}") for name in study.tests}
+    return SeedResult(seed, Card.model_validate(values[_seed_step(seed)]), evaluations)
+
+
+def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, MeanOverSeeds]:
+    """Return the means of the numbers that all seeds have."""
     return {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
+
+
+def _kind(study: Study[EvaluationT]) -> type[StudyResult[EvaluationT]]:
+    return StudyResult[study.evaluation]  # pyright: ignore[reportInvalidTypeArguments]

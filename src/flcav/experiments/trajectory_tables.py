@@ -1,9 +1,11 @@
 """The tables on the pages of the trajectory task's studies."""
 
 from collections.abc import Mapping
-from typing import Any
 
-from flcav.markdown import bullets, interval, table
+from flcav.experiments.task_study import SeedResult, StudyResult
+from flcav.intervals import MeanOverSeeds
+from flcav.markdown import bullets, table
+from flcav.perception.trajectory.evaluate import ALL, TrajectoryEvaluation
 from flcav.verdicts import aim_sentence
 
 WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # of constant velocity's final error at junctions, at most
@@ -16,13 +18,13 @@ PREDICTORS = {
 }
 
 
-def tables(results: Mapping[str, Any]) -> dict[str, str]:
+def tables(results: StudyResult[TrajectoryEvaluation]) -> dict[str, str]:
     """Return the page's tables by name, from what `run_study` returned."""
     return {
         "findings": bullets(
-            _finding(wanted, test, means, len(results["seeds"]))
-            for test, means in results["summary"].items()
-            for wanted in WANTED[results["network"]]
+            _finding(wanted, test, means, len(results.seeds))
+            for test, means in results.summary.items()
+            for wanted in WANTED[results.network]
         ),
         "errors": table(
             (
@@ -34,7 +36,7 @@ def tables(results: Mapping[str, Any]) -> dict[str, str]:
                 "missed by 2 m",
                 "of constant velocity",
             ),
-            [row for test, means in results["summary"].items() for row in _errors(test, means)],
+            [row for test, means in results.summary.items() for row in _errors(test, means)],
         ),
         "training": table(
             (
@@ -44,33 +46,34 @@ def tables(results: Mapping[str, Any]) -> dict[str, str]:
                 "loss of the last epoch",
                 "validation, final error m: likeliest mode, best of six",
             ),
-            [_trained(seed["seed"], seed["card"]) for seed in results["seeds"]],
+            [_trained(seed) for seed in results.seeds],
         ),
     }
 
 
-def _finding(wanted: float, test: str, means: Mapping[str, Any], seeds: int) -> str:
+def _finding(wanted: float, test: str, means: Mapping[str, MeanOverSeeds], seeds: int) -> str:
     ratio = means[f"{SLICE}, ratio_single"]
     aim = f"A final error of {wanted} times constant velocity's at junctions, {test}"
     said = aim_sentence(aim, wanted, ratio, seeds, at_most=True)
-    best, plain = (means[f"{SLICE}, {key}"]["mean"] for key in ("minFDE_K", "constant_velocity_FDE"))
+    best, plain = (means[f"{SLICE}, {key}"].mean for key in ("minFDE_K", "constant_velocity_FDE"))
     return f"{said}. Of six modes the best ends {best:.2f} m off, constant velocity {plain:.2f} m."
 
 
-def _errors(test: str, means: Mapping[str, Any]) -> list[list[str]]:
+def _errors(test: str, means: Mapping[str, MeanOverSeeds]) -> list[list[str]]:
     rows = []
     for name in dict.fromkeys(key.rpartition(", ")[0] for key in means):
-        count = round(means[f"{name}, samples"]["mean"])
+        count = round(means[f"{name}, samples"].mean)
         for who, (ade, fde, missed) in PREDICTORS.items():
             average, final, misses = (means[f"{name}, {key}"] for key in (ade, fde, missed))
-            share = final["mean"] / means[f"{name}, constant_velocity_FDE"]["mean"]
-            shown = interval(final) if final["high"] > final["low"] else f"{final['mean']:.3f}"
-            numbers = [f"{average['mean']:.2f}", shown, f"{misses['mean']:.1%}", f"{share:.2f}"]
+            share = final.mean / means[f"{name}, constant_velocity_FDE"].mean
+            shown = final.told() if final.high > final.low else f"{final.mean:.3f}"
+            numbers = [f"{average.mean:.2f}", shown, f"{misses.mean:.1%}", f"{share:.2f}"]
             rows.append([test, f"{name} ({count})", who, *numbers])
     return rows
 
 
-def _trained(seed: int, card: Mapping[str, Any]) -> list[str]:
-    every = card["metrics"]["slices"]["all"]
-    known = ", ".join(f"{every[key]:.2f}" for key in ("minFDE_1", "minFDE_K"))
-    return [str(seed), str(card["samples"]), str(card["training"]["steps"]), f"{card['training']['loss']:.2f}", known]
+def _trained(seed: SeedResult[TrajectoryEvaluation]) -> list[str]:
+    every = TrajectoryEvaluation.of_json(seed.card.metrics, "card").slices[ALL]
+    known = "" if every is None else f"{every.minFDE_1:.2f}, {every.minFDE_K:.2f}"
+    learning = seed.card.learning
+    return [str(seed.seed), str(seed.card.samples), str(learning.steps), f"{learning.loss:.2f}", known]

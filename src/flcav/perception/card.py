@@ -1,16 +1,18 @@
 """What one should know of a network before using it: a model card, after Mitchell et al. (FAT* 2019)."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from flcav.config import Config
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.files import sha256, write_bytes
+from flcav.files import Json, sha256, write_bytes
 from flcav.markdown import bullets, table
 from flcav.perception.agents import Chosen
+from flcav.records import LEFT_OUT, Record
 from flcav.sensors.rig import RIGS
 
 CARD_KEY = "flcav.card"  # metadata entry of a file of weights
@@ -31,6 +33,26 @@ FACTS = ("parameters", "seed", "samples", "licence", "flcav", "torch", "threads"
 RIG_FIELDS = ("vehicle_rig", "pole_rig")
 
 
+@dataclass(frozen=True)
+class Learning(Record):
+    """How a training went."""
+
+    steps: int
+    loss: float  # mean of the last epoch
+    scores: tuple[float, ...] = ()  # on the validation data, after each epoch
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataEntry:
+    """What of a dataset was used."""
+
+    name: str
+    frames: int
+    agents: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose; None in older cards
+    manifest: str  # its SHA-256
+    recipe: Mapping[str, Json]  # what makes two datasets differ most, and the rigs that have a name
+
+
 class Card(Config):
     """How a file of weights came about; kept in its metadata as JSON and beside it as text."""
 
@@ -39,15 +61,20 @@ class Card(Config):
     parameters: int
     seed: int
     samples: int
-    training: dict[str, Any]  # settings
-    data: tuple[dict[str, Any], ...]  # one entry per dataset, see `data_entry`
-    validation: dict[str, Any] | None = None  # entry of the dataset that `metrics` are of
-    metrics: dict[str, Any]  # on the validation data; empty where there were none
+    training: Mapping[str, Json]  # settings, and what `Learning` says
+    data: tuple[DataEntry, ...]  # one per dataset
+    validation: DataEntry | None = None  # of the dataset that `metrics` are of
+    metrics: Mapping[str, Json]  # evaluation on the validation data; empty where there were none
     licence: str = LICENCE
     flcav: str = version("flcav")
     torch: str | None = None  # its version; this and the next are None in older cards
     threads: int | None = None  # that a process computed on
     processor: str | None = None  # kind of, see `flcav.perception.device`
+
+    @property
+    def learning(self) -> Learning:
+        """Return how the training went."""
+        return Learning.of_json(self.training, f"card of {self.task}, {self.network}")
 
     def markdown(self) -> str:
         """Return the card as a page of text; its numbers are rounded, the file of weights has them whole."""
@@ -68,21 +95,18 @@ class Card(Config):
         return "\n\n".join(blocks) + "\n"
 
 
-def data_entry(data: Dataset, chosen: Chosen) -> dict[str, Any]:
-    """Return what of a dataset was used: its name, frames and agents, its manifest's fingerprint, and its recipe.
-
-    Of the recipe, what makes two datasets differ most, and the rigs that have a name; the manifest has the whole.
-    """
+def data_entry(data: Dataset, chosen: Chosen) -> DataEntry:
+    """Return what of a dataset was used."""
     recipe = data.manifest.get("recipe", {})
     rigs = {name: _rig_name(recipe[name]) for name in RIG_FIELDS if name in recipe}
-    return {
-        "name": "/".join(data.folder.resolve().parts[-2:]),
-        "frames": len(chosen.frames),
-        "agents": list(chosen.agents),
-        "manifest": sha256(data.folder / MANIFEST),
-        "recipe": {name: recipe[name] for name in RECIPE_FIELDS if name in recipe}
+    return DataEntry(
+        name="/".join(data.folder.resolve().parts[-2:]),
+        frames=len(chosen.frames),
+        agents=tuple(chosen.agents),
+        manifest=sha256(data.folder / MANIFEST),
+        recipe={name: recipe[name] for name in RECIPE_FIELDS if name in recipe}
         | {name: rig for name, rig in rigs.items() if rig is not None},
-    }
+    )
 
 
 def write_card(card: Card, path: Path) -> None:
@@ -94,10 +118,10 @@ def _rig_name(rig: Any) -> str | None:
     return next((name for name, known in RIGS.items() if known.model_dump(mode="json") == rig), None)
 
 
-def _entry(entry: Mapping[str, Any]) -> str:
-    recipe = {name: value for name, value in entry["recipe"].items() if value not in ([], {}, None)}
-    frames = f"{entry['frames']} frames" + (f" of {', '.join(entry['agents'])}" if "agents" in entry else "")
-    return f"{entry['name']}: {frames}; {_text(recipe)}; SHA-256 of its manifest {entry['manifest']}"
+def _entry(entry: DataEntry) -> str:
+    recipe = {name: value for name, value in entry.recipe.items() if value not in ([], {}, None)}
+    frames = f"{entry.frames} frames" + (f" of {', '.join(entry.agents)}" if entry.agents is not None else "")
+    return f"{entry.name}: {frames}; {_text(recipe)}; SHA-256 of its manifest {entry.manifest}"
 
 
 def _blocks(values: Mapping[str, Any]) -> list[str]:

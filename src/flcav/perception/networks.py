@@ -14,15 +14,17 @@ from torch import nn
 from flcav.config import InputError
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.perception.agents import Chosen, choose_frames
 from flcav.perception.card import Card
 from flcav.perception.device import device_named
 from flcav.perception.errors import RegistersErrors, Registry
 from flcav.perception.objects.area import narrowed
+from flcav.perception.objects.results import ObjectsEvaluation
 from flcav.perception.objects.task import ObjectsTask
 from flcav.perception.task import Finding, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
-from flcav.perception.tracking.evaluate import evaluate_tracks, sequences, tracks_lines
+from flcav.perception.tracking.evaluate import evaluate_tracks, sequences
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network, read_card, shipped
 from flcav.progress import Report, silent
@@ -48,7 +50,7 @@ class Evaluation:
     task: str
     score: float  # the one number that training raises, in [0, 1]: accuracy, mAP, AP, by task
     chosen: Chosen  # whose frames
-    numbers: Mapping[str, Any]  # all of the task's, as JSON knows them: docs/tasks.md
+    numbers: Mapping[str, Json]  # all of the task's, as JSON knows them: docs/tasks.md
     lines: tuple[str, ...]  # the numbers in words
 
     def __str__(self) -> str:
@@ -133,12 +135,11 @@ def evaluate(
     narrow = {} if within is None else {"asked": narrowed(tested.config, within)}
     if tracks:
         sequences(dataset, chosen.frames)  # said before the long work
-    numbers = learned.evaluate(tested, dataset, chosen.frames, **narrow, progress=progress)
-    lines = learned.evaluation_lines(numbers)
-    if tracks:
+    found = learned.evaluate(tested, dataset, chosen.frames, **narrow, progress=progress)
+    if isinstance(found, ObjectsEvaluation) and tracks:
         followed = evaluate_tracks(tested, dataset, chosen.frames, **narrow, progress=progress)
-        numbers, lines = {**numbers, "tracks": followed}, [*lines, *tracks_lines(followed)]
-    return Evaluation(learned.name, learned.score(numbers), chosen, numbers, tuple(lines))
+        found = replace(found, tracks=followed)
+    return Evaluation(learned.name, found.score, chosen, found.as_json(), tuple(found.lines()))
 
 
 def infer(

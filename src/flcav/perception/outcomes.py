@@ -89,7 +89,7 @@ class SceneScores:
         scores = []
         for done, scene in enumerate(scenes, start=1):
             own = [i for i in frames if data.keys[i].scene == scene]
-            scores.append(self._task.score(self._task.evaluate(network, data, own)))
+            scores.append(self._task.evaluate(network, data, own).score)
             progress(done, len(scenes), "")
         return Outcomes(np.array(scenes), {"score": np.array(scores, dtype=np.float64)})
 

@@ -4,6 +4,7 @@ Training is `flcav.perception.training`, files of weights are `flcav.perception.
 `flcav.perception.client`: each works with any `Task`, and so do the command line and the federation.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.perception.marks import Mark
 from flcav.progress import Report, silent
+from flcav.records import Record
 from flcav.seeds import child_seed
 
 if TYPE_CHECKING:
@@ -41,13 +43,30 @@ def no_view() -> None:
     """Return no camera's view."""
 
 
+class Result(Record):
+    """What a network came to, as a frozen dataclass: in JSON and in words."""
+
+    def lines(self) -> list[str]:
+        """Return it in words: each field on a line, where a task has none of its own."""
+        return [f"{name}: {value}" for name, value in self.as_json().items()]
+
+
+class Evaluated(Result, ABC):
+    """The task's numbers on some frames."""
+
+    @property
+    @abstractmethod
+    def score(self) -> float:
+        """Return the one number that training is to raise."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """What a network found in one input."""
 
     path: Path  # the input's own
     seen: NDArray[Any]  # picture (H, W, 3) u8, point cloud (N, 4) f32, or map: (3, H, W) bool of road, lane, crossing
-    result: dict[str, Any]  # as JSON knows it, without the path
+    result: Result
     marks: tuple[Mark, ...] = ()  # the same, as it is drawn on what was seen
     view: Callable[[], "CameraView | None"] = no_view  # of a camera beside the LiDAR, read when asked for
 
@@ -99,12 +118,8 @@ class Task(Protocol[ConfigT, NetworkT, SampleT]):
 
     def evaluate(
         self, network: NetworkT, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
-    ) -> dict[str, Any]:
-        """Return the task's numbers on frames of a dataset, as JSON knows them."""
-        ...
-
-    def score(self, result: Mapping[str, Any]) -> float:
-        """Return the one number of an evaluation that training is to raise."""
+    ) -> Evaluated:
+        """Return the task's numbers on frames of a dataset (None: all)."""
         ...
 
     def infer(
@@ -114,14 +129,6 @@ class Task(Protocol[ConfigT, NetworkT, SampleT]):
 
         Raises `InputError` for a bad one.
         """
-        ...
-
-    def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return an evaluation in words."""
-        ...
-
-    def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return the result of a `Finding` in words."""
         ...
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import mean_over_seeds
+from flcav.intervals import Estimate, mean_over_seeds
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
-from flcav.pipeline.results import OUTCOMES, Estimate, Run, Test
+from flcav.pipeline.results import OUTCOMES, Run, Test
 from flcav.pipeline.running import RESULTS, WORK, seed_folders
-from flcav.verdicts import UNDECIDED, verdict
+from flcav.verdicts import verdict
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task
 
@@ -68,16 +68,12 @@ def _key(test: Test) -> Key:
 
 def _compared(key: Key, first: Test, second: Test, change: Estimate) -> Compared:
     values = first.result.estimate.mean, second.result.estimate.mean
-    return Compared(*key, second.result.measure, *values, change, _verdict(change))
+    return Compared(*key, second.result.measure, *values, change, verdict(change.low, change.high))
 
 
 def _over_seeds(key: Key, rows: list[Compared]) -> Compared:
     if len(rows) == 1:
         return rows[0]
-    change = Estimate(**mean_over_seeds([row.difference.mean for row in rows]))
+    change = mean_over_seeds([row.difference.mean for row in rows])
     first, second = float(np.mean([row.first for row in rows])), float(np.mean([row.second for row in rows]))
-    return Compared(*key, rows[0].measure, first, second, change, _verdict(change))
-
-
-def _verdict(change: Estimate) -> str:
-    return UNDECIDED if change.low is None or change.high is None else verdict(change.low, change.high)
+    return Compared(*key, rows[0].measure, first, second, change, verdict(change.low, change.high))

@@ -2,58 +2,31 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
-from pydantic import TypeAdapter, ValidationError
-
-from flcav.config import InputError, read_json
+from flcav.config import read_json
 from flcav.files import write_json
+from flcav.intervals import Estimate
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
+from flcav.records import Record
 
 RESULT = "result.json"
 WEIGHTS, LEDGER, ERRORS, OUTCOMES = "weights.safetensors", "ledger.parquet", "errors.parquet", "outcomes.npz"
 
 
-class Saved:
-    """A dataclass that is kept as JSON in a folder."""
+class Saved(Record):
+    """A record that is kept as JSON in a folder."""
 
     def save(self, folder: Path, name: str = RESULT) -> None:
         """Write the record to `folder`, atomically; tasks and regions stay in their order."""
         write_json(folder / name, self.as_json(), sort=False)
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the record as JSON has it."""
-        return _adapter(type(self)).dump_python(self, mode="json")
-
     @classmethod
     def load(cls, folder: Path, name: str = RESULT) -> Self:
         """Return what `save` wrote; raises `InputError` where it is not there, or of another version."""
-        try:
-            return _adapter(cls).validate_python(read_json(folder / name))
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            raise InputError(
-                f"{folder / name}: not a result of this version of flcav (field '{where}': {first['msg']}); run it "
-                "anew, in another folder"
-            ) from None
-
-
-@cache
-def _adapter(record: type) -> TypeAdapter:
-    return TypeAdapter(record)
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its 95 % interval, which is None where one scene or one seed leaves it unknown."""
-
-    mean: float
-    low: float | None = None
-    high: float | None = None
+        return cls.of_json(read_json(folder / name), str(folder / name))
 
 
 @dataclass(frozen=True)

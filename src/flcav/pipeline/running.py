@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import mean_over_seeds
+from flcav.intervals import Estimate, mean_over_seeds
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
@@ -24,7 +24,6 @@ from flcav.pipeline.results import (
     OUTCOMES,
     ArmResult,
     Difference,
-    Estimate,
     LinkUse,
     Mean,
     Placed,
@@ -135,7 +134,7 @@ def summarise(runs: Sequence[Run]) -> Summary:
 
     def means(of: Callable[[Run], Mapping[str, float]]) -> tuple[Mean, ...]:
         rows = [of(each) for each in runs]
-        return tuple(Mean(name, Estimate(**mean_over_seeds([row[name] for row in rows]))) for name in rows[0])
+        return tuple(Mean(name, mean_over_seeds([row[name] for row in rows])) for name in rows[0])
 
     return Summary(
         tuple(each.recipe.seed for each in runs),

@@ -12,6 +12,7 @@ import numpy as np
 from flcav.config import InputError
 from flcav.federation.strategies import strategy_named
 from flcav.files import write_json
+from flcav.intervals import Estimate
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.network.plan import MessageSizes, Price
 from flcav.perception.errors import THRESHOLD, RegistersErrors, load_errors, save_errors
@@ -39,7 +40,6 @@ from flcav.pipeline.results import (
     OUTCOMES,
     WEIGHTS,
     ErrorRegistry,
-    Estimate,
     Placed,
     Plan,
     Pretrained,

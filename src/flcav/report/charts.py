@@ -6,6 +6,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
+from flcav.intervals import MeanOverSeeds
 from flcav.report import style
 
 Row = Mapping[str, Any]
@@ -97,14 +98,14 @@ def draw_megabytes(axes: Axes, ledger_by_stage: Sequence[Row], budgets: Mapping[
     axes.set(xlabel="uplink megabytes (1 MB = 10⁶ bytes)", ylim=(len(budgets) - 0.6, -0.65))
 
 
-def draw_arms(axes: Axes, rows: Sequence[Row]) -> None:
-    """Draw a forest plot: one line per row (arm, town, ap50, low, high), with its numbers."""
-    for y, row in enumerate(rows):
-        colour = _colour(row["town"], [row["town"]])
-        axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=2)
-        axes.plot(row["ap50"], y, "s", color=colour, markersize=6)
+def draw_arms(axes: Axes, town: str, rows: Mapping[str, MeanOverSeeds]) -> None:
+    """Draw a forest plot of a town: one line per arm, with its numbers."""
+    colour = _colour(town, [town])
+    for y, ap in enumerate(rows.values()):
+        axes.plot([ap.low, ap.high], [y, y], color=colour, linewidth=2)
+        axes.plot(ap.mean, y, "s", color=colour, markersize=6)
         axes.annotate(
-            f"{row['ap50']:.3f}  ({row['low']:.3f}–{row['high']:.3f})",
+            f"{ap.mean:.3f}  ({ap.low:.3f}–{ap.high:.3f})",
             (1.0, y),
             (6, 0),
             xycoords=axes.get_yaxis_transform(),
@@ -112,6 +113,6 @@ def draw_arms(axes: Axes, rows: Sequence[Row]) -> None:
             va="center",
             fontsize=style.SMALL,
         )
-    axes.set_yticks(range(len(rows)), [row["arm"] for row in rows])
+    axes.set_yticks(range(len(rows)), list(rows))
     axes.set(ylim=(len(rows) - 0.5, -0.5))
     axes.grid(axis="x")

@@ -1,7 +1,7 @@
 """Learning curves with the points they were fitted to and their bands."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import networkx as nx
 from matplotlib.axes import Axes
@@ -13,47 +13,49 @@ from flcav.report.layers_chart import draw_layers
 NAME_HEIGHT = 0.11  # of the axes: two lines of text
 COLOURS = (style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.VERMILLION)
 
+Route = Sequence[tuple[int, int]]  # edge rounds, cloud rounds, place by place
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A learning curve as it is drawn."""
+
+    name: str  # at its end
+    x: Sequence[float]
+    accuracy: Sequence[float]  # at each x
+    low: Sequence[float]  # band
+    high: Sequence[float]
+    points: Sequence[tuple[float, float]]  # x, accuracy: what it was fitted to
+
 
 @style.styled
-def fig3a(results: Mapping[str, Any], graph: nx.Graph) -> Figure:
+def fig3a(article: Sequence[Curve], own: Sequence[Curve], route: Route, graph: nx.Graph) -> Figure:
     """Return the graph, the curves of the article's points by task, and those of our own history by sample size."""
     figure = style.canvas(14.4, 4.4)
     left, middle, right = figure.subplots(1, 3, width_ratios=(5.6, 3, 3))
     draw_layers(left, graph)
     left.set_title("Tasks, networks, modalities, vehicles", fontweight="bold")
-    draw_power_curves(middle, results["article"])
+    draw_power_curves(middle, article)
     middle.set_title("The article's points", fontweight="bold")
-    draw_own_curves(right, results["own"])
+    draw_own_curves(right, own, route)
     right.set_title("Our own runs", fontweight="bold")
     return figure
 
 
-def draw_power_curves(axes: Axes, curves: Mapping[str, Mapping[str, Any]]) -> None:
+def draw_power_curves(axes: Axes, curves: Sequence[Curve]) -> None:
     """Draw accuracy against samples, a curve per task, with its points and 95 % band."""
-    ends = []
-    for (task, curve), colour in zip(curves.items(), COLOURS, strict=False):
-        axes.fill_between(curve["resource"], curve["low"], curve["high"], color=colour, alpha=0.18, linewidth=0)
-        axes.plot(curve["resource"], curve["accuracy"], color=colour)
-        axes.plot(*zip(*curve["points"], strict=True), "o", color=colour, markersize=5, markeredgecolor="white")
-        decay = curve["fitted"]["pretrain"]
-        fitted = f"{task}\n1 − {decay['a']:.3g}·x$^{{-{decay['b']:.2g}}}$"
-        ends.append((curve["resource"][-1], curve["accuracy"][-1], fitted, colour))
+    _draw(axes, curves, COLOURS)
     axes.set_xscale("log")
     axes.set(xlabel="samples", ylabel="accuracy", ylim=(None, 1.03))
-    _name_ends(axes, ends)
+    _name_ends(axes, curves, COLOURS)
     axes.grid(axis="y")
 
 
-def draw_own_curves(axes: Axes, own: Mapping[str, Any]) -> None:
+def draw_own_curves(axes: Axes, curves: Sequence[Curve], route: Route) -> None:
     """Draw accuracy along a run, pretrained, edge rounds, cloud rounds: a curve per sample size."""
-    route = own["route"]
-    places, ends = range(len(route)), []
-    for line, colour in zip(own["lines"], COLOURS[1:], strict=False):
-        axes.fill_between(places, line["low"], line["high"], color=colour, alpha=0.18, linewidth=0)
-        axes.plot(places, line["accuracy"], color=colour)
-        axes.plot(*zip(*line["points"], strict=True), "o", color=colour, markersize=5, markeredgecolor="white")
-        ends.append((places[-1], line["accuracy"][-1], f"{line['samples']}\nsamples", colour))
-    _name_ends(axes, ends)
+    places = range(len(route))
+    _draw(axes, curves, COLOURS[1:])
+    _name_ends(axes, curves, COLOURS[1:])
     edges = [place for place, (edge, cloud) in enumerate(route) if edge and not cloud]
     clouds = [place for place, (_, cloud) in enumerate(route) if cloud]
     for stage, places_of in (("edge rounds", edges), ("cloud rounds", clouds)):
@@ -66,8 +68,18 @@ def draw_own_curves(axes: Axes, own: Mapping[str, Any]) -> None:
     axes.grid(axis="y")
 
 
-def _name_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> None:
-    """Name lines (x, y of the end, name, colour) at their ends; names keep a distance from each other."""
+def _draw(axes: Axes, curves: Sequence[Curve], colours: Sequence[str]) -> None:
+    for curve, colour in zip(curves, colours, strict=False):
+        axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.18, linewidth=0)
+        axes.plot(curve.x, curve.accuracy, color=colour)
+        axes.plot(*zip(*curve.points, strict=True), "o", color=colour, markersize=5, markeredgecolor="white")
+
+
+def _name_ends(axes: Axes, curves: Sequence[Curve], colours: Sequence[str]) -> None:
+    """Name curves at their ends; names keep a distance from each other."""
+    ends = [
+        (curve.x[-1], curve.accuracy[-1], curve.name, colour) for curve, colour in zip(curves, colours, strict=False)
+    ]
     low, high = axes.get_ylim()
     above = high
     for x, y, name, colour in sorted(ends, key=lambda end: -end[1]):

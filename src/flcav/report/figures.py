@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 
+from flcav.intervals import MeanOverSeeds
 from flcav.report import charts, maps, style, sweeps
 from flcav.report.charts import Row
 
@@ -51,12 +52,12 @@ def megabytes(ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> F
 
 
 @style.styled
-def arms(rows: Sequence[Row]) -> Figure:
-    """Return a forest plot of rows arm, town, ap50, low, high: a panel per town, one above the other."""
-    towns = list(dict.fromkeys(row["town"] for row in rows))
-    figure = style.canvas(6.4, 0.9 + 0.32 * len(rows))
-    for axes, town in zip(figure.subplots(len(towns), sharex=True, squeeze=False)[:, 0], towns, strict=True):
-        charts.draw_arms(axes, [row for row in rows if row["town"] == town])
+def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
+    """Return a forest plot of AP50 by town and arm: a panel per town, one above the other."""
+    figure = style.canvas(6.4, 0.9 + 0.32 * sum(map(len, towns.values())))
+    panels = figure.subplots(len(towns), sharex=True, squeeze=False)[:, 0]
+    for axes, (town, rows) in zip(panels, towns.items(), strict=True):
+        charts.draw_arms(axes, town, rows)
         axes.set_title(town, fontweight="bold")
     figure.axes[-1].set_xlabel("AP50 (95 % interval)")
     return figure

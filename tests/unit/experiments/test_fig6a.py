@@ -1,50 +1,42 @@
-import copy
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from flcav.experiments.fig6a_allocation import (
-    COUNTS,
-    PLANS,
-    STAGES,
-    draw_allocation,
-    summarise,
-)
-from flcav.experiments.fig6a_findings import EQUAL, JOINT, allocation_findings
+from flcav.experiments.fig6a_allocation import PLANS, STAGES, draw_allocation, summarise
+from flcav.experiments.fig6a_findings import allocation_findings
+from flcav.experiments.fig6a_results import EQUAL, JOINT, AllocationResult, AllocationSeed, Planned, Reached
 from flcav.experiments.fig6a_tables import tables
+from flcav.intervals import Estimate
+from flcav.pipeline.results import LinkUse
 
+TOWNS = ("grid", "ring")
 PREDICTED = {EQUAL: (0.49, 0.60, 0.62), JOINT: (0.53, 0.63, 0.66)}
-HISTORY = {"samples": [80.0, 320.0], "edge_rounds": [0.0, 6.0], "cloud_rounds": [0.0, 3.0]}
+HISTORY = {"samples": (80.0, 320.0), "edge_rounds": (0.0, 6.0), "cloud_rounds": (0.0, 3.0)}
 
 
-def seed_of(number: int, equal: tuple[float, ...], joint: tuple[float, ...]) -> dict[str, Any]:
+def seed_of(number: int, equal: tuple[float, ...], joint: tuple[float, ...]) -> AllocationSeed:
     """Return what one seed reached: AP50 after each stage with either plan."""
     reached = {EQUAL: equal, JOINT: joint}
-    realised = {name: {s: {"ap50": ap} for s, ap in zip(STAGES, aps)} for name, aps in reached.items()}
-    differences = {
-        s: {"mean": b - a, "low": b - a - 0.05, "high": b - a + 0.05} for s, a, b in zip(STAGES, equal, joint)
-    }
-    plan = dict(zip(COUNTS, (118, 6, 6))) | {"predicted_error": 0.38}
-    book = {
-        "wireless": {"budget_mb": 180.0, "planned_mb": 175.0, "used_mb": 176.0},
-        "wireline": {"budget_mb": 110.0, "planned_mb": 70.0, "used_mb": 69.5},
-    }
-    return {
-        "seed": number,
-        "plans": {EQUAL: plan, JOINT: plan | {"samples": 118, "edge_rounds": 12, "cloud_rounds": 1}},
-        "predicted": {name: dict(zip(STAGES, aps)) for name, aps in PREDICTED.items()},
-        "realised": dict.fromkeys(("grid", "ring"), realised),
-        "differences": dict.fromkeys(("grid", "ring"), differences),
-        "poles": {name: {"grid": 3, "ring": 5} for name in PLANS},
-        "ledger": {name: copy.deepcopy(book) for name in PLANS},
-    }
+    realised = {name: {str(s): Reached(ap) for s, ap in zip(STAGES, aps)} for name, aps in reached.items()}
+    differences = {s: Estimate(b - a, b - a - 0.05, b - a + 0.05) for s, a, b in zip(STAGES, equal, joint)}
+    plan = Planned(118, 6, 6, 175.0, 70.0, predicted_error=0.38)
+    book = {"wireless": LinkUse(180.0, 175.0, 176.0), "wireline": LinkUse(110.0, 70.0, 69.5)}
+    return AllocationSeed(
+        seed=number,
+        plans={EQUAL: plan, JOINT: replace(plan, edge_rounds=12, cloud_rounds=1)},
+        predicted={name: dict(zip(STAGES, aps)) for name, aps in PREDICTED.items()},
+        realised=dict.fromkeys(TOWNS, realised),
+        differences=dict.fromkeys(TOWNS, differences),
+        poles={name: {"grid": 3, "ring": 5} for name in PLANS},
+        ledger=dict.fromkeys(PLANS, book),
+    )
 
 
-def results_of(*seeds: tuple[tuple[float, ...], tuple[float, ...]]) -> dict[str, Any]:
-    rows = [seed_of(number, *aps) for number, aps in enumerate(seeds, start=1)]
-    results = {"history": HISTORY, "seeds": rows, "summary": summarise(rows)}
-    return results | {"findings": allocation_findings(results)}
+def results_of(*seeds: tuple[tuple[float, ...], tuple[float, ...]]) -> AllocationResult:
+    rows = tuple(seed_of(number, *aps) for number, aps in enumerate(seeds, start=1))
+    results = AllocationResult(HISTORY, rows, summarise(rows))
+    return replace(results, findings=allocation_findings(results))
 
 
 RIGHT = results_of(
@@ -59,20 +51,20 @@ WRONG = results_of(
 )
 
 
-def verdicts(results: dict[str, Any]) -> list[str]:
-    return [finding["verdict"] for finding in results["findings"]]
+def verdicts(results: AllocationResult) -> list[str]:
+    return [finding.verdict for finding in results.findings]
 
 
 def test_differences_are_paired_by_seed() -> None:
-    found = RIGHT["summary"]["realised_difference"]["grid"]["cloud"]
-    assert found["mean"] == pytest.approx(np.mean([0.05, 0.06, 0.05]))
-    assert found["low"] == pytest.approx(found["mean"] - 4.302653 * np.std([0.05, 0.06, 0.05], ddof=1) / np.sqrt(3))
-    assert RIGHT["summary"]["predicted_difference"]["cloud"] == pytest.approx(0.04)
+    found = RIGHT.summary.realised_difference["grid"]["cloud"]
+    assert found.mean == pytest.approx(np.mean([0.05, 0.06, 0.05]))
+    assert found.low == pytest.approx(found.mean - 4.302653 * np.std([0.05, 0.06, 0.05], ddof=1) / np.sqrt(3))
+    assert RIGHT.summary.predicted_difference["cloud"] == pytest.approx(0.04)
 
 
 def test_a_prediction_that_came_true_is_said_to_have_held() -> None:
     assert verdicts(RIGHT) == ["held", "held", "undecided", "held", "held"]
-    better, ranking, stages, accuracy, budgets = (finding["sentence"] for finding in RIGHT["findings"])
+    better, ranking, stages, accuracy, budgets = (finding.sentence for finding in RIGHT.findings)
     assert "0.613 with equal stages and 0.667 with the joint plan: +0.053" in better
     assert "predicts +0.040 for the joint plan; 3 of 3 seeds agree in sign, and so does their mean" in ranking
     assert "edge FL of the joint plan (12 rounds) +0.107 (+0.092 to +0.121)" in stages
@@ -82,45 +74,46 @@ def test_a_prediction_that_came_true_is_said_to_have_held() -> None:
 
 
 def test_a_wrong_ranking_is_said_and_why() -> None:
-    better, ranking, *_ = WRONG["findings"]
-    assert (better["verdict"], ranking["verdict"]) == ("did not hold", "did not hold")
-    assert "0 of 3 seeds agree in sign, and their mean does not. They part most in edge FL" in ranking["sentence"]
-    assert "was to have −0.010 more than equal stages, and had −0.067" in ranking["sentence"]
-    assert "extrapolated for edge rounds 12 of the joint plan (history: 0 to 6)" in ranking["sentence"]
+    better, ranking, *_ = WRONG.findings
+    assert (better.verdict, ranking.verdict) == ("did not hold", "did not hold")
+    assert "0 of 3 seeds agree in sign, and their mean does not. They part most in edge FL" in ranking.sentence
+    assert "was to have −0.010 more than equal stages, and had −0.067" in ranking.sentence
+    assert "extrapolated for edge rounds 12 of the joint plan (history: 0 to 6)" in ranking.sentence
 
 
 def test_a_stage_that_costs_accuracy_is_said_beside_what_it_brought_elsewhere() -> None:
     rows = [((0.48, 0.58, 0.60), (0.52, 0.62, ap)) for ap in (0.58, 0.585, 0.59)]
-    stages = results_of(*rows)["findings"][2]
-    assert stages["verdict"] == "did not hold"
-    assert "cloud FL of the joint plan (1 round) −0.035 (−0.047 to −0.023)" in stages["sentence"]
-    assert "foresees a loss" in stages["sentence"]
-    assert "on ring the same stage brought −0.035" in stages["sentence"]
-    assert results_of(rows[0])["findings"][2]["verdict"] == "undecided"
+    stages = results_of(*rows).findings[2]
+    assert stages.verdict == "did not hold"
+    assert "cloud FL of the joint plan (1 round) −0.035 (−0.047 to −0.023)" in stages.sentence
+    assert "foresees a loss" in stages.sentence
+    assert "on ring the same stage brought −0.035" in stages.sentence
+    assert results_of(rows[0]).findings[2].verdict == "undecided"
 
 
 def test_seeds_that_disagree_decide_nothing() -> None:
     mixed = results_of(((0.48, 0.58, 0.60), (0.5, 0.6, 0.65)), ((0.5, 0.6, 0.65), (0.5, 0.6, 0.63)))
     assert verdicts(mixed)[:2] == ["undecided", "undecided"]
-    assert (
-        "1 of 2 seeds agree in sign, and so does their mean, but its interval contains 0"
-        in (mixed["findings"][1]["sentence"])
+    assert "1 of 2 seeds agree in sign, and so does their mean, but its interval contains 0" in (
+        mixed.findings[1].sentence
     )
 
 
 def test_one_seed_is_judged_by_its_scenes() -> None:
     single = results_of(((0.48, 0.58, 0.60), (0.5, 0.6, 0.63)))
-    sentence = single["findings"][0]["sentence"]
+    sentence = single.findings[0].sentence
     assert "over test scenes of one seed, in which training does not vary" in sentence
-    assert single["findings"][0]["verdict"] == "undecided"
+    assert single.findings[0].verdict == "undecided"
 
 
 def test_a_budget_that_was_exceeded_is_said() -> None:
-    broken = copy.deepcopy(RIGHT)
-    broken["seeds"][0]["ledger"][JOINT]["wireline"]["used_mb"] = 111.0
+    first, *others = RIGHT.seeds
+    own = first.ledger[JOINT]
+    above = {**own, "wireline": replace(own["wireline"], used_mb=111.0)}
+    broken = replace(RIGHT, seeds=(replace(first, ledger={**first.ledger, JOINT: above}), *others))
     found = allocation_findings(broken)[-1]
-    assert found["verdict"] == "did not hold"
-    assert "above its budgets" in found["sentence"]
+    assert found.verdict == "did not hold"
+    assert "above its budgets" in found.sentence
 
 
 def test_tables_hold_a_row_per_run() -> None:

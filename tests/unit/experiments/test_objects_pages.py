@@ -3,12 +3,16 @@
 import numpy as np
 
 from flcav.experiments import objects_tables, sim_to_real_tables
+from flcav.experiments.sim_to_real import LabelledCar, RealScore, SimToReal, Story
 from flcav.experiments.studies.objects import STUDY
+from flcav.experiments.task_study import Recorded, SeedResult, StudyResult
 from flcav.geometry import Boxes
 from flcav.intervals import mean_over_seeds
 from flcav.perception.camera_view import CameraView
+from flcav.perception.card import Card
+from flcav.perception.objects.results import ObjectsEvaluation
 from flcav.report import style
-from flcav.report.clouds import compare, real_frame
+from flcav.report.clouds import CloudNumbers, SeenCar, Street, compare, real_frame
 
 
 def result(ap):
@@ -25,6 +29,8 @@ def result(ap):
     }
     sliced = {"class": "Car", "by": "distance", "slice": "0-20 m", "targets": 7, "ap": ap}
     return {
+        "frames": 3,
+        "scenes": 1,
         "scores": [row | {"kind": kind, "iou": iou} for kind, iou in measures],
         "slices": [sliced | {"kind": kind, "iou": iou} for kind, iou in measures],
         "trust": [{"class": "Car", "detections": 9, "ece": 0.04, "variance_ratio": 1.1}],
@@ -33,22 +39,30 @@ def result(ap):
 
 def tracked(ap):
     row = {"class": "Car", "mota": 0.7, "amota": 0.6, "id_switches": 2, "velocity_error_mps": 0.5}
+    row |= {"objects": 9, "motp_m": 0.2, "misses": 1, "false_positives": 1}
     return result(ap) | {"tracks": {"sequences": 1, "frames": 3, "scores": [row]}}
 
 
 def study(aps):
-    card = {"samples": 40, "training": {"steps": 60, "scores": [0.25, 0.5]}}
-    seeds = [
-        {"seed": n, "card": card, "tests": {"suburb": result(ap), "tracks": tracked(ap)}} for n, ap in enumerate(aps)
-    ]
-    summary = {
-        test: {
-            name: mean_over_seeds([STUDY.numbers(seed["tests"][test])[name] for seed in seeds])
-            for name in STUDY.numbers(seeds[0]["tests"][test])
-        }
-        for test in ("suburb", "tracks")
-    }
-    return {"seeds": seeds, "summary": summary, "recipes": {"train": [{"town": "suburb"}]}}
+    card = {"task": "objects", "network": "small", "parameters": 9, "seed": 1, "samples": 40, "data": [], "metrics": {}}
+    card["training"] = {"steps": 60, "loss": 1.0, "scores": [0.25, 0.5]}
+    seeds = tuple(
+        SeedResult(
+            n,
+            Card.model_validate(card),
+            {
+                "suburb": ObjectsEvaluation.of_json(result(ap), "suburb"),
+                "tracks": ObjectsEvaluation.of_json(tracked(ap), "tracks"),
+            },
+        )
+        for n, ap in enumerate(aps)
+    )
+    summary = {}
+    for test in ("suburb", "tracks"):
+        rows = [STUDY.numbers(seed.tests[test]) for seed in seeds]
+        summary[test] = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
+    recipes = Recorded(({"town": "suburb"},), {}, {})
+    return StudyResult("objects", "small", "full", 8, 8, recipes, seeds, summary)
 
 
 def test_what_is_reached_is_said_with_its_interval():
@@ -71,26 +85,21 @@ def test_a_study_is_drawn():
 
 
 def cloud():
-    return {
-        "returns": 100.0,
-        "returns_per_range": {"0-5 m": 40.0},
-        "intensity_quantiles": [0, 0.1, 0.2, 0.3, 0.4],
-        "without_intensity": 0.25,
-        "ground": [{"ahead_m": "5-8", "height_m": -1.7, "spread_m": 0.1, "intensity": 0.3}],
-        "cars": [{"distance_m": 5.0, "returns": 9, "length_m": 4.0, "width_m": 1.7, "height_m": 1.5}],
-    }
+    return CloudNumbers(
+        frames=1,
+        returns=100.0,
+        returns_per_range={"0-5 m": 40.0},
+        intensity_quantiles=(0, 0.1, 0.2, 0.3, 0.4),
+        without_intensity=0.25,
+        ground=(Street("5-8", height_m=-1.7, spread_m=0.1, intensity=0.3),),
+        cars=(SeenCar(5.0, 9, length_m=4.0, width_m=1.7, height_m=1.5, without_intensity=0.0),),
+    )
 
 
 def test_clouds_and_real_cars_stand_beside_each_other():
-    car = {"distance_m": 5.0, "found_at": [0.5]}
-    score = {"class": "Car", "kind": "3d", "iou": 0.5, "targets": 1, "found": 1, "false_positives": 0, "ap": 1.0}
-    tables = sim_to_real_tables.tables(
-        {
-            "clouds": {"KITTI": cloud(), "simulated": cloud()},
-            "scores": [score],
-            "frames": [{"frame": "000008", "cars": [car], "boxes": []}],
-        }
-    )
+    score = RealScore("Car", "3d", 0.5, targets=1, found=1, false_positives=0, ap=1.0)
+    story = Story("000008", (), (LabelledCar(5.0, (0.5,)),))
+    tables = sim_to_real_tables.tables(SimToReal({"KITTI": cloud(), "simulated": cloud()}, (score,), (story,)))
     assert "| 000008 | 5.0 | 0.5 |" in tables["cars"]
     assert "| Car | 3d at 0.5 | 1 | 1 | 0 | 1.000 |" in tables["detections"]
     assert "| returns without intensity | 25% | 25% |" in tables["clouds"]
@@ -98,11 +107,9 @@ def test_clouds_and_real_cars_stand_beside_each_other():
 
 def test_clouds_and_frames_are_drawn():
     assert style.png(compare({"KITTI": cloud(), "simulated": cloud()}), 40).startswith(b"\x89PNG")
-    box = {"class": "Car", "x": 12.0, "y": 0.0, "z": -1.0, "length": 4.0, "width": 1.7, "height": 1.5, "yaw": 0.1}
-    story = {"frame": "000008", "cars": [{"distance_m": 12.0, "found_at": []}], "boxes": [box | {"score": 0.5}]}
     cars = Boxes.from_array([[12, 0, -1, 4, 1.7, 1.5, 0.1]], "Car")
     camera_from_lidar = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=float)
     intrinsics = np.array([[700, 0, 600], [0, 700, 180], [0, 0, 1]], dtype=float)
     view = CameraView(np.zeros((375, 1242, 3), np.uint8), camera_from_lidar, intrinsics, np.zeros(5))
-    figure = real_frame(np.ones((9, 4), np.float32), view, cars, story)
+    figure = real_frame("000008", np.ones((9, 4), np.float32), view, cars, np.zeros(1, bool), cars)
     assert "0 of 1 cars found" in figure.axes[0].get_title(loc="left")

@@ -1,51 +1,47 @@
 """The study of the sign task: its amber lights, its tables and its picture."""
 
-from typing import Any
-
 import pytest
 
 from flcav.config import parse_config
 from flcav.dataset.formats.rectangles import SIGNS
 from flcav.experiments.signs_tables import name_of, tables
 from flcav.experiments.studies.signs import STUDY
+from flcav.experiments.task_study import Recorded, SeedResult, StudyResult
 from flcav.intervals import mean_over_seeds
+from flcav.perception.card import Card
+from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
 MISSING = frozenset({"stop", "speed_90"})  # in the held-out town
 
 
-def evaluation(score: float, missing: frozenset[str] = frozenset()) -> dict[str, Any]:
-    classes = [
-        {
-            "class": name,
-            "ap50": None if name in missing else score,
-            "ap50_95": score / 2,
-            "targets": 7 * (name not in missing),
-        }
+def evaluation(score: float, missing: frozenset[str] = frozenset()) -> SignsEvaluation:
+    classes = tuple(
+        ClassPrecision(name, None if name in missing else score, score / 2, targets=7 * (name not in missing))
         for name in SIGNS
-    ]
-    sizes = [{"from_px": 6.0, "to_px": 12.0, "map50": score - 0.1, "targets": 30}]
-    sizes += [{"from_px": 24.0, "to_px": None, "map50": score + 0.1, "targets": 26}]
-    return {"map50": score, "map50_95": score / 2, "classes": classes, "sizes": sizes}
+    )
+    sizes = (SizePrecision(6.0, 12.0, score - 0.1, targets=30), SizePrecision(24.0, None, score + 0.1, targets=26))
+    return SignsEvaluation(score, score / 2, classes, sizes, neutral=0, pictures=9)
 
 
-def results(*scores: float) -> dict[str, Any]:
+def results(*scores: float) -> StudyResult[SignsEvaluation]:
+    facts = {"task": "signs", "network": "n", "parameters": 9, "seed": 1, "samples": 80, "data": [], "metrics": {}}
     names = list(STUDY.tests)
-    seeds = [
-        {
-            "seed": seed,
-            "card": {"samples": 80, "training": {"steps": 20, "scores": [0.1, score]}},
-            "tests": {names[0]: evaluation(score), names[1]: evaluation(score - 0.3, MISSING)},
-        }
+    seeds = tuple(
+        SeedResult(
+            seed,
+            Card.model_validate({**facts, "training": {"steps": 20, "loss": 1.0, "scores": [0.1, score]}}),
+            {names[0]: evaluation(score), names[1]: evaluation(score - 0.3, MISSING)},
+        )
         for seed, score in enumerate(scores, start=1)
-    ]
-    rows = {name: [STUDY.numbers(seed["tests"][name]) for seed in seeds] for name in names}
+    )
+    rows = {name: [STUDY.numbers(seed.tests[name]) for seed in seeds] for name in names}
     summary = {
         name: {key: mean_over_seeds([row[key] for row in of_seeds]) for key in of_seeds[0]}
         for name, of_seeds in rows.items()
     }
-    return {"seeds": seeds, "summary": summary}
+    return StudyResult("signs", "n", "full", 15, 15, Recorded((), {}, {}), seeds, summary)
 
 
 @pytest.mark.slow
@@ -71,5 +67,5 @@ def test_an_interval_around_what_was_wanted_decides_nothing():
 
 
 def test_the_picture_has_a_bar_for_each_number():
-    assert name_of({"class": "light_red"}) == "light red"
+    assert name_of(ClassPrecision("light_red", None, None, 0)) == "light red"
     assert STUDY.draw(results(0.7, 0.8)).startswith(b"\x89PNG")

@@ -31,15 +31,15 @@ def test_numbers_of_a_cloud_are_counts():
     on_car = [(20.0, 0.0, -1.0, i) for i in (0.0, 0.0, 0.2)]
     behind = [(-10.0, 0.0, -1.7, 0.9)]
     said = describe([(np.array(street + on_car + behind, np.float32), boxes((20, 0), (40, 0)))])
-    assert said["returns"] == 7
-    assert said["returns_per_range"]["5-10 m"] == 4
-    assert said["returns_per_range"]["20-25 m"] == 3
-    assert said["without_intensity"] == pytest.approx(2 / 7)
-    assert said["ground"][0]["height_m"] == pytest.approx(-1.7)
-    assert said["ground"][0]["intensity"] == pytest.approx(0.3)
-    (car,) = said["cars"]
-    assert (car["returns"], car["length_m"], car["distance_m"]) == (3, 4.0, 20.0)
-    assert car["without_intensity"] == pytest.approx(2 / 3)
+    assert said.returns == 7
+    assert said.returns_per_range["5-10 m"] == 4
+    assert said.returns_per_range["20-25 m"] == 3
+    assert said.without_intensity == pytest.approx(2 / 7)
+    assert said.ground[0].height_m == pytest.approx(-1.7)
+    assert said.ground[0].intensity == pytest.approx(0.3)
+    (car,) = said.cars
+    assert (car.returns, car.length_m, car.distance_m) == (3, 4.0, 20.0)
+    assert car.without_intensity == pytest.approx(2 / 3)
 
 
 def test_what_the_image_does_not_show_does_not_count():
@@ -53,12 +53,11 @@ def test_real_frames_are_judged_as_kitti_does(monkeypatch):
     van = Boxes.from_array(np.array([(30, 5, -1.0, 5, 2, 2, 0.0)]), "Van")
     cars = boxes((20, 0), (40.9, 0))
     labelled = Boxes.from_array(np.concatenate((cars.array(), van.array())), np.array(["Car", "Car", "Van"]))
-    said = sim_to_real.detections(second(small_config()), [frame(labelled)])
-    row = {(r["class"], r["kind"], r["iou"]): r for r in said["scores"]}
-    assert row["Car", "3d", 0.5] == {
-        "class": "Car", "kind": "3d", "iou": 0.5, "targets": 2, "found": 2, "false_positives": 1, "ap": 1.0
-    }  # fmt: skip
-    assert (row["Car", "3d", 0.7]["found"], row["Car", "3d", 0.7]["false_positives"]) == (1, 2)
-    assert row["Pedestrian", "3d", 0.5]["ap"] is None
-    (story,) = said["frames"]
-    assert [car["found_at"] for car in story["cars"]] == [[0.5, 0.7], [0.5]]
+    scores, (story,) = sim_to_real.detections(second(small_config()), [frame(labelled)])
+    row = {(score.label, score.kind, score.iou): score for score in scores}
+    assert row["Car", "3d", 0.5] == sim_to_real.RealScore(
+        "Car", "3d", 0.5, targets=2, found=2, false_positives=1, ap=1.0
+    )
+    assert (row["Car", "3d", 0.7].found, row["Car", "3d", 0.7].false_positives) == (1, 2)
+    assert row["Pedestrian", "3d", 0.5].ap is None
+    assert [car.found_at for car in story.cars] == [(0.5, 0.7), (0.5,)]

@@ -11,7 +11,7 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.experiments.studies import STUDIES, study_named, weather
-from flcav.experiments.task_study import at_scale, run_study, steps_of
+from flcav.experiments.task_study import at_scale, results_as_json, results_of_json, run_study, steps_of
 from flcav.perception.training.run import CARD, EVENTS, WEIGHTS
 from flcav.sources.recipe import Recipe
 
@@ -80,19 +80,22 @@ def test_a_toy_study_gives_numbers_of_each_seed_and_goes_on(tmp_path: Path):
         said.append(f"{step} {note}")
 
     results = run_study(study, tmp_path, seeds=[1, 2], jobs=1, notify=notify)
-    assert [seed["seed"] for seed in results["seeds"]] == [1, 2]
-    for seed in results["seeds"]:
-        folder = tmp_path / f"seed-{seed['seed']}"
+    assert [seed.seed for seed in results.seeds] == [1, 2]
+    for seed in results.seeds:
+        folder = tmp_path / f"seed-{seed.seed}"
         assert (folder / WEIGHTS).is_file()
         assert (folder / CARD).is_file()
         assert list((folder / EVENTS).iterdir())
-        assert seed["card"]["seed"] == seed["seed"]
-        assert seed["tests"]["held-out town"]["pictures"] == 4
-    accuracies = [seed["tests"]["held-out town"]["accuracy"] for seed in results["seeds"]]
-    mean = results["summary"]["held-out town"]["accuracy"]
-    assert mean["mean"] == pytest.approx(np.mean(accuracies))
-    assert mean["low"] <= mean["mean"] <= mean["high"]
-    assert "nearest class" in results["summary"][weather.WHOLE_SPACE]
+        assert seed.card.seed == seed.seed
+        assert seed.tests["held-out town"].pictures == 4
+    accuracies = [found.accuracy for found in results.tested("held-out town")]
+    mean = results.summary["held-out town"]["accuracy"]
+    assert mean.mean == pytest.approx(np.mean(accuracies))
+    assert mean.low <= mean.mean <= mean.high
+    assert "nearest class" in results.summary[weather.WHOLE_SPACE]
+    values = results_as_json(study, results)
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+    assert results_of_json(study, values, "result.json") == results
     assert study.draw(results).startswith(b"\x89PNG")
 
     said.clear()

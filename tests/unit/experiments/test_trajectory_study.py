@@ -1,14 +1,18 @@
 """The trajectory task's studies: what they record, their numbers, tables and picture."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flcav.experiments.studies import study_named
 from flcav.experiments.studies.trajectory import CAMERAS, STUDY
+from flcav.experiments.task_study import Recorded, SeedResult, StudyResult
 from flcav.experiments.trajectory_tables import tables
 from flcav.intervals import mean_over_seeds
+from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST
-from flcav.perception.trajectory.evaluate import metrics
+from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, metrics
 
 
 @pytest.mark.parametrize("study", [STUDY, CAMERAS])
@@ -17,7 +21,7 @@ def test_no_split_shares_a_scene(study):
     assert len({(recipe["town"], recipe["seed"]) for recipe in recipes}) == len(recipes)
 
 
-def evaluated(off_m: float) -> dict:
+def evaluated(off_m: float) -> TrajectoryEvaluation:
     """Return the evaluation of paths that end `off_m` to the side of a road user who stops 4 m ahead."""
     future = np.zeros((2, FUTURE, 2))
     future[..., 0] = np.minimum(np.arange(1, FUTURE + 1), 4)
@@ -29,14 +33,17 @@ def evaluated(off_m: float) -> dict:
     return metrics(paths, np.tile((0.9, 0.1), (2, 1)), columns)
 
 
-def results(*off_m: float) -> dict:
+def results(*off_m: float) -> StudyResult[TrajectoryEvaluation]:
+    facts = {"task": "trajectory", "network": "tiny", "parameters": 9, "seed": 1, "samples": 9, "data": []}
     runs = []
     for seed, off in enumerate(off_m):
-        card = {"samples": 9, "training": {"steps": 7, "loss": 1.5}, "metrics": evaluated(off)}
-        runs.append({"seed": seed, "card": card, "tests": {"held-out scenes": evaluated(off)}})
+        found = evaluated(off)
+        card = Card.model_validate({**facts, "training": {"steps": 7, "loss": 1.5}, "metrics": found.as_json()})
+        runs.append(SeedResult(seed, card, {"held-out scenes": found}))
     rows = [STUDY.numbers(evaluated(off)) for off in off_m]
     means = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
-    return {"network": "tiny", "seeds": runs, "summary": {"held-out scenes": means}}
+    nothing = Recorded((), {}, {})
+    return StudyResult("trajectory", "tiny", "full", 3, 3, nothing, tuple(runs), {"held-out scenes": means})
 
 
 @pytest.mark.parametrize(
@@ -49,7 +56,7 @@ def test_a_finding_names_its_verdict(off_m, verdict):
 
 
 def test_cameras_are_measured_against_constant_velocity_too():
-    found = tables(results(7.0, 7.1) | {"network": "tiny-cameras"})["findings"].splitlines()
+    found = tables(replace(results(7.0, 7.1), network="tiny-cameras"))["findings"].splitlines()
     assert [line.partition("**")[2].partition("**")[0] for line in found] == ["reached", "not reached"]
 
 

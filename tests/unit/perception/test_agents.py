@@ -152,7 +152,8 @@ def test_every_command_says_whose_frames_it_uses(street, tmp_path, said):
     weights = out / "weights.safetensors"
     card = read_card(weights)
     assert card.samples == 4
-    assert [entry["agents"] for entry in (*card.data, card.validation or {})] == 2 * [["cav0", "cav1"]]
+    assert card.validation is not None
+    assert [entry.agents for entry in (*card.data, card.validation)] == 2 * [("cav0", "cav1")]
     assert "4 frames of cav0, cav1;" in card.markdown()
     evaluated = said("evaluate", "objects", "--data", street.folder, "--weights", weights).splitlines()
     assert evaluated[:2] == [counts, f"network: tiny, seed 0, {weights}"]
@@ -170,7 +171,7 @@ def test_what_is_left_out_is_neither_tested_nor_looked_at(street, tmp_path, said
         )
         asked_for = OBJECTS.evaluate(second_tiny(), street, street.select(agents=agents))
         assert result["frames"] == 2 * len(agents)
-        assert [row["targets"] for row in result["scores"]] == [row["targets"] for row in asked_for["scores"]]
+        assert [row["targets"] for row in result["scores"]] == [row.targets for row in asked_for.scores]
         found = json.loads(said("infer", "objects", street.folder, "--weights", weights, "--json", *wanted))
         assert [one["path"].rsplit("_", 1)[1] for one in found["inputs"]] == 2 * agents
         assert result["agents"] == found["datasets"][0]["agents"] == agents
@@ -189,8 +190,8 @@ def test_networks_of_different_ranges_are_asked_for_the_same_objects(street):
     own, same = [], []
     for network in (tiny, small):
         asked = narrowed(network.config, "48,24")
-        own.append(OBJECTS.evaluate(network, street)["scores"][0]["targets"])
-        same.append(OBJECTS.evaluate(network, street, asked=asked)["scores"][0]["targets"])
+        own.append(OBJECTS.evaluate(network, street).scores[0].targets)
+        same.append(OBJECTS.evaluate(network, street, asked=asked).scores[0].targets)
     assert own == [6, 18]
     assert same == [6, 6]
 
@@ -200,10 +201,11 @@ def test_beyond_the_range_nothing_is_wrong(street, monkeypatch):
     monkeypatch.setattr(evaluation, "detect_all", lambda *_, **__: [concatenate([beyond, hit])])
     network = second_small(classes=("Car",))
     ap = [
-        OBJECTS.evaluate(network, street, street.select(agents=["cav0"]), asked=asked)["scores"][0]["ap"]
+        OBJECTS.evaluate(network, street, street.select(agents=["cav0"]), asked=asked).scores[0].ap
         for asked in (narrowed(network.config, "40,24"), narrowed(network.config, "51,28"))
     ]
     assert ap[0] == 1
+    assert ap[1] is not None
     assert ap[1] < 0.5
 
 

@@ -14,7 +14,7 @@ from flcav.dataset.formats.kitti.export import calibration_lines
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.camera_view import CameraView, kitti_view, recorded_view, view_beside
 from flcav.perception.marks import CloudBoxes
-from flcav.perception.objects.infer import box_rows, boxes_of_rows
+from flcav.perception.objects.infer import ObjectsFound, box_rows, boxes_of_rows
 from flcav.perception.task import Finding
 from flcav.report import style
 from flcav.report.inference import draw
@@ -128,7 +128,7 @@ def finding(*places, view: CameraView | None) -> Finding:
     boxes = Boxes.from_array(rows, "Car", np.full(len(rows), 0.9))
     points = np.pad(np.random.default_rng(0).uniform((1, -9, -2), (40, 9, 1), (500, 3)), ((0, 0), (0, 1)))
     return Finding(
-        Path("000003.bin"), points.astype(np.float32), {"boxes": box_rows(boxes)}, (CloudBoxes(boxes),), lambda: view
+        Path("000003.bin"), points.astype(np.float32), ObjectsFound(box_rows(boxes)), (CloudBoxes(boxes),), lambda: view
     )
 
 

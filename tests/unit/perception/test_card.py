@@ -83,6 +83,6 @@ def test_a_dataset_s_entry_names_its_rig_where_it_has_a_name(known, tmp_path):
     record(Once(rig if known else {**rig, "cameras": {"front": {}}}), tmp_path / "run" / "data")
     data = Dataset.open(tmp_path / "run" / "data")
     entry = data_entry(data, choose_frames(WEATHER, None, data))
-    assert entry["recipe"].get("vehicle_rig") == ("kitti_lidar" if known else None)
-    assert entry["recipe"]["warmup_s"] == 5.0
-    assert (entry["name"], entry["frames"], entry["agents"]) == ("run/data", 1, ["cav0"])
+    assert entry.recipe.get("vehicle_rig") == ("kitti_lidar" if known else None)
+    assert entry.recipe["warmup_s"] == 5.0
+    assert (entry.name, entry.frames, entry.agents) == ("run/data", 1, ("cav0",))

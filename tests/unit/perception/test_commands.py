@@ -98,7 +98,7 @@ def test_scores_are_calibrated_on_the_validation_data(data, tmp_path, monkeypatc
     assert (without.config.calibration, held.config.calibration) == (None, ((2.0, -0.25),))
     assert all(np.array_equal(to_arrays(held)[name], array) for name, array in to_arrays(without).items())
     card = read_card(tmp_path / "with" / "weights.safetensors")
-    assert card.metrics == OBJECTS.evaluate(held, Dataset.open(data))  # of the calibrated scores
+    assert card.metrics == OBJECTS.evaluate(held, Dataset.open(data)).as_json()  # of the calibrated scores
 
 
 def test_infer_takes_files_folders_and_datasets(data, weights, tmp_path, capsys):

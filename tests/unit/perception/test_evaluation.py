@@ -10,7 +10,7 @@ from flcav.geometry import Boxes
 from flcav.perception.errors import load_errors, save_errors
 from flcav.perception.objects import sample_from_frame, second_paper, second_tiny
 from flcav.perception.objects.errors import register_errors
-from flcav.perception.objects.evaluate import asked_of, evaluate, score_detections
+from flcav.perception.objects.evaluate import Score, asked_of, score_detections
 from flcav.perception.objects.samples import checked_points
 from flcav.perception.objects.truth import ground_truth
 
@@ -62,20 +62,17 @@ def test_scores_count_targets_and_hidden_objects():
     truths = [asked_of(frame(MIXED, scene=f"s{i}"), CONFIG) for i in range(3)]
     found = [detections((10, 0, 0.9), (20, 0, 0.8), (30, 0, 0.7), (40, 0, 0.6))] * 3
     result = score_detections(found, truths, ("Car",))
-    assert result.score("Car", "3d", 0.7).ap == 1
-    row = result.summary()["scores"][0]
-    assert row == {
-        "class": "Car", "kind": "3d", "iou": 0.5, "ap": 1.0, "low": 1.0, "high": 1.0, "aos": 1.0,
-        "right_headings": 1.0, "targets": 6, "hidden": 3
-    }  # fmt: skip
-    assert result.frames == 3
+    assert [(score.kind, score.iou, score.ap) for score in result[:2]] == [("3d", 0.5, 1), ("3d", 0.7, 1)]
+    assert result[0] == Score(
+        "Car", "3d", 0.5, ap=1.0, low=1.0, high=1.0, aos=1.0, right_headings=1.0, targets=6, hidden=3
+    )
     nothing = score_detections([Boxes.empty()], [asked_of(frame([]), CONFIG)], ("Car",))
-    assert nothing.summary()["scores"][0]["ap"] is None
+    assert nothing[0].ap is None
 
 
 def test_evaluating_nothing_is_said():
     with pytest.raises(InputError, match="0 frames"):
-        evaluate(second_tiny(), [])
+        score_detections([], [], ("Car",))
 
 
 def test_misses_are_registered_once_per_track():

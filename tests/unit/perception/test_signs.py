@@ -11,7 +11,7 @@ from flcav.perception.ops.rectangles import complete_iou
 from flcav.perception.signs.augment import GREY, cut, draw, joined, window
 from flcav.perception.signs.config import CONFIGURATIONS, STRIDES, SignsConfig
 from flcav.perception.signs.detect import Detections, detect
-from flcav.perception.signs.evaluate import Truth, mean_average_precision
+from flcav.perception.signs.evaluate import ClassPrecision, Truth, mean_average_precision
 from flcav.perception.signs.loss import BOX, CLASS, LEVELS, OBJECT, detection_loss
 from flcav.perception.signs.model import SignDetector, boxes_of, decode
 from flcav.perception.signs.samples import Sample
@@ -215,19 +215,19 @@ def truth(*rows, neutral=NO_BOXES) -> Truth:
 def test_map_of_cases_by_hand():
     classes = ("a", "b")
     perfect = mean_average_precision([found((10, 10, 20, 0, 0.9))], [truth((10, 10, 20, 0))], classes, 6)
-    assert (perfect["map50"], perfect["map50_95"]) == (1, 1)
-    assert perfect["classes"][1] == {"class": "b", "ap50": None, "ap50_95": None, "targets": 0}
-    assert [row["map50"] for row in perfect["sizes"]] == [None, 1, None]
+    assert (perfect.map50, perfect.map50_95) == (1, 1)
+    assert perfect.classes[1] == ClassPrecision("b", None, None, 0)
+    assert [row.map50 for row in perfect.sizes] == [None, 1, None]
     half = [found((10, 10, 20, 0, 0.9)), found()]
     missed = mean_average_precision(half, [truth((10, 10, 20, 0))] * 2, classes, 6)
-    assert missed["map50"] == pytest.approx(51 / 101)  # precision 1 at 51 of the 101 recalls of COCO
+    assert missed.map50 == pytest.approx(51 / 101)  # precision 1 at 51 of the 101 recalls of COCO
     false_first = [found((60, 60, 20, 0, 0.95), (10, 10, 20, 0, 0.9))]
-    assert mean_average_precision(false_first, [truth((10, 10, 20, 0))], classes, 6)["map50"] == pytest.approx(0.5)
+    assert mean_average_precision(false_first, [truth((10, 10, 20, 0))], classes, 6).map50 == pytest.approx(0.5)
     shifted = mean_average_precision([found((13, 10, 20, 0, 0.9))], [truth((10, 10, 20, 0))], classes, 6)
-    assert shifted["map50"] == 1
-    assert shifted["map50_95"] == pytest.approx(0.5)  # IoU 17 / 23: right at 0.5, 0.55, ..., 0.7
+    assert shifted.map50 == 1
+    assert shifted.map50_95 == pytest.approx(0.5)  # IoU 17 / 23: right at 0.5, 0.55, ..., 0.7
     wrong = mean_average_precision([found((10, 10, 20, 1, 0.9))], [truth((10, 10, 20, 0))], classes, 6)
-    assert wrong["map50"] == 0
+    assert wrong.map50 == 0
 
 
 def test_neutral_and_tiny_findings_are_no_mistakes():
@@ -235,16 +235,16 @@ def test_neutral_and_tiny_findings_are_no_mistakes():
     neutral = np.array([[60.0, 60, 70, 80]])
     right = (10, 10, 20, 0, 0.5)
     for extra in ((61, 61, 9, 0, 0.9), (61, 61, 9, 1, 0.9), (100, 100, 4, 0, 0.9)):
-        assert mean_average_precision([found(right, extra)], [truth(target, neutral=neutral)], classes, 6)["map50"] == 1
+        assert mean_average_precision([found(right, extra)], [truth(target, neutral=neutral)], classes, 6).map50 == 1
     mistake = mean_average_precision([found(right, (100, 100, 9, 0, 0.9))], [truth(target)], classes, 6)
-    assert mistake["map50"] == pytest.approx(0.5)
+    assert mistake.map50 == pytest.approx(0.5)
 
 
 def test_nothing_found_and_nothing_to_find():
     nothing = mean_average_precision([found()], [truth()], ("a",), 6)
-    assert nothing["map50"] is None
-    assert SIGNS.score(nothing) == 0
-    assert mean_average_precision([found()], [truth((10, 10, 20, 0))], ("a",), 6)["map50"] == 0
+    assert nothing.map50 is None
+    assert nothing.score == 0
+    assert mean_average_precision([found()], [truth((10, 10, 20, 0))], ("a",), 6).map50 == 0
 
 
 def test_any_size_of_picture_is_looked_at():
@@ -271,7 +271,7 @@ def test_it_learns_eight_pictures():
     def map50() -> float:
         seen = [detect(network, sample.picture, threshold=0.01) for sample in samples]
         truths = [Truth(s.boxes, s.label, s.ignore) for s in samples]
-        return mean_average_precision(seen, truths, TINY.classes, 6)["map50"]
+        return mean_average_precision(seen, truths, TINY.classes, 6).score
 
     assert map50() < 0.1
     losses = train(WithoutAugmentation(), network, samples, steps=60, seed=0).losses

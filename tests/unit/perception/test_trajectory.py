@@ -238,11 +238,15 @@ def test_slices_and_misses():
         "scene": np.array(["a"] * 3),
     }
     result = metrics(ahead[:, None], np.ones((3, 1)), columns)
-    assert [numbers["samples"] for numbers in result["slices"].values()] == [3, 2, 1]
-    assert result["slices"]["all"]["miss_rate_1"] == pytest.approx(1 / 3)
-    assert result["slices"]["turning at junctions"]["ratio_1"] == pytest.approx(1.0)
+    every, junctions, turned_there = result.slices.values()
+    assert every is not None
+    assert junctions is not None
+    assert turned_there is not None
+    assert (every.samples, junctions.samples, turned_there.samples) == (3, 2, 1)
+    assert every.miss_rate_1 == pytest.approx(1 / 3)
+    assert turned_there.ratio_1 == pytest.approx(1.0)
     nobody = metrics(ahead[:1, None], np.ones((1, 1)), {name: column[:1] for name, column in columns.items()})
-    assert nobody["slices"]["at junctions"] is None
+    assert nobody.slices["at junctions"] is None
 
 
 def test_only_the_nearest_mode_learns_much():

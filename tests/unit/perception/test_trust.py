@@ -42,8 +42,8 @@ def truth(*xs, occlusion, weather: str | None = "clear", neutral=()):
 
 
 def row(rows, by, name, kind="3d", iou=0.5):
-    (found,) = [r for r in rows if (r["by"], r["slice"], r["kind"], r["iou"]) == (by, name, kind, iou)]
-    return found["ap"], found["targets"]
+    (found,) = [r for r in rows if (r.by, r.slice, r.kind, r.iou) == (by, name, kind, iou)]
+    return found.ap, found.targets
 
 
 def test_slices_ask_for_their_own_objects_and_for_no_others():
@@ -55,7 +55,7 @@ def test_slices_ask_for_their_own_objects_and_for_no_others():
     assert row(rows, "distance", "40-80 m") == (0, 1)
     assert row(rows, "occlusion", "0%-20%") == (1, 1)
     assert row(rows, "occlusion", "60%-100%") == (0, 1)
-    assert not [r for r in rows if r["by"] == "weather"]
+    assert not [r for r in rows if r.by == "weather"]
 
 
 def test_a_false_positive_counts_in_the_slice_of_its_distance():
@@ -79,15 +79,16 @@ def test_a_weather_s_slice_is_the_evaluation_of_its_frames():
     found = [cars(*xs[:3] + rng.normal(0, 0.7, 3), 70.0, scores=rng.random(4)) for xs in places]
     rows = sliced(found, truths, ("Car",))
     for number, name in enumerate(names):
-        alone = score_detections(found[number::3], truths[number::3], ("Car",)).score("Car", "3d", 0.5).ap
-        assert 0 < row(rows, "weather", name)[0] < 1
+        alone = score_detections(found[number::3], truths[number::3], ("Car",))[0].ap
+        assert alone is not None
+        assert 0 < alone < 1
         assert row(rows, "weather", name) == (pytest.approx(alone, abs=1e-6), 16)
 
 
 def test_weathers_come_in_the_order_of_their_classes():
     names = ("night", "heavy_rain", None, "clear")
     rows = sliced([cars()] * 4, [truth(10, occlusion=(0,), weather=name) for name in names], ("Car",))
-    assert list(dict.fromkeys(r["slice"] for r in rows if r["by"] == "weather")) == ["clear", "heavy_rain", "night"]
+    assert list(dict.fromkeys(r.slice for r in rows if r.by == "weather")) == ["clear", "heavy_rain", "night"]
 
 
 def test_variances_are_judged_by_the_errors_they_foretell():
@@ -95,6 +96,6 @@ def test_variances_are_judged_by_the_errors_they_foretell():
     variance = np.full((2, 7), 0.02)
     found = Boxes(found.center, found.size, found.yaw, found.label, found.score, variance)
     (said,) = trust([found], [truth(10, 30, occlusion=(0, 0))], ("Car",))
-    assert said["variance_ratio"] == pytest.approx(0.04 / 0.04, abs=1e-6)
-    assert said["ece"] == pytest.approx(0.1)
-    assert said["detections"] == 2
+    assert said.variance_ratio == pytest.approx(0.04 / 0.04, abs=1e-6)
+    assert said.ece == pytest.approx(0.1)
+    assert said.detections == 2

@@ -92,14 +92,16 @@ def test_a_picture_is_squeezed_to_its_means():
 def test_accuracy_recall_and_confusion_by_hand():
     truth, found = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 0, 1, 1, 1, 0])
     result = classification(truth, found, list("aabbcc"), ["x", "y", "z", "w"])
-    assert result["accuracy"] == pytest.approx(4 / 6)
-    assert result["confusion"] == [[2, 1, 0, 0], [0, 2, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]
-    assert result["recall"] == {"x": pytest.approx(2 / 3), "y": 1, "z": 0, "w": None}
-    assert result["low"] <= result["accuracy"] <= result["high"]
-    assert (result["pictures"], result["scenes"]) == (6, 3)
+    assert result.accuracy == pytest.approx(4 / 6)
+    assert result.confusion == ((2, 1, 0, 0), (0, 2, 0, 0), (1, 0, 0, 0), (0, 0, 0, 0))
+    assert result.recall == {"x": pytest.approx(2 / 3), "y": 1, "z": 0, "w": None}
+    assert result.low is not None
+    assert result.high is not None
+    assert result.low <= result.accuracy <= result.high
+    assert (result.pictures, result.scenes) == (6, 3)
     alone = classification(truth, found, ["a"] * 6, ["x", "y", "z", "w"])
-    assert (alone["low"], alone["high"]) == (None, None)
-    assert "accuracy 0.667 (no interval: one scene)" in WEATHER.evaluation_lines(alone)[0]
+    assert (alone.low, alone.high) == (None, None)
+    assert "accuracy 0.667 (no interval: one scene)" in alone.lines()[0]
 
 
 def test_the_classes_are_those_of_the_world():

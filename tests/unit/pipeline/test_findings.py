@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import pytest
 
+from flcav.intervals import Estimate
 from flcav.pipeline import results
 from flcav.pipeline.findings import findings
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results import ArmResult, Difference, Estimate, Placed, Plan
+from flcav.pipeline.results import ArmResult, Difference, Placed, Plan
 from flcav.pipeline.running import gap_closed, gaps_closed
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
 
@@ -22,7 +23,7 @@ MEANS = {
 
 
 def result_of(arm: str, stage: str, mean: float) -> results.Test:
-    found = results.Tested("grid", "objects", "AP50", Estimate(mean), {}, 96, 8)
+    found = results.Tested("grid", "objects", "AP50", Estimate(mean, None, None), {}, 96, 8)
     return results.Test(arm, stage, "grid", "objects", "test", found)
 
 
@@ -67,7 +68,7 @@ def test_a_densest_pole_that_was_chosen_leaves_nothing_to_compare() -> None:
 
 
 def test_one_scene_decides_nothing() -> None:
-    alone = replace(difference(EDGE, (MAIN, PRETRAIN), 0.1, 0.0, 0.0), estimate=Estimate(0.1))
+    alone = replace(difference(EDGE, (MAIN, PRETRAIN), 0.1, 0.0, 0.0), estimate=Estimate(0.1, None, None))
     (edge,) = told(alone)
     assert edge.verdict == UNDECIDED
     assert "too few scenes" in edge.sentence

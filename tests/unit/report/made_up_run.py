@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 
 from flcav.geometry import Boxes
+from flcav.intervals import Estimate
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import (
     ArmResult,
     Block,
     Difference,
-    Estimate,
     Finding,
     LinkUse,
     Placed,

@@ -9,15 +9,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
+from flcav.intervals import MeanOverSeeds
 from flcav.report import figures, style
 
 TESTED, ROUNDS = made_up_run.chart_rows(), made_up_run.rounds()
 BUDGETS, SENT = made_up_run.BUDGETS, made_up_run.sent()
-ARMS = [
-    {"arm": arm, "town": town, "ap50": ap50, "low": ap50 - 0.03, "high": ap50 + 0.04}
+REACHED = {"pretrained": 0.41, "edge FL": 0.5, "oracle": 0.57}
+ARMS = {
+    town: {arm: MeanOverSeeds(ap50, ap50 - 0.03, ap50 + 0.04) for arm, ap50 in REACHED.items()}
     for town in ("grid", "ring")
-    for arm, ap50 in (("pretrained", 0.41), ("edge FL", 0.5), ("oracle", 0.57))
-]
+}
 
 DRAWN: dict[str, Callable[[], Figure]] = {
     "town_map": lambda: figures.town_map(made_up_run.error_map()),

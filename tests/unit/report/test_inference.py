@@ -8,6 +8,7 @@ import pytest
 from flcav.geometry import Boxes
 from flcav.perception.camera_view import CameraView
 from flcav.perception.marks import Bars, CloudBoxes, Light, Mark, Mode, Paths, PictureBoxes, RoadUser
+from flcav.perception.objects.infer import ObjectsFound
 from flcav.perception.task import Finding
 from flcav.report import style
 from flcav.report.inference import DRAWERS, draw
@@ -24,6 +25,9 @@ USER = RoadUser("veh0", "car", 5.0, 2.0, 0.1, 8.0, 4.4, 1.8, (Mode(0.6, np.array
 WAYS = Paths((0.0, 0.0, 0.0), 20.0, (0.5, 1.0), (USER,), (Light(3.0, 1.0, True),))
 
 
+NOTHING = ObjectsFound(())
+
+
 @pytest.mark.parametrize(
     ("seen", "marks", "title", "axes"),
     [
@@ -37,14 +41,14 @@ WAYS = Paths((0.0, 0.0, 0.0), 20.0, (0.5, 1.0), (USER,), (Light(3.0, 1.0, True),
     ],
 )
 def test_marks_are_drawn_on_what_was_seen(seen: np.ndarray, marks: tuple[Mark, ...], title: str, axes: int):
-    figure = draw(Finding(Path("input.png").with_suffix(""), seen, {}, marks, lambda: VIEW))
+    figure = draw(Finding(Path("input.png").with_suffix(""), seen, NOTHING, marks, lambda: VIEW))
     assert title in [each.get_title("left") for each in figure.axes]
     assert len(figure.axes) == axes
     assert style.png(figure, dpi=40).startswith(b"\x89PNG")
 
 
 def test_every_class_has_its_legend_whoever_named_it():
-    figure = draw(Finding(Path("input"), CLOUD, {}, (TRAILERS,)))
+    figure = draw(Finding(Path("input"), CLOUD, NOTHING, (TRAILERS,)))
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["1 Car", "1 Trailer"]
 
 

@@ -4,13 +4,14 @@ The sweeps are those of recipes/objects.yaml, in every town. Scores are calibrat
 """
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from flcav.dataset.store import Dataset
-from flcav.experiments.task_study import Result, Study, recipe_of
+from flcav.experiments.task_study import Study, StudyResult, recipe_of
 from flcav.perception.objects.model import Second
+from flcav.perception.objects.results import ObjectsEvaluation
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.tracking import evaluate_tracks
 from flcav.report import style
@@ -24,46 +25,40 @@ WEATHERS = "weathers"
 TRACKS = "tracks"
 
 
-def followed(network: Second, data: Dataset) -> dict[str, Any]:
-    """Return the evaluation of the network's tracks."""
-    return {TRACKS: evaluate_tracks(network, data)}
+def followed(found: ObjectsEvaluation, network: Second, data: Dataset) -> ObjectsEvaluation:
+    """Return the evaluation with that of the network's tracks besides."""
+    return replace(found, tracks=evaluate_tracks(network, data))
 
 
-def _numbers(result: Result) -> Mapping[str, float]:
+def _numbers(found: ObjectsEvaluation) -> Mapping[str, float]:
     """Return AP in 3D and from above of each class, AOS, headings, the error of calibration, MOTA of tracks."""
-    ap = {
-        f"{row['class']} AP {row['kind']} at {row['iou']}": row["ap"]
-        for row in result["scores"]
-        if row["ap"] is not None
-    }
+    ap = {f"{row.label} AP {row.kind} at {row.iou}": row.ap for row in found.scores}
     headings = {
-        f"{row['class']} {name}": row[key]
-        for row in result["scores"]
-        for name, key in (("AOS 3d at 0.5", "aos"), ("right headings", "right_headings"))
-        if (row["kind"], row["iou"]) == ("3d", 0.5) and row[key] is not None
+        f"{row.label} {name}": value
+        for row in found.scores
+        if (row.kind, row.iou) == ("3d", 0.5)
+        for name, value in (("AOS 3d at 0.5", row.aos), ("right headings", row.right_headings))
     }
-    errors = {f"{row['class']} calibration error": row["ece"] for row in result["trust"] if row["ece"] is not None}
-    rows = result[TRACKS]["scores"] if TRACKS in result else []
+    errors = {f"{row.label} calibration error": row.ece for row in found.trust}
     tracks = {
-        f"{row['class']} {name.upper()}": row[name]
-        for row in rows
-        for name in ("mota", "amota")
-        if row[name] is not None
+        f"{row.label} {name}": value
+        for row in (found.tracks.scores if found.tracks else ())
+        for name, value in (("MOTA", row.mota), ("AMOTA", row.amota))
     }
-    return ap | headings | errors | tracks
+    return {name: value for name, value in (ap | headings | errors | tracks).items() if value is not None}
 
 
-def _draw(results: Mapping[str, Any]) -> bytes:
+def _draw(results: StudyResult[ObjectsEvaluation]) -> bytes:
     """Return AP at IoU 0.5 in 3D of each test: of the classes, and of cars by distance and occlusion."""
     panels = {}
-    for test in results["summary"]:
-        tested = [seed["tests"][test] for seed in results["seeds"]]
-        rows = {}
-        for result in tested:
-            for row in result["scores"] + [r for r in result["slices"] if r["class"] == "Car"]:
-                if (row["kind"], row["iou"]) == ("3d", 0.5) and row["ap"] is not None:
-                    name = row["class"] if "slice" not in row else f"cars, {row['by']} {row['slice']}"
-                    rows.setdefault((name, row["targets"]), []).append(row["ap"])
+    for test in results.summary:
+        rows: dict[tuple[str, int], list[float]] = {}
+        for found in results.tested(test):
+            classes = [(row.label, row) for row in found.scores]
+            slices = [(f"cars, {row.by} {row.slice}", row) for row in found.slices if row.label == "Car"]
+            for name, row in (*classes, *slices):
+                if (row.kind, row.iou) == ("3d", 0.5) and row.ap is not None:
+                    rows.setdefault((name, row.targets), []).append(row.ap)
         panels[test] = [Bar(name, float(np.mean(ap)), tuple(ap), count) for (name, count), ap in rows.items()]
     return style.png(precisions(panels))
 
@@ -80,6 +75,7 @@ STUDY = Study(
     },
     epochs=8,
     patience=8,
+    evaluation=ObjectsEvaluation,
     numbers=_numbers,
     draw=_draw,
     extra={TRACKS: followed},

@@ -5,10 +5,10 @@ The held-out scenes have all eight classes; the held-out town has speed limits o
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 from flcav.experiments.signs_tables import name_of
-from flcav.experiments.task_study import Result, Study, recipe_of
+from flcav.experiments.task_study import Study, StudyResult, recipe_of
+from flcav.perception.signs.evaluate import SignsEvaluation
 from flcav.perception.signs.task import SIGNS
 from flcav.report import style
 from flcav.report.precision import Bar, precisions
@@ -17,24 +17,23 @@ ARTERIAL, SUBURB, GRID = recipe_of("signs"), recipe_of("signs_suburb"), recipe_o
 RING = {**ARTERIAL, "town": "ring", "warmup_s": [87.0, 89.5]}
 
 
-def _numbers(result: Result) -> Mapping[str, float]:
+def _numbers(found: SignsEvaluation) -> Mapping[str, float]:
     """Return mAP, and AP50 by class and by size, of what there was to find."""
-    parts = {name_of(row): row["ap50"] for row in result["classes"]} | {
-        name_of(row): row["map50"] for row in result["sizes"]
-    }
-    known = {name: value for name, value in parts.items() if value is not None}
-    return {"mAP50": result["map50"], "mAP50-95": result["map50_95"], **known}
+    means = {"mAP50": found.map50, "mAP50-95": found.map50_95}
+    classes = {name_of(row): row.ap50 for row in found.classes}
+    sizes = {name_of(row): row.map50 for row in found.sizes}
+    return {name: value for name, value in (means | classes | sizes).items() if value is not None}
 
 
-def _draw(results: Mapping[str, Any]) -> bytes:
+def _draw(results: StudyResult[SignsEvaluation]) -> bytes:
     """Return a panel per test: AP50 of each class, of each size, and their mean."""
     panels = {}
-    for test, means in results["summary"].items():
-        tested = [seed["tests"][test] for seed in results["seeds"]]
-        targets = {name_of(row): row["targets"] for row in (*tested[0]["classes"], *tested[0]["sizes"])}
+    for test, means in results.summary.items():
+        tested = results.tested(test)
+        targets = {name_of(row): row.targets for row in (*tested[0].classes, *tested[0].sizes)}
         numbers = [_numbers(result) for result in tested]
         panels[test] = [
-            Bar(name, means[name]["mean"], tuple(row[name] for row in numbers), targets.get(name))
+            Bar(name, means[name].mean, tuple(row[name] for row in numbers), targets.get(name))
             for name in numbers[0]
             if name in means and name != "mAP50-95"
         ]
@@ -52,6 +51,7 @@ STUDY = Study(
     },
     epochs=15,
     patience=15,
+    evaluation=SignsEvaluation,
     numbers=_numbers,
     draw=_draw,
 )

@@ -5,54 +5,54 @@ recipes/trajectory.yaml, trajectory_suburb.yaml and trajectory_ring.yaml. Throug
 held-out scenes, by recipes/trajectory_cameras.yaml.
 """
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flcav.experiments.task_study import Result, Study, recipe_of
+from flcav.experiments.task_study import Study, StudyResult, recipe_of
+from flcav.perception.trajectory.evaluate import PathErrors, TrajectoryEvaluation
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.report import style
 from flcav.report.path_errors import Bar, path_errors
 
 GRID, SUBURB, RING = recipe_of("trajectory"), recipe_of("trajectory_suburb"), recipe_of("trajectory_ring")
 CAMERA_RECIPE = recipe_of("trajectory_cameras")
-PREDICTORS = {
-    "constant velocity": "constant_velocity_FDE",
-    "single path": "single_FDE",
-    "best of six modes": "minFDE_K",
-}
-JUNCTIONS = "at junctions"
 
 
-def _numbers(result: Result) -> Mapping[str, float]:
+def _numbers(found: TrajectoryEvaluation) -> Mapping[str, float]:
     """Return errors, misses and ratios to constant velocity of each slice that has samples."""
     return {
         f"{name}, {key}": value
-        for name, numbers in result["slices"].items()
-        if numbers is not None
-        for key, value in numbers.items()
+        for name, errors in found.slices.items()
+        if errors is not None
+        for key, value in vars(errors).items()
         if value is not None
     }
 
 
-def _draw(results: Mapping[str, Any]) -> bytes:
+def _draw(results: StudyResult[TrajectoryEvaluation]) -> bytes:
     """Return final errors of each test and slice."""
     panels = {}
-    for test in results["summary"]:
-        tested = [seed["tests"][test]["slices"] for seed in results["seeds"]]
+    for test in results.summary:
+        slices: dict[str, list[PathErrors]] = {}
+        for tested in results.tested(test):
+            for name, errors in tested.slices.items():
+                slices.setdefault(name, []).extend([errors] if errors else [])
         panels[test] = {
-            f"{name}\n({numbers['samples']})": [
-                _bar(label, [one[name][key] for one in tested]) for label, key in PREDICTORS.items()
+            f"{name}\n({seeds[0].samples})": [
+                _bar("constant velocity", [each.constant_velocity_FDE for each in seeds]),
+                _bar("single path", [each.single_FDE for each in seeds]),
+                _bar("best of six modes", [each.minFDE_K for each in seeds]),
             ]
-            for name, numbers in tested[0].items()
-            if numbers is not None
+            for name, seeds in slices.items()
+            if seeds
         }
     return style.png(path_errors(panels))
 
 
-def _bar(name: str, seeds: list[float]) -> Bar:
-    return Bar(name, float(np.mean(seeds)), seeds)
+def _bar(name: str, seeds: Sequence[float | None]) -> Bar:
+    known = [value for value in seeds if value is not None]
+    return Bar(name, float(np.mean(known)), known)
 
 
 STUDY = Study(
@@ -66,6 +66,7 @@ STUDY = Study(
     },
     epochs=3,
     patience=3,
+    evaluation=TrajectoryEvaluation,
     numbers=_numbers,
     draw=_draw,
     quick_scenes=1,
@@ -79,6 +80,7 @@ CAMERAS = Study(
     tests={"held-out scenes": {**CAMERA_RECIPE, "seed": 331, "split": "test", "cavs": 3, "scenes": 6}},
     epochs=5,
     patience=5,
+    evaluation=TrajectoryEvaluation,
     numbers=_numbers,
     draw=_draw,
     quick_scenes=1,

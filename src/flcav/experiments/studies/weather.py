@@ -4,11 +4,14 @@ The recipe is that of recipes/weather.yaml: each scene goes once through all eig
 """
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
-from flcav.experiments.task_study import Result, Study, recipe_of
+from flcav.dataset.store import Dataset
+from flcav.experiments.task_study import Study, StudyResult, recipe_of
+from flcav.perception.weather.evaluate import Classification
+from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.task import WEATHER, over_the_whole_space
 from flcav.report import style
 from flcav.report.confusion import confusions
@@ -19,18 +22,22 @@ WHOLE_SPACE = "whole space"
 ANY_WEATHER = {"classes": [ANY] * 8, "turn_s": 4.0}
 
 
-def _numbers(result: Result) -> Mapping[str, float]:
+def with_nearest(found: Classification, network: Classifier, data: Dataset) -> Classification:
+    """Return the evaluation with that of all pictures besides, each of the nearest class."""
+    return replace(found, nearest=over_the_whole_space(network, data))
+
+
+def _numbers(found: Classification) -> Mapping[str, float]:
     """Return the accuracy on pictures within the classes' regions, and on all where the whole space was asked for."""
-    nearest = {"nearest class": result["nearest"]["accuracy"]} if "nearest" in result else {}
-    return {"accuracy": result["accuracy"], **nearest}
+    nearest = {} if found.nearest is None else {"nearest class": found.nearest.accuracy}
+    return {"accuracy": found.accuracy, **nearest}
 
 
-def _draw(results: Mapping[str, Any]) -> bytes:
+def _draw(results: StudyResult[Classification]) -> bytes:
     """Return the confusion matrix of each test, the seeds' together."""
-    tests = [seed["tests"] for seed in results["seeds"]]
-    shown = {name: [test[name].get("nearest", test[name]) for test in tests] for name in results["summary"]}
-    counts = {name: np.sum([result["confusion"] for result in found], axis=0) for name, found in shown.items()}
-    return style.png(confusions(counts, next(iter(shown.values()))[0]["classes"]))
+    shown = {name: [each.nearest or each for each in results.tested(name)] for name in results.summary}
+    counts = {name: np.sum([result.confusion for result in found], axis=0) for name, found in shown.items()}
+    return style.png(confusions(counts, next(iter(shown.values()))[0].classes))
 
 
 STUDY = Study(
@@ -45,7 +52,8 @@ STUDY = Study(
     },
     epochs=60,
     patience=15,
+    evaluation=Classification,
     numbers=_numbers,
     draw=_draw,
-    extra={WHOLE_SPACE: over_the_whole_space},
+    extra={WHOLE_SPACE: with_nearest},
 )

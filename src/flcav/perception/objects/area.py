@@ -1,9 +1,7 @@
 """What an evaluation asks for: where objects have to lie, and with how many returns, said beside its numbers."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 from flcav.config import InputError
 from flcav.intervals import CONFIDENCE
@@ -29,18 +27,26 @@ def narrowed(config: SecondConfig, text: str) -> SecondConfig:
     return replace(config, range_m=(0.0, -side, z0, ahead, side, z1))
 
 
-def rules(config: SecondConfig) -> dict[str, Any]:
-    """Return what makes an object a target, and the level of intervals, as JSON knows them."""
-    return {"range_m": list(config.range_m), "min_returns": MIN_RETURNS, "confidence": CONFIDENCE}
+@dataclass(frozen=True)
+class Rules:
+    """What makes an object a target, and the level of intervals."""
+
+    range_m: tuple[float, ...]  # of its centre: least x, y, z, then the most [m]
+    min_returns: int
+    confidence: float
+
+    def lines(self) -> list[str]:
+        """Return them in words."""
+        return [
+            f"targets: centre {_extent(self.range_m)}, {self.min_returns} LiDAR returns or more; "
+            "others are neutral, and so are trucks and buses beside cars",
+            f"intervals: {100 * self.confidence:g} %, over scenes",
+        ]
 
 
-def rules_lines(rules: Mapping[str, Any]) -> list[str]:
-    """Return `rules` in words."""
-    return [
-        f"targets: centre {_extent(rules['range_m'])}, {rules['min_returns']} LiDAR returns or more; "
-        "others are neutral, and so are trucks and buses beside cars",
-        f"intervals: {100 * rules['confidence']:g} %, over scenes",
-    ]
+def rules(config: SecondConfig) -> Rules:
+    """Return the rules of an evaluation as `config` has them."""
+    return Rules(tuple(config.range_m), MIN_RETURNS, CONFIDENCE)
 
 
 def _extent(range_m: tuple[float, ...]) -> str:

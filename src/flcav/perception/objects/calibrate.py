@@ -1,8 +1,7 @@
 """Scores that say how often a detection is right, and how far that, and its variance, can be trusted."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from flcav.perception.metrics import calibration_error, fit_logistic, match
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.evaluate import Asked, detections_and_truths, number_or_none, of_class
 from flcav.perception.objects.model import Second
+from flcav.records import Class
 from flcav.sensors.frame import Frame
 
 OVERLAP = 0.5  # 3D IoU that makes a detection right
@@ -27,19 +27,24 @@ def calibrate(network: Second, frames: Iterable[Frame]) -> None:
     network.config = replace(network.config, calibration=tuple(fitted))
 
 
-def trust(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Return a row per class: the scores' expected calibration error, and where detections have variances, theirs.
+@dataclass(frozen=True)
+class Trust:
+    """How far the scores of a class's detections, and their variances, can be trusted; None where that is not known."""
 
-    `variance_ratio` is the mean squared error of found objects' x and y over the mean variance predicted: 1 is right,
-    more is too sure.
-    """
+    label: Class
+    detections: int
+    ece: float | None  # expected calibration error of the scores
+    variance_ratio: float | None  # mean squared error of found objects' x and y over the mean variance predicted
+
+
+def trust(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> tuple[Trust, ...]:
+    """Return for each class how far to trust its detections; of a variance ratio 1 is right, more is too sure."""
     rows = []
     for name in classes:
         matches = _matches(detections, truths, name)
-        row = {"class": name, "detections": len(matches.score)}
-        row["ece"] = number_or_none(calibration_error(matches.score, matches.hit))
-        rows.append(row | {"variance_ratio": number_or_none(_variance_ratio(detections, truths, name))})
-    return rows
+        ece, ratio = calibration_error(matches.score, matches.hit), _variance_ratio(detections, truths, name)
+        rows.append(Trust(name, len(matches.score), number_or_none(ece), number_or_none(ratio)))
+    return tuple(rows)
 
 
 def _matches(detections: Sequence[Boxes], truths: Sequence[Asked], name: str):

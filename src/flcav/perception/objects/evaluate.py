@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.perception.metrics import (
-    Matches,
     average_precision,
     bootstrap_interval,
     match,
@@ -23,6 +21,7 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
 from flcav.perception.ops.rotated import Kind
 from flcav.progress import Report, silent
+from flcav.records import Class
 from flcav.seeds import stream
 from flcav.sensors.frame import Frame
 from flcav.world.weather import weather_class
@@ -45,54 +44,18 @@ class Asked:
 
 @dataclass(frozen=True)
 class Score:
-    """The result for one class under one measure of overlap."""
+    """The result for one class under one measure of overlap; numbers are None where there was nothing to find."""
 
-    name: str  # detection class
+    label: Class
     kind: Kind
-    overlap: float  # IoU that makes a detection a hit
-    ap: float  # [0, 1]; NaN where there was nothing to find
-    low: float  # 95 % interval over scenes; NaN where one scene holds all targets
-    high: float
-    aos: float  # average orientation similarity, [0, ap]
-    right: float  # share of found objects whose heading is off by less than 90 degrees; NaN where none was found
-    matches: Matches
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The scores of one network on one set of frames."""
-
-    scores: tuple[Score, ...]
-    frames: int
-    scenes: tuple[str, ...]  # (frames,) the scene of each
-    targets: dict[str, int]  # class -> objects asked for
-    hidden: dict[str, int]  # class -> objects in range without a single return
-
-    def score(self, name: str = "Car", kind: Kind = "3d", overlap: float = 0.5) -> Score:
-        """Return the score of a class; raises `KeyError` for one that was not evaluated."""
-        for score in self.scores:
-            if (score.name, score.kind, score.overlap) == (name, kind, overlap):
-                return score
-        raise KeyError((name, kind, overlap))
-
-    def summary(self) -> dict[str, Any]:
-        """Return the numbers as JSON knows them; AP, or its interval, is null where it is NaN."""
-        rows = [
-            {
-                "class": score.name,
-                "kind": score.kind,
-                "iou": score.overlap,
-                "ap": number_or_none(score.ap),
-                "low": number_or_none(score.low),
-                "high": number_or_none(score.high),
-                "aos": number_or_none(score.aos),
-                "right_headings": number_or_none(score.right),
-                "targets": self.targets[score.name],
-                "hidden": self.hidden[score.name],
-            }
-            for score in self.scores
-        ]
-        return {"frames": self.frames, "scenes": len(set(self.scenes)), "scores": rows}
+    iou: float  # that makes a detection a hit
+    ap: float | None  # [0, 1]
+    low: float | None  # 95 % interval over scenes; None where one scene holds all targets
+    high: float | None
+    aos: float | None  # average orientation similarity, [0, ap]
+    right_headings: float | None  # share of found objects whose heading is off by less than 90 degrees
+    targets: int  # objects asked for
+    hidden: int  # objects in range without a single return
 
 
 def asked_of(frame: Frame, config: SecondConfig) -> Asked:
@@ -106,14 +69,6 @@ def asked_of(frame: Frame, config: SecondConfig) -> Asked:
     occlusion = frame.annotations.occlusion[truth.target].astype(float)
     boxes = truth.boxes
     return Asked(frame.scene, boxes[truth.target], boxes[neutral], boxes[truth.hidden], occlusion, weather)
-
-
-def evaluate(
-    network: Second, frames: Iterable[Frame], *, total: int = 0, seed: int = 0, progress: Report = silent
-) -> Evaluation:
-    """Return the evaluation of `network` on `frames`; raises `InputError` where there are none."""
-    detections, truths = detections_and_truths(network, frames, total=total, progress=progress)
-    return score_detections(detections, truths, network.config.classes, seed=seed)
 
 
 def detections_and_truths(
@@ -140,8 +95,11 @@ def detections_and_truths(
 
 def score_detections(
     detections: Sequence[Boxes], truths: Sequence[Asked], classes: tuple[str, ...], *, seed: int = 0
-) -> Evaluation:
-    """Return the evaluation of `detections` (LiDAR frame) against `truths`, frame by frame."""
+) -> tuple[Score, ...]:
+    """Return the scores of `detections` (LiDAR frame) against `truths`, frame by frame.
+
+    Raises `InputError` where there are no frames.
+    """
     if not truths:
         raise InputError("evaluation on 0 frames: at least one is wanted")
     scenes = tuple(truth.scene for truth in truths)
@@ -150,14 +108,14 @@ def score_detections(
         found = [of_class(boxes, name) for boxes in detections]
         targets = [of_class(truth.targets, name) for truth in truths]
         neutral = [of_class(truth.neutral, name) for truth in truths]
+        hidden = sum(len(of_class(truth.hidden, name)) for truth in truths)
         for kind, overlap in OVERLAPS:
             matches = match(found, targets, neutral, overlap, kind)
             low, high = bootstrap_interval(matches, scenes, rng=stream(seed, "bootstrap"))
-            ap, aos = average_precision(matches), orientation_similarity(matches)
-            scores.append(Score(name, kind, overlap, ap, low, high, aos, right_headings(matches), matches))
-    targets_of = {name: sum(int((truth.targets.label == name).sum()) for truth in truths) for name in classes}
-    hidden_of = {name: sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes}
-    return Evaluation(tuple(scores), len(truths), scenes, targets_of, hidden_of)
+            ap, aos, right = average_precision(matches), orientation_similarity(matches), right_headings(matches)
+            numbers = map(number_or_none, (ap, low, high, aos, right))
+            scores.append(Score(name, kind, overlap, *numbers, targets=sum(map(len, targets)), hidden=hidden))
+    return tuple(scores)
 
 
 def of_class(boxes: Boxes, name: str) -> Boxes:

@@ -1,9 +1,10 @@
-"""Point clouds from what a user names, and boxes as JSON knows them."""
+"""Point clouds from what a user names, and the objects found in them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,8 @@ from flcav.geometry import Boxes
 from flcav.perception.camera_view import CameraView, recorded_view, view_beside
 from flcav.perception.objects.samples import checked_points
 from flcav.perception.objects.truth import only_lidar
-from flcav.perception.task import of_frames
-
-FIELDS = ("x", "y", "z", "length", "width", "height", "yaw")
+from flcav.perception.task import Result, of_frames
+from flcav.records import Class
 
 
 class Cloud(NamedTuple):
@@ -48,19 +48,48 @@ def point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterator[Cl
     return (cloud._replace(points=checked_points(cloud.points, cloud.path)) for cloud in clouds)
 
 
-def box_rows(boxes: Boxes) -> list[dict[str, Any]]:
-    """Return one dictionary per box: class, score, centre, size [m] and yaw [rad], LiDAR frame."""
+@dataclass(frozen=True)
+class ObjectFound:
+    """A box around an object, LiDAR frame."""
+
+    label: Class
+    score: float  # [0, 1]
+    x: float  # of its centre [m]
+    y: float
+    z: float
+    length: float  # [m]
+    width: float
+    height: float
+    yaw: float  # [rad]
+
+
+@dataclass(frozen=True)
+class ObjectsFound(Result):
+    """The objects of a point cloud."""
+
+    boxes: tuple[ObjectFound, ...]
+
+    def lines(self) -> list[str]:
+        """Return one line per box."""
+        lines = [f"{len(self.boxes)} objects"]
+        for box in self.boxes:
+            place = f"at ({box.x:.1f}, {box.y:.1f}, {box.z:.1f}) m, yaw {box.yaw:.2f} rad"
+            size = f"{box.length:.1f} x {box.width:.1f} x {box.height:.1f} m"
+            lines.append(f"{box.label:<11}{box.score:.2f}  {place}, {size}")
+        return lines
+
+
+def box_rows(boxes: Boxes) -> tuple[ObjectFound, ...]:
+    """Return each box with its class; scores that are not known are 1."""
     scores = boxes.score if boxes.score is not None else np.ones(len(boxes))
-    return [
-        {"class": str(label), "score": float(score)} | {name: float(v) for name, v in zip(FIELDS, row, strict=True)}
-        for row, label, score in zip(boxes.array(), boxes.label, scores, strict=True)
-    ]
+    rows = zip(boxes.label.tolist(), scores.tolist(), boxes.array().tolist(), strict=True)
+    return tuple(ObjectFound(label, score, *row) for label, score, row in rows)
 
 
-def boxes_of_rows(rows: Sequence[Mapping[str, Any]]) -> Boxes:
+def boxes_of_rows(rows: Sequence[ObjectFound]) -> Boxes:
     """Return the boxes that `box_rows` made rows of."""
-    array = np.array([[row[name] for name in FIELDS] for row in rows]).reshape(-1, len(FIELDS))
-    return Boxes.from_array(array, [row["class"] for row in rows], [row["score"] for row in rows])
+    array = np.array([(b.x, b.y, b.z, b.length, b.width, b.height, b.yaw) for b in rows]).reshape(-1, 7)
+    return Boxes.from_array(array, [row.label for row in rows], [row.score for row in rows])
 
 
 def _of_file(path: Path) -> Cloud:

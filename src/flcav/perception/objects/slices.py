@@ -1,7 +1,8 @@
 """Average precision where it is hard and where it is easy: by distance, by occlusion, by weather."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 from flcav.geometry import Boxes, concatenate
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.objects.evaluate import OVERLAPS, Asked, number_or_none, of_class
+from flcav.perception.ops.rotated import Kind
+from flcav.records import Class
 from flcav.world.weather import WEATHER_CLASSES
 
 DISTANCES_M = ((0, 20), (20, 40), (40, 80))
@@ -26,8 +29,21 @@ class Slice(NamedTuple):
     frames: NDArray[np.int64]
 
 
-def sliced(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Return a row per slice that holds targets of a class, kind of overlap and IoU: its AP and number of targets."""
+@dataclass(frozen=True)
+class SlicePrecision:
+    """Average precision of one class in a slice, under one measure of overlap."""
+
+    by: str  # distance | occlusion | weather
+    slice: str
+    label: Class
+    kind: Kind
+    iou: float
+    ap: float | None
+    targets: int
+
+
+def sliced(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> tuple[SlicePrecision, ...]:
+    """Return AP and number of targets of each slice that holds targets of a class, by kind of overlap and IoU."""
     rows = []
     for part in slices(detections, truths):
         for label in classes:
@@ -41,23 +57,20 @@ def sliced(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequen
             neutral = [concatenate([of_class(t.neutral, label), o]) for t, o in zip(truths, others, strict=True)]
             for kind, overlap in OVERLAPS:
                 ap = average_precision(match(found, targets, neutral, overlap, kind), part.frames)
-                row = {"by": part.by, "slice": part.name, "class": label, "kind": kind, "iou": overlap}
-                rows.append(row | {"ap": number_or_none(ap), "targets": count})
-    return rows
+                rows.append(SlicePrecision(part.by, part.name, label, kind, overlap, number_or_none(ap), count))
+    return tuple(rows)
 
 
-def slice_lines(rows: Sequence[Mapping[str, Any]], overlap: float) -> list[str]:
+def slice_lines(rows: Sequence[SlicePrecision], overlap: float) -> list[str]:
     """Return the rows of `sliced` in words, of one IoU: a line per class and slice, of one class after the other."""
-    parts: dict[str, dict[tuple[str, str], dict[str, Any]]] = {}
-    for row in rows:
-        if row["iou"] == overlap:
-            own = parts.setdefault(row["class"], {}).setdefault((row["by"], row["slice"]), {"targets": row["targets"]})
-            own[row["kind"]] = row["ap"]
+    own = [row for row in rows if row.iou == overlap]
+    ap = {(row.label, row.by, row.slice, row.kind): row.ap for row in own}
+    known = {(row.label, row.by, row.slice): row.targets for row in own}
+    labels = list(dict.fromkeys(row.label for row in own))
     return [
-        f"{label:<12}{by:<11}{name.replace('_', ' '):<12}AP 3d {found['3d']:.3f}  bev {found['bev']:.3f}"
-        f"  (objects: {found['targets']})"
-        for label, own in parts.items()
-        for (by, name), found in own.items()
+        f"{label:<12}{by:<11}{name.replace('_', ' '):<12}AP 3d {ap[label, by, name, '3d']:.3f}"
+        f"  bev {ap[label, by, name, 'bev']:.3f}  (objects: {targets})"
+        for (label, by, name), targets in sorted(known.items(), key=lambda each: labels.index(each[0][0]))
     ]
 
 

@@ -11,21 +11,21 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.marks import CloudBoxes
-from flcav.perception.metrics import interval_words
-from flcav.perception.objects.area import rules, rules_lines
+from flcav.perception.objects.area import rules
 from flcav.perception.objects.augment import augment
 from flcav.perception.objects.batch import batch_loss
-from flcav.perception.objects.calibrate import OVERLAP, calibrate, trust
+from flcav.perception.objects.calibrate import calibrate, trust
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
 from flcav.perception.objects.errors import register_errors
 from flcav.perception.objects.evaluate import detections_and_truths, score_detections
-from flcav.perception.objects.infer import box_rows, point_clouds
+from flcav.perception.objects.infer import ObjectsFound, box_rows, point_clouds
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.outcomes import ObjectsOutcomes
 from flcav.perception.objects.paste import Cutouts, cut, pasted
+from flcav.perception.objects.results import ObjectsEvaluation
 from flcav.perception.objects.samples import RecordedSweeps, Sample, fitting_frames
-from flcav.perception.objects.slices import slice_lines, sliced
+from flcav.perception.objects.slices import sliced
 from flcav.perception.objects.truth import only_lidar
 from flcav.perception.task import Finding, Practice, of_frames
 from flcav.progress import Report, silent
@@ -85,7 +85,7 @@ class ObjectsTask(ObjectsOutcomes):
         *,
         asked: SecondConfig | None = None,
         progress: Report = silent,
-    ) -> dict[str, Any]:
+    ) -> ObjectsEvaluation:
         """Return AP per class, kind of overlap and IoU, with intervals over scenes; its slices; what to trust.
 
         `asked`: the network's configuration with a smaller range, see `flcav.perception.objects.area`.
@@ -94,8 +94,14 @@ class ObjectsTask(ObjectsOutcomes):
         found, truths = detections_and_truths(
             network, map(data.frame, numbers), asked, total=len(numbers), progress=progress
         )
-        summary = score_detections(found, truths, classes).summary() | {"rules": rules(asked or network.config)}
-        return summary | {"slices": sliced(found, truths, classes), "trust": trust(found, truths, classes)}
+        return ObjectsEvaluation(
+            frames=len(truths),
+            scenes=len({truth.scene for truth in truths}),
+            scores=score_detections(found, truths, classes),
+            rules=rules(asked or network.config),
+            slices=sliced(found, truths, classes),
+            trust=trust(found, truths, classes),
+        )
 
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the calibration of the network's scores, see `flcav.perception.objects.calibrate`."""
@@ -105,18 +111,13 @@ class ObjectsTask(ObjectsOutcomes):
         """Return the bytes of each sweep with its annotation rows."""
         return [data.payload_bytes(i) for i in frames]
 
-    def score(self, result: Mapping[str, Any]) -> float:
-        """Return the mean over classes of AP in 3D at IoU 0.5; 0 where there was nothing to find."""
-        known = [row["ap"] for row in result["scores"] if (row["kind"], row["iou"]) == ("3d", 0.5) and row["ap"]]
-        return float(np.mean(known)) if known else 0.0
-
     def infer(
         self, network: Second, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield {"boxes": [...]} for each point cloud of `path`, see `infer.point_clouds`."""
+        """Yield the objects in each point cloud of `path`, see `infer.point_clouds`."""
         for cloud in point_clouds(path, frames):
             found = detect(network, cloud.points, score_threshold=threshold)
-            yield Finding(cloud.path, cloud.points, {"boxes": box_rows(found)}, (CloudBoxes(found),), cloud.view)
+            yield Finding(cloud.path, cloud.points, ObjectsFound(box_rows(found)), (CloudBoxes(found),), cloud.view)
 
     def register_errors(
         self,
@@ -136,32 +137,6 @@ class ObjectsTask(ObjectsOutcomes):
                 progress(done, len(numbers), "")
 
         return Registry(register_errors(map(data.frame, numbers), found(), network.config, threshold))
-
-    def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return one line per class, kind of overlap and IoU, and one per class and slice."""
-        lines = [f"{result['frames']} frames of {result['scenes']} scenes", *rules_lines(result["rules"])]
-        for row in result["scores"]:
-            found = "nothing to find"
-            if row["ap"] is not None:
-                found = f"AP {row['ap']:.3f} {interval_words(row['low'], row['high'])}  AOS {row['aos']:.3f}"
-            if row["right_headings"] is not None:
-                found += f", {row['right_headings']:.0%} of those found head the right way"
-            counts = f"objects: {row['targets']}, and {row['hidden']} without a return"
-            lines.append(f"{row['class']:<12}{row['kind']:>4} IoU {row['iou']:.1f}  {found}  ({counts})")
-        lines += [f"at IoU {OVERLAP:g} by distance, occlusion and weather:", *slice_lines(result["slices"], OVERLAP)]
-        for row in result["trust"]:
-            if row["ece"] is not None:
-                lines.append(f"{row['class']:<12}expected calibration error {row['ece']:.3f}")
-        return lines
-
-    def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return one line per box."""
-        lines = [f"{len(result['boxes'])} objects"]
-        for box in result["boxes"]:
-            place = f"at ({box['x']:.1f}, {box['y']:.1f}, {box['z']:.1f}) m, yaw {box['yaw']:.2f} rad"
-            size = f"{box['length']:.1f} x {box['width']:.1f} x {box['height']:.1f} m"
-            lines.append(f"{box['class']:<11}{box['score']:.2f}  {place}, {size}")
-        return lines
 
 
 OBJECTS = ObjectsTask()

@@ -13,6 +13,8 @@ from flcav.perception.ops.rectangles import nms
 from flcav.perception.signs.augment import GREY
 from flcav.perception.signs.config import STRIDES
 from flcav.perception.signs.model import SignDetector, decode
+from flcav.perception.task import Result
+from flcav.records import Class
 
 CANDIDATES = 512  # best-scoring places that suppression looks at
 MOST_OVERLAP = 0.5  # IoU above which two boxes are the same sign, whatever class they say
@@ -29,6 +31,39 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.label)
+
+
+@dataclass(frozen=True)
+class BoxFound:
+    """A box around a sign or light, from the upper left corner of the picture."""
+
+    label: Class
+    score: float  # [0, 1]
+    x1: float  # [px]
+    y1: float
+    x2: float
+    y2: float
+
+
+@dataclass(frozen=True)
+class BoxesFound(Result):
+    """The signs and lights of a picture, best first."""
+
+    boxes: tuple[BoxFound, ...]
+
+    def lines(self) -> list[str]:
+        """Return one line per box."""
+        lines = [f"{len(self.boxes)} signs and lights"]
+        for box in self.boxes:
+            corners = f"({box.x1:.1f}, {box.y1:.1f}) to ({box.x2:.1f}, {box.y2:.1f}) px"
+            lines.append(f"{box.label:<14}{box.score:.2f}  {corners}")
+        return lines
+
+
+def boxes_found(found: Detections, classes: Sequence[str]) -> BoxesFound:
+    """Return detections with the names of their classes."""
+    rows = zip(found.box.tolist(), map(int, found.label), map(float, found.score), strict=True)
+    return BoxesFound(tuple(BoxFound(classes[label], score, *box) for box, label, score in rows))
 
 
 def detect(network: SignDetector, picture: Picture, *, threshold: float) -> Detections:

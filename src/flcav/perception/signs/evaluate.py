@@ -5,7 +5,6 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from faster_coco_eval import COCO, COCOeval_faster
@@ -13,6 +12,8 @@ from numpy.typing import NDArray
 
 from flcav.perception.signs.detect import Detections
 from flcav.perception.signs.samples import size_px
+from flcav.perception.task import Evaluated
+from flcav.records import Class
 
 EDGES_PX = (12.0, 24.0)  # between small, medium and large: roots of a box's area
 LARGEST_PX = 1e5
@@ -28,13 +29,62 @@ class Truth:
     neutral: NDArray[np.float64]  # (K, 4) to find them, as whatever, is neither right nor wrong
 
 
+@dataclass(frozen=True)
+class ClassPrecision:
+    """Average precision of a class; None where there was nothing to find."""
+
+    label: Class
+    ap50: float | None
+    ap50_95: float | None
+    targets: int
+
+
+@dataclass(frozen=True)
+class SizePrecision:
+    """Mean average precision of targets of one size, roots of a box's area; None where there was nothing to find."""
+
+    from_px: float
+    to_px: float | None  # None: no limit
+    map50: float | None
+    targets: int
+
+
+@dataclass(frozen=True)
+class SignsEvaluation(Evaluated):
+    """COCO's mean average precision, by class and by size; None where there was nothing to find."""
+
+    map50: float | None
+    map50_95: float | None
+    classes: tuple[ClassPrecision, ...]
+    sizes: tuple[SizePrecision, ...]
+    neutral: int  # boxes that are neither asked for nor counted as false
+    pictures: int
+    scenes: int = 1  # of the pictures
+
+    @property
+    def score(self) -> float:
+        """Return mAP at IoU 0.5; 0 where there was nothing to find."""
+        return self.map50 or 0.0
+
+    def lines(self) -> list[str]:
+        """Return mAP, then AP by class and by size."""
+        seen = f"{self.pictures} pictures of {self.scenes} scenes"
+        lines = [f"{seen}: mAP50 {_known(self.map50)}, mAP50-95 {_known(self.map50_95)}"]
+        for row in self.classes:
+            lines.append(f"{row.label:<14}AP50 {_known(row.ap50)}  ({row.targets} to find)")
+        for row in self.sizes:
+            span = f"{row.from_px:g} px on" if row.to_px is None else f"{row.from_px:g}-{row.to_px:g} px"
+            lines.append(f"{span:<14}mAP50 {_known(row.map50)}  ({row.targets} to find)")
+        return [*lines, f"{self.neutral} more were too small or cut off: neither asked for nor counted as false"]
+
+
 def mean_average_precision(
     found: Sequence[Detections], truths: Sequence[Truth], classes: Sequence[str], smallest_px: float
-) -> dict[str, Any]:
+) -> SignsEvaluation:
     """Return mAP at IoU 0.5 and averaged over 0.5 to 0.95, by class and by size of the true box.
 
     Boxes found that are smaller than `smallest_px`, or mostly within a neutral one (a "crowd" in COCO's words), are
-    neither right nor wrong. None where there is nothing to find.
+    neither right nor wrong.
     """
     edges = (smallest_px, *EDGES_PX, LARGEST_PX)
     ranges = [(smallest_px, LARGEST_PX), *pairwise(edges)]
@@ -42,30 +92,30 @@ def mean_average_precision(
     precision = evaluated.eval["precision"][..., -1]  # (IoU, recall, class, range); -1 where nothing is to be found
     sizes = np.concatenate([np.zeros(0), *(size_px(truth.box) for truth in truths)])
     label = np.concatenate([np.zeros(0, np.int64), *(truth.label for truth in truths)])
-    return {
-        "map50": _mean(precision[FIFTY, :, :, ALL]),
-        "map50_95": _mean(precision[:, :, :, ALL]),
-        "classes": [
-            {
-                "class": name,
-                "ap50": _mean(precision[FIFTY, :, number, ALL]),
-                "ap50_95": _mean(precision[:, :, number, ALL]),
-                "targets": int((label == number).sum()),
-            }
+    return SignsEvaluation(
+        map50=_mean(precision[FIFTY, :, :, ALL]),
+        map50_95=_mean(precision[:, :, :, ALL]),
+        classes=tuple(
+            ClassPrecision(
+                name,
+                ap50=_mean(precision[FIFTY, :, number, ALL]),
+                ap50_95=_mean(precision[:, :, number, ALL]),
+                targets=int((label == number).sum()),
+            )
             for number, name in enumerate(classes)
-        ],
-        "sizes": [
-            {
-                "from_px": low,
-                "to_px": None if high == LARGEST_PX else high,
-                "map50": _mean(precision[FIFTY, :, :, 1 + number]),
-                "targets": int(((sizes >= low) & (sizes < high)).sum()),
-            }
+        ),
+        sizes=tuple(
+            SizePrecision(
+                low,
+                None if high == LARGEST_PX else high,
+                map50=_mean(precision[FIFTY, :, :, 1 + number]),
+                targets=int(((sizes >= low) & (sizes < high)).sum()),
+            )
             for number, (low, high) in enumerate(pairwise(edges))
-        ],
-        "neutral": sum(len(truth.neutral) for truth in truths),
-        "pictures": len(truths),
-    }
+        ),
+        neutral=sum(len(truth.neutral) for truth in truths),
+        pictures=len(truths),
+    )
 
 
 def _evaluated(
@@ -108,3 +158,7 @@ def _corner_and_size(box: NDArray[np.float64]) -> list[float]:
 def _mean(precision: NDArray[np.float64]) -> float | None:
     known = precision[precision > -1]
     return round(float(known.mean()), 6) if known.size else None
+
+
+def _known(value: float | None) -> str:
+    return "unknown (nothing to find)" if value is None else f"{value:.3f}"

@@ -58,7 +58,7 @@ class SignsOutcomes:
         for counts in times:
             drawn = np.repeat(np.arange(len(counts)), counts)
             result = mean_average_precision([found[i] for i in drawn], [truths[i] for i in drawn], classes, smallest)
-            values.append(np.nan if result["map50"] is None else result["map50"])
+            values.append(np.nan if result.map50 is None else result.map50)
         return np.array(values, dtype=np.float64)
 
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
@@ -66,7 +66,7 @@ class SignsOutcomes:
         found, truths = by_picture(outcomes)
         classes, smallest = outcomes.arrays[CLASSES].tolist(), float(outcomes.arrays[SMALLEST])
         result = mean_average_precision(found, truths, classes, smallest)
-        return {"mAP50-95": result["map50_95"], "targets": float(len(outcomes.arrays[f"{WANTED}/label"]))}
+        return {"mAP50-95": result.map50_95, "targets": float(len(outcomes.arrays[f"{WANTED}/label"]))}
 
 
 def by_picture(outcomes: Outcomes) -> tuple[list[Detections], list[Truth]]:

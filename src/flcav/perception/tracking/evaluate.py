@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,13 +16,50 @@ from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import number_or_none
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
-from flcav.perception.task import of_frames
+from flcav.perception.task import Result, of_frames
 from flcav.perception.tracking.tracker import Tracked, Tracker
 from flcav.progress import Report, silent
+from flcav.records import Class
 from flcav.sensors.frame import Frame
 
 LONGEST_GAP_S = 1.0  # between two frames of a sequence
 SCORE = 0.3  # lowest of a detection that is followed
+
+
+@dataclass(frozen=True)
+class TrackScore:
+    """How well the objects of one class were followed; numbers are None where there were none."""
+
+    label: Class
+    objects: int
+    mota: float | None
+    amota: float | None
+    motp_m: float | None
+    misses: int
+    false_positives: int
+    id_switches: int
+    velocity_error_mps: float | None
+
+
+@dataclass(frozen=True)
+class TracksEvaluation(Result):
+    """How well objects were followed through sequences of frames."""
+
+    sequences: int
+    frames: int
+    scores: tuple[TrackScore, ...]
+
+    def lines(self) -> list[str]:
+        """Return a line per class."""
+        lines = [f"tracks in {self.frames} frames of {self.sequences} sequences"]
+        for row in self.scores:
+            if row.mota is None:
+                lines.append(f"{row.label:<12}nothing to follow")
+                continue
+            wrong = f"{row.misses} misses, {row.false_positives} false positives, {row.id_switches} id switches"
+            speed = "" if row.velocity_error_mps is None else f", velocity off by {row.velocity_error_mps:.2f} m/s"
+            lines.append(f"{row.label:<12}MOTA {row.mota:.3f}  AMOTA {row.amota:.3f}  {wrong}{speed}")
+        return lines
 
 
 def evaluate_tracks(
@@ -32,8 +69,8 @@ def evaluate_tracks(
     *,
     asked: SecondConfig | None = None,
     progress: Report = silent,
-) -> dict[str, Any]:
-    """Return MOTA, AMOTA, switches of identity and errors of velocity per class, as JSON knows them.
+) -> TracksEvaluation:
+    """Return MOTA, AMOTA, switches of identity and errors of velocity per class.
 
     A sequence is the frames (None: all) of one agent in one scene. Objects to follow are those that detection asks for,
     by the network's configuration or by `asked`, one of smaller range.
@@ -64,32 +101,19 @@ def evaluate_tracks(
     for name, moments in per_class.items():
         counts = clear(moments)
         rows.append(
-            {
-                "class": name,
-                "objects": counts.objects,
-                "mota": number_or_none(counts.mota),
-                "amota": number_or_none(amota(moments)),
-                "motp_m": number_or_none(counts.motp_m),
-                "misses": counts.misses,
-                "false_positives": counts.false_positives,
-                "id_switches": counts.switches,
-                "velocity_error_mps": number_or_none(float(np.mean(speed_errors[name] or [np.nan]))),
-            }
+            TrackScore(
+                name,
+                objects=counts.objects,
+                mota=number_or_none(counts.mota),
+                amota=number_or_none(amota(moments)),
+                motp_m=number_or_none(counts.motp_m),
+                misses=counts.misses,
+                false_positives=counts.false_positives,
+                id_switches=counts.switches,
+                velocity_error_mps=number_or_none(float(np.mean(speed_errors[name] or [np.nan]))),
+            )
         )
-    return {"sequences": len(numbers), "frames": total, "scores": rows}
-
-
-def tracks_lines(result: Mapping[str, Any]) -> list[str]:
-    """Return the evaluation of tracks in words."""
-    lines = [f"tracks in {result['frames']} frames of {result['sequences']} sequences"]
-    for row in result["scores"]:
-        if row["mota"] is None:
-            lines.append(f"{row['class']:<12}nothing to follow")
-            continue
-        wrong = f"{row['misses']} misses, {row['false_positives']} false positives, {row['id_switches']} id switches"
-        speed = "" if row["velocity_error_mps"] is None else f", velocity off by {row['velocity_error_mps']:.2f} m/s"
-        lines.append(f"{row['class']:<12}MOTA {row['mota']:.3f}  AMOTA {row['amota']:.3f}  {wrong}{speed}")
-    return lines
+    return TracksEvaluation(len(numbers), total, tuple(rows))
 
 
 def sequences(data: Dataset, frames: Sequence[int] | None = None) -> dict[tuple[str, str], list[int]]:

@@ -14,9 +14,9 @@ from torch.utils.data import ConcatDataset
 from flcav.dataset.store import Dataset
 from flcav.files import check_writable
 from flcav.perception.agents import Chosen, choose_frames
-from flcav.perception.card import Card, data_entry, write_card
+from flcav.perception.card import Card, DataEntry, data_entry, write_card
 from flcav.perception.device import CPU, processor_of
-from flcav.perception.task import Calibrates, Task, configuration, fresh
+from flcav.perception.task import Calibrates, Evaluated, Task, configuration, fresh
 from flcav.perception.training.events import event_files
 from flcav.perception.training.loop import Checkpointing, Validation, train
 from flcav.perception.training.settings import Settings, finished_card, part_of
@@ -46,7 +46,7 @@ class Part:
 
     data: Dataset
     chosen: Chosen
-    entry: dict[str, Any]  # in the card
+    entry: DataEntry  # in the card
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,14 @@ class Prepared:
         return [f"{part.data.folder}: {part.chosen.sentence}{what}" for part, what in named]
 
 
+@dataclass(frozen=True)
+class Trained:
+    """What a training came to."""
+
+    card: Card  # of the weights
+    evaluation: Evaluated | None = None  # on the validation data; None where there are none, or it was trained before
+
+
 def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progress: Report = silent) -> Card:
     """Train, going on from where an interrupted run left off in `out`; write weights, card and curves there.
 
@@ -76,7 +84,7 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     calibrated where the task does so, and its evaluation is in the card. Where `out` holds the weights of these very
     settings, nothing is done. Raises as `prepare` does.
     """
-    return train_prepared(prepare(task, request, out), progress)
+    return train_prepared(prepare(task, request, out), progress).card
 
 
 def prepare(task: Task[Any, Any, Any], request: Request, out: Path) -> Prepared:
@@ -111,10 +119,10 @@ def prepare(task: Task[Any, Any, Any], request: Request, out: Path) -> Prepared:
     return Prepared(task, request, out, config, settings, parts, held, finished, samples)
 
 
-def train_prepared(prepared: Prepared, progress: Report = silent) -> Card:
-    """Train what `prepare` returned, see `train_network`; return the card of the weights."""
+def train_prepared(prepared: Prepared, progress: Report = silent) -> Trained:
+    """Train what `prepare` returned, see `train_network`."""
     if prepared.finished is not None:
-        return prepared.finished
+        return Trained(prepared.finished)
     task, request, out, held = prepared.task, prepared.request, prepared.out, prepared.held
     settings, samples = prepared.settings, prepared.samples
     network = fresh(task, prepared.config, request.seed).to(request.device)
@@ -133,6 +141,7 @@ def train_prepared(prepared: Prepared, progress: Report = silent) -> Card:
         )
     if held is not None and isinstance(task, Calibrates):
         task.calibrate(network, held.data, held.chosen.frames)
+    evaluation = None if held is None else task.evaluate(network, held.data, held.chosen.frames)
     asked = settings.model_dump(include={*vars(task.practice), "epochs", "patience", "device"}, exclude_none=True)
     reached = {"loss": float(history.losses[-per_epoch:].mean()), "scores": _rounded(history.scores)}
     card = Card(
@@ -144,14 +153,14 @@ def train_prepared(prepared: Prepared, progress: Report = silent) -> Card:
         training=asked | {"steps": len(history.losses)} | reached,
         data=tuple(part.entry for part in prepared.parts),
         validation=None if held is None else held.entry,
-        metrics={} if held is None else task.evaluate(network, held.data, held.chosen.frames),
+        metrics={} if evaluation is None else evaluation.as_json(),
         torch=str(torch.__version__),
         threads=settings.threads,
         processor=processor_of(request.device),
     )
     save_network(task, network, out / WEIGHTS, card)
     write_card(card, out / CARD)
-    return card
+    return Trained(card, evaluation)
 
 
 def _part(task: Task[Any, Any, Any], config: Any, data: Dataset, agents: str | None) -> Part:
@@ -169,6 +178,6 @@ def _validation(prepared: Prepared, per_epoch: int) -> Validation | None:
         return None
 
     def score(network: nn.Module) -> float:
-        return task.score(task.evaluate(network, held.data, held.chosen.frames))
+        return task.evaluate(network, held.data, held.chosen.frames).score
 
     return Validation(score, per_epoch, prepared.request.patience)

@@ -1,13 +1,12 @@
 """What a training was asked for: all that decides its weights but the kind of processor and the libraries' versions."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from flcav.config import Config, InputError
-from flcav.perception.card import Card
+from flcav.perception.card import Card, DataEntry
 from flcav.perception.weights import read_card
 
+TRAINED = ("device", "epochs", "patience", "batch", "learning_rate", "schedule")  # told in a card's training
 Part = tuple[str, tuple[str, ...] | None]  # of data: a manifest's fingerprint, the agents; None where not recorded
 NAMED = {"data": "other data or agents", "validation": "other validation data or agents"}
 
@@ -38,26 +37,22 @@ class Settings(Config):
 
 def settings_of(card: Card) -> Settings:
     """Return the settings of the training that a card is of."""
-    training = card.training
-    return Settings(
-        task=card.task,
-        network=card.network,
-        seed=card.seed,
-        threads=card.threads,
-        device=training.get("device"),
-        data=tuple(map(part_of, card.data)),
-        validation=None if card.validation is None else part_of(card.validation),
-        epochs=training["epochs"],
-        patience=training.get("patience"),
-        batch=training["batch"],
-        learning_rate=training["learning_rate"],
-        schedule=training["schedule"],
+    return Settings.model_validate(
+        {
+            "task": card.task,
+            "network": card.network,
+            "seed": card.seed,
+            "threads": card.threads,
+            "data": tuple(map(part_of, card.data)),
+            "validation": None if card.validation is None else part_of(card.validation),
+            **{name: card.training.get(name) for name in TRAINED},
+        }
     )
 
 
-def part_of(entry: Mapping[str, Any]) -> Part:
+def part_of(entry: DataEntry) -> Part:
     """Return what a card's entry of a dataset says of which data they are."""
-    return entry["manifest"], tuple(entry["agents"]) if "agents" in entry else None
+    return entry.manifest, entry.agents
 
 
 def finished_card(path: Path, asked: Settings) -> Card | None:

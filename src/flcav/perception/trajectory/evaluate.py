@@ -1,41 +1,111 @@
 """How near predictions come to where road users went, beside keeping heading and speed."""
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.perception.task import Evaluated
 from flcav.perception.trajectory.predict import single
 from flcav.perception.trajectory.tracks import constant_velocity
+from flcav.records import LEFT_OUT
 
 Array = NDArray[np.float64]
 
 MISS_M = 2.0  # a last position farther off than this is a miss
-RATIOS = ("1", "K", "single")  # of final errors to constant velocity's
 TURN = np.radians(20.0)  # between heading at present and from the last second's displacement
+ALL = "all"  # the slice of all samples
 
 
-def metrics(paths: Array, probabilities: Array, columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the numbers of all samples, of those at junctions, and of those that turn there.
+Newer = Annotated[float | None, LEFT_OUT]  # always there, but in results of before
 
-    `paths` (N, K, FUTURE, 2) and `probabilities` (N, K) belong to the samples whose `columns` are given. A slice
-    without samples is None.
+
+@dataclass(frozen=True, kw_only=True)
+class PathErrors:
+    """Mean errors of some samples' predictions [m]: ADE over a path, FDE at its end.
+
+    Of the likeliest mode (1), the best of all modes (K), the single path, and constant velocity, which the others'
+    final errors are divided by: a ratio is None where it makes none.
+    """
+
+    samples: int
+    minADE_1: float
+    minFDE_1: float
+    minADE_K: float
+    minFDE_K: float
+    single_ADE: Newer = None
+    single_FDE: Newer = None
+    constant_velocity_ADE: float
+    constant_velocity_FDE: float
+    miss_rate_1: float
+    miss_rate_K: float
+    miss_rate_single: Newer = None
+    miss_rate_constant_velocity: float
+    ratio_1: float | None
+    ratio_K: float | None
+    ratio_single: float | None = None
+
+
+@dataclass(frozen=True)
+class TrajectoryEvaluation(Evaluated):
+    """Errors of predicted paths, by slice."""
+
+    modes: int
+    miss_m: float
+    scenes: int
+    slices: Mapping[str, PathErrors | None]  # of all samples, at junctions, turning there; None without samples
+
+    @property
+    def score(self) -> float:
+        """Return 1 / (1 + the mean of the likeliest and the best mode's final error in metres)."""
+        every = self.slices[ALL]
+        if every is None:
+            return 0.0
+        return 1 / (1 + (every.minFDE_1 + every.minFDE_K) / 2)
+
+    def lines(self) -> list[str]:
+        """Return a line per slice, and of each one per predictor."""
+        lines = [f"{self.modes} modes, {self.scenes} scenes; errors in m: average / final / missed"]
+        for name, e in self.slices.items():
+            if e is None:
+                lines.append(f"{name}: none")
+                continue
+            lines.append(f"{name}: {e.samples} samples")
+            plain = e.constant_velocity_FDE
+            for label, ade, fde, missed in (
+                ("single path", e.single_ADE, e.single_FDE, e.miss_rate_single),
+                ("likeliest mode", e.minADE_1, e.minFDE_1, e.miss_rate_1),
+                (f"best of {self.modes}", e.minADE_K, e.minFDE_K, e.miss_rate_K),
+                ("constant velocity", e.constant_velocity_ADE, plain, e.miss_rate_constant_velocity),
+            ):
+                if ade is None or fde is None or missed is None:
+                    continue
+                ratio = fde / plain if plain else 1.0
+                lines.append(f"  {label:<18}{ade:.2f} / {fde:.2f} / {missed:.1%}  ({ratio:.2f}x)")
+        return lines
+
+
+def metrics(paths: Array, probabilities: Array, columns: Mapping[str, NDArray[Any]]) -> TrajectoryEvaluation:
+    """Return the errors of all samples, of those at junctions, and of those that turn there.
+
+    `paths` (N, K, FUTURE, 2) and `probabilities` (N, K) belong to the samples whose `columns` are given.
     """
     future, past = columns["future"].astype(np.float64), columns["past"]
     at_junction = columns["at_junction"].astype(np.bool_)
     slices = {
-        "all": np.ones(len(future), np.bool_),
+        ALL: np.ones(len(future), np.bool_),
         "at junctions": at_junction,
         "turning at junctions": at_junction & turning(future),
     }
     errors = errors_of(paths, probabilities, future, constant_velocity(past))
-    return {
-        "modes": paths.shape[1],
-        "miss_m": MISS_M,
-        "scenes": len(np.unique(columns["scene"])),
-        "slices": {name: _numbers({key: e[rows] for key, e in errors.items()}) for name, rows in slices.items()},
-    }
+    return TrajectoryEvaluation(
+        modes=paths.shape[1],
+        miss_m=MISS_M,
+        scenes=len(np.unique(columns["scene"])),
+        slices={name: _means({key: e[rows] for key, e in errors.items()}) for name, rows in slices.items()},
+    )
 
 
 def turning(future: Array) -> NDArray[np.bool_]:
@@ -62,17 +132,26 @@ def errors_of(paths: Array, probabilities: Array, future: Array, baseline: Array
     }
 
 
-def _numbers(errors: Mapping[str, Array]) -> dict[str, Any] | None:
-    count = len(errors["minFDE_1"])
-    if not count:
+def _means(errors: Mapping[str, Array]) -> PathErrors | None:
+    if not len(errors["minFDE_1"]):
         return None
     means = {name: float(error.mean()) for name, error in errors.items()}
-    finals = {"1": "minFDE_1", "K": "minFDE_K", "single": "single_FDE", "constant_velocity": "constant_velocity_FDE"}
-    misses = {f"miss_rate_{key}": float((errors[name] > MISS_M).mean()) for key, name in finals.items()}
     plain = means["constant_velocity_FDE"]
-    return {
-        "samples": count,
+
+    def missed(name: str) -> float:
+        return float((errors[name] > MISS_M).mean())
+
+    def ratio(name: str) -> float | None:
+        return means[name] / plain if plain else None
+
+    return PathErrors(
+        samples=len(errors["minFDE_1"]),
         **means,
-        **misses,
-        **{f"ratio_{key}": means[name] / plain if plain else None for key, name in finals.items() if key in RATIOS},
-    }
+        miss_rate_1=missed("minFDE_1"),
+        miss_rate_K=missed("minFDE_K"),
+        miss_rate_single=missed("single_FDE"),
+        miss_rate_constant_velocity=missed("constant_velocity_FDE"),
+        ratio_1=ratio("minFDE_1"),
+        ratio_K=ratio("minFDE_K"),
+        ratio_single=ratio("single_FDE"),
+    )

@@ -1,9 +1,8 @@
 """Predictions for the frames of a dataset, as JSON knows them, on the map around who observes."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose, yaw_of
 from flcav.perception.marks import Light, Mode, Paths, RoadUser
-from flcav.perception.task import Finding, of_frames
+from flcav.perception.task import Finding, Result, of_frames
 from flcav.perception.trajectory.config import FUTURE, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import predict, single
@@ -20,24 +19,76 @@ from flcav.perception.trajectory.rasters import OPEN
 from flcav.perception.trajectory.roads import STATIC_ROWS, RoadMap, roads_of
 from flcav.perception.trajectory.samples import Samples, present_at, seen_from, traffic
 from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame
+from flcav.records import Class
 from flcav.world.lanes import rasterise
 from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
+Point = tuple[float, float]  # x, y in the world [m]
 
 AROUND_M = 50.0  # of the observing agent, ahead, behind and to both sides: shown, and predicted with rasters
 PIXEL_M = 0.2  # of the map that is shown
 TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where someone is."""
+
+    x: float  # world [m]
+    y: float
+    yaw: float  # [rad]
+
+
+@dataclass(frozen=True)
+class ForecastMode:
+    """One way that a road user may take."""
+
+    probability: float
+    path: tuple[Point, ...]  # at `Forecasts.time_s`
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forecast:
+    """The predicted paths of a road user, as `RoadUser` has them."""
+
+    track: str
+    label: Class
+    x: float  # world [m]
+    y: float
+    yaw: float  # [rad]
+    speed: float  # [m/s]
+    length: float  # [m]
+    width: float
+    modes: tuple[ForecastMode, ...]  # the first is the one for who wants a single one, the others come by probability
+    constant_velocity: tuple[Point, ...] | None
+    truth: tuple[Point, ...] | None  # where it went; None where that was not recorded
+
+
+@dataclass(frozen=True)
+class Forecasts(Result):
+    """What is predicted in a frame."""
+
+    time_s: tuple[float, ...]  # of the points of every path, from the present
+    observer: Place
+    lights: tuple[Light, ...]
+    agents: tuple[Forecast, ...]
+
+    def lines(self) -> list[str]:
+        """Return where each road user will be, by one mode."""
+        lines = []
+        for agent in self.agents:
+            x, y = agent.modes[0].path[-1]
+            said = f"at ({agent.x:.1f}, {agent.y:.1f}), in {self.time_s[-1]:g} s at ({x:.1f}, {y:.1f})"
+            lines.append(f"{agent.track} {said}")
+        return lines or ["nobody to predict"]
+
+
 def findings(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | None = None) -> Iterator[Finding]:
     """Yield what is predicted in `frames` of the dataset `path` (None: all); raises `InputError` for anything else.
 
-    The result is in the world's frame: {"time_s": [...], "observer": {"x", "y", "yaw"}, "lights": [{"x", "y",
-    "open"}], "agents": [{"track", "class", "x", "y", "yaw", "speed", "length", "width", "modes": [{"probability",
-    "path": [[x, y], ...]}], "constant_velocity": [...], "truth": [...] or None}]}. The first mode is the one for who
-    wants a single one, the others come by probability. It is shown on the map around the observer, (len(STATIC), H, W),
-    row 0 ahead of it and column 0 to its left. Frames whose vehicles have no past of 2 s yet have no agents.
+    The `Forecasts` are shown on the map around the observer, (len(STATIC), H, W), row 0 ahead of it and column 0 to its
+    left. Frames whose vehicles have no past of 2 s yet have no agents.
     """
     read_manifest(path)
     data = Dataset.open(path)
@@ -50,27 +101,33 @@ def findings(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | Non
         world_from_agent = data.frame(number).world_from_agent
         observer = np.array([*world_from_agent[:2, 3], yaw_of(world_from_agent)])
         found = _predicted(network, data, number, trace, observer)
-        yield Finding(path / data.name(number), map_around(roads_of(data), observer), paths_as_json(found), (found,))
+        yield Finding(path / data.name(number), map_around(roads_of(data), observer), forecasts(found), (found,))
 
 
-def paths_as_json(paths: Paths) -> dict[str, Any]:
-    """Return predicted paths as JSON knows them, see `findings`."""
-    return {
-        "time_s": list(paths.times_s),
-        "observer": dict(zip(("x", "y", "yaw"), paths.observer)),
-        "lights": [asdict(light) for light in paths.lights],
-        "agents": [_user_as_json(user) for user in paths.users],
-    }
+def forecasts(paths: Paths) -> Forecasts:
+    """Return predicted paths as a record."""
+    x, y, yaw = paths.observer
+    return Forecasts(paths.times_s, Place(x, y, yaw), paths.lights, tuple(map(_forecast, paths.users)))
 
 
-def _user_as_json(user: RoadUser) -> dict[str, Any]:
-    return {
-        **{"track": user.track, "class": user.label, "x": user.x, "y": user.y, "yaw": user.yaw, "speed": user.speed},
-        **{"length": user.length, "width": user.width},
-        "modes": [{"probability": mode.probability, "path": mode.path.tolist()} for mode in user.modes],
-        "constant_velocity": None if user.constant_velocity is None else user.constant_velocity.tolist(),
-        "truth": None if user.truth is None else user.truth.tolist(),
-    }
+def _forecast(user: RoadUser) -> Forecast:
+    return Forecast(
+        track=user.track,
+        label=user.label,
+        x=user.x,
+        y=user.y,
+        yaw=user.yaw,
+        speed=user.speed,
+        length=user.length,
+        width=user.width,
+        modes=tuple(ForecastMode(mode.probability, _points(mode.path)) for mode in user.modes),
+        constant_velocity=None if user.constant_velocity is None else _points(user.constant_velocity),
+        truth=None if user.truth is None else _points(user.truth),
+    )
+
+
+def _points(path: Array) -> tuple[Point, ...]:
+    return tuple((x, y) for x, y in path.tolist())
 
 
 def map_around(roads: RoadMap, observer: Array) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from flcav.perception.task import Finding, Practice
 from flcav.perception.trajectory.batch import futures_of, inputs_of, rasters_of
 from flcav.perception.trajectory.config import CONFIGURATIONS, TrajectoryConfig
 from flcav.perception.trajectory.errors import register_errors
-from flcav.perception.trajectory.evaluate import metrics
+from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, metrics
 from flcav.perception.trajectory.infer import findings
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
 from flcav.perception.trajectory.model import TrajectoryNetwork
@@ -73,7 +73,7 @@ class TrajectoryTask(TrajectoryOutcomes):
         frames: Sequence[int] | None = None,
         *,
         progress: Report = silent,
-    ) -> dict[str, Any]:
+    ) -> TrajectoryEvaluation:
         """Return errors of a single path, of K modes and of constant velocity by slice, see `metrics`."""
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
@@ -89,11 +89,6 @@ class TrajectoryTask(TrajectoryOutcomes):
         keys = [i if config.cameras else (data.keys[i].scene, data.keys[i].index) for i in range(len(data))]
         counts = Counter(keys[i] for i in columns["frame"].tolist())
         return [each * counts[keys[i]] for i in frames]
-
-    def score(self, result: Mapping[str, Any]) -> float:
-        """Return 1 / (1 + the mean of the likeliest and the best mode's final error in metres)."""
-        every = result["slices"]["all"]
-        return 1 / (1 + (every["minFDE_1"] + every["minFDE_K"]) / 2)
 
     def infer(
         self, network: TrajectoryNetwork, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None
@@ -111,40 +106,6 @@ class TrajectoryTask(TrajectoryOutcomes):
     ) -> Registry:
         """Return who went elsewhere than predicted, see `errors.register_errors`; a path has no score."""
         return register_errors(network, data, samples_of(data, network.config, frames), progress)
-
-    def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return a line per slice."""
-        lines = [f"{result['modes']} modes, {result['scenes']} scenes; errors in m: average / final / missed"]
-        for name, numbers in result["slices"].items():
-            if numbers is None:
-                lines.append(f"{name}: none")
-                continue
-            lines.append(f"{name}: {numbers['samples']} samples")
-            for label, ade, fde, missed in (
-                ("single path", "single_ADE", "single_FDE", "miss_rate_single"),
-                ("likeliest mode", "minADE_1", "minFDE_1", "miss_rate_1"),
-                (f"best of {result['modes']}", "minADE_K", "minFDE_K", "miss_rate_K"),
-                (
-                    "constant velocity",
-                    "constant_velocity_ADE",
-                    "constant_velocity_FDE",
-                    "miss_rate_constant_velocity",
-                ),
-            ):
-                ratio = numbers[fde] / numbers["constant_velocity_FDE"] if numbers["constant_velocity_FDE"] else 1.0
-                lines.append(
-                    f"  {label:<18}{numbers[ade]:.2f} / {numbers[fde]:.2f} / {numbers[missed]:.1%}  ({ratio:.2f}x)"
-                )
-        return lines
-
-    def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return where each road user will be, by one mode."""
-        lines = []
-        for agent in result["agents"]:
-            x, y = agent["modes"][0]["path"][-1]
-            said = f"at ({agent['x']:.1f}, {agent['y']:.1f}), in {result['time_s'][-1]:g} s at ({x:.1f}, {y:.1f})"
-            lines.append(f"{agent['track']} {said}")
-        return lines or ["nobody to predict"]
 
 
 TRAJECTORY = TrajectoryTask()

@@ -1,6 +1,7 @@
 """Weather classification as a `Task`."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,29 @@ from torch.nn import functional
 from flcav.dataset.store import Dataset
 from flcav.perception.images import pictures
 from flcav.perception.marks import Bars
-from flcav.perception.metrics import interval_words
 from flcav.perception.sharing import ANNOTATED, camera_ahead, picture_bytes
-from flcav.perception.task import Finding, Practice
+from flcav.perception.task import Finding, Practice, Result
 from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
-from flcav.perception.weather.evaluate import classification
+from flcav.perception.weather.evaluate import Classification, classification
 from flcav.perception.weather.model import Classifier, LeNet
 from flcav.perception.weather.outcomes import WeatherOutcomes
 from flcav.perception.weather.probabilities import probabilities, tensor_of
 from flcav.perception.weather.samples import Sample, augment, labelled, small
 from flcav.progress import Report, silent
+from flcav.records import Class
 from flcav.world.weather import WEATHER_CLASSES, nearest_class
+
+
+@dataclass(frozen=True)
+class Named(Result):
+    """The likeliest class of a picture, and the probability of each."""
+
+    label: Class
+    probabilities: Mapping[str, float]  # by class
+
+    def lines(self) -> list[str]:
+        """Return the class and its probability."""
+        return [f"{self.label} ({self.probabilities[self.label]:.2f})"]
 
 
 class WeatherTask(WeatherOutcomes):
@@ -57,7 +70,7 @@ class WeatherTask(WeatherOutcomes):
 
     def evaluate(
         self, network: Classifier, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
-    ) -> dict[str, Any]:
+    ) -> Classification:
         """Return accuracy, recall per class and the confusion matrix, see `classification`."""
         return classified(network, self.samples(data, network.config, frames), progress)
 
@@ -65,51 +78,28 @@ class WeatherTask(WeatherOutcomes):
         """Return the bytes of each frame's pictures, with one for the class."""
         return [picture_bytes(data, i) + 1 for i in frames]
 
-    def score(self, result: Mapping[str, Any]) -> float:
-        """Return the accuracy."""
-        return float(result["accuracy"])
-
     def infer(
         self, network: Classifier, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield {"class", "probabilities"} for each picture; the likeliest class, however unlikely."""
+        """Yield the probabilities of each picture's classes; the likeliest class is named, however unlikely."""
         classes = network.config.classes
         for origin, rgb in pictures(path, frames):
             shares = probabilities(network, [small(rgb)])[0]
             rows = {name: float(share) for name, share in zip(classes, shares, strict=True)}
-            result = {"class": classes[int(shares.argmax())], "probabilities": rows}
-            yield Finding(origin, rgb, result, (Bars(rows),))
-
-    def evaluation_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return accuracy, then recall and confusions class by class."""
-        interval = interval_words(result["low"], result["high"])
-        if result["low"] is not None:
-            interval += f" ({100 * result['confidence']:g} %, over scenes)"
-        seen = f"{result['pictures']} pictures of {result['scenes']} scenes"
-        lines = [f"{seen}: accuracy {result['accuracy']:.3f} {interval}"]
-        for name, row in zip(result["classes"], result["confusion"], strict=True):
-            recall = result["recall"][name]
-            taken = [f"{other} {count}" for other, count in zip(result["classes"], row) if count and other != name]
-            known = "no pictures" if recall is None else f"recall {recall:.3f} of {sum(row)}"
-            lines.append(f"{name:<12}{known}" + (f"; taken for {', '.join(taken)}" if taken else ""))
-        return lines
-
-    def finding_lines(self, result: Mapping[str, Any]) -> list[str]:
-        """Return the class and its probability."""
-        return [f"{result['class']} ({result['probabilities'][result['class']]:.2f})"]
+            yield Finding(origin, rgb, Named(classes[int(shares.argmax())], rows), (Bars(rows),))
 
 
 WEATHER = WeatherTask()
 
 
-def classified(network: Classifier, samples: Sequence[Sample], progress: Report = silent) -> dict[str, Any]:
+def classified(network: Classifier, samples: Sequence[Sample], progress: Report = silent) -> Classification:
     """Return how the network does on labelled pictures, see `classification`."""
     found = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
     truth = np.array([sample.label for sample in samples])
     return classification(truth, found, [sample.scene for sample in samples], network.config.classes)
 
 
-def over_the_whole_space(network: Classifier, data: Dataset) -> dict[str, Any]:
-    """Return {"nearest": as `classified`} where pictures between and beyond the regions count as of the nearest."""
+def over_the_whole_space(network: Classifier, data: Dataset) -> Classification:
+    """Return as `classified`, where pictures between and beyond the regions count as of the nearest."""
     samples = labelled(data, network.config.classes, named=nearest_class)
-    return {"nearest": classified(network, samples)}
+    return classified(network, samples)

@@ -1,0 +1,84 @@
+"""The numbers of the comparison of two plans: what was predicted of them, and what training reached."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+from flcav.files import Json
+from flcav.intervals import Estimate, MeanOverSeeds
+from flcav.pipeline.provenance import Provenance
+from flcav.pipeline.results import LinkUse
+from flcav.records import LEFT_OUT, Record
+
+EQUAL, JOINT = "equal-stages", "joint"  # the plans
+TOWN = "grid"  # whose accuracies the planner's history holds
+COUNTS = ("samples", "edge_rounds", "cloud_rounds")
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan, and the error that its curve predicts after the last stage."""
+
+    samples: int
+    edge_rounds: int
+    cloud_rounds: int
+    wireless_mb: float
+    wireline_mb: float
+    predicted_error: float
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Return `COUNTS` by name."""
+        return dict(zip(COUNTS, (self.samples, self.edge_rounds, self.cloud_rounds), strict=True))
+
+
+@dataclass(frozen=True)
+class Reached:
+    """AP50 after a stage."""
+
+    ap50: float
+
+
+@dataclass(frozen=True)
+class AllocationSeed:
+    """What one seed came to; by plan are `EQUAL` and `JOINT`, by stage pretrain, edge and cloud."""
+
+    seed: int
+    plans: Mapping[str, Planned]
+    predicted: Mapping[str, Mapping[str, float]]  # AP50 by plan and stage
+    realised: Mapping[str, Mapping[str, Mapping[str, Reached]]]  # by town, plan and stage
+    differences: Mapping[str, Mapping[str, Estimate]]  # joint - equal by town and stage, over test scenes
+    poles: Mapping[str, Mapping[str, int]]  # by plan and town
+    ledger: Mapping[str, Mapping[str, LinkUse]]  # by plan and link
+
+
+@dataclass(frozen=True)
+class AllocationSummary:
+    """Means over seeds; differences are joint minus equal stages, paired by seed."""
+
+    predicted: Mapping[str, Mapping[str, float]]  # AP50 by plan and stage
+    realised: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by town, plan and stage
+    predicted_difference: Mapping[str, float]  # by stage
+    realised_difference: Mapping[str, Mapping[str, MeanOverSeeds]]  # by town and stage
+
+
+@dataclass(frozen=True)
+class PlanFinding:
+    """What the numbers say of a claim."""
+
+    question: str
+    verdict: str
+    sentence: str  # with the numbers behind it
+
+
+@dataclass(frozen=True)
+class AllocationResult(Record):
+    """The numbers of both plans, and what they say."""
+
+    history: Mapping[str, tuple[float, float]]  # least and most of each count in what both plans were predicted from
+    seeds: tuple[AllocationSeed, ...]
+    summary: AllocationSummary
+    findings: tuple[PlanFinding, ...] = ()
+    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: not in results of before
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    note: str = "road labels come from an ideal road detector: AP after edge FL and cloud FL is an upper bound"
