@@ -50,7 +50,7 @@ def recipe_of(recipe: RunRecipe, task: str, chosen: Chosen) -> RunRecipe:
     asked = recipe.model_dump(mode="json")
     plan = {"samples": chosen.samples, "edge_rounds": chosen.edge_rounds, "cloud_rounds": chosen.cloud_rounds}
     placed = {} if task in recipe.placement.tasks else {"rule": "none", "tasks": []}
-    splits = recipe.sized_splits.model_dump(mode="json") | {"test": {"scenes": 1, "spins": 1, "cavs": 1}}
+    splits = recipe.sized_splits.model_dump(mode="json") | {"test": {"scenes": 2, "spins": 1, "cavs": 1}}
     return RunRecipe.model_validate(
         asked
         | {

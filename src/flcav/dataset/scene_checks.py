@@ -24,7 +24,8 @@ class Sight:
     def add(self, frame: Frame) -> None:
         """Count the points of one frame."""
         for name, points in frame.lidar.items():
-            close = np.linalg.norm(points[:, :3].astype(np.float64), axis=1) < CLOSE_M
+            with np.errstate(invalid="ignore"):  # signalling NaNs, which the frame's own checks tell
+                close = np.linalg.norm(points[:, :3].astype(np.float64), axis=1) < CLOSE_M
             self._points[frame.agent, name] += len(points)
             self._close[frame.agent, name] += int(close.sum())
 
