@@ -180,6 +180,16 @@ def test_a_wrong_cell(folder: Path, table: str, column: str, value: Any, message
     assert any(re.search(message, problem) for problem in validate(folder))
 
 
+def test_pixels_of_who_is_not_in_the_image(folder: Path):
+    rows = pq.read_table(folder / "views.parquet")
+    pixels = rows["pixels"].to_numpy()
+    claimed = pa.array(np.where(pixels == 0, 10_000, pixels), rows.schema.field("pixels").type)
+    at = rows.schema.get_field_index("pixels")
+    write_table(rows.set_column(at, rows.schema.field(at), claimed), folder / "views.parquet")
+    resign(folder)
+    assert any("shows 0 pixels of" in problem for problem in validate(folder))
+
+
 @pytest.mark.parametrize(
     ("which", "field", "change", "message"),
     [

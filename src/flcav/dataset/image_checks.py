@@ -81,6 +81,8 @@ def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) ->
     rays = directions(lens).astype(np.float64).reshape(*image.instance.shape, 3)
     for i in np.flatnonzero(views.pixels >= JUDGED):
         v, u = np.nonzero(image.instance == i + 1)
+        if len(v) < JUDGED:
+            continue  # `check_visibility` tells that they are not those of the annotations
         chosen = np.linspace(0, len(v) - 1, JUDGED).astype(int)
         v, u = v[chosen], u[chosen]
         points = rays[v, u] * (image.depth_m[v, u] / rays[v, u, 2])[:, None]
