@@ -33,6 +33,7 @@ KINDS = {
     "final_error": ("final error", FINAL_ERROR),
 }
 NOTE_M = 15.0  # about where a note stands above its pole
+WIDE = 3.0  # a note is so much wider than high
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
@@ -84,19 +85,22 @@ def draw_errors(axes: Axes, scene: ErrorMap) -> None:
         if not len(xyz):
             continue
         axes.plot(*xyz[:, :2].T, linestyle="none", label=f"{label} ({len(xyz)})", **look)
+    notes: list[Array] = []  # where they stand
     for number, (x, y, _) in scene.poles.items():
         chosen, densest = number in scene.chosen, number == scene.densest
         face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)
         axes.plot(x, y, "s" if densest else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
         axes.text(x, y, number, ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
         if note := " and ".join(word for word, said in (("placed", chosen), ("densest traffic", densest)) if said):
-            others = np.array([xyz[:2] for other, xyz in scene.poles.items() if other != number]).reshape(-1, 2)
-            _write_beside(axes, note, np.array([x, y]), others)
+            others = [xyz[:2] for other, xyz in scene.poles.items() if other != number]
+            notes.append(_write_beside(axes, note, np.array([x, y]), np.array([*others, *notes]).reshape(-1, 2)))
 
 
-def _write_beside(axes: Axes, note: str, at: Array, others: Array) -> None:
-    """Write `note` above or below the pole `at`, whichever is farther from the `others` (N, 2)."""
-    above, below = (np.hypot(*(others - at - (0, side * NOTE_M)).T).min(initial=np.inf) for side in (1, -1))
+def _write_beside(axes: Axes, note: str, at: Array, others: Array) -> Array:
+    """Write `note` above or below the pole `at`, whichever is farther from the `others` (N, 2); return where (2,)."""
+    places = [at + (0.0, side * NOTE_M) for side in (1, -1)]
+    above, below = (np.hypot(*((others - place) / (WIDE, 1.0)).T).min(initial=np.inf) for place in places)
     look = {"fontsize": style.SMALL, "fontweight": "bold", "path_effects": HALO, "zorder": 6}
     offset, align = (10, "bottom") if above >= below else (-10, "top")
     axes.annotate(note, (at[0], at[1]), (0, offset), textcoords="offset points", ha="center", va=align, **look)
+    return places[0] if above >= below else places[1]
