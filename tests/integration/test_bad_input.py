@@ -241,8 +241,9 @@ def test_numbers_that_nobody_can_mean_in_a_history_and_a_graph(tmp_path: Path, r
     for model in ("additive", "effective"):
         assert "samples = 1e-310 must be a number from 0 to 1e+09" in refused("fit", history, "--model", model)
     text = (Path(__file__).parents[2] / "recipes" / "graphs" / "three_layers.yaml").read_text()
-    (tmp_path / "graph.yaml").write_text(text.replace("b: 0.10, alpha: 0.1", "b: 0.10, alpha: 1e-320"))
-    assert "alpha' = '1e-320': " in refused("allocate", tmp_path / "graph.yaml")
+    for name, changed in (("alpha", "b: 0.10, alpha: 1e-320"), ("b", "b: 1e-320, alpha: 0.1")):
+        (tmp_path / "graph.yaml").write_text(text.replace("b: 0.10, alpha: 0.1", changed))
+        assert f"{name}' = '1e-320': " in refused("allocate", tmp_path / "graph.yaml")
     steep = PROBLEM["tasks"][0] | {"curve": {"model": "additive", "pretrain": {"a": 1.0, "b": 200.0, "x0": 1e-9}}}
     steep["limits"] = steep["limits"] | {"samples": [0, 400]}
     (tmp_path / "problem.yaml").write_text(yaml.safe_dump(PROBLEM | {"tasks": [steep]}))

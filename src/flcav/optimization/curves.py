@@ -12,6 +12,7 @@ STAGES = ("pretrain", "edge", "cloud")  # measured in samples, edge rounds, clou
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+Sizeable = Annotated[float, Field(ge=1e-9)]  # small enough for every curve, and large enough to divide by
 
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ class Decay(Fitted):
     """The error a * (x + x0)^(-b) that is left after x samples or rounds. The default is none at all."""
 
     a: NonNegative = 0.0
-    b: Positive = 1.0
+    b: Sizeable = 1.0
     x0: NonNegative = 0.0
 
     def __str__(self) -> str:
@@ -91,9 +92,9 @@ class Effective(Fitted):
 
     model: Literal["effective"]
     floor: NonNegative = 0.0
-    a: Positive
-    b: Positive
-    alpha: Annotated[float, Field(ge=1e-9)]
+    a: Sizeable
+    b: Sizeable
+    alpha: Sizeable
     beta: NonNegative
     group_samples: NonNegative
 

@@ -98,7 +98,7 @@ def draw_errors(axes: Axes, scene: ErrorMap) -> None:
 
 def _write_beside(axes: Axes, note: str, at: Array, others: Array) -> Array:
     """Write `note` above or below the pole `at`, whichever is farther from the `others` (N, 2); return where (2,)."""
-    places = [at + (0.0, side * NOTE_M) for side in (1, -1)]
+    places = [at + np.array((0.0, side * NOTE_M)) for side in (1, -1)]
     above, below = (np.hypot(*((others - place) / (WIDE, 1.0)).T).min(initial=np.inf) for place in places)
     look = {"fontsize": style.SMALL, "fontweight": "bold", "path_effects": HALO, "zorder": 6}
     offset, align = (10, "bottom") if above >= below else (-10, "top")
