@@ -20,17 +20,13 @@ STEPS = "a step's function, arguments and JSON value: whatever the step is"
 OWN = "what a user's module holds, of the protocol that was asked for"
 DTYPE = "a cloud or a picture: arrays of whatever type of number"
 GENERIC = "the same for every curve, task, network or sample: the parameters play no part"
-MANIFEST = "manifest.json as it is read; a record of its own is wanted"
 STUDY = "a result.json that is written, drawn and tabulated as it is; records are wanted"
 ALLOWED: Mapping[str, str] = {
     "flcav.config:parse_config": UNCHECKED,
     "flcav.config:read_json": UNCHECKED,
     "flcav.config:read_yaml": UNCHECKED,
     "flcav.config:shorten": UNCHECKED,
-    "flcav.dataset.layout:read_manifest": MANIFEST,
-    "flcav.dataset.leakage:leaks": MANIFEST,
     "flcav.dataset.ray_engine:ray_session": EXTRA,
-    "flcav.dataset.store:Dataset.__init__": MANIFEST,
     "flcav.lazy:lazy_names": OWN,
     "flcav.optimization.bands:bands": GENERIC,
     "flcav.optimization.bands:pointwise": GENERIC,
