@@ -18,8 +18,6 @@ UNCHECKED = "takes what a user's file holds, before it is checked"
 EXTRA = "types of an extra (view, ray) that is not installed where types are checked"
 STEPS = "a step's function, arguments and JSON value: whatever the step is"
 OWN = "what a user's module holds, of the protocol that was asked for"
-DTYPE = "a cloud or a picture: arrays of whatever type of number"
-GENERIC = "the same for every curve, task, network or sample: the parameters play no part"
 STUDY = "a result.json that is written, drawn and tabulated as it is; records are wanted"
 ALLOWED: Mapping[str, str] = {
     "flcav.config:parse_config": UNCHECKED,
@@ -28,35 +26,6 @@ ALLOWED: Mapping[str, str] = {
     "flcav.config:shorten": UNCHECKED,
     "flcav.dataset.ray_engine:ray_session": EXTRA,
     "flcav.lazy:lazy_names": OWN,
-    "flcav.optimization.bands:bands": GENERIC,
-    "flcav.optimization.bands:pointwise": GENERIC,
-    "flcav.optimization.bands:upper_curve": GENERIC,
-    "flcav.optimization.learning_curve:fit": GENERIC,
-    "flcav.optimization.problem_file:learned": GENERIC,
-    "flcav.perception.errors:RegistersErrors.register_errors": GENERIC,
-    "flcav.perception.networks:evaluate": GENERIC,
-    "flcav.perception.networks:infer": GENERIC,
-    "flcav.perception.networks:network_of": GENERIC,
-    "flcav.perception.networks:origin_of": GENERIC,
-    "flcav.perception.networks:register_errors": GENERIC,
-    "flcav.perception.networks:train": GENERIC,
-    "flcav.perception.outcomes:Outcomes.arrays": DTYPE,
-    "flcav.perception.outcomes:difference": GENERIC,
-    "flcav.perception.outcomes:interval": GENERIC,
-    "flcav.perception.outcomes:measurable": GENERIC,
-    "flcav.perception.outcomes:measured": GENERIC,
-    "flcav.perception.outcomes:score_on": GENERIC,
-    "flcav.perception.sharing:shared": GENERIC,
-    "flcav.perception.task:Finding.seen": DTYPE,
-    "flcav.perception.task:configuration": GENERIC,
-    "flcav.perception.task:fresh": GENERIC,
-    "flcav.perception.tasks:task_named": GENERIC,
-    "flcav.perception.training.loop:train_steps": GENERIC,
-    "flcav.perception.training.run:prepare": GENERIC,
-    "flcav.perception.training.run:train_network": GENERIC,
-    "flcav.perception.weights:load_network": GENERIC,
-    "flcav.perception.weights:load_weights": GENERIC,
-    "flcav.perception.weights:save_network": GENERIC,
     "flcav.pipeline.steps.run:run_steps": STEPS,
     "flcav.pipeline.steps.step:Step.arguments": STEPS,
     "flcav.pipeline.steps.step:Step.run": STEPS,
