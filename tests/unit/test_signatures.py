@@ -14,14 +14,13 @@ import flcav
 
 VAGUE = frozenset({"Any", "object"})
 
-UNCHECKED = "takes what a user's file holds, before it is checked"
+UNCHECKED = "whatever a user's file holds, a date of YAML too, before it is checked"
 EXTRA = "types of an extra (view, ray) that is not installed where types are checked"
 STEPS = "a step's function, arguments and JSON value: whatever the step is"
 OWN = "what a user's module holds, of the protocol that was asked for"
-STUDY = "a result.json that is written, drawn and tabulated as it is; records are wanted"
+PAGE = "what the template of a page names; a record of each page is wanted"
 ALLOWED: Mapping[str, str] = {
     "flcav.config:parse_config": UNCHECKED,
-    "flcav.config:read_json": UNCHECKED,
     "flcav.config:read_yaml": UNCHECKED,
     "flcav.config:shorten": UNCHECKED,
     "flcav.dataset.ray_engine:ray_session": EXTRA,
@@ -31,7 +30,7 @@ ALLOWED: Mapping[str, str] = {
     "flcav.pipeline.steps.step:Step.run": STEPS,
     "flcav.pipeline.steps.step:Work.result": STEPS,
     "flcav.plugins:load_own": OWN,
-    "flcav.report.html:render": STUDY,
+    "flcav.report.html:render": PAGE,
     "flcav.report.rerun_log:blueprint": EXTRA,
     "flcav.report.rerun_log:log_scene": EXTRA,
 }
