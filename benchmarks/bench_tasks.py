@@ -52,7 +52,7 @@ def main(names: list[str]) -> None:
                 time_network(task, network, config, data)
 
 
-def time_network(task: Task[Any, Any, Any], name: str, config: Any, data: Dataset) -> None:
+def time_network(task: Task, name: str, config: Any, data: Dataset) -> None:
     network = fresh(task, config, 0)
     samples = task.samples(data, config)
     batch = 2 if name.startswith("paper") else min(task.practice.batch, len(samples))
@@ -65,7 +65,7 @@ def time_network(task: Task[Any, Any, Any], name: str, config: Any, data: Datase
     print(f"  {name:<14}{million:6.2f} M parameters: {told}", flush=True)
 
 
-def training(task: Task[Any, Any, Any], network: Any, samples: Any, batch: int) -> Callable[[], float]:
+def training(task: Task, network: Any, samples: Any, batch: int) -> Callable[[], float]:
     optimizer = adamw(network.train(), task.practice.learning_rate)
 
     def work() -> float:

@@ -7,6 +7,8 @@ from typing import Any, ClassVar, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
+from flcav.files import Json
+
 SHOWN = 80  # characters of a wrong value in the sentence about it
 
 
@@ -62,7 +64,7 @@ def read_yaml(path: Path) -> object:
         raise InputError(f"{path}: not a YAML file ({error})") from None
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path) -> Json:
     """Return what the JSON file at `path` holds; raises `InputError`."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))

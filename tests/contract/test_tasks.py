@@ -45,7 +45,7 @@ LACKING = {"objects": ({"lidar": False}, "no LiDAR"), "trajectory": ({"traffic":
 FILES = {"weather": "front/*.webp", "signs": "front/*.webp", "objects": "top/*.bin"}
 
 
-def small(task: Task[Any, Any, Any]) -> Any:
+def small(task: Task) -> Any:
     return CONFIGS.get(task.name, configuration(task, None))
 
 

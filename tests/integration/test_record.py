@@ -216,5 +216,5 @@ def test_the_recipes_we_ship_run_at_toy_scale(name: str, tmp_path: Path):
     record(EmbeddedSource(toy), tmp_path / "data")
     dataset = Dataset.open(tmp_path / "data")
     assert len(dataset) == frames
-    assert dataset.manifest["counts"]["images"] >= frames * bool(recipe.vehicle_rig.cameras)
+    assert dataset.manifest.counts.images >= frames * bool(recipe.vehicle_rig.cameras)
     assert flcav("validate", tmp_path / "data") == 0

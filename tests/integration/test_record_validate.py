@@ -14,7 +14,7 @@ import pytest
 
 from flcav.config import InputError
 from flcav.dataset.checks import check_order, validate
-from flcav.dataset.layout import FrameKey
+from flcav.dataset.layout import FrameKey, Manifest
 from flcav.dataset.leakage import leaks
 from flcav.dataset.recorder import record
 from flcav.dataset.store import Dataset
@@ -213,7 +213,7 @@ def test_leakage_between_splits(recorded: Path, edit: Callable[[dict], None], me
     manifest = json.loads((recorded / "manifest.json").read_text())
     other = json.loads((recorded / "manifest.json").read_text())
     edit(other)
-    found = leaks({"one": manifest, "two": other})
+    found = leaks({"one": Manifest.model_validate(manifest), "two": Manifest.model_validate(other)})
     assert found == [] if message is None else message in only(found)
 
 

@@ -25,7 +25,7 @@ SCHEMAS = {
 def test_it_decodes_every_message_with_its_time(together: Dataset, peer: Callable[[str], Peer], tmp_path: Path):
     export(together, "mcap", tmp_path / "out")
     read = peer("mcap").read(tmp_path / "out")
-    assert list(read) == sorted(together.manifest["scenes"])
+    assert list(read) == sorted(together.manifest.scenes)
     for topics in read.values():
         for name, topic in topics.items():
             assert topic["schema"] == SCHEMAS[name.rpartition("/")[2]], name

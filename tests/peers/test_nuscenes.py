@@ -85,7 +85,7 @@ def test_the_devkit_finds_and_scores_what_was_recorded(together: Dataset, peer: 
                     shares.append(_area(views.amodal_box[i]) / _area(np.array(rectangle)))
     assert np.mean(shares) > 0.8
 
-    validating = [key for key in frames if key.startswith(together.manifest["scenes"][-1])]
+    validating = [key for key in frames if key.startswith(together.manifest.scenes[-1])]
     counted = [name for key in validating for name, *_ in detections[key]]
     for name in {name for name in counted if counted.count(name) >= FLOOR}:
         assert min(read["ap"][name].values()) > 0.99, name

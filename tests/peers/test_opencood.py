@@ -33,7 +33,7 @@ def test_its_datasets_find_what_was_recorded(together: Dataset, peer: Callable[[
     read = peer("opencood").read(OPENCOOD, tmp_path / "out")
     assert [read[fusion]["train"] for fusion in ("late", "early", "intermediate")] == [TRAIN] * 3
     assert [len(read[fusion]["test"]) for fusion in ("late", "early", "intermediate")] == [TEST] * 3
-    scene = together.manifest["scenes"][-1]
+    scene = together.manifest.scenes[-1]
     numbers = yaml.safe_load((tmp_path / "out" / "validate" / scene / "data_protocol.yaml").read_text())["numbers"]
     name = {number: name for name, number in numbers.items()}
     ego = name[min(numbers.values())]

@@ -54,7 +54,7 @@ def test_it_tests_on_what_was_recorded_for_that(
 ):
     """The `data.yaml` of such a dataset names folders to train and validate, though nothing is in them."""
     recorded_for = Dataset.open(streets.folder)
-    recorded_for.manifest["recipe"]["split"] = split
+    recorded_for.manifest.recipe = {**recorded_for.manifest.recipe, "split": split}
     export(recorded_for, "yolo", tmp_path / "out")
     assert {"train", "val", split} <= yaml.safe_load((tmp_path / "out" / "data.yaml").read_text()).keys()
     read = peer("ultralytics").read(tmp_path / "out", tmp_path / "runs", split, **ALONE)

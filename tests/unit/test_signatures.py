@@ -14,59 +14,23 @@ import flcav
 
 VAGUE = frozenset({"Any", "object"})
 
-UNCHECKED = "takes what a user's file holds, before it is checked"
+UNCHECKED = "whatever a user's file holds, a date of YAML too, before it is checked"
 EXTRA = "types of an extra (view, ray) that is not installed where types are checked"
 STEPS = "a step's function, arguments and JSON value: whatever the step is"
 OWN = "what a user's module holds, of the protocol that was asked for"
-DTYPE = "a cloud or a picture: arrays of whatever type of number"
-GENERIC = "the same for every curve, task, network or sample: the parameters play no part"
-MANIFEST = "manifest.json as it is read; a record of its own is wanted"
-STUDY = "a result.json that is written, drawn and tabulated as it is; records are wanted"
+PAGE = "what the template of a page names; a record of each page is wanted"
 ALLOWED: Mapping[str, str] = {
     "flcav.config:parse_config": UNCHECKED,
-    "flcav.config:read_json": UNCHECKED,
     "flcav.config:read_yaml": UNCHECKED,
     "flcav.config:shorten": UNCHECKED,
-    "flcav.dataset.layout:read_manifest": MANIFEST,
-    "flcav.dataset.leakage:leaks": MANIFEST,
     "flcav.dataset.ray_engine:ray_session": EXTRA,
-    "flcav.dataset.store:Dataset.__init__": MANIFEST,
     "flcav.lazy:lazy_names": OWN,
-    "flcav.optimization.bands:bands": GENERIC,
-    "flcav.optimization.bands:pointwise": GENERIC,
-    "flcav.optimization.bands:upper_curve": GENERIC,
-    "flcav.optimization.learning_curve:fit": GENERIC,
-    "flcav.optimization.problem_file:learned": GENERIC,
-    "flcav.perception.errors:RegistersErrors.register_errors": GENERIC,
-    "flcav.perception.networks:evaluate": GENERIC,
-    "flcav.perception.networks:infer": GENERIC,
-    "flcav.perception.networks:network_of": GENERIC,
-    "flcav.perception.networks:origin_of": GENERIC,
-    "flcav.perception.networks:register_errors": GENERIC,
-    "flcav.perception.networks:train": GENERIC,
-    "flcav.perception.outcomes:Outcomes.arrays": DTYPE,
-    "flcav.perception.outcomes:difference": GENERIC,
-    "flcav.perception.outcomes:interval": GENERIC,
-    "flcav.perception.outcomes:measurable": GENERIC,
-    "flcav.perception.outcomes:measured": GENERIC,
-    "flcav.perception.outcomes:score_on": GENERIC,
-    "flcav.perception.sharing:shared": GENERIC,
-    "flcav.perception.task:Finding.seen": DTYPE,
-    "flcav.perception.task:configuration": GENERIC,
-    "flcav.perception.task:fresh": GENERIC,
-    "flcav.perception.tasks:task_named": GENERIC,
-    "flcav.perception.training.loop:train_steps": GENERIC,
-    "flcav.perception.training.run:prepare": GENERIC,
-    "flcav.perception.training.run:train_network": GENERIC,
-    "flcav.perception.weights:load_network": GENERIC,
-    "flcav.perception.weights:load_weights": GENERIC,
-    "flcav.perception.weights:save_network": GENERIC,
     "flcav.pipeline.steps.run:run_steps": STEPS,
     "flcav.pipeline.steps.step:Step.arguments": STEPS,
     "flcav.pipeline.steps.step:Step.run": STEPS,
     "flcav.pipeline.steps.step:Work.result": STEPS,
     "flcav.plugins:load_own": OWN,
-    "flcav.report.html:render": STUDY,
+    "flcav.report.html:render": PAGE,
     "flcav.report.rerun_log:blueprint": EXTRA,
     "flcav.report.rerun_log:log_scene": EXTRA,
 }

@@ -41,15 +41,15 @@ def record(
     with progress.live(f"record {out}") as report:
         written = write(source, out, jobs=jobs, engine=engine, progress=report)
     manifest = read_manifest(out)
-    counts = manifest["counts"]
+    counts = manifest.counts
     done = "recorded" if written else "already recorded, nothing to do:"
-    size_mb = (counts["payload_bytes"] + sum(entry["bytes"] for entry in manifest["tables"].values())) / 1e6
+    size_mb = (counts.payload_bytes + sum(entry.bytes for entry in manifest.tables.values())) / 1e6
     typer.echo(
-        f"{out}: {done} {counts['frames']} frames of {counts['scenes']} scenes, "
-        f"{counts['annotations']} annotations, {counts['points']} points, {counts['images']} images, {size_mb:.1f} MB"
+        f"{out}: {done} {counts.frames} frames of {counts.scenes} scenes, "
+        f"{counts.annotations} annotations, {counts.points} points, {counts.images} images, {size_mb:.1f} MB"
     )
     if source.recipe.scenarios:
-        happened = [event.kind for scene in manifest["scenes"] for event in Trace.load(out / trace_path(scene)).events]
-        asked_for = counts["scenes"] * len(source.recipe.scenarios)
+        happened = [event.kind for scene in manifest.scenes for event in Trace.load(out / trace_path(scene)).events]
+        asked_for = counts.scenes * len(source.recipe.scenarios)
         each = ", ".join(f"{happened.count(kind)} {kind}" for kind in sorted(set(happened)))
         typer.echo(f"corner cases: {len(happened)} of {asked_for} found their moment ({each or 'none'})")

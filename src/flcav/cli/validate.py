@@ -28,4 +28,4 @@ def validate(
         typer.echo(problem)
     if problems:
         raise typer.Exit(1)
-    typer.echo(f"{sum(manifest['counts']['frames'] for manifest in manifests.values())} frames, no problems")
+    typer.echo(f"{sum(manifest.counts.frames for manifest in manifests.values())} frames, no problems")

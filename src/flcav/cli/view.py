@@ -37,7 +37,7 @@ def view(
     from flcav.report.rerun_log import blueprint, log_scene
 
     dataset = Dataset.open(folder)
-    scenes = dataset.manifest["scenes"]
+    scenes = dataset.manifest.scenes
     if scene is not None and scene not in scenes:
         raise InputError(f"{folder}: no scene '{scene}'; it has {', '.join(scenes)}")
     shown = scene or scenes[0]

@@ -30,7 +30,7 @@ def to_json(frame: Frame) -> dict[str, Any]:
 
 def read_calibrations(path: Path, sensors: Mapping[str, set[str]]) -> dict[str, Calibrations]:
     """Return the calibrations by agent; raises `InputError` where one of its `sensors` is missing or malformed."""
-    values = read_json(path)
+    values: Any = read_json(path)
     found = {}
     for agent, names in sensors.items():
         try:

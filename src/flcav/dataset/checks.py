@@ -4,13 +4,12 @@ import contextlib
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from flcav.config import InputError
 from flcav.dataset.calibration_checks import check_calibrations
 from flcav.dataset.frame_checks import check_measurements, check_points, check_sweeps, check_traffic, check_values
 from flcav.dataset.image_checks import check_images
-from flcav.dataset.layout import FILES, MANIFEST, FrameKey, read_manifest, table_path, trace_path
+from flcav.dataset.layout import FILES, MANIFEST, FrameKey, Manifest, read_manifest, table_path, trace_path
 from flcav.dataset.scene_checks import Sight, check_motion
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import read_table
@@ -41,7 +40,7 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
         return [*problems, str(error)]
     problems += check_order(dataset.keys)
     problems += _other_counts(dataset)
-    problems += check_calibrations(dataset.calibrations, manifest["recipe"])
+    problems += check_calibrations(dataset.calibrations, manifest.recipe)
 
     traces: dict[str, Trace | None] = {}
     sight = Sight()
@@ -90,9 +89,9 @@ def check_order(keys: Sequence[FrameKey]) -> list[str]:
     return problems
 
 
-def _listed_files(folder: Path, manifest: dict[str, Any]) -> dict[str, tuple[int, str]]:
+def _listed_files(folder: Path, manifest: Manifest) -> dict[str, tuple[int, str]]:
     """Return the bytes and the hash of every file of the dataset but the manifest."""
-    listed = {name: (int(entry["bytes"]), str(entry["sha256"])) for name, entry in manifest["tables"].items()}
+    listed = {name: (entry.bytes, entry.sha256) for name, entry in manifest.tables.items()}
     with contextlib.suppress(InputError):  # named as damaged
         files = read_table(folder / table_path(FILES), FILES).to_pydict()
         listed |= {name: (size, digest) for name, size, digest in zip(files["path"], files["bytes"], files["sha256"])}
@@ -117,10 +116,10 @@ def _extra_files(folder: Path, listed: Collection[str]) -> Iterator[str]:
 
 def _other_counts(dataset: Dataset) -> Iterator[str]:
     scenes = list(dict.fromkeys(key.scene for key in dataset.keys))
-    if scenes != dataset.manifest["scenes"]:
+    if scenes != dataset.manifest.scenes:
         yield f"{dataset.folder / MANIFEST}: its scenes are not those of the frames"
-    if len(dataset) != dataset.manifest["counts"]["frames"]:
-        yield f"{dataset.folder / MANIFEST}: counts {dataset.manifest['counts']['frames']} frames of {len(dataset)}"
+    if len(dataset) != dataset.manifest.counts.frames:
+        yield f"{dataset.folder / MANIFEST}: counts {dataset.manifest.counts.frames} frames of {len(dataset)}"
 
 
 def _trace(dataset: Dataset, scene: str, damaged: Collection[str]) -> Trace | None:

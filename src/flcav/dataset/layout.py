@@ -1,14 +1,14 @@
 """Where things lie in a dataset folder, and its manifest."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from flcav.config import InputError, read_json, tell
+from flcav.files import Json
 
 FORMAT = 2
 MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
@@ -48,7 +48,7 @@ class Manifest(Strict):
     """What every manifest holds."""
 
     format: int
-    recipe: dict[str, Any]
+    recipe: Mapping[str, Json]
     versions: dict[str, str]
     counts: Counts
     scenes: list[str]
@@ -90,7 +90,7 @@ def town_path(town: str) -> str:
     return f"{TOWN}/{town}"
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> Manifest:
     """Return a dataset's manifest; raises `InputError` where the folder holds no finished dataset of this format."""
     path = folder / MANIFEST
     if not folder.is_dir():
@@ -104,7 +104,6 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         advice = "update flcav to read it" if found > FORMAT else "record it again from its recipe"
         raise InputError(f"{path}: dataset format {found}, this version of flcav reads format {FORMAT}; {advice}")
     try:
-        Manifest.model_validate(manifest)
+        return Manifest.model_validate(manifest)
     except ValidationError as error:
         raise InputError(f"{path}: not a dataset manifest: {tell(error, Manifest)}") from None
-    return manifest

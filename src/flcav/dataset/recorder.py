@@ -103,7 +103,7 @@ def _claim(out: Path, header: dict[str, Any]) -> bool:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; a dataset needs a folder")
     if (out / MANIFEST).exists():
-        _refuse_other(out, "holds another dataset", {"recipe": read_manifest(out)["recipe"]}, header)
+        _refuse_other(out, "holds another dataset", {"recipe": read_manifest(out).recipe}, header)
         shutil.rmtree(out / WORK, ignore_errors=True)
         return False
     begun = out / WORK / HEADER

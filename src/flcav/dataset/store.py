@@ -4,7 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -17,7 +17,16 @@ from flcav.dataset.calibration_checks import check_calibration
 from flcav.dataset.frame_checks import check_measurements, check_values
 from flcav.dataset.frames import annotations_of, vectors_of, weather_of
 from flcav.dataset.image_checks import check_planes, check_views
-from flcav.dataset.layout import CALIBRATION, FrameKey, payload_path, read_manifest, table_path, town_path, trace_path
+from flcav.dataset.layout import (
+    CALIBRATION,
+    FrameKey,
+    Manifest,
+    payload_path,
+    read_manifest,
+    table_path,
+    town_path,
+    trace_path,
+)
 from flcav.dataset.payloads import INFRARED, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, read_table
 from flcav.sensors.frame import CameraImage, Frame
@@ -46,7 +55,7 @@ class Dataset:
     def __init__(
         self,
         folder: Path,
-        manifest: dict[str, Any],
+        manifest: Manifest,
         calibrations: dict[str, Calibrations],
         tables: dict[str, pa.Table],
         first: dict[str, NDArray[np.int64]],
@@ -155,7 +164,7 @@ class Dataset:
 
     def town(self) -> Town | None:
         """Return the town of the dataset, None where it is not known."""
-        name = str(self.manifest["recipe"].get("town", ""))
+        name = str(self.manifest.recipe.get("town", ""))
         kept = self.folder / town_path(name)
         try:
             return load_town(kept if name and kept.is_dir() else name)

@@ -212,7 +212,7 @@ def _trajectory(network: Any, data: Dataset, number: int) -> page.Column:
     )
 
 
-def _looked(task: Task[Any, Any, Any], network: Any, path: Path) -> tuple[Finding, list[page.Layer]]:
+def _looked(task: Task, network: Any, path: Path) -> tuple[Finding, list[page.Layer]]:
     with watched(LAYERS[task.name](network)) as seen:
         finding = next(task.infer(network, path, SCORE))
     return finding, list(seen.values())

@@ -72,7 +72,7 @@ class Study(Generic[EvaluationT]):
     Fields that two studies are not compared by are of no step: what they reach makes none stale.
     """
 
-    task: Task[Any, Any, Any]
+    task: Task
     network: str  # name of the configuration
     train: tuple[RecipeFields, ...]
     validation: RecipeFields

@@ -7,13 +7,12 @@ Cases are not drawn: of five points a draw often leaves too few different ones.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.optimization.curves import Additive, Effective
-from flcav.optimization.learning_curve import Fit, refitted
+from flcav.optimization.learning_curve import CurveFit, refitted
 from flcav.seeds import stream
 
 Array = NDArray[np.float64]
@@ -38,7 +37,7 @@ class Bands:
         return low, high
 
 
-def bands(fit: Fit[Any], *, level: float = 0.9, repeats: int = 200, seed: int = 0, k: int = 1) -> Bands | None:
+def bands(fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 0, k: int = 1) -> Bands | None:
     """Return the bands of `fit`; None where no residuals are left: no more points than parameters."""
     fitted = fit.fitted
     if fitted is None or fit.points <= len(fitted.parameters):
@@ -55,7 +54,7 @@ def bands(fit: Fit[Any], *, level: float = 0.9, repeats: int = 200, seed: int = 
     return Bands(level, seed, tuple(curves), k)
 
 
-def upper_curve(fit: Fit[Any], found: Bands) -> Additive | Effective:
+def upper_curve(fit: CurveFit, found: Bands) -> Additive | Effective:
     """Return a curve of the fit's form that is nowhere below the upper band, at the points and up to 4 times beyond.
 
     It is fitted to the band, then lifted by raising its floor: what a robust plan should assume.
@@ -72,7 +71,7 @@ def upper_curve(fit: Fit[Any], found: Bands) -> Additive | Effective:
     return curve.model_copy(update={"floor": curve.floor + lift})
 
 
-def pointwise(fit: Fit[Any], found: Bands | None, resources: Array, k: int) -> list[dict[str, float | None]]:
+def pointwise(fit: CurveFit, found: Bands | None, resources: Array, k: int) -> list[dict[str, float | None]]:
     """Return error, low and high at every row of `resources` (n, 3); without bands, low and high are None."""
     errors = fit.curve.error(*resources.T, k=k)
     edges: Sequence[Sequence[float | None]] = [[None] * len(errors)] * 2

@@ -87,6 +87,9 @@ class Fit(Generic[CurveT]):
         return f"extrapolated beyond the history: {', '.join(over)}" if over else None
 
 
+CurveFit = Fit[Additive] | Fit[Effective]
+
+
 @dataclass(frozen=True)
 class Fitted(Generic[CurveT]):
     """What a fit was made from: all that repeating it needs."""
@@ -117,7 +120,7 @@ def fit(
     k: int = 1,
     alpha: float = 0.1,
     beta: float | None = None,
-) -> Fit[Any]:
+) -> CurveFit:
     """Return how the error falls with samples and rounds: the learning curve fitted to the history of one task.
 
     For the other settings, of the effective model, see `fit_effective`. Raises `InputError` where there are too few

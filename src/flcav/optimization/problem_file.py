@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.optimization.curves import Additive, Effective
 from flcav.optimization.definitions import TERMS
-from flcav.optimization.learning_curve import QUANTITIES, Fit
+from flcav.optimization.learning_curve import QUANTITIES, CurveFit
 
 Array = NDArray[np.float64]
 Edit = tuple[int, int, str]  # from, to, what stands there then
@@ -33,7 +33,7 @@ class Learned:
     measured: Mapping[str, float]  # most of each quantity that varies
 
 
-def learned(fit: Fit[Any], resources: Array, upper: Additive | Effective | None) -> Learned:
+def learned(fit: CurveFit, resources: Array, upper: Additive | Effective | None) -> Learned:
     """Return what `fit` and its upper band say of a task whose history covers `resources` (n, 3)."""
     least = np.ceil(resources.min(axis=0)).astype(int).tolist()
     most = np.floor(resources.max(axis=0)).astype(int).tolist()

@@ -32,7 +32,7 @@ class Chosen:
         return {"agents": list(self.agents), "used": dict(self.used), "left_out": dict(self.left_out)}
 
 
-def choose_frames(task: Task[Any, Any, Any], config: Any, data: Dataset, wanted: str | None = None) -> Chosen:
+def choose_frames(task: Task, config: Any, data: Dataset, wanted: str | None = None) -> Chosen:
     """Return the frames of the agents `wanted`: "all", "vehicles", "poles" or names, with commas between several.
 
     None stands for the frames whose sensors stand as a network of `config` expects them, all where the task does not

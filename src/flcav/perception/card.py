@@ -97,7 +97,7 @@ class Card(Config):
 
 def data_entry(data: Dataset, chosen: Chosen) -> DataEntry:
     """Return what of a dataset was used."""
-    recipe = data.manifest.get("recipe", {})
+    recipe = data.manifest.recipe
     rigs = {name: _rig_name(recipe[name]) for name in RIG_FIELDS if name in recipe}
     return DataEntry(
         name="/".join(data.folder.resolve().parts[-2:]),

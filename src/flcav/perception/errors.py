@@ -6,12 +6,13 @@ What a mistake is, each task says in its own `errors.py`; here is how they are k
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from torch import nn
 
 from flcav.dataset.exchange import write_table
 from flcav.dataset.store import Dataset
@@ -78,7 +79,12 @@ class RegistersErrors(Protocol):
     """A task whose mistakes have a place in the town."""
 
     def register_errors(
-        self, network: Any, data: Dataset, frames: Sequence[int] | None, threshold: float, progress: Report = silent
+        self,
+        network: nn.Module,
+        data: Dataset,
+        frames: Sequence[int] | None,
+        threshold: float,
+        progress: Report = silent,
     ) -> Registry:
         """Return what `network` misses and invents in the frames; detections below `threshold` are none.
 

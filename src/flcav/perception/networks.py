@@ -7,7 +7,7 @@ and a network is one in memory, a file of weights, or, where none is given, the 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from torch import nn
 
@@ -22,14 +22,14 @@ from flcav.perception.errors import RegistersErrors, Registry
 from flcav.perception.objects.area import narrowed
 from flcav.perception.objects.results import ObjectsEvaluation
 from flcav.perception.objects.task import ObjectsTask
-from flcav.perception.task import Finding, Scores, Task
+from flcav.perception.task import ConfigT, Finding, NetworkT, SampleT, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.tracking.evaluate import evaluate_tracks, sequences
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network, read_card, shipped
 from flcav.progress import Report, silent
 
-Named = str | Task[Any, Any, Any]
+Named = str | Task
 Data = Dataset | Path | str
 Weights = nn.Module | Path | str | None
 
@@ -205,7 +205,7 @@ def register_errors(
     return replace(learned.register_errors(tested, dataset, chosen.frames, lowest, progress), chosen=chosen)
 
 
-def task_of(task: Named) -> Task[Any, Any, Any]:
+def task_of(task: Named) -> Task:
     """Return the task, by its name where that is what is given; raises `InputError` for an unknown one."""
     return task_named(task) if isinstance(task, str) else task
 
@@ -215,14 +215,14 @@ def opened(data: Data) -> Dataset:
     return data if isinstance(data, Dataset) else Dataset.open(data)
 
 
-def network_of(task: Task[Any, Any, Any], network: Weights, device: str = "cpu") -> Any:
+def network_of(task: Task[ConfigT, NetworkT, SampleT], network: Weights, device: str = "cpu") -> NetworkT:
     """Return the network: one in memory as it is, one in a file of weights on the device, None: the task's own."""
     if isinstance(network, nn.Module):
-        return network
+        return cast(NetworkT, network)  # whose it is, is for those to say who have it
     return load_network(task, Path(network or shipped(task))).to(device_named(device))
 
 
-def threshold_of(task: Task[Any, Any, Any], threshold: float | None) -> float:
+def threshold_of(task: Task, threshold: float | None) -> float:
     """Return the lowest score of a finding: `threshold`, for None the task's own, 0 where its findings have none."""
     own = task.threshold if isinstance(task, Scores) else 0.0
     return own if threshold is None else threshold
@@ -241,7 +241,7 @@ class Origin:
         return f"network: {card}, {self.weights}"
 
 
-def origin_of(task: Task[Any, Any, Any], weights: Path | None) -> Origin:
+def origin_of(task: Task, weights: Path | None) -> Origin:
     """Return which network `network_of` loads."""
     path = weights or shipped(task)
     try:

@@ -6,10 +6,11 @@ A task says in its `outcomes.py` what is kept of a frame, a picture or a road us
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import nn
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
@@ -29,7 +30,7 @@ class Outcomes:
     """What a network did with N units, each one scene's: frames, pictures or road users, as the task has them."""
 
     scene: NDArray[np.str_]  # (N,)
-    arrays: Mapping[str, NDArray[Any]]  # the task's own
+    arrays: Mapping[str, NDArray]  # the task's own
 
     def save(self, path: Path) -> None:
         """Write them as NumPy's archive, atomically."""
@@ -61,7 +62,7 @@ class Measurable(Protocol):
         """Return how many redrawings of the scenes there is time for."""
         ...
 
-    def outcomes(self, network: Any, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
+    def outcomes(self, network: nn.Module, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
         """Return what `network` does in the frames; raises `InputError` where there is nothing to measure."""
         ...
 
@@ -80,10 +81,10 @@ class SceneScores:
     measure_name = "mean score of a scene"
     redraws = REDRAWS
 
-    def __init__(self, task: Task[Any, Any, Any]) -> None:
+    def __init__(self, task: Task) -> None:
         self._task = task
 
-    def outcomes(self, network: Any, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
+    def outcomes(self, network: nn.Module, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
         """Return the score of each scene."""
         scenes = list(dict.fromkeys(data.keys[i].scene for i in frames))
         scores = []
@@ -102,23 +103,23 @@ class SceneScores:
         return {}
 
 
-def measurable(task: Task[Any, Any, Any]) -> Measurable:
+def measurable(task: Task) -> Measurable:
     """Return how the task is measured."""
     return task if isinstance(task, Measurable) else SceneScores(task)
 
 
-def measured(task: Task[Any, Any, Any], outcomes: Outcomes) -> float:
+def measured(task: Task, outcomes: Outcomes) -> float:
     """Return the task's measure, each unit counted once; NaN where there was nothing to find."""
     return float(measurable(task).measure(outcomes, np.ones((1, len(outcomes.scene)), dtype=np.int64))[0])
 
 
-def score_on(task: Task[Any, Any, Any], network: Any, data: Dataset, frames: Sequence[int] | None = None) -> float:
+def score_on(task: Task, network: nn.Module, data: Dataset, frames: Sequence[int] | None = None) -> float:
     """Return the measure of `network` on frames (None: all); 0 where there was nothing to find."""
     found = measured(task, measurable(task).outcomes(network, data, of_frames(data, frames)))
     return 0.0 if np.isnan(found) else found
 
 
-def interval(task: Task[Any, Any, Any], outcomes: Outcomes, seed: int = 0) -> tuple[float | None, float | None]:
+def interval(task: Task, outcomes: Outcomes, seed: int = 0) -> tuple[float | None, float | None]:
     """Return the 95 % interval of the measure over scenes; None where fewer than two hold something to measure."""
     own = measurable(task)
     counted = [scene for scene in np.unique(outcomes.scene) if not np.isnan(_alone(own, outcomes, scene))]
@@ -129,7 +130,7 @@ def interval(task: Task[Any, Any, Any], outcomes: Outcomes, seed: int = 0) -> tu
 
 
 def difference(
-    task: Task[Any, Any, Any], before: Outcomes, after: Outcomes, seed: int = 0
+    task: Task, before: Outcomes, after: Outcomes, seed: int = 0
 ) -> tuple[float, float | None, float | None]:
     """Return measure(after) - measure(before) and its 95 % interval, both on the same redrawn scenes.
 

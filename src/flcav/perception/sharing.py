@@ -39,7 +39,7 @@ class WholeFrames:
         return [data.payload_bytes(i) + picture_bytes(data, i) for i in frames]
 
 
-def shared(task: Task[Any, Any, Any]) -> Shared:
+def shared(task: Task) -> Shared:
     """Return how vehicles share the task."""
     return task if isinstance(task, Shared) else WholeFrames()
 

@@ -8,12 +8,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from typing_extensions import TypeVar  # of typing from Python 3.13 on: with defaults
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
@@ -25,9 +26,9 @@ from flcav.seeds import child_seed
 if TYPE_CHECKING:
     from flcav.perception.camera_view import CameraView
 
-ConfigT = TypeVar("ConfigT")
-NetworkT = TypeVar("NetworkT", bound=nn.Module)
-SampleT = TypeVar("SampleT")
+ConfigT = TypeVar("ConfigT", default=Any)
+NetworkT = TypeVar("NetworkT", bound=nn.Module, default=Any)
+SampleT = TypeVar("SampleT", default=Any)
 
 
 @dataclass(frozen=True)
@@ -65,14 +66,14 @@ class Finding:
     """What a network found in one input."""
 
     path: Path  # the input's own
-    seen: NDArray[Any]  # picture (H, W, 3) u8, point cloud (N, 4) f32, or map: (3, H, W) bool of road, lane, crossing
+    seen: NDArray  # picture (H, W, 3) u8, point cloud (N, 4) f32, or map: (3, H, W) bool of road, lane, crossing
     result: Result
     marks: tuple[Mark, ...] = ()  # the same, as it is drawn on what was seen
     view: Callable[[], "CameraView | None"] = no_view  # of a camera beside the LiDAR, read when asked for
 
 
 class Task(Protocol[ConfigT, NetworkT, SampleT]):
-    """One thing to learn from recorded frames.
+    """One thing to learn from recorded frames; without parameters, whatever its configurations, networks and samples.
 
     A network carries its configuration as `config`, a pydantic dataclass from which `build` makes it again.
     """
@@ -160,7 +161,7 @@ class RigBound(Protocol):
         ...
 
 
-def configuration(task: Task[ConfigT, Any, Any], name: str | None) -> ConfigT:
+def configuration(task: Task[ConfigT, NetworkT, SampleT], name: str | None) -> ConfigT:
     """Return the configuration of that name, the default for None; raises `InputError` for an unknown one."""
     known = task.configurations
     if name is None:
@@ -170,7 +171,7 @@ def configuration(task: Task[ConfigT, Any, Any], name: str | None) -> ConfigT:
     return known[name]
 
 
-def fresh(task: Task[ConfigT, NetworkT, Any], config: ConfigT, seed: int) -> NetworkT:
+def fresh(task: Task[ConfigT, NetworkT, SampleT], config: ConfigT, seed: int) -> NetworkT:
     """Return a new network, its weights drawn from `seed`."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(child_seed(seed, "weights"))

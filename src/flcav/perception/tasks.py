@@ -7,7 +7,7 @@
 
 from collections.abc import Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from flcav.plugins import load_own
 
@@ -22,7 +22,7 @@ TASKS: Mapping[str, str] = {  # name -> module:NAME, so that listing them loads 
 }
 
 
-def task_named(name: str) -> "Task[Any, Any, Any]":
+def task_named(name: str) -> "Task":
     """Return the task of that name, one of `TASKS`, or a user's own as `module:NAME`.
 
     Raises `InputError` for an unknown name, and where the user's module is not there or holds no task of that name.

@@ -17,7 +17,7 @@ from torch import nn
 from flcav.config import InputError
 from flcav.files import write_bytes
 from flcav.perception.card import CARD_KEY, Card
-from flcav.perception.task import ConfigT, NetworkT, Task
+from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 
 PREFIX = "flcav."
 LARGEST = 1e9  # of a weight: larger ones overflow in a few layers
@@ -25,7 +25,7 @@ SHIPPED = "shipped/weights.safetensors"  # beside a task's module; its card lies
 COUNTER = "num_batches_tracked"  # of batch normalisation with a fixed momentum, which does not use it
 
 
-def shipped(task: Task[Any, Any, Any]) -> Path:
+def shipped(task: Task) -> Path:
     """Return the file of weights that comes with a task; raises `InputError` where it has none."""
     module = sys.modules.get(type(task).__module__)
     path = Path(getattr(module, "__file__", None) or "").parent / SHIPPED
@@ -34,12 +34,14 @@ def shipped(task: Task[Any, Any, Any]) -> Path:
     return path
 
 
-def config_key(task: Task[Any, Any, Any]) -> str:
+def config_key(task: Task) -> str:
     """Return the metadata entry that holds the network's configuration as JSON."""
     return PREFIX + task.family
 
 
-def save_network(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path, card: Card | None = None) -> None:
+def save_network(
+    task: Task[ConfigT, NetworkT, SampleT], network: NetworkT, path: Path, card: Card | None = None
+) -> None:
     """Write the network's configuration, weights and card to a safetensors file, atomically."""
     tensors = {name: tensor.contiguous().cpu() for name, tensor in network.state_dict().items()}
     metadata = {config_key(task): _adapter(task).dump_json(network.config).decode()}
@@ -48,7 +50,7 @@ def save_network(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path, 
     write_bytes(path, _in_order(save(tensors, metadata)))
 
 
-def load_network(task: Task[ConfigT, NetworkT, Any], path: Path) -> NetworkT:
+def load_network(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> NetworkT:
     """Return the network that `save_network` wrote, in evaluation mode; raises `InputError` for any other file."""
     config, tensors = _read(task, path)
     try:
@@ -68,7 +70,7 @@ def read_card(path: Path) -> Card:
     return Card.model_validate_json(metadata[CARD_KEY])
 
 
-def load_weights(task: Task[Any, NetworkT, Any], network: NetworkT, path: Path) -> None:
+def load_weights(task: Task[ConfigT, NetworkT, SampleT], network: NetworkT, path: Path) -> None:
     """Load the weights at `path` into `network`; raises `InputError` where they are of another one."""
     config, tensors = _read(task, path)
     if config != network.config:
@@ -109,7 +111,7 @@ def _learned(network: nn.Module) -> dict[str, torch.Tensor]:
     return {name: tensor for name, tensor in network.state_dict().items() if not name.endswith(COUNTER)}
 
 
-def _adapter(task: Task[Any, Any, Any]) -> TypeAdapter[Any]:
+def _adapter(task: Task) -> TypeAdapter[Any]:
     return TypeAdapter(type(next(iter(task.configurations.values()))))
 
 
@@ -124,7 +126,7 @@ def _opened(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
         raise InputError(f"{path}: not a safetensors file, or a damaged one") from None
 
 
-def _read(task: Task[ConfigT, Any, Any], path: Path) -> tuple[ConfigT, dict[str, torch.Tensor]]:
+def _read(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> tuple[ConfigT, dict[str, torch.Tensor]]:
     metadata, tensors = _opened(path)
     key = config_key(task)
     if key not in metadata:

@@ -63,7 +63,7 @@ def own_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
 
 
 def annotated_samples(
-    task: Task[Any, Any, Any], config: Any, split: Frames, frames: Sequence[int], region: str
+    task: Task, config: Any, split: Frames, frames: Sequence[int], region: str
 ) -> dict[str, Sequence[Any]]:
     """Return each vehicle's samples as they were recorded with them, by its name."""
     own: dict[str, list[int]] = {}

@@ -135,7 +135,7 @@ def _planned(task: Asked, own: Allotted, problem: Problem) -> TaskPlan:
     return TaskPlan(*counts, own.wireless_mb, own.wireline_mb, sizes.sample_mb, sizes.model_mb, predicted)
 
 
-def model_mb(task: Task[Any, Any, Any], network: str | None) -> float:
+def model_mb(task: Task, network: str | None) -> float:
     """Return the size of one model update on the wire, by a dry run of the message [MB]."""
     return update_bytes(to_arrays(fresh(task, configuration(task, network), 0))) / BYTES_PER_MB
 

@@ -35,14 +35,12 @@ from flcav.seeds import child_seed, stream
 
 BLOCKS, ROUND = "blocks.json", "round.json"
 
-AnyTask = Task[Any, Any, Any]
-
 
 @dataclass(frozen=True)
 class Learning:
     """How a task's networks learn in a run."""
 
-    task: AnyTask
+    task: Task
     network: str | None  # name of the configuration
     training: Training
     seed: int
@@ -79,7 +77,7 @@ def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) 
     return {region: tuple(frames) for region, frames in chosen.items()}
 
 
-def book_uploads(book: Ledger, task: AnyTask, config: Any, region: str, pool: Frames, chosen: Sequence[int]) -> None:
+def book_uploads(book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int]) -> None:
     """Enter each sample twice: vehicle to edge server by wireless, edge server to cloud by wireline."""
     sizes = shared(task).sample_bytes(pool.data, config, chosen)
     for frame, size in zip(chosen, sizes, strict=True):
@@ -122,7 +120,7 @@ def train_until_level(
     return tuple(blocks)
 
 
-def mean_score(task: AnyTask, network: Any, splits: Sequence[Frames]) -> float:
+def mean_score(task: Task, network: Any, splits: Sequence[Frames]) -> float:
     """Return the mean over regions of the task's measure on their vehicles' frames."""
     return float(np.mean([score_on(task, network, split.data, split.vehicles) for split in splits]))
 
@@ -185,7 +183,7 @@ def clients_of(learning: Learning, config: Any, samples: Mapping[str, Sequence[A
 class Federating:
     """A federation that goes on after a kill: each round's weights, its loss, and what the ledger held then."""
 
-    def __init__(self, task: AnyTask, folder: Path, book: Ledger, report: Report) -> None:
+    def __init__(self, task: Task, folder: Path, book: Ledger, report: Report) -> None:
         self._task, self._folder, self._book, self._report = task, folder, book, report
         self.losses: list[float] = []
 
@@ -296,13 +294,13 @@ def round_path(folder: Path, round_: int) -> Path:
     return folder / f"round{round_}.safetensors"
 
 
-def round_network(task: AnyTask, config: Any, folder: Path, round_: int) -> Any:
+def round_network(task: Task, config: Any, folder: Path, round_: int) -> Any:
     """Return a network with a federation's weights after a round."""
     network = task.build(config)
     from_arrays(network, load_file(round_path(folder, round_)))
     return network.eval()
 
 
-def stage_network(task: AnyTask, folder: Path) -> Any:
+def stage_network(task: Task, folder: Path) -> Any:
     """Return the network that a stage ended with."""
     return load_network(task, folder / WEIGHTS)

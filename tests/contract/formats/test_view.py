@@ -53,7 +53,7 @@ def _read(path: Path) -> dict[str, dict[int, dict[str, list]]]:
 def test_a_recording_holds_points_boxes_tracks_and_pictures(dataset: Dataset, tmp_path: Path):
     assert _view(dataset, "--save", str(tmp_path / "a.rrd")) == 0
     found = _read(tmp_path / "a.rrd")
-    for i in dataset.select(scenes=[dataset.manifest["scenes"][0]]):
+    for i in dataset.select(scenes=[dataset.manifest.scenes[0]]):
         frame = dataset.frame(i)
         agent = f"/world/agents/{frame.agent}"
         place = found[agent][frame.index]
@@ -72,7 +72,7 @@ def test_a_recording_holds_points_boxes_tracks_and_pictures(dataset: Dataset, tm
     for spin in range(SPINS):
         assert actors[spin]["labels"] == [f"{name} veh{i}" for i, name in enumerate(CATEGORIES)]
         assert [len(line) for line in tracks[spin]["strips"]] == [spin + 1] * len(CATEGORIES)
-    last = dataset.frame(dataset.select(scenes=[dataset.manifest["scenes"][0]])[-1]).annotations.boxes
+    last = dataset.frame(dataset.select(scenes=[dataset.manifest.scenes[0]])[-1]).annotations.boxes
     np.testing.assert_allclose(actors[SPINS - 1]["centers"], last.center, atol=1e-4)
     np.testing.assert_allclose(2 * np.array(actors[SPINS - 1]["half_sizes"]), last.size, atol=1e-4)
 
@@ -89,7 +89,7 @@ def test_a_recording_holds_the_map_of_its_town(dataset: Dataset, tmp_path: Path)
 
 @needs_rerun
 def test_a_scene_can_be_chosen(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    names = dataset.manifest["scenes"]
+    names = dataset.manifest.scenes
     assert _view(dataset, "--scene", names[1], "--save", str(tmp_path / "a.rrd")) == 0
     assert f"scene {names[1]}, {2 * SPINS} frames" in capsys.readouterr().out
     assert _view(dataset, "--scene", "other", "--save", str(tmp_path / "b.rrd")) == 2

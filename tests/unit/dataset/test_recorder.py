@@ -53,11 +53,11 @@ def test_the_manifest_lists_every_file_and_no_surroundings(tmp_path: Path):
     found = digests(tmp_path / "data")
     del found["manifest.json"]
     files = pq.read_table(tmp_path / "data" / "files.parquet").to_pydict()
-    listed = {name: entry["sha256"] for name, entry in manifest["tables"].items()}
+    listed = {name: entry.sha256 for name, entry in manifest.tables.items()}
     assert listed | dict(zip(files["path"], files["sha256"])) == found
     counts = {"scenes": 2, "frames": 12, "annotations": 48, "points": 12 * 125, "images": 0}
-    assert manifest["counts"] == counts | {"payload_bytes": 12 * 125 * 16}
-    assert manifest["recipe"] == ToySource().describe()
+    assert manifest.counts.model_dump() == counts | {"payload_bytes": 12 * 125 * 16}
+    assert manifest.recipe == ToySource().describe()
     assert str(tmp_path) not in (tmp_path / "data" / "manifest.json").read_text()
 
 

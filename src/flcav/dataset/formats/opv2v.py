@@ -74,7 +74,7 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
             vehicles = _vehicles(frame, numbers, options.min_points)
             _write_frame(frame, folder / str(numbers[frame.agent]), vehicles, speed)
             counts.update(frames=1, objects=len(vehicles))
-        protocol = {"recipe": dataset.manifest["recipe"], "numbers": numbers}
+        protocol = {"recipe": dataset.manifest.recipe, "numbers": numbers}
         (folder / "data_protocol.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False), encoding="utf-8")
         counts["scenarios"] += 1
     return exported

@@ -17,7 +17,7 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
     is asked for all the same. Of any other, the last scenes validate: that share of them, rounded up, but never all.
     """
     scenes = list(dict.fromkeys(key.scene for key in dataset.keys))
-    recorded_for = str(dataset.manifest["recipe"].get("split", ""))
+    recorded_for = str(dataset.manifest.recipe.get("split", ""))
     for split in ("val", "test"):
         if recorded_for.startswith(split):
             if "validation" in options.model_fields_set:

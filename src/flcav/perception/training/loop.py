@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from flcav.config import InputError
-from flcav.perception.task import NetworkT, SampleT, Task
+from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 from flcav.perception.training.checkpoint import Progress, load_checkpoint, save_checkpoint
 from flcav.perception.training.schedules import SCHEDULES
 from flcav.progress import Report, silent
@@ -58,7 +58,7 @@ class History:
 
 
 def train(
-    task: Task[Any, NetworkT, SampleT],
+    task: Task[ConfigT, NetworkT, SampleT],
     network: NetworkT,
     samples: Sequence[SampleT],
     *,
@@ -93,6 +93,7 @@ def train(
     identity = f"{json.dumps(settings)} on {len(samples)} samples {checkpointing.of if checkpointing else ''}"
     done = load_checkpoint(checkpointing.path, identity, network, optimizer) if checkpointing else Progress()
     order = batches(len(samples), batch, steps, seed)
+    config: Any = network.config  # which every network of a task carries
     for number in range(len(done.losses), steps):
         if validation and validation.over(done.scores):
             break
@@ -100,7 +101,7 @@ def train(
         for group in optimizer.param_groups:
             group["lr"] = rate
         drawn = [
-            task.draw(samples, int(index), network.config, stream(seed, "augment", number, place))
+            task.draw(samples, int(index), config, stream(seed, "augment", number, place))
             for place, index in enumerate(order[number])
         ]
         done.losses.append(step(task, network, optimizer, drawn))
@@ -117,7 +118,7 @@ def train(
 
 
 def train_steps(
-    task: Task[Any, NetworkT, SampleT],
+    task: Task[ConfigT, NetworkT, SampleT],
     network: NetworkT,
     samples: Sequence[SampleT],
     *,
@@ -146,7 +147,7 @@ def adamw(network: nn.Module, learning_rate: float) -> torch.optim.AdamW:
 
 
 def step(
-    task: Task[Any, NetworkT, SampleT],
+    task: Task[ConfigT, NetworkT, SampleT],
     network: NetworkT,
     optimizer: torch.optim.Optimizer,
     samples: Sequence[SampleT],

@@ -53,7 +53,7 @@ class Part:
 class Prepared:
     """A training that can begin, or has been finished before."""
 
-    task: Task[Any, Any, Any]
+    task: Task
     request: Request
     out: Path
     config: Any  # the network's
@@ -77,7 +77,7 @@ class Trained:
     evaluation: Evaluated | None = None  # on the validation data; None where there are none, or it was trained before
 
 
-def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progress: Report = silent) -> Card:
+def train_network(task: Task, request: Request, out: Path, progress: Report = silent) -> Card:
     """Train, going on from where an interrupted run left off in `out`; write weights, card and curves there.
 
     One learning-rate cycle over all epochs. With validation data, the network of the best epoch is kept, its scores are
@@ -87,7 +87,7 @@ def train_network(task: Task[Any, Any, Any], request: Request, out: Path, progre
     return train_prepared(prepare(task, request, out), progress).card
 
 
-def prepare(task: Task[Any, Any, Any], request: Request, out: Path) -> Prepared:
+def prepare(task: Task, request: Request, out: Path) -> Prepared:
     """Return the training that is asked for, its samples found.
 
     Raises `InputError` for an unknown network, for data or agents that the task cannot use and where `out` holds the
@@ -163,7 +163,7 @@ def train_prepared(prepared: Prepared, progress: Report = silent) -> Trained:
     return Trained(card, evaluation)
 
 
-def _part(task: Task[Any, Any, Any], config: Any, data: Dataset, agents: str | None) -> Part:
+def _part(task: Task, config: Any, data: Dataset, agents: str | None) -> Part:
     chosen = choose_frames(task, config, data, agents)
     return Part(data, chosen, data_entry(data, chosen))
 

@@ -46,7 +46,7 @@ def held_in(folder: Path) -> Record | None:
     """
     for path in (folder / DONE, folder / STARTED):
         if path.exists():
-            values = read_json(path)
+            values: Any = read_json(path)
             if not isinstance(values, dict) or not isinstance(values.get("fingerprint"), str):
                 raise InputError(f"{path}: not the record of a step; choose another folder")
             return Record(values["fingerprint"], values.get("code") or {}, values.get("lineage") or "")

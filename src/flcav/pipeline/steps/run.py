@@ -190,7 +190,8 @@ def stopwatch(folder: Path) -> Callable[[], float]:
     A start's seconds count up to the last time that the clock was read.
     """
     path, start = folder / "elapsed.json", time.monotonic()
-    earlier = read_json(path)["elapsed_s"] if path.exists() else 0.0
+    kept: Any = read_json(path) if path.exists() else {"elapsed_s": 0.0}
+    earlier = kept["elapsed_s"]
 
     def clock() -> float:
         elapsed = earlier + time.monotonic() - start

@@ -6,6 +6,7 @@ The global frame is our world, shifted so that the map's lower left corner is it
 
 import json
 from collections import Counter, defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
     split_of = split_scenes(dataset, options)
     tables = constant_rows()
     global_from_world = _write_map(dataset, out / MAP)
-    location = Path(str(dataset.manifest["recipe"].get("town", "unknown"))).name
+    location = Path(str(dataset.manifest.recipe.get("town", "unknown"))).name
     splits: dict[str, list[str]] = defaultdict(list)
     counts: Counter[str] = Counter(scenes=0, samples=0, objects=0)
     for scene, split in split_of.items():
@@ -74,9 +75,11 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
 
 def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:
     """Return LiDAR name -> elevations [rad] of its channels from the lowest, as far as the recipe has the rig."""
-    rig = dataset.manifest["recipe"].get("pole_rig" if agent.startswith("pole") else "vehicle_rig", {})
+    rig = dataset.manifest.recipe.get("pole_rig" if agent.startswith("pole") else "vehicle_rig")
+    lidars = rig.get("lidars") if isinstance(rig, Mapping) else None
     elevations = {}
-    for name, lidar in rig.get("lidars", {}).items():
+    for name, lidar in lidars.items() if isinstance(lidars, Mapping) else ():
+        assert isinstance(lidar, Mapping)
         settings = Lidar.model_validate(lidar["settings"])
         first = ray_pattern(settings)[:: settings.azimuth_steps].astype(np.float64)  # of each channel
         elevations[name] = np.arcsin(first[::-1, 2])
