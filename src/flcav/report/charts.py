@@ -11,6 +11,7 @@ from flcav.report import style
 
 Row = Mapping[str, Any]
 
+LINE = 0.07  # height of a name, as a share of the axis
 STAGES = ("pretraining", "edge FL", "cloud FL")  # what `rounds` call them, in the order of a town's tested rows
 
 
@@ -25,21 +26,43 @@ def draw_by_round(axes: Axes, rounds: Sequence[Row], tested: Sequence[Row], meas
         town: sorted((places[row["stage"]][row["round"]], row["score"]) for row in rounds if row["town"] == town)
         for town in dict.fromkeys(row["town"] for row in rounds)
     }
-    for town, line in lines.items():
-        colour = _colour(town, lines)
-        axes.plot(*zip(*line, strict=True), color=colour, linewidth=1.6, marker="o", markersize=2.5)
-        beside = [other[-1] for other in lines.values() if other is not line and other[-1][0] == line[-1][0]]
-        side = "center" if not beside else "bottom" if line[-1] > max(beside) else "top"  # two names stay apart
-        axes.annotate(town, line[-1], (9, 0), textcoords="offset points", color=colour, va=side, fontweight="bold")
     towns = list(dict.fromkeys(row["town"] for row in tested))
+    colours = {town: _colour(town, [*lines, *towns]) for town in (*lines, *towns)}
+    for town, line in lines.items():
+        axes.plot(*zip(*line, strict=True), color=colours[town], linewidth=1.6, marker="o", markersize=2.5)
+    ends = {town: line[-1] for town, line in lines.items()}
     for number, town in enumerate(towns):
         aside = 0.04 * (number - (len(towns) - 1) / 2)  # so that the intervals of two towns do not hide each other
         for row in tested:
             if row["town"] == town and row["stage"] in places:
-                _draw_tested(axes, max(places[row["stage"]].values()) + aside, row, _colour(town, [*lines, *towns]))
+                x = max(places[row["stage"]].values()) + aside
+                _draw_tested(axes, x, row, colours[town])
+                if town not in lines:
+                    ends[town] = x, row["score"]
+    axes.set_ylim(0, None)
+    _name_ends(axes, ends, colours)
     _mark_stages(axes, places)
-    axes.set(xlabel="round of the stage", ylabel=measure, ylim=(0, None))
+    axes.set(xlabel="round of the stage", ylabel=measure)
     axes.grid(axis="y")
+
+
+def _name_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Mapping[str, str]) -> None:
+    """Write each town beside its end (x, y), those of one stage above each other."""
+    line = LINE * axes.get_ylim()[1]
+    for stage in dict.fromkeys(int(x) for x, _ in ends.values()):
+        towns = sorted((town for town, (x, _) in ends.items() if int(x) == stage), key=lambda town: ends[town][1])
+        place, right = -line, max(ends[town][0] for town in towns)
+        for town in towns:
+            place = max(ends[town][1], place + line)
+            axes.annotate(
+                town,
+                (right, place),
+                (9, 0),
+                textcoords="offset points",
+                color=colours[town],
+                va="center",
+                fontweight="bold",
+            )
 
 
 def _colour(town: str, towns: Iterable[str]) -> str:
