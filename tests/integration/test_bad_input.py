@@ -248,6 +248,9 @@ def test_numbers_that_nobody_can_mean_in_a_history_and_a_graph(tmp_path: Path, r
     steep["limits"] = steep["limits"] | {"samples": [0, 400]}
     (tmp_path / "problem.yaml").write_text(yaml.safe_dump(PROBLEM | {"tasks": [steep]}))
     assert "curve of task 'objects' predicts an error of inf" in refused("allocate", tmp_path / "problem.yaml")
+    slight = PROBLEM["tasks"][0] | {"curve": {"model": "additive", "pretrain": {"a": 5e-324, "b": 0.4}}}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(PROBLEM | {"tasks": [slight]}))
+    assert "pretrain.a' = 5e-324" in refused("allocate", tmp_path / "problem.yaml")
 
 
 @pytest.mark.parametrize("text", ["a: " + "[" * 2000 + "]" * 2000, "a: 2020-13-45", "{[1]: 2}", "a: &b [*b]"])

@@ -35,7 +35,7 @@ def effective_samples(
 class Fitted(Config):
     """Base of curves: their parameters are fitted, and of steep ones any size."""
 
-    magnitudes: ClassVar[tuple[float, float]] = (0.0, 1e100)
+    magnitudes: ClassVar[tuple[float, float]] = (1e-100, 1e100)
 
 
 class Decay(Fitted):

@@ -62,7 +62,7 @@ def test_the_page_tells_the_numbers() -> None:
     for shown in (
         "objects, pretrained 0.412 0.371–0.450",
         "objects, edge + cloud FL 0.511 0.470–0.549",
-        "edge + cloud FL ring 0.468 0.427–0.506 0.278 0.96 96 8",
+        "edge + cloud FL ring 0.468 0.427–0.506 0.278 0.960 96 8",
         "ideal road detector, upper bound",
         "grid, objects: edge FL - pretrained +0.091 +0.055 to +0.127",
         "wireless 230.0 216.0 214.7",
