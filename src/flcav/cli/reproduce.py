@@ -42,13 +42,25 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig3a: (),
     Target.sim_to_real: (*RUN, "kitti", "weights"),
 }
+OWN = "a study of your own as module:NAME"
 SEEDS: Mapping[str, int] = {Target.demo_arms: 5}
 COMMON_SEEDS = 3
 
 
+class Reproducible(click.Choice):
+    """One of `TARGETS`, or somebody's own."""
+
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the target; raises `click.BadParameter` for one that is neither."""
+        return value if ":" in value else super().convert(value, param, ctx)
+
+
 def reproduce(
     target: str = typer.Argument(
-        ..., metavar="TARGET", click_type=click.Choice(TARGETS), help=f"What to reproduce: {listed(TARGETS)}."
+        ...,
+        metavar="TARGET",
+        click_type=Reproducible(TARGETS),
+        help=f"What to reproduce: {listed(TARGETS)}, or {OWN}.",
     ),
     out: Path = typer.Option(..., "--out", help="Folder of the runs; the same command goes on after a stop."),
     seeds: int | None = typer.Option(
@@ -67,7 +79,7 @@ def reproduce(
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
     use_threads(1)
-    refuse_unused(f"reproduce {target}", *{*STUDY, "kitti", "weights"}.difference(TAKEN[target]))
+    refuse_unused(f"reproduce {target}", *{*STUDY, "kitti", "weights"}.difference(TAKEN.get(target, STUDY)))
     if target in (Target.fig1b, Target.fig3a):
         draw = _fig1b if target == Target.fig1b else _fig3a
         draw(out)
@@ -78,7 +90,7 @@ def reproduce(
     count = seeds or SEEDS.get(target, COMMON_SEEDS)
     numbers = range(1, count + 1)
     quick = scale == Scale.quick
-    if target.startswith(TASK):
+    if target.startswith(TASK) or ":" in target:
         _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
         run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms

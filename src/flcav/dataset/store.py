@@ -2,7 +2,7 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -108,6 +108,10 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.keys)
+
+    def numbers(self, frames: Sequence[int] | None) -> Sequence[int]:
+        """Return the frame numbers `frames`, or all for None."""
+        return range(len(self)) if frames is None else frames
 
     def frame(self, i: int) -> Frame:
         """Return frame `i`; images are read when first asked for.

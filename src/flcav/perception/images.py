@@ -10,7 +10,6 @@ from PIL import Image, ImageEnhance, UnidentifiedImageError
 from flcav.config import InputError
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.perception.task import of_frames
 from flcav.sensors.frame import Frame
 
 Picture = NDArray[np.uint8]  # (H, W, 3) sRGB
@@ -42,7 +41,7 @@ def pictures(path: Path, frames: Sequence[int] | None = None) -> Iterator[tuple[
 def recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterator[tuple[Frame, str, Picture]]:
     """Yield the pictures in frames of a dataset, with frame and camera; raises `InputError` where there is none."""
     seen = False
-    for number in of_frames(data, frames):
+    for number in data.numbers(frames):
         frame = data.frame(number)
         for camera in data.cameras(number):
             seen = True

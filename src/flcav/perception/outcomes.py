@@ -16,7 +16,7 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.files import atomic_path
 from flcav.intervals import REDRAWS, over_scenes
-from flcav.perception.task import Task, of_frames
+from flcav.perception.task import Task
 from flcav.progress import Report, silent
 from flcav.seeds import stream
 
@@ -115,7 +115,7 @@ def measured(task: Task, outcomes: Outcomes) -> float:
 
 def score_on(task: Task, network: nn.Module, data: Dataset, frames: Sequence[int] | None = None) -> float:
     """Return the measure of `network` on frames (None: all); 0 where there was nothing to find."""
-    found = measured(task, measurable(task).outcomes(network, data, of_frames(data, frames)))
+    found = measured(task, measurable(task).outcomes(network, data, data.numbers(frames)))
     return 0.0 if np.isnan(found) else found
 
 

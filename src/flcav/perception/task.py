@@ -176,8 +176,3 @@ def fresh(task: Task[ConfigT, NetworkT, SampleT], config: ConfigT, seed: int) ->
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(child_seed(seed, "weights"))
         return task.build(config)
-
-
-def of_frames(data: Dataset, frames: Sequence[int] | None) -> Sequence[int]:
-    """Return the frame numbers: `frames`, or all of `data` for None."""
-    return range(len(data)) if frames is None else frames

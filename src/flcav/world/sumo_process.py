@@ -101,6 +101,7 @@ def serve() -> None:
     import libsumo  # noqa: F401 - for the forks
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # is the matter of the process that asks, which ends this one
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # nobody waits for the answer any more: end without a word
     for line in sys.stdin:
         fork = os.fork()
         if not fork:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flcav.cli.main import run as command
 from flcav.config import InputError, parse_config
 from flcav.experiments.studies import STUDIES, study_named, weather
 from flcav.experiments.task_study import at_scale, results_as_json, results_of_json, run_study, steps_of
@@ -60,20 +62,44 @@ def test_a_training_waits_for_its_frames_and_a_test_for_its_training():
     assert set(steps["seed-2-tested"].needs) == {"seed-2", *(f"test-{name}" for name in weather.STUDY.tests)}
 
 
+def toy(recipe: Any) -> dict[str, Any]:
+    """Return a recipe with four frames to record."""
+    small = {"cavs": 1, "spins_per_scene": 4, "scenes": 1, "warmup_s": 20.0}
+    return {**recipe, **small, "weather": {"classes": ["clear", "night", "clear", "fog"], "turn_s": 4.0}}
+
+
+OWN = replace(
+    weather.STUDY,
+    train=(toy(weather.STUDY.train[0]),),
+    validation=toy(weather.STUDY.validation),
+    tests={name: toy(weather.STUDY.tests[name]) for name in ("held-out town", weather.WHOLE_SPACE)},
+    epochs=1,
+)
+
+
+def test_a_study_of_ones_own_is_found_by_its_module(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sys.path", [str(Path(__file__).parent), *sys.path])
+    assert study_named(f"{Path(__file__).stem}:OWN").tests.keys() == OWN.tests.keys()
+    with pytest.raises(InputError, match=r"has no 'NONE'"):
+        study_named(f"{Path(__file__).stem}:NONE")
+    with pytest.raises(InputError, match=r"is no study, it has no .*learn"):
+        study_named("pathlib:Path")
+    with pytest.raises(InputError, match=r"choose one of .*weather.*, or name your own as module:NAME"):
+        study_named("none")
+
+
+def test_the_command_says_what_is_no_study(tmp_path: Path, capsys: pytest.CaptureFixture):
+    for target, said in (("no_such_module:STUDY", "no module 'no_such_module'"), ("nothing", "task-weather")):
+        with pytest.raises(SystemExit) as stopped:
+            command(["reproduce", target, "--out", str(tmp_path / "out")])
+        assert stopped.value.code == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_a_toy_study_gives_numbers_of_each_seed_and_goes_on(tmp_path: Path):
-    small: dict[str, Any] = {"cavs": 1, "spins_per_scene": 4, "scenes": 1, "warmup_s": 20.0}
-
-    def toy(recipe):
-        return {**recipe, **small, "weather": {"classes": ["clear", "night", "clear", "fog"], "turn_s": 4.0}}
-
-    study = replace(
-        weather.STUDY,
-        train=(toy(weather.STUDY.train[0]),),
-        validation=toy(weather.STUDY.validation),
-        tests={name: toy(weather.STUDY.tests[name]) for name in ("held-out town", weather.WHOLE_SPACE)},
-        epochs=1,
-    )
+    study = OWN
     said: list[str] = []
 
     def notify(step: str, done: int, total: int, note: str) -> None:

@@ -168,8 +168,8 @@ class Recording:
         self._frames = [replace(one, time_s=every_s * i) for i, one in enumerate(frames)]
         self.keys = [FrameKey(one.scene, i, one.agent, one.time_s) for i, one in enumerate(self._frames)]
 
-    def __len__(self):
-        return len(self._frames)
+    def numbers(self, frames):
+        return range(len(self._frames)) if frames is None else frames
 
     def frame(self, number):
         return self._frames[number]

@@ -27,7 +27,7 @@ from flcav.perception.trajectory.cross_view import (
 )
 from flcav.perception.trajectory.evaluate import errors_of, metrics, turning
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
-from flcav.perception.trajectory.model import Forecast, Inputs
+from flcav.perception.trajectory.model import Forecast
 from flcav.perception.trajectory.rasters import LAYERS, STATIC, cell_of, centres
 from flcav.perception.trajectory.roads import BEFORE_M, road_map
 from flcav.perception.trajectory.samples import present_at
@@ -41,6 +41,7 @@ from flcav.perception.trajectory.tracks import (
     tracks_around,
     tracks_at,
 )
+from flcav.perception.trajectory.views import Inputs
 from flcav.world.lanes import RASTER_LAYERS, map_layers, rasterise
 from flcav.world.town import load_town
 from flcav.world.trace import Trace

@@ -20,8 +20,9 @@ ASK = """
 import sys
 from pathlib import Path
 from flcav.world import sumo
+print(sumo._running().pid, flush=True)
 sumo.simulate_in(Path(sys.argv[1]))
-print(sumo._process[1].pid, flush=True)
+print("done", flush=True)
 sys.stdin.read()
 """
 
@@ -95,15 +96,23 @@ def test_an_interrupted_simulation_leaves_no_answer_to_the_next(tmp_path: Path, 
     assert pid() != before
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, None])
-def test_it_ends_with_the_process_that_started_it(number: signal.Signals | None, tmp_path: Path):
-    command = [sys.executable, "-c", ASK, asked(tmp_path / "job", [10])]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+@pytest.mark.parametrize("when", ["idle", "killed idle", "killed at work"])
+def test_it_ends_with_the_process_that_started_it_without_a_word(when: str, tmp_path: Path):
+    steps = [20_000] if when == "killed at work" else [10]
+    command = [sys.executable, "-c", ASK, asked(tmp_path / "job", steps)]
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen(command, **pipes, text=True) as process:
         assert process.stdout is not None
         server = int(process.stdout.readline())
-        if number is not None:
-            process.send_signal(number)
-        process.communicate()
+        if when == "killed at work":
+            time.sleep(1.0)
+            assert process.poll() is None
+        else:
+            assert process.stdout.readline() == "done\n"
+        if when != "idle":
+            process.kill()
+        said, errors = process.communicate()  # the server has stderr, too, as long as it is there
+    assert (said, errors) == ("", "")
     for _ in range(100):
         try:
             os.kill(server, 0)

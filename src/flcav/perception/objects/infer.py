@@ -17,7 +17,7 @@ from flcav.geometry import Boxes
 from flcav.perception.camera_view import CameraView, recorded_view, view_beside
 from flcav.perception.objects.samples import checked_points
 from flcav.perception.objects.truth import only_lidar
-from flcav.perception.task import Result, of_frames
+from flcav.perception.task import Result
 from flcav.records import Class
 
 
@@ -98,7 +98,7 @@ def _of_file(path: Path) -> Cloud:
 
 def _recorded(folder: Path, frames: Sequence[int] | None) -> Iterator[Cloud]:
     dataset = Dataset.open(folder)
-    for i in of_frames(dataset, frames):
+    for i in dataset.numbers(frames):
         frame = dataset.frame(i)
         lidar = only_lidar(frame)
         yield Cloud(folder / frame.key, frame.lidar[lidar], partial(recorded_view, dataset, i, lidar))

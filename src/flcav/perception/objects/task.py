@@ -27,7 +27,7 @@ from flcav.perception.objects.results import ObjectsEvaluation
 from flcav.perception.objects.samples import RecordedSweeps, Sample, fitting_frames
 from flcav.perception.objects.slices import sliced
 from flcav.perception.objects.truth import only_lidar
-from flcav.perception.task import Finding, Practice, of_frames
+from flcav.perception.task import Finding, Practice
 from flcav.progress import Report, silent
 
 
@@ -51,7 +51,7 @@ class ObjectsTask(ObjectsOutcomes):
 
     def samples(self, data: Dataset, config: SecondConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
         """Return each frame's sweep with its ground truth as labels, read when asked for."""
-        return RecordedSweeps(data, config, of_frames(data, frames))
+        return RecordedSweeps(data, config, data.numbers(frames))
 
     def fitting(self, data: Dataset, config: SecondConfig) -> Sequence[int]:
         """Return the frames whose LiDAR is about as high as the network expects, see `fitting_frames`."""
@@ -90,7 +90,7 @@ class ObjectsTask(ObjectsOutcomes):
 
         `asked`: the network's configuration with a smaller range, see `flcav.perception.objects.area`.
         """
-        numbers, classes = of_frames(data, frames), network.config.classes
+        numbers, classes = data.numbers(frames), network.config.classes
         found, truths = detections_and_truths(
             network, map(data.frame, numbers), asked, total=len(numbers), progress=progress
         )
@@ -105,7 +105,7 @@ class ObjectsTask(ObjectsOutcomes):
 
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the calibration of the network's scores, see `flcav.perception.objects.calibrate`."""
-        calibrate(network, map(data.frame, of_frames(data, frames)))
+        calibrate(network, map(data.frame, data.numbers(frames)))
 
     def sample_bytes(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> list[int]:
         """Return the bytes of each sweep with its annotation rows."""
@@ -128,7 +128,7 @@ class ObjectsTask(ObjectsOutcomes):
         progress: Report = silent,
     ) -> Registry:
         """Return the objects that are missed and invented, see `errors.register_errors`."""
-        numbers = of_frames(data, frames)
+        numbers = data.numbers(frames)
 
         def found() -> Iterator[Boxes]:
             for done, number in enumerate(numbers, start=1):

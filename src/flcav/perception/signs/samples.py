@@ -12,7 +12,6 @@ from flcav.dataset.formats.rectangles import CLASSES, rectangles
 from flcav.dataset.store import Dataset
 from flcav.perception.images import Picture, checked_picture
 from flcav.perception.signs.config import SignsConfig
-from flcav.perception.task import of_frames
 from flcav.sensors.frame import Frame
 
 KEPT_BYTES = 3_000_000_000  # of pictures that stay in memory once they are read
@@ -37,7 +36,7 @@ class RecordedPictures(Sequence[Sample]):
 
     def __init__(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> None:
         self._data, self._config = data, config
-        self._of = [(number, camera) for number in of_frames(data, frames) for camera in data.frame(number).images]
+        self._of = [(number, camera) for number in data.numbers(frames) for camera in data.frame(number).images]
         if not self._of:
             raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
         self._kept: dict[int, Sample] = {}

@@ -23,7 +23,7 @@ from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.outcomes import SignsOutcomes, by_picture
 from flcav.perception.signs.samples import RecordedPictures, Sample
 from flcav.perception.signs.targets import assign
-from flcav.perception.task import Finding, Practice, of_frames
+from flcav.perception.task import Finding, Practice
 from flcav.progress import Report, silent
 
 BOX_BYTES = 4 * 4 + 1  # of a label: a box in float32, and its class
@@ -64,7 +64,7 @@ class SignsTask(SignsOutcomes):
         self, network: SignDetector, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
     ) -> SignsEvaluation:
         """Return COCO's mAP, by class and by size, see `mean_average_precision`."""
-        kept = self.outcomes(network, data, of_frames(data, frames), progress)
+        kept = self.outcomes(network, data, data.numbers(frames), progress)
         found, truths = by_picture(kept)
         result = mean_average_precision(found, truths, network.config.classes, network.config.smallest_px)
         return replace(result, scenes=len(set(kept.scene.tolist())))
@@ -94,7 +94,7 @@ class SignsTask(SignsOutcomes):
         progress: Report = silent,
     ) -> Registry:
         """Return the signs that are missed and invented, see `errors.register_errors`."""
-        return register_errors(network, data, of_frames(data, frames), threshold, progress)
+        return register_errors(network, data, data.numbers(frames), threshold, progress)
 
 
 SIGNS = SignsTask()

@@ -16,7 +16,7 @@ from flcav.perception.objects.detect import detect
 from flcav.perception.objects.evaluate import number_or_none
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
-from flcav.perception.task import Result, of_frames
+from flcav.perception.task import Result
 from flcav.perception.tracking.tracker import Tracked, Tracker
 from flcav.progress import Report, silent
 from flcav.records import Class
@@ -122,7 +122,7 @@ def sequences(data: Dataset, frames: Sequence[int] | None = None) -> dict[tuple[
     Raises `InputError` where they are too far apart.
     """
     found: dict[tuple[str, str], list[int]] = defaultdict(list)
-    for number in sorted(of_frames(data, frames), key=lambda i: data.keys[i].time_s):
+    for number in sorted(data.numbers(frames), key=lambda i: data.keys[i].time_s):
         found[data.keys[number].scene, data.keys[number].agent].append(number)
     for (scene, agent), numbers in found.items():
         gap = max(np.diff([data.keys[i].time_s for i in numbers]), default=0.0)

@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from flcav.perception.trajectory.model import Inputs
 from flcav.perception.trajectory.samples import Sample
+from flcav.perception.trajectory.views import Inputs
 
 
 def inputs_of(samples: Sequence[Sample], network: nn.Module) -> Inputs:

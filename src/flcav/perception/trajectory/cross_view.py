@@ -9,18 +9,13 @@ Small convolutions take the place of EfficientNet, there are one or two rounds o
 ground lies around the road user that is predicted instead of the vehicle with the cameras.
 """
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from flcav.perception.trajectory.config import CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.rasters import OTHERS
-from flcav.perception.trajectory.views import Seen, Summary, conv
-
-if TYPE_CHECKING:
-    from flcav.perception.trajectory.model import Inputs
+from flcav.perception.trajectory.views import Inputs, Seen, Summary, conv
 
 LEARNED = {"road": 1.0, "lane": 1.0, "crossing": 5.0, "way": 3.0, "red": 10.0, "green": 10.0, OTHERS[0]: 8.0}
 """Layers of the raster that cameras are taught to see, and how much more a cell in one weighs: some are rare."""
@@ -56,7 +51,7 @@ class CrossViewEncoder(nn.Module):
     pixels: Tensor  # (P, 3) homogeneous
     places: Tensor  # (Q, 2) x, y [SCALE_M]
 
-    def forward(self, inputs: "Inputs") -> Seen:
+    def forward(self, inputs: Inputs) -> Seen:
         """Return what is seen in (B, n, 3, height, width) pictures; places are half as far apart as the queries."""
         assert inputs.pictures is not None
         assert inputs.intrinsics is not None

@@ -11,7 +11,7 @@ from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose, yaw_of
 from flcav.perception.marks import Light, Mode, Paths, RoadUser
-from flcav.perception.task import Finding, Result, of_frames
+from flcav.perception.task import Finding, Result
 from flcav.perception.trajectory.config import FUTURE, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import predict, single
@@ -93,7 +93,7 @@ def findings(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | Non
     read_manifest(path)
     data = Dataset.open(path)
     traces: dict[str, Trace] = {}
-    for number in of_frames(data, frames):
+    for number in data.numbers(frames):
         key = data.keys[number]
         if key.scene not in traces:
             traces = {key.scene: traffic(data, key.scene)}

@@ -13,20 +13,10 @@ from torch.nn import functional
 
 from flcav.perception.trajectory.config import FUTURE, STEP_S, TrajectoryConfig
 from flcav.perception.trajectory.cross_view import CrossViewEncoder
-from flcav.perception.trajectory.views import RasterEncoder, Seen
+from flcav.perception.trajectory.views import Inputs, RasterEncoder, Seen
 
 SCALE_M = 10.0  # positions and speeds are divided by this
 TRACK = 6  # features of a point of the past
-
-
-class Inputs(NamedTuple):
-    """A batch as the network takes it."""
-
-    past: Tensor  # (B, PAST + 1, 4) x, y, yaw, speed
-    raster: Tensor | None = None  # (B, LAYERS, cells, cells) of zeros and ones
-    pictures: Tensor | None = None  # (B, n, 3, height, width) in [-1, 1]
-    intrinsics: Tensor | None = None  # (B, n, 3, 3)
-    camera_from_frame: Tensor | None = None  # (B, n, 4, 4)
 
 
 class Forecast(NamedTuple):

@@ -12,7 +12,6 @@ from flcav.config import InputError
 from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
 from flcav.perception.agents import POLE, kind_of
-from flcav.perception.task import of_frames
 from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.rasters import rasters
 from flcav.perception.trajectory.roads import BEFORE_M, RoadMap, roads_of
@@ -74,7 +73,7 @@ def samples_of(data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | 
     each frame's own vehicle, itself too. Raises `InputError` where the dataset lacks traffic, its map or pictures, or
     holds no such sample.
     """
-    return _samples(data, config.patch, config.cameras, tuple(of_frames(data, frames)))
+    return _samples(data, config.patch, config.cameras, tuple(data.numbers(frames)))
 
 
 @lru_cache(maxsize=LOOKED_AT_AGAIN)

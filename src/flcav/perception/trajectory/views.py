@@ -1,16 +1,23 @@
 """What a network of trajectories sees of the surroundings, and convolutions that see it on rasters."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor, nn
 
 from flcav.perception.trajectory.config import TrajectoryConfig
 from flcav.perception.trajectory.rasters import LAYERS
 
-if TYPE_CHECKING:
-    from flcav.perception.trajectory.model import Inputs
-
 COARSE = 8  # cells along each side of the map that is summed up
+
+
+class Inputs(NamedTuple):
+    """A batch as the network takes it."""
+
+    past: Tensor  # (B, PAST + 1, 4) x, y, yaw, speed
+    raster: Tensor | None = None  # (B, LAYERS, cells, cells) of zeros and ones
+    pictures: Tensor | None = None  # (B, n, 3, height, width) in [-1, 1]
+    intrinsics: Tensor | None = None  # (B, n, 3, 3)
+    camera_from_frame: Tensor | None = None  # (B, n, 4, 4)
 
 
 class Seen(NamedTuple):
@@ -45,7 +52,7 @@ class RasterEncoder(nn.Module):
         self.layers = nn.Sequential(conv(len(LAYERS), fine, 2), conv(fine, ground, 2))
         self.sum_up = Summary(ground, coarse, self.summary)
 
-    def forward(self, inputs: "Inputs") -> Seen:
+    def forward(self, inputs: Inputs) -> Seen:
         """Return what is seen on (B, LAYERS, cells, cells) rasters; places are 4 x 4 cells."""
         assert inputs.raster is not None
         ground = self.layers(inputs.raster)
