@@ -18,7 +18,16 @@ from flcav.optimization.history import History
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.planning import Asked, Frame, append_points, history_of, make_plan, model_mb, parse_history
+from flcav.pipeline.planning import (
+    HISTORIES,
+    Asked,
+    Frame,
+    append_points,
+    history_of,
+    make_plan,
+    model_mb,
+    parse_history,
+)
 from flcav.pipeline.recipe import FixedPlan, Limits
 
 SIZES = MessageSizes(sample_mb=0.4, model_mb=1.4)
@@ -108,10 +117,11 @@ def test_a_models_size_is_what_flower_sends() -> None:
     assert book.used_mb("wireless") == pytest.approx(sent / 1e6, rel=1e-4)
 
 
-def test_the_committed_history_falls_with_every_resource() -> None:
-    known = history_of("objects")
+@pytest.mark.parametrize("name", sorted(path.name.removesuffix(".csv") for path in HISTORIES.iterdir()))
+def test_a_history_of_the_package_falls_with_every_resource(name: str) -> None:
+    known = history_of(name)
     assert len(known.accuracy) >= 6
-    problem = make_plan((Asked("objects", 1.0, SIZES, 400, known, None),), frame(), "joint")[1]
+    problem = make_plan((Asked(name, 1.0, SIZES, 400, known, None),), frame(), "joint")[1]
     assert problem is not None
     curve = problem.tasks[0].curve
     here = float(curve.error(200, 2, 1, 1))
