@@ -5,7 +5,6 @@ Each is simulated on a grid of STEP_S from time 0 and read off it by linear inte
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 
@@ -17,6 +16,8 @@ def wander(rng: np.random.Generator, time_s: float, deviation: Array, correlatio
 
     It has the standard deviations `deviation` (K,) at all times and forgets over `correlation_s`.
     """
+    from scipy.signal import lfilter  # takes a second to import, which who records neither GNSS nor IMU is spared
+
     kept = np.exp(-STEP_S / correlation_s)
     normal = _grid(rng, time_s, len(deviation))
     normal[1:] *= np.sqrt(1 - kept**2)
