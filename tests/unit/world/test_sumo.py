@@ -105,8 +105,9 @@ def test_it_ends_with_the_process_that_started_it_without_a_word(when: str, tmp_
         assert process.stdout is not None
         server = int(process.stdout.readline())
         if when == "killed at work":
-            time.sleep(1.0)
-            assert process.poll() is None
+            while not (tmp_path / "job/said.txt").exists():  # the fork has begun
+                assert process.poll() is None
+                time.sleep(0.001)
         else:
             assert process.stdout.readline() == "done\n"
         if when != "idle":
