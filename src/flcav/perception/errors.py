@@ -12,13 +12,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from torch import nn
 
 from flcav.dataset.exchange import write_table
 from flcav.dataset.store import Dataset
 from flcav.progress import Report, silent
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from flcav.perception.agents import Chosen
 
 SAME_PLACE_M = 2.0  # false positives of one scene within this of one another are one
@@ -80,7 +81,7 @@ class RegistersErrors(Protocol):
 
     def register_errors(
         self,
-        network: nn.Module,
+        network: "nn.Module",
         data: Dataset,
         frames: Sequence[int] | None,
         threshold: float,

@@ -48,12 +48,12 @@ def draw_by_round(axes: Axes, rounds: Sequence[Row], tested: Sequence[Row], meas
 
 def _name_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Mapping[str, str]) -> None:
     """Write each town beside its end (x, y), those of one stage above each other."""
-    line = LINE * axes.get_ylim()[1]
+    top = axes.get_ylim()[1]
     for stage in dict.fromkeys(int(x) for x, _ in ends.values()):
-        towns = sorted((town for town, (x, _) in ends.items() if int(x) == stage), key=lambda town: ends[town][1])
-        place, right = -line, max(ends[town][0] for town in towns)
-        for town in towns:
-            place = max(ends[town][1], place + line)
+        own = {town: end for town, end in ends.items() if int(end[0]) == stage}
+        right = max(x for x, _ in own.values())
+        places = style.keep_apart([y for _, y in own.values()], LINE * top, top)
+        for town, place in zip(own, places, strict=True):
             axes.annotate(
                 town,
                 (right, place),

@@ -77,17 +77,13 @@ def _draw(axes: Axes, curves: Sequence[Curve], colours: Sequence[str]) -> None:
 
 def _name_ends(axes: Axes, curves: Sequence[Curve], colours: Sequence[str]) -> None:
     """Name curves at their ends; names keep a distance from each other."""
-    ends = [
-        (curve.x[-1], curve.accuracy[-1], curve.name, colour) for curve, colour in zip(curves, colours, strict=False)
-    ]
     low, high = axes.get_ylim()
-    above = high
-    for x, y, name, colour in sorted(ends, key=lambda end: -end[1]):
-        above = min(y, above - NAME_HEIGHT * (high - low))
+    places = style.keep_apart([curve.accuracy[-1] for curve in curves], NAME_HEIGHT * (high - low), high)
+    for curve, place, colour in zip(curves, places, colours, strict=False):
         axes.annotate(
-            name,
-            (x, y),
-            xytext=(1.02, above),
+            curve.name,
+            (curve.x[-1], curve.accuracy[-1]),
+            xytext=(1.02, place),
             textcoords=axes.get_yaxis_transform(),
             color=colour,
             va="center",

@@ -97,6 +97,15 @@ def key(owner: FigureBase | Axes, handles: Sequence[Artist], **changes: Any) -> 
     owner.legend(handles=handles, **{**options, **spacing, **changes})
 
 
+def keep_apart(heights: Sequence[float], gap: float, top: float) -> list[float]:
+    """Return where names of what ends at `heights` stand: there or lower, `gap` from each other and from `top`."""
+    places: dict[int, float] = {}
+    above = top
+    for i in sorted(range(len(heights)), key=lambda i: -heights[i]):
+        places[i] = above = min(heights[i], above - gap)
+    return [places[i] for i in range(len(heights))]
+
+
 def png(figure: Figure, dpi: int = 200) -> bytes:
     """Return the figure as a PNG file; equal figures give equal bytes."""
     buffer = io.BytesIO()
