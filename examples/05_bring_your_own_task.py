@@ -1,17 +1,19 @@
 """Bring your own task: how many road users a LiDAR sweep holds. Commands take it too, in the folder of this file:
 flcav train 05_bring_your_own_task:TASK --data DIR --out own --epochs 20
 flcav evaluate 05_bring_your_own_task:TASK --data DIR --weights own/weights.safetensors
-flcav infer 05_bring_your_own_task:TASK DIR --weights own/weights.safetensors --pictures pictures"""
+flcav infer 05_bring_your_own_task:TASK DIR --weights own/weights.safetensors --pictures pictures
+flcav reproduce 05_bring_your_own_task:TASK --out study --seeds 2 --jobs 2"""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import torch
 from pydantic.dataclasses import dataclass
 
 from flcav import Dataset, Recipe, evaluate, record, train
-from flcav.perception import Bars, Evaluated, Finding, Practice, Result
+from flcav.perception import Bars, Evaluated, Finding, Practice, Result, StudyRecipe
+
+SCENE = {"town": "grid", "cavs": 3, "spins_per_scene": 6, "every_s": 4.0, "warmup_s": 40.0}
 
 
 @dataclass(frozen=True)
@@ -22,9 +24,8 @@ class Square:  # seen from above, around the sensor
 
 class Counter(torch.nn.Sequential):  # cells (N, H, W) -> logarithm of the expected number (N, 1)
     def __init__(self, config: Square) -> None:
-        super().__init__(
-            torch.nn.Flatten(), torch.nn.Linear(config.cells**2, 32), torch.nn.ReLU(), torch.nn.Linear(32, 1)
-        )
+        hidden = torch.nn.Linear(config.cells**2, 32)
+        super().__init__(torch.nn.Flatten(), hidden, torch.nn.ReLU(), torch.nn.Linear(32, 1))
         self.config = config
 
     def expected(self, samples):
@@ -33,15 +34,11 @@ class Counter(torch.nn.Sequential):  # cells (N, H, W) -> logarithm of the expec
 
 @dataclass(frozen=True)
 class Counted(Evaluated):
-    frames: int
-    off_by: float
+    off_by: float  # road users, on average
 
     @property
     def score(self):
         return 1 / (1 + self.off_by)
-
-    def lines(self):
-        return [f"{self.frames} sweeps: off by {self.off_by:.1f} road users"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,7 @@ class CountingTask:
     build = Counter
 
     def samples(self, data, config, frames=None):
-        return [sample(data.frame(i), config) for i in (range(len(data)) if frames is None else frames)]
+        return [sample(data.frame(i), config) for i in data.numbers(frames)]
 
     def draw(self, samples, index, config, rng):
         return samples[index]  # as it is: nothing is augmented
@@ -63,17 +60,20 @@ class CountingTask:
         counts = torch.tensor([float(count) for _, count in samples])
         return torch.nn.functional.poisson_nll_loss(network.expected(samples), counts, log_input=False)
 
-    def evaluate(self, network, data, frames=None, **progress):
-        samples = self.samples(data, network.config, frames)
-        wrong = network.expected(samples) - torch.tensor([count for _, count in samples])
-        return Counted(len(samples), wrong.abs().mean().item())
+    def evaluate(self, network, data, frames=None, **progress) -> Counted:
+        off = [abs(network.expected([s]).item() - s[1]) for s in self.samples(data, network.config, frames)]
+        return Counted(sum(off) / len(off))
 
     def infer(self, network, path, threshold=0.0, frames=None):
         data = Dataset.open(path)
-        for frame in (data.frame(i) for i in (range(len(data)) if frames is None else frames)):
+        for frame in map(data.frame, data.numbers(frames)):
             law = torch.distributions.Poisson(network.expected([sample(frame, network.config)]).detach())
             shares = {str(count): share.item() for count, share in enumerate(law.log_prob(torch.arange(16.0)).exp())}
             yield Finding(path / frame.key, frame.lidar["lidar"], Count(law.mean.item()), (Bars(shares),))
+
+    def study(self):  # for `reproduce`: what is recorded to learn from, to choose the epoch by, to test
+        train, validation, test = ({**SCENE, "seed": seed} for seed in (1, 2, 3))
+        return StudyRecipe("tiny", (train,), validation, {"other scenes": test}, epochs=20, patience=20)
 
 
 def sample(frame, config):  # the logarithm of returns by cell, of what stands on the ground; who has five or more
@@ -85,6 +85,6 @@ def sample(frame, config):  # the logarithm of returns by cell, of what stands o
 TASK = CountingTask()
 
 if __name__ == "__main__":
-    out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/own_task")
-    record(Recipe(town="grid", cavs=3, spins_per_scene=6, every_s=4.0, warmup_s=40.0), out / "data")
-    print(evaluate(TASK, out / "data", train(TASK, out / "data", out=out / "network", epochs=20).network))
+    out = sys.argv[1] if len(sys.argv) > 1 else "out/own_task"
+    record(Recipe(**SCENE), f"{out}/data")
+    print(evaluate(TASK, f"{out}/data", train(TASK, f"{out}/data", out=f"{out}/network", epochs=20).network))

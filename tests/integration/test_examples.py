@@ -59,22 +59,27 @@ def test_federate_a_detector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
 def test_bring_your_own_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     name = "05_bring_your_own_task.py"
     run(name, tmp_path, monkeypatch=monkeypatch)
-    found = re.fullmatch(r"18 vehicle frames\n18 sweeps: off by (\S+) road users\n", capsys.readouterr().out)
+    found = re.fullmatch(r"18 vehicle frames\noff_by: (\S+)\n", capsys.readouterr().out)
     assert found is not None
     assert float(found[1]) < 3
     monkeypatch.chdir(EXAMPLES)
     shown = (EXAMPLES / name).read_text().split('"""')[1]
     commands = [line.split() for line in shown.splitlines() if line.startswith("flcav ")]
-    assert [command[1] for command in commands] == ["train", "evaluate", "infer"]
+    assert [command[1] for command in commands] == ["train", "evaluate", "infer", "reproduce"]
     places = {"DIR": str(tmp_path / "data"), "own": str(tmp_path / "network"), "pictures": str(tmp_path / "pictures")}
+    places["study"] = str(tmp_path / "study")
     for command in commands:
         with pytest.raises(SystemExit) as stopped:
-            flcav([re.sub(r"^(DIR|own|pictures)\b", lambda known: places[known[1]], word) for word in command[1:]])
+            flcav(
+                [re.sub(r"^(DIR|own|pictures|study)\b", lambda known: places[known[1]], word) for word in command[1:]]
+            )
         assert stopped.value.code == 0, capsys.readouterr().err
     said = capsys.readouterr().out
     assert "trained with these settings before" in said  # by the program
-    assert f"18 sweeps: off by {found[1]} road users" in said
+    assert f"off_by: {found[1]}\n" in said
     assert len(list((tmp_path / "pictures").iterdir())) == 18
+    assert re.search(r"^other scenes, score: 0\.\d+", said, re.MULTILINE)
+    assert (tmp_path / "study" / "counting.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.slow

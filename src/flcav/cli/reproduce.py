@@ -42,7 +42,7 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig3a: (),
     Target.sim_to_real: (*RUN, "kitti", "weights"),
 }
-OWN = "a study of your own as module:NAME"
+OWN = "a task of your own that says how it is studied, as module:NAME"
 SEEDS: Mapping[str, int] = {Target.demo_arms: 5}
 COMMON_SEEDS = 3
 

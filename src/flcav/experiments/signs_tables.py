@@ -30,13 +30,6 @@ def tables(results: StudyResult[SignsEvaluation]) -> dict[str, str]:
     }
 
 
-def name_of(row: ClassPrecision | SizePrecision) -> str:
-    """Return what the row is about."""
-    if isinstance(row, ClassPrecision):
-        return row.label.replace("_", " ")
-    return f"{row.from_px:g} px on" if row.to_px is None else f"{row.from_px:g} to {row.to_px:g} px"
-
-
 def _findings(results: StudyResult[SignsEvaluation]) -> list[str]:
     seeds = len(results.seeds)
     said = []
@@ -54,7 +47,7 @@ def _rows(tests: Sequence[Sequence[Sequence[ClassPrecision | SizePrecision]]]) -
     """Return a row per class or size; `tests`: of each test, of each seed, their average precision."""
     rows = []
     for number, named in enumerate(tests[0][0]):
-        row = [name_of(named)]
+        row = [named.name]
         for seeds in tests:
             own = [rows[number] for rows in seeds]
             known = [value for each in own if (value := _precision(each)) is not None]

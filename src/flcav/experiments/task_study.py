@@ -4,27 +4,25 @@ The epoch that is kept is chosen on the validation frames; the test frames are u
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar, cast, get_type_hints
 
-from flcav.config import InputError, read_yaml
+from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.experiments.recording import opened, record_split
 from flcav.files import Json
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
 from flcav.perception.card import Card
+from flcav.perception.study import RecipeFields, StudyRecipe
 from flcav.perception.task import Evaluated, Task
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps import Notify, Step, Work, run_steps
 from flcav.records import LEFT_OUT, of_json, to_json
-from flcav.sources.recipe import recipe_path
 
-RecipeFields = Mapping[str, Json]  # of a `Recipe`, as YAML has it
 EvaluationT = TypeVar("EvaluationT", bound=Evaluated)
-SCALES = ("full", "quick")
 VALIDATION = "validation"
 
 
@@ -73,18 +71,17 @@ class Study(Generic[EvaluationT]):
     """
 
     task: Task
-    network: str  # name of the configuration
-    train: tuple[RecipeFields, ...]
-    validation: RecipeFields
-    tests: Mapping[str, RecipeFields]  # by name
-    epochs: int
-    patience: int
-    evaluation: type[EvaluationT] = field(compare=False)  # what the task returns
-    numbers: Callable[[EvaluationT], Mapping[str, float]] = field(compare=False)  # those of a test that are averaged
+    recipe: StudyRecipe
     draw: Callable[[StudyResult[EvaluationT]], bytes] = field(compare=False)  # -> PNG
     extra: Mapping[str, Callable[[EvaluationT, Any, Dataset], EvaluationT]] = field(default_factory=dict)  # by test
-    quick_scenes: int = 2  # of every recipe at the quick scale
-    quick_epochs: int = 1
+
+    @property
+    def evaluation(self) -> type[EvaluationT]:
+        """Return the record that the task's `evaluate` is annotated to return; raises `InputError` for no such."""
+        found = get_type_hints(self.task.evaluate).get("return")
+        if not (isinstance(found, type) and issubclass(found, Evaluated) and is_dataclass(found)):
+            raise InputError(f"task '{self.task.name}': its evaluate() has no annotation of the dataclass it returns")
+        return cast("type[EvaluationT]", found)
 
     def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> Json:
         """Train one seed, going on where an interrupted run left off; return its card."""
@@ -95,20 +92,13 @@ class Study(Generic[EvaluationT]):
     def test(self, work: Work, *, seed: int) -> Json:
         """Return what the network of one seed reaches on each test."""
         network = load_network(self.task, work.inputs[_seed_step(seed)] / WEIGHTS)
-        return {name: self._tested(name, network, opened(work, _test_step(name)), work) for name in self.tests}
+        return {name: self._tested(name, network, opened(work, _test_step(name)), work) for name in self.recipe.tests}
 
     def _tested(self, name: str, network: Any, data: Dataset, work: Work) -> Mapping[str, Json]:
         result = self.task.evaluate(network, data, progress=work.report)
         assert isinstance(result, self.evaluation)
         more = self.extra.get(name)
         return (more(result, network, data) if more else result).as_json()
-
-
-def recipe_of(name: str) -> RecipeFields:
-    """Return the fields of a recipe that comes with flcav as YAML has them, without its split: a study has its own."""
-    fields = read_yaml(recipe_path(name))
-    assert isinstance(fields, dict)
-    return {field: value for field, value in fields.items() if field != "split"}
 
 
 def run_study(
@@ -124,20 +114,23 @@ def run_study(
 ) -> StudyResult[EvaluationT]:
     """Run what of the study is not done yet in `out`, as `run_steps`; return its numbers: of seeds, and their means.
 
-    Raises `InputError` for an unknown scale, and where `out` holds another study.
+    Raises `InputError` for an unknown scale, where `out` holds another study, and where the task does not say which
+    record its evaluation returns.
     """
-    study = at_scale(study, scale)
+    recipe = study.recipe.at_scale(scale)
+    study = replace(study, recipe=recipe)
+    assert study.evaluation  # before hours of work
     values = run_steps(steps_of(study, seeds), out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     runs = tuple(_seed_result(study, seed, values) for seed in seeds)
     return StudyResult(
         study.task.name,
-        study.network,
+        recipe.network,
         scale,
-        study.epochs,
-        study.patience,
-        Recorded(study.train, study.validation, study.tests),
+        recipe.epochs,
+        recipe.patience,
+        Recorded(recipe.train, recipe.validation, recipe.tests),
         runs,
-        {name: _means([study.numbers(run.tests[name]) for run in runs]) for name in study.tests},
+        {name: _means([run.tests[name].numbers() for run in runs]) for name in recipe.tests},
         provenance(),
     )
 
@@ -161,33 +154,13 @@ def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int
     return rows
 
 
-def at_scale(study: Study, scale: str) -> Study:
-    """Return the study as it stands ("full") or in minutes ("quick"); raises `InputError` for another scale."""
-    if scale not in SCALES:
-        raise InputError(f"scale '{scale}': a task's study knows {' and '.join(SCALES)}")
-    if scale == "full":
-        return study
-
-    def few(recipe: RecipeFields) -> RecipeFields:
-        scenes = recipe["scenes"]
-        assert isinstance(scenes, int)
-        return {**recipe, "scenes": min(scenes, study.quick_scenes)}
-
-    return replace(
-        study,
-        train=tuple(few(recipe) for recipe in study.train),
-        validation=few(study.validation),
-        tests={name: few(recipe) for name, recipe in study.tests.items()},
-        epochs=study.quick_epochs,
-    )
-
-
 def steps_of(study: Study, seeds: Sequence[int]) -> list[Step]:
     """Return the steps: a recording per recipe, a training and a test per seed."""
-    recipes = dict(zip(_training_steps(study), study.train, strict=True)) | {VALIDATION: study.validation}
-    tests = {_test_step(name): recipe for name, recipe in study.tests.items()}
-    steps = [Step(name, record_split, {"recipe": recipe}) for name, recipe in {**recipes, **tests}.items()]
-    trained = {"network": study.network, "epochs": study.epochs, "patience": study.patience}
+    recipe = study.recipe
+    recipes = dict(zip(_training_steps(study), recipe.train, strict=True)) | {VALIDATION: recipe.validation}
+    tests = {_test_step(name): fields for name, fields in recipe.tests.items()}
+    steps = [Step(name, record_split, {"recipe": fields}) for name, fields in {**recipes, **tests}.items()]
+    trained = {"network": recipe.network, "epochs": recipe.epochs, "patience": recipe.patience}
     for seed in seeds:
         steps.append(Step(_seed_step(seed), study.learn, {"seed": seed, **trained}, tuple(recipes)))
         steps.append(Step(_tested_step(seed), study.test, {"seed": seed}, (_seed_step(seed), *tests)))
@@ -195,7 +168,7 @@ def steps_of(study: Study, seeds: Sequence[int]) -> list[Step]:
 
 
 def _training_steps(study: Study) -> list[str]:
-    return [f"train-{number}" for number in range(len(study.train))]
+    return [f"train-{number}" for number in range(len(study.recipe.train))]
 
 
 def _test_step(name: str) -> str:
@@ -212,7 +185,7 @@ def _tested_step(seed: int) -> str:
 
 def _seed_result(study: Study[EvaluationT], seed: int, values: Mapping[str, Any]) -> SeedResult[EvaluationT]:
     tests = values[_tested_step(seed)]
-    evaluations = {name: study.evaluation.of_json(tests[name], f"test on {name}") for name in study.tests}
+    evaluations = {name: study.evaluation.of_json(tests[name], f"test on {name}") for name in study.recipe.tests}
     return SeedResult(seed, Card.model_validate(values[_seed_step(seed)]), evaluations)
 
 

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from flcav.perception.errors import PerceptionError, Registry, load_errors, save_errors
     from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
     from flcav.perception.networks import Evaluation, Inference, TrainedNetwork, evaluate, infer, register_errors, train
+    from flcav.perception.study import StudyRecipe
     from flcav.perception.task import Evaluated, Finding, Practice, Result, Task, fresh
     from flcav.perception.tasks import TASKS, task_named
     from flcav.perception.weights import from_arrays, load_network, save_network, to_arrays
@@ -30,6 +31,7 @@ PLACES = {
     "infer": "flcav.perception.networks",
     "register_errors": "flcav.perception.networks",
     "train": "flcav.perception.networks",
+    "StudyRecipe": "flcav.perception.study",
     "Evaluated": "flcav.perception.task",
     "Finding": "flcav.perception.task",
     "Practice": "flcav.perception.task",

@@ -60,6 +60,10 @@ class Evaluated(Result, ABC):
     def score(self) -> float:
         """Return the one number that training is to raise."""
 
+    def numbers(self) -> Mapping[str, float]:
+        """Return the numbers whose means over seeds a study gives, by name: the score, where a task has no others."""
+        return {"score": self.score}
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -1,4 +1,4 @@
-"""Average precision as bars: of the whole, of parts of it."""
+"""Average precision, and other numbers, as bars: of the whole, of parts of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,8 +23,9 @@ class Bar:
 
 
 @style.styled
-def precisions(panels: Mapping[str, Sequence[Bar]]) -> Figure:
-    """Return a panel per title: a bar for each number from 0 to 1, a dot for each seed."""
+def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precision at IoU 0.5") -> Figure:
+    """Return a panel per title: a bar for each number, a dot for each seed, from 0 to 1 where all are within."""
+    every = [value for bars in panels.values() for bar in bars for value in (bar.mean, *bar.seeds)]
     rows = max(len(bars) for bars in panels.values())
     columns = min(len(panels), ABREAST)
     lines = -(-len(panels) // columns)
@@ -39,8 +40,8 @@ def precisions(panels: Mapping[str, Sequence[Bar]]) -> Figure:
         names = [bar.name if bar.targets is None else f"{bar.name} ({bar.targets})" for bar in bars]
         axes.set_yticks(range(len(bars)), names)
         axes.set_ylim(rows - 0.4, -0.6)
-        axes.set_xlim(0, 1)
-        axes.set_xlabel("average precision at IoU 0.5")
+        axes.set_xlim(min(0, *every), max(1, *every))
+        axes.set_xlabel(label)
         axes.set_title(title)
         axes.grid(axis="x")
     return figure

@@ -59,7 +59,7 @@ def study(aps):
     )
     summary = {}
     for test in ("suburb", "tracks"):
-        rows = [STUDY.numbers(seed.tests[test]) for seed in seeds]
+        rows = [seed.tests[test].numbers() for seed in seeds]
         summary[test] = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
     recipes = Recorded(({"town": "suburb"},), {}, {})
     return StudyResult("objects", "small", "full", 8, 8, recipes, seeds, summary)

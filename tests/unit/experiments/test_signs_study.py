@@ -4,7 +4,7 @@ import pytest
 
 from flcav.config import parse_config
 from flcav.dataset.formats.rectangles import SIGNS
-from flcav.experiments.signs_tables import name_of, tables
+from flcav.experiments.signs_tables import tables
 from flcav.experiments.studies.signs import STUDY
 from flcav.experiments.task_study import Recorded, SeedResult, StudyResult
 from flcav.intervals import mean_over_seeds
@@ -27,7 +27,7 @@ def evaluation(score: float, missing: frozenset[str] = frozenset()) -> SignsEval
 
 def results(*scores: float) -> StudyResult[SignsEvaluation]:
     facts = {"task": "signs", "network": "n", "parameters": 9, "seed": 1, "samples": 80, "data": [], "metrics": {}}
-    names = list(STUDY.tests)
+    names = list(STUDY.recipe.tests)
     seeds = tuple(
         SeedResult(
             seed,
@@ -36,7 +36,7 @@ def results(*scores: float) -> StudyResult[SignsEvaluation]:
         )
         for seed, score in enumerate(scores, start=1)
     )
-    rows = {name: [STUDY.numbers(seed.tests[name]) for seed in seeds] for name in names}
+    rows = {name: [seed.tests[name].numbers() for seed in seeds] for name in names}
     summary = {
         name: {key: mean_over_seeds([row[key] for row in of_seeds]) for key in of_seeds[0]}
         for name, of_seeds in rows.items()
@@ -46,7 +46,7 @@ def results(*scores: float) -> StudyResult[SignsEvaluation]:
 
 @pytest.mark.slow
 def test_half_of_the_spins_see_amber():
-    source = EmbeddedSource(parse_config(Recipe, {**STUDY.validation, "scenes": 1}, "study"))
+    source = EmbeddedSource(parse_config(Recipe, {**STUDY.recipe.validation, "scenes": 1}, "study"))
     states = source.trace(source.scenes()[0]).light_state
     assert ((states == "y").any(1)).tolist() in ([True, False] * 2, [False, True] * 2)
 
@@ -67,5 +67,5 @@ def test_an_interval_around_what_was_wanted_decides_nothing():
 
 
 def test_the_picture_has_a_bar_for_each_number():
-    assert name_of(ClassPrecision("light_red", None, None, 0)) == "light red"
+    assert ClassPrecision("light_red", None, None, 0).name == "light red"
     assert STUDY.draw(results(0.7, 0.8)).startswith(b"\x89PNG")

@@ -13,7 +13,7 @@ import pytest
 from flcav.cli.main import run as command
 from flcav.config import InputError, parse_config
 from flcav.experiments.studies import STUDIES, study_named, weather
-from flcav.experiments.task_study import at_scale, results_as_json, results_of_json, run_study, steps_of
+from flcav.experiments.task_study import results_as_json, results_of_json, run_study, steps_of
 from flcav.perception.training.run import CARD, EVENTS, WEIGHTS
 from flcav.sources.recipe import Recipe
 
@@ -22,21 +22,22 @@ each_study = pytest.mark.parametrize("study", [study_named(name) for name in STU
 
 @each_study
 def test_no_two_splits_share_a_scene(study):
-    recipes = [*study.train, study.validation, *study.tests.values()]
+    recipes = [*study.recipe.train, study.recipe.validation, *study.recipe.tests.values()]
     parsed = [parse_config(Recipe, dict(recipe), study.task.name) for recipe in recipes]
     assert len({(recipe.town, recipe.seed) for recipe in parsed}) == len(recipes)
-    assert study.network in study.task.configurations
+    assert study.recipe.network in study.task.configurations
 
 
 @each_study
 def test_a_quick_study_is_the_same_with_fewer_scenes_and_epochs(study):
-    quick = at_scale(study, "quick")
-    assert at_scale(study, "full") == study
-    assert quick.epochs <= study.epochs
-    assert all(recipe["scenes"] <= study.quick_scenes for recipe in (*quick.train, quick.validation))
-    assert {step.name for step in steps_of(quick, [1])} == {step.name for step in steps_of(study, [1])}
+    recipe, quick = study.recipe, study.recipe.at_scale("quick")
+    assert recipe.at_scale("full") == recipe
+    assert quick.epochs <= recipe.epochs
+    assert all(fields["scenes"] <= recipe.quick_scenes for fields in (*quick.train, quick.validation))
+    smaller = replace(study, recipe=quick)
+    assert {step.name for step in steps_of(smaller, [1])} == {step.name for step in steps_of(study, [1])}
     with pytest.raises(InputError, match="scale 'paper'"):
-        at_scale(study, "paper")
+        recipe.at_scale("paper")
 
 
 RECORDED = {
@@ -52,14 +53,15 @@ RECORDED = {
 def test_what_a_study_records_stays_what_its_committed_figures_are_of(name):
     """A recipe that changes, changes the frames, and the steps' fingerprints: run the study anew, then write both."""
     study = study_named(name)
-    recipes = {"train": list(study.train), "validation": study.validation, "tests": dict(study.tests)}
+    recipe = study.recipe
+    recipes = {"train": list(recipe.train), "validation": recipe.validation, "tests": dict(recipe.tests)}
     assert hashlib.sha256(json.dumps(recipes, sort_keys=True).encode()).hexdigest()[:16] == RECORDED[name]
 
 
 def test_a_training_waits_for_its_frames_and_a_test_for_its_training():
     steps = {step.name: step for step in steps_of(weather.STUDY, [1, 2])}
     assert set(steps["seed-2"].needs) == {"train-0", "train-1", "train-2", "validation"}
-    assert set(steps["seed-2-tested"].needs) == {"seed-2", *(f"test-{name}" for name in weather.STUDY.tests)}
+    assert set(steps["seed-2-tested"].needs) == {"seed-2", *(f"test-{name}" for name in weather.STUDY.recipe.tests)}
 
 
 def toy(recipe: Any) -> dict[str, Any]:
@@ -68,21 +70,25 @@ def toy(recipe: Any) -> dict[str, Any]:
     return {**recipe, **small, "weather": {"classes": ["clear", "night", "clear", "fog"], "turn_s": 4.0}}
 
 
+RECIPE = weather.STUDY.recipe
 OWN = replace(
     weather.STUDY,
-    train=(toy(weather.STUDY.train[0]),),
-    validation=toy(weather.STUDY.validation),
-    tests={name: toy(weather.STUDY.tests[name]) for name in ("held-out town", weather.WHOLE_SPACE)},
-    epochs=1,
+    recipe=replace(
+        RECIPE,
+        train=(toy(RECIPE.train[0]),),
+        validation=toy(RECIPE.validation),
+        tests={name: toy(RECIPE.tests[name]) for name in ("held-out town", weather.WHOLE_SPACE)},
+        epochs=1,
+    ),
 )
 
 
 def test_a_study_of_ones_own_is_found_by_its_module(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("sys.path", [str(Path(__file__).parent), *sys.path])
-    assert study_named(f"{Path(__file__).stem}:OWN").tests.keys() == OWN.tests.keys()
+    assert study_named(f"{Path(__file__).stem}:OWN").recipe.tests.keys() == OWN.recipe.tests.keys()
     with pytest.raises(InputError, match=r"has no 'NONE'"):
         study_named(f"{Path(__file__).stem}:NONE")
-    with pytest.raises(InputError, match=r"is no study, it has no .*learn"):
+    with pytest.raises(InputError, match=r"neither a study nor a task with a study"):
         study_named("pathlib:Path")
     with pytest.raises(InputError, match=r"choose one of .*weather.*, or name your own as module:NAME"):
         study_named("none")
@@ -128,4 +134,20 @@ def test_a_toy_study_gives_numbers_of_each_seed_and_goes_on(tmp_path: Path):
     assert run_study(study, tmp_path, seeds=[1, 2], jobs=1, notify=notify) == results
     assert all(line.endswith("done before") for line in said)
     with pytest.raises(InputError, match="another configuration"):
-        run_study(replace(study, epochs=2), tmp_path, seeds=[1, 2], jobs=1, notify=notify)
+        run_study(replace(study, recipe=replace(study.recipe, epochs=2)), tmp_path, seeds=[1, 2], jobs=1, notify=notify)
+
+
+class Unsaid:
+    """A task whose evaluation does not say what it returns."""
+
+    name = "unsaid"
+
+    def evaluate(self, network, data, frames=None):
+        return None
+
+
+def test_a_task_without_an_annotation_of_its_evaluation_is_named_before_anything_is_recorded(tmp_path: Path):
+    study: Any = replace(OWN, task=Unsaid())
+    with pytest.raises(InputError, match=r"task 'unsaid': its evaluate\(\) has no annotation of the dataclass"):
+        run_study(study, tmp_path / "out", seeds=[1], jobs=1, notify=lambda *_: None)
+    assert not (tmp_path / "out").exists()

@@ -17,7 +17,7 @@ from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, metrics
 
 @pytest.mark.parametrize("study", [STUDY, CAMERAS])
 def test_no_split_shares_a_scene(study):
-    recipes = [*study.train, study.validation, *study.tests.values()]
+    recipes = [*study.recipe.train, study.recipe.validation, *study.recipe.tests.values()]
     assert len({(recipe["town"], recipe["seed"]) for recipe in recipes}) == len(recipes)
 
 
@@ -40,7 +40,7 @@ def results(*off_m: float) -> StudyResult[TrajectoryEvaluation]:
         found = evaluated(off)
         card = Card.model_validate({**facts, "training": {"steps": 7, "loss": 1.5}, "metrics": found.as_json()})
         runs.append(SeedResult(seed, card, {"held-out scenes": found}))
-    rows = [STUDY.numbers(evaluated(off)) for off in off_m]
+    rows = [evaluated(off).numbers() for off in off_m]
     means = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
     nothing = Recorded((), {}, {})
     return StudyResult("trajectory", "tiny", "full", 3, 3, nothing, tuple(runs), {"held-out scenes": means})

@@ -1,24 +1,51 @@
-"""The studies of the tasks: every module here holds one, called `STUDY`, and gives it its name."""
+"""The studies of the tasks: every module here holds one, called `STUDY`, and gives it its name.
+
+What is recorded, trained and tested is the task's own (`flcav.perception.study`); here is how its results are drawn.
+"""
 
 from importlib import import_module
 from pkgutil import iter_modules
 from typing import TYPE_CHECKING
 
+from flcav.config import InputError
 from flcav.plugins import load_own
 
 if TYPE_CHECKING:
-    from flcav.experiments.task_study import Study
+    from flcav.experiments.task_study import Study, StudyResult
 
 STUDIES: tuple[str, ...] = tuple(sorted(found.name.replace("_", "-") for found in iter_modules(__path__)))
 
 
 def study_named(name: str) -> "Study":
-    """Return the study of that name, one of `STUDIES`, or somebody's own (`module:NAME`).
+    """Return the study of that name, one of `STUDIES`, or as `module:NAME` a study or a studied task of somebody's own.
 
     Raises `InputError` where there is none.
     """
     if name in STUDIES:
         return import_module(f"{__name__}.{name.replace('-', '_')}").STUDY
     from flcav.experiments.task_study import Study
+    from flcav.perception.study import Studied
+    from flcav.perception.task import Task
 
-    return load_own("study", name, STUDIES, Study)
+    own = load_own("study", name, STUDIES, object)
+    if isinstance(own, Study):
+        return own
+    if not isinstance(own, Studied):
+        raise InputError(f"study '{name}': is neither a study nor a task with a study()")
+    task = load_own("task", name, (), Task)
+    return Study(task, own.study(), draw=draw_numbers)
+
+
+def draw_numbers(results: "StudyResult") -> bytes:
+    """Return a PNG with a panel per test: a bar for the mean of each number, a dot for each seed."""
+    from flcav.report import style
+    from flcav.report.precision import Bar, precisions
+
+    panels = {
+        test: [
+            Bar(name, mean.mean, tuple(found.numbers()[name] for found in results.tested(test)))
+            for name, mean in means.items()
+        ]
+        for test, means in results.summary.items()
+    }
+    return style.png(precisions(panels, label="mean over seeds"))

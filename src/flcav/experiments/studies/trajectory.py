@@ -1,33 +1,15 @@
-"""The studies of the trajectory task: on rasters, and through cameras.
+"""The studies of the trajectory task, on rasters and through cameras: final errors are drawn by slice."""
 
-On rasters two towns are learned from, and held-out scenes and a held-out town tested; the recipes are those of
-recipes/trajectory.yaml, trajectory_suburb.yaml and trajectory_ring.yaml. Through cameras it is one town and its
-held-out scenes, by recipes/trajectory_cameras.yaml.
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from flcav.experiments.task_study import Study, StudyResult, recipe_of
+from flcav.experiments.task_study import Study, StudyResult
+from flcav.perception.trajectory import study
 from flcav.perception.trajectory.evaluate import PathErrors, TrajectoryEvaluation
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.report import style
 from flcav.report.path_errors import Bar, path_errors
-
-GRID, SUBURB, RING = recipe_of("trajectory"), recipe_of("trajectory_suburb"), recipe_of("trajectory_ring")
-CAMERA_RECIPE = recipe_of("trajectory_cameras")
-
-
-def _numbers(found: TrajectoryEvaluation) -> Mapping[str, float]:
-    """Return errors, misses and ratios to constant velocity of each slice that has samples."""
-    return {
-        f"{name}, {key}": value
-        for name, errors in found.slices.items()
-        if errors is not None
-        for key, value in vars(errors).items()
-        if value is not None
-    }
 
 
 def _draw(results: StudyResult[TrajectoryEvaluation]) -> bytes:
@@ -55,33 +37,5 @@ def _bar(name: str, seeds: Sequence[float | None]) -> Bar:
     return Bar(name, float(np.mean(known)), known)
 
 
-STUDY = Study(
-    task=TRAJECTORY,
-    network="tiny",
-    train=(GRID, SUBURB),
-    validation={**GRID, "seed": 121, "split": "validation", "scenes": 1},
-    tests={
-        "held-out scenes": {**GRID, "seed": 221, "split": "test", "scenes": 3},
-        "held-out town": {**RING, "split": "test"},
-    },
-    epochs=3,
-    patience=3,
-    evaluation=TrajectoryEvaluation,
-    numbers=_numbers,
-    draw=_draw,
-    quick_scenes=1,
-)
-
-CAMERAS = Study(
-    task=TRAJECTORY,
-    network="tiny-cameras",
-    train=(CAMERA_RECIPE,),
-    validation={**CAMERA_RECIPE, "seed": 131, "split": "validation", "cavs": 3, "scenes": 4},
-    tests={"held-out scenes": {**CAMERA_RECIPE, "seed": 331, "split": "test", "cavs": 3, "scenes": 6}},
-    epochs=5,
-    patience=5,
-    evaluation=TrajectoryEvaluation,
-    numbers=_numbers,
-    draw=_draw,
-    quick_scenes=1,
-)
+STUDY = Study(TRAJECTORY, TRAJECTORY.study(), draw=_draw)
+CAMERAS = Study(TRAJECTORY, study.CAMERAS, draw=_draw)

@@ -1,5 +1,6 @@
 """How good a network is at finding objects: average precision, where that is hard and easy, and trust in scores."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -32,6 +33,23 @@ class ObjectsEvaluation(Evaluated):
         """Return the mean over classes of AP in 3D at IoU 0.5; 0 where there was nothing to find."""
         known = [row.ap for row in self.scores if (row.kind, row.iou) == ("3d", 0.5) and row.ap]
         return float(np.mean(known)) if known else 0.0
+
+    def numbers(self) -> Mapping[str, float]:
+        """Return AP in 3D and from above of each class, AOS, headings, the error of calibration, MOTA of tracks."""
+        ap = {f"{row.label} AP {row.kind} at {row.iou}": row.ap for row in self.scores}
+        headings = {
+            f"{row.label} {name}": value
+            for row in self.scores
+            if (row.kind, row.iou) == ("3d", 0.5)
+            for name, value in (("AOS 3d at 0.5", row.aos), ("right headings", row.right_headings))
+        }
+        errors = {f"{row.label} calibration error": row.ece for row in self.trust}
+        tracks = {
+            f"{row.label} {name}": value
+            for row in (self.tracks.scores if self.tracks else ())
+            for name, value in (("MOTA", row.mota), ("AMOTA", row.amota))
+        }
+        return {name: value for name, value in (ap | headings | errors | tracks).items() if value is not None}
 
     def lines(self) -> list[str]:
         """Return one line per class, kind of overlap and IoU, one per class and slice, and those of tracks."""

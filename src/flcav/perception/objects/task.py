@@ -27,6 +27,7 @@ from flcav.perception.objects.results import ObjectsEvaluation
 from flcav.perception.objects.samples import RecordedSweeps, Sample, fitting_frames
 from flcav.perception.objects.slices import sliced
 from flcav.perception.objects.truth import only_lidar
+from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.progress import Report, silent
 
@@ -44,6 +45,12 @@ class ObjectsTask(ObjectsOutcomes):
 
     def __init__(self) -> None:
         self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # what was cut out last, and of which samples
+
+    def study(self) -> StudyRecipe:
+        """Return how it is studied, see `flcav.perception.objects.study`."""
+        from flcav.perception.objects.study import STUDY
+
+        return STUDY
 
     def build(self, config: SecondConfig) -> Second:
         """Return a fresh network."""

@@ -2,7 +2,7 @@
 
 import contextlib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -38,6 +38,11 @@ class ClassPrecision:
     ap50_95: float | None
     targets: int
 
+    @property
+    def name(self) -> str:
+        """Return the class in words."""
+        return self.label.replace("_", " ")
+
 
 @dataclass(frozen=True)
 class SizePrecision:
@@ -47,6 +52,11 @@ class SizePrecision:
     to_px: float | None  # None: no limit
     map50: float | None
     targets: int
+
+    @property
+    def name(self) -> str:
+        """Return the span of sizes in words."""
+        return f"{self.from_px:g} px on" if self.to_px is None else f"{self.from_px:g} to {self.to_px:g} px"
 
 
 @dataclass(frozen=True)
@@ -65,6 +75,13 @@ class SignsEvaluation(Evaluated):
     def score(self) -> float:
         """Return mAP at IoU 0.5; 0 where there was nothing to find."""
         return self.map50 or 0.0
+
+    def numbers(self) -> Mapping[str, float]:
+        """Return mAP, and AP50 by class and by size, of what there was to find."""
+        means = {"mAP50": self.map50, "mAP50-95": self.map50_95}
+        classes = {row.name: row.ap50 for row in self.classes}
+        sizes = {row.name: row.map50 for row in self.sizes}
+        return {name: value for name, value in (means | classes | sizes).items() if value is not None}
 
     def lines(self) -> list[str]:
         """Return mAP, then AP by class and by size."""

@@ -23,6 +23,7 @@ from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.outcomes import SignsOutcomes, by_picture
 from flcav.perception.signs.samples import RecordedPictures, Sample
 from flcav.perception.signs.targets import assign
+from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.progress import Report, silent
 
@@ -42,6 +43,12 @@ class SignsTask(SignsOutcomes):
     }
     labels = (ANNOTATED,)
     threshold = THRESHOLD
+
+    def study(self) -> StudyRecipe:
+        """Return how it is studied, see `flcav.perception.signs.study`."""
+        from flcav.perception.signs.study import STUDY
+
+        return STUDY
 
     def build(self, config: SignsConfig) -> SignDetector:
         """Return a fresh network."""

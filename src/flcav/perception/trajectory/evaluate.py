@@ -65,6 +65,16 @@ class TrajectoryEvaluation(Evaluated):
             return 0.0
         return 1 / (1 + (every.minFDE_1 + every.minFDE_K) / 2)
 
+    def numbers(self) -> Mapping[str, float]:
+        """Return errors, misses and ratios to constant velocity of each slice that has samples."""
+        return {
+            f"{name}, {key}": value
+            for name, errors in self.slices.items()
+            if errors is not None
+            for key, value in vars(errors).items()
+            if value is not None
+        }
+
     def lines(self) -> list[str]:
         """Return a line per slice, and of each one per predictor."""
         lines = [f"{self.modes} modes, {self.scenes} scenes; errors in m: average / final / missed"]

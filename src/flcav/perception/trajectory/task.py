@@ -11,6 +11,7 @@ from torch import Tensor
 
 from flcav.dataset.store import Dataset
 from flcav.perception.errors import Registry
+from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.perception.trajectory.batch import futures_of, inputs_of, rasters_of
 from flcav.perception.trajectory.config import CONFIGURATIONS, TrajectoryConfig
@@ -39,6 +40,12 @@ class TrajectoryTask(TrajectoryOutcomes):
         "every_s": 0.5,
     }
     labels = ("future",)
+
+    def study(self) -> StudyRecipe:
+        """Return how it is studied, see `flcav.perception.trajectory.study`."""
+        from flcav.perception.trajectory.study import STUDY
+
+        return STUDY
 
     def build(self, config: TrajectoryConfig) -> TrajectoryNetwork:
         """Return a fresh network."""

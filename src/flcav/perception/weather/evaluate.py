@@ -34,6 +34,11 @@ class Classification(Evaluated):
         """Return the accuracy."""
         return self.accuracy
 
+    def numbers(self) -> Mapping[str, float]:
+        """Return the accuracy on pictures within the classes' regions, and on all where they were asked for."""
+        nearest = {} if self.nearest is None else {"nearest class": self.nearest.accuracy}
+        return {"accuracy": self.accuracy, **nearest}
+
     def lines(self) -> list[str]:
         """Return accuracy, then recall and confusions class by class."""
         interval = interval_words(self.low, self.high)

@@ -14,6 +14,7 @@ from flcav.dataset.store import Dataset
 from flcav.perception.images import pictures
 from flcav.perception.marks import Bars
 from flcav.perception.sharing import ANNOTATED, camera_ahead, picture_bytes
+from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice, Result
 from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
 from flcav.perception.weather.evaluate import Classification, classification
@@ -50,6 +51,12 @@ class WeatherTask(WeatherOutcomes):
         "weather": {"classes": list(WEATHER_CLASSES), "turn_s": 4.0},
     }
     labels = (ANNOTATED,)
+
+    def study(self) -> StudyRecipe:
+        """Return how it is studied, see `flcav.perception.weather.study`."""
+        from flcav.perception.weather.study import STUDY
+
+        return STUDY
 
     def build(self, config: LeNetConfig) -> Classifier:
         """Return a fresh network."""

@@ -1,0 +1,26 @@
+"""The study of the object task: three towns to learn from, other scenes of each to test, weathers and tracks besides.
+
+The sweeps are those of recipes/objects.yaml, in every town.
+"""
+
+from flcav.perception.study import StudyRecipe, read_recipe
+
+RECIPE = read_recipe("objects")
+SEQUENCES = {**RECIPE, "spins_per_scene": 30, "every_s": 0.5, "cavs": 1}
+TOWNS = ("suburb", "ring", "grid")
+CHANGING = {"classes": ["clear", "light_rain", "heavy_rain", "fog"], "turn_s": 4.0}
+WEATHERS = "weathers"
+TRACKS = "tracks"
+
+STUDY = StudyRecipe(
+    network="small",
+    train=tuple({**RECIPE, "town": town} for town in TOWNS),
+    validation={**RECIPE, "town": "suburb", "seed": 121, "split": "validation", "scenes": 2},
+    tests={
+        **{town: {**RECIPE, "town": town, "seed": 431, "split": "test", "scenes": 6} for town in TOWNS},
+        WEATHERS: {**RECIPE, "town": "suburb", "seed": 531, "split": "test", "scenes": 4, "weather": CHANGING},
+        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 631, "split": "test", "scenes": 3},
+    },
+    epochs=8,
+    patience=8,
+)

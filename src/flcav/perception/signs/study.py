@@ -1,0 +1,22 @@
+"""The study of the sign task: three towns to learn from; held-out scenes and a held-out town to test.
+
+It learns from recipes/signs.yaml, signs_suburb.yaml and signs_grid.yaml.
+The held-out scenes have all eight classes; the held-out town has speed limits of 30, yield signs and lights alone.
+"""
+
+from flcav.perception.study import StudyRecipe, read_recipe
+
+ARTERIAL, SUBURB, GRID = read_recipe("signs"), read_recipe("signs_suburb"), read_recipe("signs_grid")
+RING = {**ARTERIAL, "town": "ring", "warmup_s": [87.0, 89.5]}
+
+STUDY = StudyRecipe(
+    network="n",
+    train=(ARTERIAL, SUBURB, GRID),
+    validation={**ARTERIAL, "seed": 114, "split": "validation", "scenes": 6},
+    tests={
+        "held-out scenes": {**ARTERIAL, "seed": 414, "split": "test", "scenes": 12},
+        "held-out town": {**RING, "seed": 514, "split": "test", "scenes": 6},
+    },
+    epochs=15,
+    patience=15,
+)

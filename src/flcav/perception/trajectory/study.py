@@ -1,0 +1,34 @@
+"""The studies of the trajectory task: on rasters, and through cameras.
+
+On rasters two towns are learned from, and held-out scenes and a held-out town tested; the recipes are those of
+recipes/trajectory.yaml, trajectory_suburb.yaml and trajectory_ring.yaml. Through cameras it is one town and its
+held-out scenes, by recipes/trajectory_cameras.yaml.
+"""
+
+from flcav.perception.study import StudyRecipe, read_recipe
+
+GRID, SUBURB, RING = read_recipe("trajectory"), read_recipe("trajectory_suburb"), read_recipe("trajectory_ring")
+CAMERA_RECIPE = read_recipe("trajectory_cameras")
+
+STUDY = StudyRecipe(
+    network="tiny",
+    train=(GRID, SUBURB),
+    validation={**GRID, "seed": 121, "split": "validation", "scenes": 1},
+    tests={
+        "held-out scenes": {**GRID, "seed": 221, "split": "test", "scenes": 3},
+        "held-out town": {**RING, "split": "test"},
+    },
+    epochs=3,
+    patience=3,
+    quick_scenes=1,
+)
+
+CAMERAS = StudyRecipe(
+    network="tiny-cameras",
+    train=(CAMERA_RECIPE,),
+    validation={**CAMERA_RECIPE, "seed": 131, "split": "validation", "cavs": 3, "scenes": 4},
+    tests={"held-out scenes": {**CAMERA_RECIPE, "seed": 331, "split": "test", "cavs": 3, "scenes": 6}},
+    epochs=5,
+    patience=5,
+    quick_scenes=1,
+)
