@@ -163,6 +163,8 @@ def test_a_shifted_instance_image(folder: Path):
         ("views", "sensor", "nowhere", "no amodal box|not \\d+"),
         ("signs", "state", "purple", "unknown state"),
         ("signs", "x2", 1e4, "does not lie in the image"),
+        ("signs", "y1", float("nan"), "sign whose box has no area"),
+        ("signs", "distance_m", float("inf"), "at no distance"),
         ("gnss", "latitude_deg", 123.0, "nowhere on Earth"),
         ("imu", "force_x", 1e6, "nothing survives"),
         ("weather", "cloud_cover", 2.0, "cloud_cover"),
@@ -178,6 +180,16 @@ def test_a_wrong_cell(folder: Path, table: str, column: str, value: Any, message
     write_table(rows.set_column(at, rows.schema.field(column), pa.array(cells, rows.schema.field(column).type)), path)
     resign(folder)
     assert any(re.search(message, problem) for problem in validate(folder))
+
+
+def test_a_sign_without_a_box_is_refused_by_whoever_reads_its_frame(folder: Path):
+    rows = pq.read_table(folder / "signs.parquet")
+    at = rows.schema.get_field_index("x1")
+    none = pa.array([float("nan")] * len(rows), rows.schema.field(at).type)
+    write_table(rows.set_column(at, rows.schema.field(at), none), folder / "signs.parquet")
+    data = Dataset.open(folder)
+    with pytest.raises(InputError, match="a sign whose box has no area"):
+        data.frame(data.number(rows["frame"][0].as_py()))
 
 
 def test_pixels_of_who_is_not_in_the_image(folder: Path):

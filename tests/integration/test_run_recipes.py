@@ -100,6 +100,22 @@ def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) ->
     }
 
 
+def test_signs_are_federated_and_their_errors_place_the_sensor(tmp_path: Path) -> None:
+    recipe = shrunk("three_tasks").model_dump()
+    recipe["tasks"] = {"signs": {"plan": {"samples": 3, "edge_rounds": 1, "cloud_rounds": 1}}}
+    recipe["placement"]["tasks"] = ["signs"]
+    result = run(RunRecipe.model_validate(recipe), tmp_path)
+    assert {(test.task, test.region, test.stage) for test in result.tested} == {
+        *(("signs", region, stage) for region in recipe["regions"] for stage in (PRETRAIN, CLOUD)),
+        ("signs", "grid", EDGE),
+    }
+    main = result.arms[MAIN]
+    assert main.sent_mb("signs", "wireless") > 0
+    assert [(placed.region, placed.errors > 0, len(placed.chosen)) for placed in main.placed] == [("grid", True, 1)]
+    write_report(result, tmp_path)
+    assert {"map_grid.png", "rounds_signs.png"} <= {path.name for path in (tmp_path / "pictures").iterdir()}
+
+
 def test_a_town_from_a_map_federates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
     path = RECIPES / "runs/imported_town.yaml"

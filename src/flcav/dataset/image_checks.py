@@ -22,6 +22,7 @@ def check_images(frame: Frame) -> Iterator[str]:
     """Check every image of a frame and what its annotations say of it."""
     for name in (*frame.images, *frame.infrared):
         yield from check_views(frame.key, name, frame.annotations.views[name])
+        yield from check_signs(frame.key, name, frame.annotations.signs[name])
     for name, image in frame.images.items():
         yield from check_planes(frame.key, name, image, len(frame.annotations))
         if not _fit(image):
@@ -29,7 +30,7 @@ def check_images(frame: Frame) -> Iterator[str]:
         lens = _lens(frame, name, image)
         yield from check_visibility(frame, name, image)
         yield from check_projection(frame, name, image, lens)
-        yield from check_signs(frame.key, name, frame.annotations.signs[name], lens)
+        yield from check_placed_signs(frame.key, name, frame.annotations.signs[name], lens)
 
 
 def check_views(key: str, name: str, views: Views) -> Iterator[str]:
@@ -98,17 +99,23 @@ def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) ->
             yield f"{frame.key}: pixels of '{truth.track[i]}' in '{name}' lie outside its amodal box"
 
 
-def check_signs(key: str, name: str, signs: SignViews, lens: Lens) -> Iterator[str]:
-    """Check the signs and lights of an image."""
+def check_signs(key: str, name: str, signs: SignViews) -> Iterator[str]:
+    """Check that the boxes, pixels, distances and states of signs and lights are such."""
     if set(signs.state.tolist()) - SIGN_STATES:
         yield f"{key}: '{name}' shows a light in an unknown state; known: {', '.join(sorted(SIGN_STATES))}"
-    last = (lens.width - 0.5, lens.height - 0.5)
-    if ((signs.box < -0.5) | (signs.box > (*last, *last))).any() or (signs.box[:, 2:] <= signs.box[:, :2]).any():
-        yield f"{key}: '{name}' has a sign whose box does not lie in the image"
-    if (signs.pixels <= 0).any() or not (signs.distance_m > 0).all():
+    if not (np.isfinite(signs.box).all() and (signs.box[:, 2:] > signs.box[:, :2]).all()):
+        yield f"{key}: '{name}' has a sign whose box has no area"
+    if (signs.pixels <= 0).any() or not ((signs.distance_m > 0) & np.isfinite(signs.distance_m)).all():
         yield f"{key}: '{name}' has a sign without pixels, or at no distance"
     if len(np.unique(signs.thing)) < len(signs):
         yield f"{key}: '{name}' shows a sign twice"
+
+
+def check_placed_signs(key: str, name: str, signs: SignViews, lens: Lens) -> Iterator[str]:
+    """Check that the boxes of signs and lights lie in the image."""
+    last = (lens.width - 0.5, lens.height - 0.5)
+    if ((signs.box < -0.5) | (signs.box > (*last, *last))).any():
+        yield f"{key}: '{name}' has a sign whose box does not lie in the image"
 
 
 def _lens(frame: Frame, name: str, image: CameraImage) -> Lens:

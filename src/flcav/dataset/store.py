@@ -16,7 +16,7 @@ from flcav.dataset.calibration import Calibrations, read_calibrations
 from flcav.dataset.calibration_checks import check_calibration
 from flcav.dataset.frame_checks import check_measurements, check_values
 from flcav.dataset.frames import annotations_of, vectors_of, weather_of
-from flcav.dataset.image_checks import check_planes, check_views
+from flcav.dataset.image_checks import check_planes, check_signs, check_views
 from flcav.dataset.layout import (
     CALIBRATION,
     FrameKey,
@@ -151,6 +151,7 @@ class Dataset:
             _refuse(self.folder, check_measurements(frame))
             for camera, views in frame.annotations.views.items():
                 _refuse(self.folder, check_views(frame.key, camera, views))
+                _refuse(self.folder, check_signs(frame.key, camera, frame.annotations.signs[camera]))
         return frame
 
     def plane(self, i: int, camera: str, plane: str) -> NDArray:

@@ -12,8 +12,8 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
-from flcav.optimization.curves import STAGES, Additive, Decay, Effective, effective_samples
+from flcav.config import InputError, parse_config
+from flcav.optimization.curves import STAGES, Additive, Effective, Fitted, effective_samples
 
 Array = NDArray[np.float64]
 CurveT = TypeVar("CurveT", Additive, Effective, covariant=True)
@@ -22,6 +22,7 @@ STEEPEST = 10.0  # largest exponent tried
 STARTS = (0.1, 0.5, 1.5)  # exponents to start from
 LARGEST_BETA = 1e3
 DEFAULT_BETA = 0.5  # of the article
+FITTED = "the fitted curve"
 
 
 class Form(Protocol[CurveT]):
@@ -45,7 +46,7 @@ class Form(Protocol[CurveT]):
         ...
 
     def curve(self, p: Array) -> CurveT:
-        """Return the curve of parameters p."""
+        """Return the curve of parameters p; raises `InputError` for one too large or too small to compute with."""
         ...
 
 
@@ -89,8 +90,9 @@ class AdditiveForm:
         decays = {}
         for i, (stage, m) in enumerate(zip(self.stages, self.middle)):
             h, b, x0 = self._decay(p, i)
-            decays[STAGES[stage]] = Decay(a=float(h * (m + x0) ** b), b=b, x0=x0)
-        return Additive.model_validate({"floor": float(p[2 * len(self.stages)]) if self.floor else 0.0, **decays})
+            decays[STAGES[stage]] = {"a": float(h * (m + x0) ** b), "b": b, "x0": x0}
+        floor = _share(p[2 * len(self.stages)]) if self.floor else 0.0
+        return parse_config(Additive, {"floor": floor, **decays}, FITTED)
 
     def _decay(self, p: Array, i: int) -> tuple[float, float, float]:
         stage = self.stages[i]
@@ -158,18 +160,24 @@ class EffectiveForm:
 
     def curve(self, p: Array) -> Effective:
         """Return the curve of parameters p."""
-        return Effective(
-            model="effective",
-            floor=float(p[2]) if self.floor else 0.0,
-            a=float(p[0] * self.middle ** p[1]),
-            b=float(p[1]),
-            alpha=self.alpha,
-            beta=self._beta(p),
-            group_samples=self.group_samples,
-        )
+        values = {
+            "model": "effective",
+            "floor": _share(p[2]) if self.floor else 0.0,
+            "a": float(p[0] * self.middle ** p[1]),
+            "b": float(p[1]),
+            "alpha": self.alpha,
+            "beta": self._beta(p),
+            "group_samples": self.group_samples,
+        }
+        return parse_config(Effective, values, FITTED)
 
     def _beta(self, p: Array) -> float:
-        return float(p[-1]) if self.beta is None else self.beta
+        return _share(p[-1]) if self.beta is None else self.beta
+
+
+def _share(fitted: float) -> float:
+    """Return a fitted floor or worth; 0 for one that has shrunk below all numbers of curves."""
+    return float(fitted) if fitted >= Fitted.magnitudes[0] else 0.0
 
 
 def effective_forms(

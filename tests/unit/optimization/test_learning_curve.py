@@ -170,3 +170,11 @@ def test_an_error_is_one_minus_an_accuracy():
         histories(joint | {"error": [1.5, 0.3]}, "t", "a")
     with pytest.raises(InputError, match=r"'accuracy' is missing.*error may stand for accuracy"):
         histories(joint, "t", "a")
+
+
+def test_a_curve_too_small_to_compute_with_is_refused_in_a_sentence():
+    rows = [[80, 160, 320, 320, 320], [0, 0, 0, 2, 6], [0] * 5, [0.4, 0.5, 0.6, 0.65, 0.7]]
+    with pytest.raises(InputError, match=r"the fitted curve: field 'group_samples' = 5e-324: .*1e-100"):
+        fit_effective(*rows, group_samples=5e-324)
+    with pytest.raises(InputError, match=r"the fitted curve: field 'beta' = 1e-300"):
+        fit_effective(*rows, group_samples=700, beta=1e-300)
