@@ -14,8 +14,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from flcav.optimization.separable import Separable, relax, separable
-from flcav.optimization.weighted import whole_plan
+from flcav.optimization.solvers.separable import Separable, relax, separable
+from flcav.optimization.solvers.weighted import whole_plan
 
 REFERENCED = (30, 300, 3000)  # tasks
 LARGE = 100_000

@@ -8,12 +8,12 @@ import numpy as np
 from cpu_time import cpu_ms
 
 from flcav.geometry import pose
-from flcav.sensors.camera import Camera, photograph
-from flcav.sensors.lens import BODY_FROM_OPTICAL, directions
-from flcav.sensors.shading.render import FAR_M
+from flcav.sensors.camera.camera import Camera, photograph
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, directions
+from flcav.sensors.rendering.render import FAR_M
+from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
-from flcav.world.town import load_town
-from flcav.world.traffic import simulate
+from flcav.world.traffic.traffic import simulate
 from flcav.world.weather import WEATHERS
 
 AIM_CLEAR, AIM_NIGHT = 7.0, 2.0

@@ -11,14 +11,14 @@ import json
 import numpy as np
 from cpu_time import cpu_ms
 
-from flcav.sensors.echoes import AFTER_PANE_M, PANES
-from flcav.sensors.lidar import cast, draw_passes, ray_pattern, scan
+from flcav.sensors.lidar.lidar import cast, draw_passes, ray_pattern, scan
+from flcav.sensors.lidar.returns import AFTER_PANE_M, PANES
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import RIGS
+from flcav.world.map.town import load_town
 from flcav.world.materials import Material
 from flcav.world.scene import Scene
-from flcav.world.town import load_town
-from flcav.world.traffic import simulate
+from flcav.world.traffic.traffic import simulate
 from flcav.world.weather import WEATHERS
 
 

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.dataset.payloads import encode_plane
-from flcav.dataset.recorder import record
-from flcav.dataset.tasks import Part, Traffic, perform
+from flcav.dataset.recording.jobs import Part, Traffic, perform
+from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
-from flcav.sensors.lidar import ray_pattern
+from flcav.sensors.lidar.lidar import ray_pattern
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.embedded import EmbeddedSource

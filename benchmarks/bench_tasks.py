@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from cpu_time import cpu_ms
 
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.task import Task, fresh
 from flcav.perception.tasks import TASKS, task_named

@@ -15,11 +15,10 @@ from flcav.perception.trajectory.config import CONFIGURATIONS, FUTURE, PAST, Tra
 from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.rasters import LAYERS
 from flcav.perception.trajectory.roads import road_map
-from flcav.perception.trajectory.samples import Sample, present_at
-from flcav.perception.trajectory.surround import Surround
+from flcav.perception.trajectory.samples import Sample, Surround, present_at
 from flcav.perception.trajectory.task import TRAJECTORY
-from flcav.world.town import load_town
-from flcav.world.traffic import simulate
+from flcav.world.map.town import load_town
+from flcav.world.traffic.traffic import simulate
 
 REFERENCE_MS = (2.9, 5.8)
 BATCH, REPEATS, CAMERAS = 16, 7, 6

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import parse_config
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.files import write_bytes
 from flcav.geometry import inverse, transform_points
 from flcav.report import style
-from flcav.report.birdseye import View, birdseye
+from flcav.report.pictures.birdseye import View, birdseye
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from flcav.config import parse_config
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate

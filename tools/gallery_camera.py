@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.geometry import pose
-from flcav.report.camera import thermal_grey
-from flcav.sensors.camera import Camera, photograph
-from flcav.sensors.infrared import Infrared, thermal_image
-from flcav.sensors.lens import BODY_FROM_OPTICAL
+from flcav.report.pictures.camera import thermal_grey
+from flcav.sensors.camera.camera import Camera, photograph
+from flcav.sensors.camera.infrared import Infrared, thermal_image
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
+from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
 from flcav.world.shapes import SHAPES
-from flcav.world.town import load_town
-from flcav.world.traffic import simulate
+from flcav.world.traffic.traffic import simulate
 from flcav.world.weather import WEATHERS
 
 Picture = NDArray[np.uint8]

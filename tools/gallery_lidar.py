@@ -9,13 +9,13 @@ from matplotlib.colors import TwoSlopeNorm
 
 from flcav.geometry import Boxes, inverse, pose, transform_points
 from flcav.report import style
-from flcav.report.birdseye import HEIGHT_COLOURS, HEIGHTS_M, View, draw_view
-from flcav.report.sweeps import GROUND_M, draw_boxes, on_page
-from flcav.sensors.lidar import Lidar, scan
-from flcav.sensors.radar import Radar, radar_sweep
+from flcav.report.pictures.birdseye import HEIGHT_COLOURS, HEIGHTS_M, View, draw_view
+from flcav.report.pictures.clouds import GROUND_M, draw_boxes, on_page
+from flcav.sensors.lidar.lidar import Lidar, scan
+from flcav.sensors.radar.radar import Radar, radar_sweep
+from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
-from flcav.world.town import load_town
-from flcav.world.traffic import simulate
+from flcav.world.traffic.traffic import simulate
 from flcav.world.weather import WEATHERS, Weather
 
 TOWN, SEED, AGENT, TIME_S = "grid", 3, "cav2", 71.0  # a busy junction, met at 12 m/s

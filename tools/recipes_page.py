@@ -16,16 +16,14 @@ from pydantic.fields import FieldInfo
 
 from flcav.config import Config
 from flcav.markdown import table
-from flcav.sensors.beams import BEAMS
 from flcav.sensors.calibration import CalibrationError
-from flcav.sensors.camera import Camera
-from flcav.sensors.carla import CarlaReturns
-from flcav.sensors.gnss import Gnss
-from flcav.sensors.imu import Imu
-from flcav.sensors.infrared import Infrared
-from flcav.sensors.lens import Lens
-from flcav.sensors.lidar import Lidar
-from flcav.sensors.radar_detector import Radar
+from flcav.sensors.camera.camera import Camera
+from flcav.sensors.camera.infrared import Infrared
+from flcav.sensors.camera.lens import Lens
+from flcav.sensors.lidar.beams import BEAMS, CarlaReturns
+from flcav.sensors.lidar.lidar import Lidar
+from flcav.sensors.navigation import Gnss, Imu
+from flcav.sensors.radar.detector import Radar
 from flcav.sensors.rig import (
     RIGS,
     Mount,
@@ -39,8 +37,8 @@ from flcav.sensors.rig import (
     Rig,
 )
 from flcav.sources.recipe import Recipe
+from flcav.world.map.town import TOWNS
 from flcav.world.scenarios.scenario import Scenario
-from flcav.world.town import TOWNS
 from flcav.world.weather import WEATHER_CLASSES, WEATHERS, Keyframe, Weather, WeatherSchedule
 
 PAGE = Path(__file__).parents[1] / "docs" / "recipes.md"

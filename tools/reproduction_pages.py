@@ -12,23 +12,21 @@ from pathlib import Path
 from typing import TypeVar
 
 from flcav.config import InputError, read_json
-from flcav.experiments import (
-    arms_tables,
-    fig3a_tables,
-    fig6a_tables,
-    objects_tables,
-    run_tables,
-    signs_tables,
-    sim_to_real_tables,
-    trajectory_tables,
-    weather_tables,
-)
-from flcav.experiments.demo_arms import ArmsResult
-from flcav.experiments.fig3a import Fig3a
-from flcav.experiments.fig6a_results import AllocationResult
-from flcav.experiments.sim_to_real import SimToReal
+from flcav.experiments import run_tables
+from flcav.experiments.arms import tables as arms_tables
+from flcav.experiments.arms.run import ArmsResult
+from flcav.experiments.fig3a import tables as fig3a_tables
+from flcav.experiments.fig3a.run import Fig3a
+from flcav.experiments.fig6a import tables as fig6a_tables
+from flcav.experiments.fig6a.results import AllocationResult
+from flcav.experiments.sim_to_real import tables as sim_to_real_tables
+from flcav.experiments.sim_to_real.run import SimToReal
 from flcav.experiments.studies import objects, signs, trajectory, weather
-from flcav.experiments.task_study import EvaluationT, Study, StudyResult, results_of_json
+from flcav.experiments.studies import objects as objects_tables
+from flcav.experiments.studies import signs as signs_tables
+from flcav.experiments.studies import trajectory as trajectory_tables
+from flcav.experiments.studies import weather as weather_tables
+from flcav.experiments.studies.run import EvaluationT, Study, StudyResult, results_of_json
 from flcav.files import Json, write_bytes
 from flcav.pipeline.results import Run
 from flcav.pipeline.running import RESULTS

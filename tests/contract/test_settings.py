@@ -14,7 +14,7 @@ import torch
 from task_drives import Drives
 
 from flcav.cli.main import run
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.files import sha256
 from flcav.perception.device import CPU, processor_of
 from flcav.perception.weather.task import WeatherTask

@@ -11,7 +11,7 @@ from flcav.config import InputError
 from flcav.perception.card import LICENCE
 from flcav.perception.networks import network_of
 from flcav.perception.tasks import TASKS, task_named
-from flcav.perception.training.settings import settings_of
+from flcav.perception.training.checkpoint import settings_of
 from flcav.perception.weights import SHIPPED, read_card, shipped, to_arrays
 
 EACH_MB, ALL_MB = 4.0, 12.0

@@ -16,9 +16,10 @@ from task_drives import Drives
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.experiments.fig1b_layers import LAYERS, watched
+from flcav.experiments.fig1b.columns import show_layers
+from flcav.experiments.fig1b.layers import LAYERS, watched
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import Trainable
@@ -34,8 +35,7 @@ from flcav.perception.training.run import Request, train_network
 from flcav.perception.weather.task import WEATHER, over_the_whole_space
 from flcav.perception.weights import load_network, save_network, to_arrays
 from flcav.report import style
-from flcav.report.inference import draw
-from flcav.report.task_columns import show_layers
+from flcav.report.pictures.inference import draw
 from flcav.sensors.frame import Frame
 from flcav.world.weather import Weather
 

@@ -14,14 +14,14 @@ from PIL import Image
 from task_drives import HEIGHT, WIDTH, Drives
 
 import flcav.world
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import configuration, fresh
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import save_network
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Frame, Views
-from flcav.sensors.lens import BODY_FROM_OPTICAL
 
 DATA = Path(__file__).parents[1] / "data"
 TOWN = Path(flcav.world.__path__[0]) / "towns" / "suburb"

@@ -19,14 +19,14 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from flcav.cli.main import run
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.perception.objects.model import second_paper, second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.weights import save_network
 from flcav.perception.weights import config_key
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.world.town import load_town
+from flcav.world.map.town import load_town
 
 COMMAND = (sys.executable, "-c", "from flcav.cli.main import run; run()")
 COARSE = {"lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 16, "azimuth_steps": 360}}}}

@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from flcav.cli.main import run
-from flcav.optimization.definitions import TERMS
-from flcav.optimization.history import ARTICLE
+from flcav.optimization.allocation.problem_file import TERMS
+from flcav.optimization.curves.history import ARTICLE
 
 RECIPES = sorted((Path(__file__).parents[2] / "recipes" / "allocation").glob("*.yaml"))
 TASK_KEYS = {"name", "samples", "edge_rounds", "cloud_rounds", "predicted_error", "wireless_mb", "wireline_mb"}

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from flcav.cli.main import run
-from flcav.world.town import TOWNS
+from flcav.world.map.town import TOWNS
 
 CROSS = Path(__file__).parents[1] / "data" / "cross.xodr"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flcav.cli.main import run
-from flcav.optimization.definitions import CURVE, STEPS, TERMS
+from flcav.optimization.allocation.problem_file import CURVE, STEPS, TERMS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "allocation.md").read_text(encoding="utf-8")
 NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e[+-]\d+)?")

@@ -14,8 +14,8 @@ from PIL import Image
 
 from flcav.cli.main import run
 from flcav.config import read_config
-from flcav.dataset import tasks
-from flcav.dataset.recorder import record
+from flcav.dataset.recording import jobs as tasks
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

@@ -13,8 +13,8 @@ from mcap_protobuf.decoder import DecoderFactory
 from test_record_sensors import resign
 
 from flcav.cli.main import run
-from flcav.dataset.checks import validate
-from flcav.dataset.frame_checks import check_points
+from flcav.dataset.checks.frames import check_points
+from flcav.dataset.checks.validate import validate
 from flcav.dataset.store import Dataset
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource

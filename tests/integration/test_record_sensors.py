@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.dataset.checks import validate
-from flcav.dataset.recorder import record
+from flcav.dataset.checks.validate import validate
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import FILES_SCHEMA, write_table
 from flcav.files import sha256, write_json

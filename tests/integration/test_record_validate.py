@@ -13,10 +13,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from flcav.config import InputError
-from flcav.dataset.checks import check_order, validate
+from flcav.dataset.checks.validate import check_order, leaks, validate
 from flcav.dataset.layout import FrameKey, Manifest
-from flcav.dataset.leakage import leaks
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import FILES_SCHEMA, write_table
 from flcav.files import sha256, write_json

@@ -28,7 +28,7 @@ from flcav.pipeline.recipe import (
 )
 from flcav.pipeline.results import Run
 from flcav.pipeline.running import RESULTS, run
-from flcav.report.run_page import page, write_report
+from flcav.report.pages.run_page import page, write_report
 from flcav.world.opendrive.importing import import_town
 
 pytestmark = pytest.mark.slow

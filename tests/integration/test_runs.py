@@ -24,9 +24,9 @@ from safetensors.numpy import load_file
 from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.experiments.demo_arms import ARMS, ArmsResult, run_arms
-from flcav.experiments.fig6a_allocation import run_allocation
-from flcav.experiments.fig6a_results import AllocationResult
+from flcav.experiments.arms.run import ARMS, ArmsResult, run_arms
+from flcav.experiments.fig6a.results import AllocationResult
+from flcav.experiments.fig6a.run import run_allocation
 from flcav.network.ledger import LINKS, Ledger
 from flcav.pipeline.comparing import compare
 from flcav.pipeline.frames import Frames
@@ -34,9 +34,9 @@ from flcav.pipeline.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, load_run_recipe
 from flcav.pipeline.results import Placed, Pretrained, Run, StageResult, Watched
 from flcav.pipeline.running import RESULTS, SUMMARY, run
-from flcav.report.run_page import write_report
+from flcav.report.pages.run_page import write_report
 from flcav.verdicts import verdict
-from flcav.world.town import load_town
+from flcav.world.map.town import load_town
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flcav.experiments.recording import opened, record_split
+from flcav.experiments.studies.run import opened, record_split
 from flcav.pipeline.steps import Step, Work, run_side_by_side, run_steps
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")

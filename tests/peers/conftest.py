@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from flcav.config import parse_config
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

@@ -13,7 +13,7 @@ from recorded import in_lidar, points_in
 
 from flcav.dataset.formats.export import export
 from flcav.dataset.formats.exporter import ExportOptions
-from flcav.dataset.formats.kitti.export import CLASSES
+from flcav.dataset.formats.kitti.write import CLASSES
 from flcav.dataset.store import Dataset
 from flcav.geometry import wrap_angle
 

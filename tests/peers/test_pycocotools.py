@@ -8,7 +8,7 @@ import pytest
 from conftest import Peer
 
 from flcav.dataset.formats.export import export
-from flcav.dataset.formats.rectangles import CLASSES
+from flcav.dataset.rectangles import CLASSES
 from flcav.dataset.store import Dataset
 
 

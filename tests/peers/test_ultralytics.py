@@ -11,7 +11,7 @@ from conftest import PEERS, Peer
 
 from flcav.dataset.formats.export import export
 from flcav.dataset.formats.exporter import ExportOptions
-from flcav.dataset.formats.rectangles import CLASSES, rectangles
+from flcav.dataset.rectangles import CLASSES, rectangles
 from flcav.dataset.store import Dataset
 
 # it fetches nothing, and leaves no settings behind

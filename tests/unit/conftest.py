@@ -8,12 +8,12 @@ import pytest
 
 import flcav.world
 from flcav.config import read_config
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.sensors.frame import Frame
-from flcav.world.parameters import TownParameters
+from flcav.world.map.parameters import TownParameters
+from flcav.world.map.town import Poles, Signs, Town
 from flcav.world.shapes import SHAPES
-from flcav.world.town import Poles, Signs, Town
 from flcav.world.trace import Trace
 
 Actor = tuple[str, str, int, float, float, float]  # id, category, shape, x, y, yaw

@@ -10,9 +10,9 @@ import pytest
 from packaging.requirements import Requirement
 
 from flcav.config import InputError
-from flcav.dataset import ray_engine
+from flcav.dataset.recording import ray_engine
 from flcav.extras import installation
-from flcav.world.opendrive import netconvert
+from flcav.world.opendrive import importing as netconvert
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
 

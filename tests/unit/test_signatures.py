@@ -23,16 +23,16 @@ ALLOWED: Mapping[str, str] = {
     "flcav.config:parse_config": UNCHECKED,
     "flcav.config:read_yaml": UNCHECKED,
     "flcav.config:shorten": UNCHECKED,
-    "flcav.dataset.ray_engine:ray_session": EXTRA,
+    "flcav.dataset.recording.ray_engine:ray_session": EXTRA,
     "flcav.lazy:lazy_names": OWN,
     "flcav.pipeline.steps.run:run_steps": STEPS,
     "flcav.pipeline.steps.step:Step.arguments": STEPS,
     "flcav.pipeline.steps.step:Step.run": STEPS,
     "flcav.pipeline.steps.step:Work.result": STEPS,
     "flcav.plugins:load_own": OWN,
-    "flcav.report.html:render": PAGE,
-    "flcav.report.rerun_log:blueprint": EXTRA,
-    "flcav.report.rerun_log:log_scene": EXTRA,
+    "flcav.report.pages.html:render": PAGE,
+    "flcav.report.pictures.rerun_log:blueprint": EXTRA,
+    "flcav.report.pictures.rerun_log:log_scene": EXTRA,
 }
 
 

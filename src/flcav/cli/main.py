@@ -6,28 +6,15 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import (
-    allocate,
-    birdseye,
-    camera,
-    errors,
-    evaluate,
-    export,
-    fit,
-    infer,
-    place,
-    record,
-    reproduce,
-    towns,
-    train,
-    validate,
-    view,
-)
+from flcav.cli import reproduce, towns
 from flcav.cli import (
     run as run_command,
 )
-from flcav.cli.interruption import Interrupted
-from flcav.cli.literal import literal
+from flcav.cli.data import birdseye, camera, export, record, validate, view
+from flcav.cli.options import literal
+from flcav.cli.perception import errors, evaluate, infer, train
+from flcav.cli.planning import allocate, fit, place
+from flcav.cli.terminal import Interrupted
 from flcav.config import InputError
 
 INTERRUPTED = 130

@@ -1,8 +1,68 @@
-"""Options that several commands share."""
+"""Options and arguments that several commands share, and how bad ones are refused."""
 
+import inspect
+import math
+from collections.abc import Iterable
+from enum import StrEnum
+
+import click
 import typer
+from click.core import ParameterSource
+from rich.markup import escape
 
-from flcav.cli.choices import Engine, Stale
+from flcav.config import InputError
+from flcav.perception.tasks import TASKS
+
+
+class Device(StrEnum):
+    """Where networks run."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+class Format(StrEnum):
+    """What datasets are exported to, see `flcav.dataset.formats.export`."""
+
+    kitti = "kitti"
+    yolo = "yolo"
+    coco = "coco"
+    nuscenes = "nuscenes"
+    opv2v = "opv2v"
+    mcap = "mcap"
+
+
+class Engine(StrEnum):
+    """Who works, see `flcav.dataset.recording.recorder` and `flcav.pipeline.steps`."""
+
+    processes = "processes"
+    ray = "ray"
+
+
+class Stale(StrEnum):
+    """What becomes of what other code did, see `flcav.pipeline.steps`."""
+
+    refuse = "refuse"
+    redo = "redo"
+    keep = "keep"
+
+
+class Method(StrEnum):
+    """How sensors are placed, see `flcav.optimization.placement`."""
+
+    exact = "exact"
+    greedy = "greedy"
+
+
+def listed(choices: Iterable[str]) -> str:
+    """Return the choices in words."""
+    *others, last = choices
+    return f"{', '.join(others)} or {last}"
+
+
+ANY_TASK = f"{listed(TASKS)}, or one of your own as module:NAME"
+
 
 THREADS = typer.Option(
     1,
@@ -24,3 +84,32 @@ STALE = typer.Option(
     help="What becomes of steps in the folder that other code did, or that are built on such: refuse the folder, redo "
     "them, or keep them.",
 )
+
+
+def finite(parameter: click.Parameter, value: float | None) -> float | None:
+    """Return the value of an option, as its callback; raises `InputError` for nan, which lies within any limits."""
+    if value is not None and not math.isfinite(value):
+        raise InputError(f"{parameter.opts[0]} {value}: a finite number is wanted")
+    return value
+
+
+def refuse_unused(what: str, *names: str) -> None:
+    """Raise `InputError` where one of the options of these parameters was given, for which `what` has no use."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and source is ParameterSource.COMMANDLINE:
+            raise InputError(f"{what}: has no use for {parameter.opts[0]}")
+
+
+def literal(command: click.Command) -> click.Command:
+    """Return the command with its help, its parameters' and its subcommands' safe from being read as markup.
+
+    Lines that a docstring breaks are joined: they are broken again as wide as the terminal is.
+    """
+    for owner in (command, *command.params):
+        text = inspect.cleandoc(getattr(owner, "help", None) or "")
+        owner.help = "\n\n".join(escape(" ".join(paragraph.split())) for paragraph in text.split("\n\n"))  # type: ignore
+    for subcommand in getattr(command, "commands", {}).values():
+        literal(subcommand)
+    return command

@@ -7,10 +7,8 @@ from pathlib import Path
 import click
 import typer
 
-from flcav.cli.choices import Engine, Stale, listed
-from flcav.cli.interruption import when_interrupted
-from flcav.cli.options import ENGINE, JOBS, STALE
-from flcav.cli.refusals import refuse_unused
+from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale, listed, refuse_unused
+from flcav.cli.terminal import when_interrupted
 from flcav.experiments.studies import STUDIES
 from flcav.threads import use_threads
 
@@ -101,7 +99,7 @@ def reproduce(
 @when_interrupted()
 def _fig1b(out: Path) -> None:
     from flcav import progress
-    from flcav.experiments.fig1b import fig1b
+    from flcav.experiments.fig1b.run import fig1b
     from flcav.files import write_bytes
 
     with progress.live("record") as report:
@@ -111,7 +109,7 @@ def _fig1b(out: Path) -> None:
 
 
 def _fig3a(out: Path) -> None:
-    from flcav.experiments.fig3a import draw_fig3a, fig3a
+    from flcav.experiments.fig3a.run import draw_fig3a, fig3a
     from flcav.files import write_bytes, write_json
 
     results = fig3a()
@@ -123,8 +121,8 @@ def _fig3a(out: Path) -> None:
 
 @when_interrupted()
 def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.steps import live_steps
-    from flcav.experiments.demo_arms import draw_arms, run_arms, study_recipe
+    from flcav.cli.terminal import live_steps
+    from flcav.experiments.arms.run import draw_arms, run_arms, study_recipe
     from flcav.files import write_bytes, write_json
 
     with live_steps(Target.demo_arms.value) as notify:
@@ -138,9 +136,9 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
 
 @when_interrupted()
 def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.steps import live_steps
-    from flcav.experiments.demo_arms import study_recipe
-    from flcav.experiments.fig6a_allocation import draw_allocation, run_allocation
+    from flcav.cli.terminal import live_steps
+    from flcav.experiments.arms.run import study_recipe
+    from flcav.experiments.fig6a.run import draw_allocation, run_allocation
     from flcav.files import write_bytes, write_json
 
     with live_steps(Target.fig6a_allocation.value) as notify:
@@ -154,14 +152,14 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
 
 @when_interrupted()
 def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.steps import live_steps
+    from flcav.cli.terminal import live_steps
     from flcav.config import InputError
-    from flcav.experiments.sim_to_real import draw_frame, run_sim_to_real
+    from flcav.experiments.sim_to_real.run import draw_frame, run_sim_to_real
     from flcav.files import write_bytes, write_json
     from flcav.perception.networks import network_of
     from flcav.perception.objects.task import OBJECTS
     from flcav.report import style
-    from flcav.report.clouds import compare
+    from flcav.report.pictures.clouds import compare
 
     if kitti is None:
         raise InputError("--kitti is missing: sim-to-real needs a folder of real frames in KITTI's layout")
@@ -180,9 +178,9 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int,
 
 @when_interrupted()
 def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.steps import live_steps
+    from flcav.cli.terminal import live_steps
     from flcav.experiments.studies import study_named
-    from flcav.experiments.task_study import results_as_json, run_study
+    from flcav.experiments.studies.run import results_as_json, run_study
     from flcav.files import write_bytes, write_json
 
     study = study_named(target.removeprefix(TASK))

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.choices import Engine, Stale
-from flcav.cli.interruption import when_interrupted
-from flcav.cli.options import ENGINE, JOBS, STALE
+from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
+from flcav.cli.terminal import when_interrupted
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
@@ -68,12 +67,12 @@ def _run(
     title: str,
 ) -> None:
     use_threads(1)
-    from flcav.cli.steps import live_steps
+    from flcav.cli.terminal import live_steps
     from flcav.files import check_writable
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import run as run_one
     from flcav.pipeline.running import run_seeds
-    from flcav.report.run_page import write_report
+    from flcav.report.pages.run_page import write_report
     from flcav.sources.recipe import find_recipe
 
     check_writable(out)

@@ -8,7 +8,7 @@ import typer
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from flcav.world.town import Town
+    from flcav.world.map.town import Town
 
 towns = typer.Typer(help="Towns: list them, draw their maps, import new ones from OpenDRIVE.", no_args_is_help=True)
 
@@ -23,8 +23,8 @@ def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSO
     """List the towns that come with flcav, and what they have."""
     import json
 
-    from flcav.world.census import census
-    from flcav.world.town import TOWNS, load_town
+    from flcav.world.map.census import census
+    from flcav.world.map.town import TOWNS, load_town
 
     found = {name: load_town(name) for name in TOWNS}
     counts = {name: census(town) for name, town in found.items()}
@@ -50,9 +50,9 @@ def show(
     """
     from flcav.dataset.exchange import write_table
     from flcav.files import write_bytes
-    from flcav.report.town_map import town_map
-    from flcav.world.census import census
-    from flcav.world.town import load_town
+    from flcav.report.pictures.town_map import town_map
+    from flcav.world.map.census import census
+    from flcav.world.map.town import load_town
 
     loaded = load_town(town)
     if poles is not None:
@@ -70,7 +70,7 @@ def import_(
     out: Path = typer.Option(..., "--out", help="New folder of the town; recipes name it as `town: DIR`."),
 ) -> None:
     """Make a town from an OpenDRIVE map, CARLA's included: streets as in the map, furnished like the other towns."""
-    from flcav.world.census import census
+    from flcav.world.map.census import census
     from flcav.world.opendrive.importing import import_town
 
     imported = import_town(xodr, out)

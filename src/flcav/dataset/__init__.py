@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from flcav.dataset.checks import validate
-    from flcav.dataset.recorder import record
+    from flcav.dataset.checks.validate import validate
+    from flcav.dataset.recording.recorder import record
     from flcav.dataset.store import Dataset
 
 PLACES = {
-    "validate": "flcav.dataset.checks",
-    "record": "flcav.dataset.recorder",
+    "validate": "flcav.dataset.checks.validate",
+    "record": "flcav.dataset.recording.recorder",
     "Dataset": "flcav.dataset.store",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]

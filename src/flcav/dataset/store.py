@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, shorten
 from flcav.dataset.calibration import Calibrations, read_calibrations
-from flcav.dataset.calibration_checks import check_calibration
-from flcav.dataset.frame_checks import check_measurements, check_values
+from flcav.dataset.checks.calibration import check_calibration
+from flcav.dataset.checks.frames import check_measurements, check_values
+from flcav.dataset.checks.images import check_planes, check_signs, check_views
 from flcav.dataset.frames import annotations_of, vectors_of, weather_of
-from flcav.dataset.image_checks import check_planes, check_signs, check_views
 from flcav.dataset.layout import (
     CALIBRATION,
     FrameKey,
@@ -30,7 +30,7 @@ from flcav.dataset.layout import (
 from flcav.dataset.payloads import INFRARED, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, read_table
 from flcav.sensors.frame import CameraImage, Frame
-from flcav.world.town import Town, load_town
+from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
 
 POINT_BYTES = 16  # four float32

@@ -5,27 +5,27 @@ from typing import TYPE_CHECKING
 from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from flcav.optimization.allocation import Allocation, allocate
+    from flcav.optimization.allocation.allocate import Allocation, allocate
+    from flcav.optimization.allocation.problem import Budgets, Limits, Problem, Task
+    from flcav.optimization.curves.fitting import Fit, fit
+    from flcav.optimization.curves.history import History, article_histories
     from flcav.optimization.graph import load_problem
-    from flcav.optimization.history import History, article_histories
-    from flcav.optimization.learning_curve import Fit, fit
     from flcav.optimization.placement import Placement, place
-    from flcav.optimization.problem import Budgets, Limits, Problem, Task
 
 PLACES = {
-    "Allocation": "flcav.optimization.allocation",
-    "allocate": "flcav.optimization.allocation",
+    "Allocation": "flcav.optimization.allocation.allocate",
+    "allocate": "flcav.optimization.allocation.allocate",
     "load_problem": "flcav.optimization.graph",
-    "History": "flcav.optimization.history",
-    "article_histories": "flcav.optimization.history",
-    "Fit": "flcav.optimization.learning_curve",
-    "fit": "flcav.optimization.learning_curve",
+    "History": "flcav.optimization.curves.history",
+    "article_histories": "flcav.optimization.curves.history",
+    "Fit": "flcav.optimization.curves.fitting",
+    "fit": "flcav.optimization.curves.fitting",
     "Placement": "flcav.optimization.placement",
     "place": "flcav.optimization.placement",
-    "Budgets": "flcav.optimization.problem",
-    "Limits": "flcav.optimization.problem",
-    "Problem": "flcav.optimization.problem",
-    "Task": "flcav.optimization.problem",
+    "Budgets": "flcav.optimization.allocation.problem",
+    "Limits": "flcav.optimization.allocation.problem",
+    "Problem": "flcav.optimization.allocation.problem",
+    "Task": "flcav.optimization.allocation.problem",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from flcav.network.plan import Price
-from flcav.optimization.allocation import (
+from flcav.optimization.allocation.allocate import (
     Allocation,
     Infeasible,
     allocate,
@@ -27,7 +27,7 @@ from flcav.optimization.allocation import (
     score,
     used,
 )
-from flcav.optimization.problem import Problem, Task
+from flcav.optimization.allocation.problem import Problem, Task
 from flcav.optimization.vehicles import BITS_PER_BYTE, Shares, TooSlow, vehicle_shares
 
 HALVINGS = 9  # of the interval in which what is made smaller is sought

@@ -16,8 +16,8 @@ from pydantic import Field, model_validator
 
 from flcav.config import InputError, parse_config, read_yaml
 from flcav.files import write_json
-from flcav.optimization.curves import Additive, Effective, Positive
-from flcav.optimization.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
+from flcav.optimization.allocation.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
+from flcav.optimization.curves.curves import Additive, Effective, Positive
 
 OwnCurve = Annotated[Additive | Effective, Field(discriminator="model")]
 KINDS = ("task", "network", "modality", "vehicle")  # a layer joins neighbours

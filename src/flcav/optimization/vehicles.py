@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array, csr_array
 
-from flcav.optimization.allocation import Infeasible, TaskPlan
-from flcav.optimization.problem import Problem, Task, Uplink
+from flcav.optimization.allocation.allocate import Infeasible, TaskPlan
+from flcav.optimization.allocation.problem import Problem, Task, Uplink
 
 Array = NDArray[np.float64]
 

@@ -1,11 +1,11 @@
-"""Where networks run."""
+"""The device that networks run on, and the precision of their arithmetic there."""
 
 import platform
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 
 from flcav.config import InputError
-from flcav.perception.ops.precision import multiplies_bfloat16
 
 CPU = torch.device("cpu")
 
@@ -32,3 +32,20 @@ def processor_of(device: torch.device) -> str:
         return torch.cuda.get_device_name(device)
     kind = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
     return f"{kind} bfloat16" if multiplies_bfloat16(device) else kind
+
+
+def bfloat16(device: torch.device, wanted: bool) -> AbstractContextManager[object]:
+    """Return a context whose convolutions and matrix products are in bfloat16 where `wanted` and in the hardware.
+
+    Elsewhere it changes nothing.
+    """
+    if wanted and multiplies_bfloat16(device):
+        return torch.autocast(device.type, torch.bfloat16)
+    return nullcontext()
+
+
+def multiplies_bfloat16(device: torch.device) -> bool:
+    """Return whether the device has instructions for products of bfloat16, which halve the time of a convolution."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()

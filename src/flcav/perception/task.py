@@ -24,7 +24,7 @@ from flcav.records import Record
 from flcav.seeds import child_seed
 
 if TYPE_CHECKING:
-    from flcav.perception.camera_view import CameraView
+    from flcav.perception.images import CameraView
 
 ConfigT = TypeVar("ConfigT", default=Any)
 NetworkT = TypeVar("NetworkT", bound=nn.Module, default=Any)

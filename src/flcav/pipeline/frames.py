@@ -1,5 +1,6 @@
-"""Frames of a run: recorded in a town, or dealt from a dataset that was recorded before."""
+"""The frames of a run: recorded from a town, or those of datasets already recorded."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,20 +10,26 @@ import numpy as np
 
 from flcav.config import InputError, parse_config, shorten
 from flcav.dataset.layout import read_manifest
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.files import sha256
 from flcav.perception.agents import POLE, kind_of
-from flcav.perception.sharing import shared
+from flcav.perception.client import shared
 from flcav.perception.tasks import task_named
-from flcav.pipeline.places import find_place
 from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName
 from flcav.pipeline.results import Recorded
 from flcav.progress import Report
 from flcav.seeds import child_seed, stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.world.town import TOWNS
+from flcav.world.map.town import TOWNS
+
+
+def find_place(name: str, beside: Path) -> Path | None:
+    """Return the file or folder `name` in the folder `beside`, or else in the working directory; None for neither."""
+    sought = (beside / name, Path.cwd() / name)
+    return next((path for path in sought if os.path.exists(path)), None)  # noqa: PTH110 - which takes any name
+
 
 DATA = "data"
 SHORTEST_S = 10.0  # of a scene whose tracks are learned: a past, a future, and some presents

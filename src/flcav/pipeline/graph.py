@@ -9,9 +9,8 @@ from typing import Any
 
 from flcav.config import InputError, shorten
 from flcav.pipeline.arms import Names, Setting, settings_of
-from flcav.pipeline.frames import data_hash, recording_fields, town_hashes
+from flcav.pipeline.frames import data_hash, find_place, recording_fields, town_hashes
 from flcav.pipeline.labels import KINDS, labels_of
-from flcav.pipeline.places import find_place
 from flcav.pipeline.planning import history_text
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, SPLITS_OF, Region, RunRecipe, SplitName
 from flcav.pipeline.steps import Step

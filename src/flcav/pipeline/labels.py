@@ -10,6 +10,7 @@ from flcav.config import InputError
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, road_view
 from flcav.network.ledger import Ledger, LedgerEntry
+from flcav.perception.client import shared
 from flcav.perception.metrics import match
 from flcav.perception.objects.detect import detect_all
 from flcav.perception.objects.evaluate import asked_of
@@ -17,7 +18,6 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import only_lidar
-from flcav.perception.sharing import shared
 from flcav.perception.task import Task
 from flcav.perception.tasks import task_named
 from flcav.pipeline.frames import Frames

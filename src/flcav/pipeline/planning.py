@@ -16,16 +16,16 @@ from flcav.federation.runtimes.embedded import update_bytes
 from flcav.files import atomic_path
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
-from flcav.optimization.allocation import TaskPlan as Allotted
-from flcav.optimization.allocation import allocate
-from flcav.optimization.baselines import baseline
-from flcav.optimization.history import JOINT, History, histories
-from flcav.optimization.learning_curve import fit_additive
-from flcav.optimization.problem import Problem
+from flcav.optimization.allocation.allocate import TaskPlan as Allotted
+from flcav.optimization.allocation.allocate import allocate
+from flcav.optimization.allocation.baselines import baseline
+from flcav.optimization.allocation.problem import Problem
+from flcav.optimization.curves.fitting import fit_additive
+from flcav.optimization.curves.history import JOINT, History, histories
 from flcav.perception.task import Task, configuration, fresh
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.places import find_place
+from flcav.pipeline.frames import find_place
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
 from flcav.pipeline.results import Plan, TaskPlan
 

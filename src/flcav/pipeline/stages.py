@@ -21,9 +21,8 @@ from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable, Weights
 from flcav.files import write_bytes, write_json
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
-from flcav.perception.client import TaskClient
+from flcav.perception.client import TaskClient, shared
 from flcav.perception.outcomes import score_on
-from flcav.perception.sharing import shared
 from flcav.perception.task import Task, configuration, fresh
 from flcav.perception.training import train_steps
 from flcav.perception.weights import from_arrays, load_network, load_weights, save_network, to_arrays

@@ -15,9 +15,9 @@ from flcav.files import write_json
 from flcav.intervals import Estimate
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.network.plan import MessageSizes, Price
+from flcav.perception.client import shared
 from flcav.perception.errors import THRESHOLD, RegistersErrors, load_errors, save_errors
 from flcav.perception.outcomes import interval, measurable, measured, score_on
-from flcav.perception.sharing import shared
 from flcav.perception.task import configuration
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
@@ -30,8 +30,7 @@ from flcav.pipeline.labels import (
     own_label_threshold,
     self_labelled_samples,
 )
-from flcav.pipeline.looking import look
-from flcav.pipeline.placing import place_sensors, sites_of, traces_of
+from flcav.pipeline.placing import look, place_sensors, sites_of, traces_of
 from flcav.pipeline.planning import Asked, Frame, make_plan, model_mb, parse_history
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, Federation, Placement, Role, RunRecipe, SplitName, Training
 from flcav.pipeline.results import (

@@ -32,7 +32,7 @@ class CameraImage:
 
     rgb: NDArray[np.uint8]  # (H, W, 3) sRGB
     depth_m: NDArray[np.float32]  # (H, W) along the optical axis; inf where there is sky
-    semantic: NDArray[np.uint8]  # (H, W) class: see `flcav.sensors.camera`
+    semantic: NDArray[np.uint8]  # (H, W) class: see `flcav.sensors.camera.camera`
     instance: NDArray[np.uint16]  # (H, W) 1 + row of the frame's annotations, 0 where there is no annotated actor
 
 
@@ -103,7 +103,7 @@ class Frame:
     annotations: Annotations
     point_times: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     # LiDAR whose spin takes time -> (N,) when each of its points was measured [s] after `time_s`, each in the sensor's
-    # frame of its own time: see `flcav.sensors.rolling`
+    # frame of its own time: see `flcav.sensors.lidar.rolling`
     images: Mapping[str, CameraImage] = field(default_factory=dict)
     infrared: Mapping[str, NDArray[np.uint16]] = field(default_factory=dict)  # (H, W) apparent temperature [0.01 K]
     radar: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)

@@ -10,15 +10,14 @@ from flcav.config import InputError
 from flcav.geometry import pose
 from flcav.seeds import stream
 from flcav.sensors.calibration import CalibrationError, assume, calibration_of
-from flcav.sensors.camera import photograph
+from flcav.sensors.camera.camera import photograph
+from flcav.sensors.camera.infrared import thermal_image
+from flcav.sensors.camera.lens import Lens, directions
 from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
-from flcav.sensors.gnss import fix
-from flcav.sensors.imu import reading
-from flcav.sensors.infrared import thermal_image
 from flcav.sensors.labels.annotate import Sight, Sweep, annotate
-from flcav.sensors.lens import Lens, directions
-from flcav.sensors.lidar import Lidar, cast, draw_passes, measure, point_times_s
-from flcav.sensors.radar import radar_sweep
+from flcav.sensors.lidar.lidar import Lidar, cast, draw_passes, measure, point_times_s
+from flcav.sensors.navigation import fix, reading
+from flcav.sensors.radar.radar import radar_sweep
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
 from flcav.world.scene import Scene
 from flcav.world.weather import WEATHERS, Weather

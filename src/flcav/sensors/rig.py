@@ -11,12 +11,11 @@ from pydantic import Field, model_validator
 
 from flcav.config import Config
 from flcav.geometry import pose
-from flcav.sensors.camera import Camera
-from flcav.sensors.gnss import Gnss
-from flcav.sensors.imu import Imu
-from flcav.sensors.infrared import Infrared
-from flcav.sensors.lidar import Lidar
-from flcav.sensors.radar import Radar
+from flcav.sensors.camera.camera import Camera
+from flcav.sensors.camera.infrared import Infrared
+from flcav.sensors.lidar.lidar import Lidar
+from flcav.sensors.navigation import Gnss, Imu
+from flcav.sensors.radar.radar import Radar
 
 CAMERA_RANGE_M = (
     100.0  # of labels, where an agent has cameras alone; what shows in an image is labelled at any distance

@@ -12,10 +12,10 @@ from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.recipe import Recipe
+from flcav.world.map.town import TOWNS, load_town
 from flcav.world.scene import Scene
-from flcav.world.town import TOWNS, load_town
 from flcav.world.trace import Trace
-from flcav.world.traffic import simulate
+from flcav.world.traffic.traffic import simulate
 
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")  # it begins the names of scenes
 

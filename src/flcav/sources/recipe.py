@@ -11,8 +11,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from flcav.config import Config, InputError, read_config, shorten
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
+from flcav.world.map.town import TOWNS
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
-from flcav.world.town import TOWNS
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
 STEP_S = 0.1  # of the traffic

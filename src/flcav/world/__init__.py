@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from flcav.world.town import TOWNS, Town, load_town
+    from flcav.world.map.town import TOWNS, Town, load_town
     from flcav.world.trace import Trace
 
 PLACES = {
-    "TOWNS": "flcav.world.town",
-    "Town": "flcav.world.town",
-    "load_town": "flcav.world.town",
+    "TOWNS": "flcav.world.map.town",
+    "Town": "flcav.world.map.town",
+    "load_town": "flcav.world.map.town",
     "Trace": "flcav.world.trace",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]

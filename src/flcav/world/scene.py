@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import pose
+from flcav.world.map.town import Town
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
 from flcav.world.rays.embree import Embree, Solid
 from flcav.world.rays.raycaster import Hits
 from flcav.world.static import Things, town_mesh, town_things
-from flcav.world.town import Town
 from flcav.world.trace import Trace
 
 OFFSET_S = 0.1  # how far from an instant actors are moved on: one step of the traffic

@@ -12,13 +12,20 @@ import shapely
 from numpy.typing import NDArray
 
 from flcav.seeds import stream
+from flcav.world.map.town import KERB_M, Town
 from flcav.world.materials import Material
 from flcav.world.meshes.buildings import building
-from flcav.world.meshes.furniture import clutter, lamp, sensor_mast, sign_plate, sign_post
+from flcav.world.meshes.furniture import (
+    clutter,
+    lamp,
+    sensor_mast,
+    sign_plate,
+    sign_post,
+    signal_head,
+    signal_mast,
+    tree,
+)
 from flcav.world.meshes.mesh import Mesh, join, moved, sheet
-from flcav.world.meshes.plants import tree
-from flcav.world.meshes.signals import signal_head, signal_mast
-from flcav.world.town import KERB_M, Town
 
 GROUND_M = -0.03  # open ground lies a little below the road
 LAND_M = 150.0  # ground beyond the town's bounds

@@ -20,7 +20,7 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.formats.export import FORMATS, export
 from flcav.dataset.formats.exporter import ExportOptions
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, points_in_boxes, wrap_angle
 from flcav.sensors.frame import Frame

@@ -11,11 +11,11 @@ import pytest
 from painted_source import CATEGORIES, PaintedSource
 
 from flcav.cli.main import run
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.extras import installation
-from flcav.world.lanes import map_layers
-from flcav.world.town import load_town
+from flcav.world.map.lanes import map_layers
+from flcav.world.map.town import load_town
 
 SPINS = 2
 WITHOUT_RERUN = importlib.util.find_spec("rerun") is None

@@ -9,10 +9,10 @@ import click
 import pytest
 import typer
 
-from flcav.cli.choices import Device, Engine, Format, Method
 from flcav.cli.main import app, run
+from flcav.cli.options import Device, Engine, Format, Method
 from flcav.dataset.formats.export import FORMATS
-from flcav.dataset.recorder import ENGINES
+from flcav.dataset.recording.recorder import ENGINES
 from flcav.perception.device import device_named
 from flcav.perception.tasks import TASKS, task_named
 

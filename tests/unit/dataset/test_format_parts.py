@@ -17,11 +17,11 @@ from flcav.dataset.formats.mounts import channels, front_camera, quaternion
 from flcav.dataset.formats.nuscenes.files import RADAR, RESOLUTION_M, lidar_bin, map_mask, radar_pcd
 from flcav.dataset.formats.nuscenes.tables import CAMERAS, attribute, chain, token, visibility
 from flcav.dataset.formats.opv2v import agent_numbers, carla_pose, pcd
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
-from flcav.sensors.lens import BODY_FROM_OPTICAL
-from flcav.sensors.lidar import Lidar, ray_pattern
-from flcav.world.town import load_town
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
+from flcav.sensors.lidar.lidar import Lidar, ray_pattern
+from flcav.world.map.town import load_town
 
 angles = st.floats(-3.1, 3.1)
 

@@ -14,7 +14,7 @@ from toy_source import ToySource
 
 from flcav.config import InputError
 from flcav.dataset import layout
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 
 
@@ -82,7 +82,7 @@ def test_another_recipe_cannot_finish_a_recording(tmp_path: Path, monkeypatch: p
         record(ToySource(fail_at=1), tmp_path / "data")
     with pytest.raises(InputError, match=r"unfinished recording of another \(different: seed\)"):
         record(ToySource(seed=1), tmp_path / "data")
-    monkeypatch.setattr("flcav.dataset.recorder.package_versions", lambda: {"numpy": "0.1"})
+    monkeypatch.setattr("flcav.dataset.recording.recorder.package_versions", lambda: {"numpy": "0.1"})
     with pytest.raises(InputError, match=r"different: embreex, flcav, libsumo"):
         record(ToySource(), tmp_path / "data")
 
@@ -111,7 +111,7 @@ def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, jobs: int, unin
 def test_an_interruption_while_files_move_is_made_good(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, str], last: int
 ):
-    from flcav.dataset import recorder
+    from flcav.dataset.recording import recorder
 
     assert last < len(uninterrupted)
     move, moved = recorder._move, []
@@ -140,7 +140,7 @@ import sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 if __name__ == "__main__":
     from pathlib import Path
-    from flcav.dataset.recorder import record
+    from flcav.dataset.recording.recorder import record
     from toy_source import ToySource
     record(ToySource(pause_s=0.3), Path({str(out)!r}), jobs={jobs})
 """

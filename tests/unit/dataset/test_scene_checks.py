@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flcav.dataset.scene_checks import Sight, check_motion
+from flcav.dataset.checks.scenes import Sight, check_motion
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import lidar_pole
+from flcav.world.map.town import TOWNS, load_town
 from flcav.world.scene import Scene
-from flcav.world.town import TOWNS, load_town
 from flcav.world.trace import Trace
-from flcav.world.traffic import simulate
+from flcav.world.traffic.traffic import simulate
 
 
 @pytest.fixture(scope="module")

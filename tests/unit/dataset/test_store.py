@@ -6,7 +6,7 @@ import pytest
 from toy_source import ToySource, toy_frame
 
 from flcav.config import InputError
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 
 

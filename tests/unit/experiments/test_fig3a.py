@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from flcav.experiments.fig3a import Fig3a, article_graph, draw_fig3a, fig3a
+from flcav.experiments.fig3a.run import Fig3a, article_graph, draw_fig3a, fig3a
 from flcav.optimization.graph import to_problem
 from flcav.pipeline.planning import history_of
 

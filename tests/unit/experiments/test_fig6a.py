@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flcav.experiments.fig6a_allocation import PLANS, STAGES, draw_allocation, summarise
-from flcav.experiments.fig6a_findings import allocation_findings
-from flcav.experiments.fig6a_results import EQUAL, JOINT, AllocationResult, AllocationSeed, Planned, Reached
-from flcav.experiments.fig6a_tables import tables
+from flcav.experiments.fig6a.findings import allocation_findings
+from flcav.experiments.fig6a.results import EQUAL, JOINT, AllocationResult, AllocationSeed, Planned, Reached
+from flcav.experiments.fig6a.run import PLANS, STAGES, draw_allocation, summarise
+from flcav.experiments.fig6a.tables import tables
 from flcav.intervals import Estimate
 from flcav.pipeline.results import LinkUse
 

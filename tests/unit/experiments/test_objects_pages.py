@@ -2,17 +2,18 @@
 
 import numpy as np
 
-from flcav.experiments import objects_tables, sim_to_real_tables
-from flcav.experiments.sim_to_real import LabelledCar, RealScore, SimToReal, Story
+from flcav.experiments.sim_to_real import tables as sim_to_real_tables
+from flcav.experiments.sim_to_real.run import LabelledCar, RealScore, SimToReal, Story
+from flcav.experiments.studies import objects as objects_tables
 from flcav.experiments.studies.objects import STUDY
-from flcav.experiments.task_study import Recorded, SeedResult, StudyResult
+from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
 from flcav.geometry import Boxes
 from flcav.intervals import mean_over_seeds
-from flcav.perception.camera_view import CameraView
 from flcav.perception.card import Card
+from flcav.perception.images import CameraView
 from flcav.perception.objects.results import ObjectsEvaluation
 from flcav.report import style
-from flcav.report.clouds import CloudNumbers, SeenCar, Street, compare, real_frame
+from flcav.report.pictures.clouds import CloudNumbers, SeenCar, Street, compare, real_frame
 
 
 def result(ap):

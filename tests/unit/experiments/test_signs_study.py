@@ -3,10 +3,9 @@
 import pytest
 
 from flcav.config import parse_config
-from flcav.dataset.formats.rectangles import SIGNS
-from flcav.experiments.signs_tables import tables
-from flcav.experiments.studies.signs import STUDY
-from flcav.experiments.task_study import Recorded, SeedResult, StudyResult
+from flcav.dataset.rectangles import SIGNS
+from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
+from flcav.experiments.studies.signs import STUDY, tables
 from flcav.intervals import mean_over_seeds
 from flcav.perception.card import Card
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision

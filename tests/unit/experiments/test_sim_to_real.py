@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from flcav.dataset.formats.kitti.folder import KittiFrame
-from flcav.dataset.formats.kitti.frame import Calibration, Objects
-from flcav.experiments import sim_to_real
-from flcav.experiments.clouds import describe
+from flcav.dataset.formats.kitti.read import Calibration, KittiFrame, Objects
+from flcav.experiments.sim_to_real import run as sim_to_real
+from flcav.experiments.sim_to_real.clouds import describe
 from flcav.geometry import Boxes
 from flcav.perception.objects.model import second, small_config
 

@@ -13,7 +13,7 @@ import pytest
 from flcav.cli.main import run as command
 from flcav.config import InputError, parse_config
 from flcav.experiments.studies import STUDIES, study_named, weather
-from flcav.experiments.task_study import results_as_json, results_of_json, run_study, steps_of
+from flcav.experiments.studies.run import results_as_json, results_of_json, run_study, steps_of
 from flcav.perception.training.run import CARD, EVENTS, WEIGHTS
 from flcav.sources.recipe import Recipe
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from flcav.experiments.studies import study_named
-from flcav.experiments.studies.trajectory import CAMERAS, STUDY
-from flcav.experiments.task_study import Recorded, SeedResult, StudyResult
-from flcav.experiments.trajectory_tables import tables
+from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
+from flcav.experiments.studies.trajectory import CAMERAS, STUDY, tables
 from flcav.intervals import mean_over_seeds
 from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from made_problems import SMALL, parsed, searched, written
 
 from flcav.config import InputError
-from flcav.optimization.allocation import Allocation, Infeasible, allocate, weighted_error
-from flcav.optimization.instance import instance
-from flcav.optimization.separable import Relaxed, Separable, relax
+from flcav.optimization.allocation.allocate import Allocation, Infeasible, allocate, weighted_error
+from flcav.optimization.solvers.instance import instance
+from flcav.optimization.solvers.separable import Relaxed, Separable, relax
 
 
 @pytest.mark.parametrize(("model", "seed", "k"), itertools.product(("additive", "effective"), range(4), (0, 1, 2)))

@@ -10,8 +10,8 @@ from made_problems import SMALL, parsed, searched, written
 from test_fleet import best_carried, fleet, problem
 
 from flcav.cli.main import run
-from flcav.optimization.allocation import allocate
-from flcav.optimization.budget_sweep import budget_sweep, savings
+from flcav.optimization.allocation.allocate import allocate
+from flcav.optimization.allocation.budget_sweep import budget_sweep, savings
 from flcav.optimization.fleet import allocate_fleet
 
 

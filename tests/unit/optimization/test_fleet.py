@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from flcav.config import parse_config
-from flcav.optimization.allocation import Infeasible, TaskPlan, allocate
+from flcav.optimization.allocation.allocate import Infeasible, TaskPlan, allocate
+from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.fleet import allocate_fleet
-from flcav.optimization.instance import cost_of
-from flcav.optimization.problem import Problem
+from flcav.optimization.solvers.instance import cost_of
 from flcav.optimization.vehicles import vehicle_shares
 
 

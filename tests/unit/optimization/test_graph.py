@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from flcav.config import InputError, parse_config
-from flcav.optimization.allocation import allocate
+from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.graph import Layers, build, clusters, describe, load, load_problem, save, to_problem
 from flcav.optimization.vehicles import vehicle_shares
 

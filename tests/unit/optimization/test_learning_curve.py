@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.config import InputError
-from flcav.optimization.bands import bands, upper_curve
-from flcav.optimization.history import article_histories, histories, resources_in_order
-from flcav.optimization.learning_curve import fit_additive, fit_effective, fit_power
+from flcav.optimization.curves.bands import bands, upper_curve
+from flcav.optimization.curves.fitting import fit_additive, fit_effective, fit_power
+from flcav.optimization.curves.history import article_histories, histories, resources_in_order
 
 PRINTED = {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}  # a and b of the article
 

@@ -9,10 +9,10 @@ from made_problems import parsed, written
 from flcav.config import InputError, parse_config
 from flcav.network.ledger import LINKS, Budget, Ledger, LedgerEntry
 from flcav.network.plan import MessageSizes, price
-from flcav.optimization.allocation import Infeasible, TaskPlan, allocate, resolved, stage_plan, weighted_error
-from flcav.optimization.area import area
-from flcav.optimization.baselines import BASELINES, baseline
-from flcav.optimization.replanning import Progress, going_on, replan
+from flcav.optimization.allocation.allocate import Infeasible, TaskPlan, allocate, resolved, stage_plan, weighted_error
+from flcav.optimization.allocation.area import area
+from flcav.optimization.allocation.baselines import BASELINES, baseline
+from flcav.optimization.allocation.replanning import Progress, going_on, replan
 
 LIMITS = {"samples": [20, 900], "edge_rounds": [0, 12], "cloud_rounds": [0, 8]}
 

@@ -9,11 +9,11 @@ import yaml
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.optimization.allocation import allocate
-from flcav.optimization.curves import Additive, Decay, Effective
+from flcav.optimization.allocation.allocate import allocate
+from flcav.optimization.allocation.problem_file import Learned, learned, new_problem, with_curves
+from flcav.optimization.curves.curves import Additive, Decay, Effective
+from flcav.optimization.curves.fitting import fit_additive
 from flcav.optimization.graph import load_problem
-from flcav.optimization.learning_curve import fit_additive
-from flcav.optimization.problem_file import Learned, learned, new_problem, with_curves
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 CURVE = Additive(floor=0.01, pretrain=Decay(a=0.7123456789, b=0.25), edge=Decay(a=2e-5, b=0.5, x0=1))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flcav.config import parse_config
-from flcav.optimization.allocation import Infeasible, TaskPlan
-from flcav.optimization.problem import Problem, Task
+from flcav.optimization.allocation.allocate import Infeasible, TaskPlan
+from flcav.optimization.allocation.problem import Problem, Task
 from flcav.optimization.vehicles import VehicleShare, vehicle_shares
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames

@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
 from flcav.geometry import Boxes, points_in_boxes
-from flcav.perception.objects.augment import augment, in_view, resized, sheared, thinned
+from flcav.perception.objects.augment import augment, cut, free, in_view, pasted, resized, sheared, thinned
 from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.model import small_config
-from flcav.perception.objects.paste import cut, free, pasted
 from flcav.perception.objects.samples import Sample, near_range
 from flcav.perception.objects.truth import MIN_RETURNS
 

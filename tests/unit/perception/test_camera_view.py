@@ -10,15 +10,15 @@ from PIL import Image
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration
-from flcav.dataset.formats.kitti.export import calibration_lines
+from flcav.dataset.formats.kitti.write import calibration_lines
 from flcav.geometry import Boxes, transform_points
-from flcav.perception.camera_view import CameraView, kitti_view, recorded_view, view_beside
+from flcav.perception.images import CameraView, kitti_view, recorded_view, view_beside
 from flcav.perception.marks import CloudBoxes
 from flcav.perception.objects.infer import ObjectsFound, box_rows, boxes_of_rows
 from flcav.perception.task import Finding
 from flcav.report import style
-from flcav.report.inference import draw
-from flcav.report.on_picture import ALONG
+from flcav.report.pictures.camera import ALONG
+from flcav.report.pictures.inference import draw
 from flcav.sensors.calibration import CalibrationError, assume
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.agents import choose_frames
 from flcav.perception.card import Card, data_entry

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from flcav.cli.main import run
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.objects import calibrate
 from flcav.perception.objects.model import second_tiny

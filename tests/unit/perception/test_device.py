@@ -12,10 +12,11 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.perception.device import CPU, device_named
 from flcav.perception.objects import Sample
-from flcav.perception.objects.batch import batch_loss
+from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import Second, second, tiny_config
-from flcav.perception.ops import norm, rules
-from flcav.perception.ops.rules import keys_of, strided_rules, submanifold_rules
+from flcav.perception.ops import norm
+from flcav.perception.ops import rulebook as rules
+from flcav.perception.ops.rulebook import keys_of, strided_rules, submanifold_rules
 from flcav.perception.ops.sparse import sparse_convolution
 
 SHAPE, SAMPLES = (9, 14, 11), 2

@@ -9,7 +9,7 @@ import pytest
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.recorder import record
+from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.errors import FALSE_POSITIVE, FINAL_ERROR, MISS, PerceptionError, keep_first, save_errors
 from flcav.perception.signs import errors as sign_errors

@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 
 from flcav.config import InputError
 from flcav.perception.objects import detect, detect_all, second, second_paper, second_tiny
-from flcav.perception.objects.batch import predict
+from flcav.perception.objects.loss import predict
 from flcav.perception.objects.model import head_shape
 from flcav.perception.objects.weights import load_network, load_weights, save_network
 from flcav.perception.weights import from_arrays, to_arrays

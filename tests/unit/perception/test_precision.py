@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from flcav.perception.objects.batch import batch_loss, predict
+from flcav.perception.device import multiplies_bfloat16
+from flcav.perception.objects.loss import batch_loss, predict
 from flcav.perception.objects.model import second, tiny_config
-from flcav.perception.ops.precision import multiplies_bfloat16
 
 CPU = torch.device("cpu")
 

@@ -12,10 +12,9 @@ from flcav.perception.signs.augment import GREY, cut, draw, joined, window
 from flcav.perception.signs.config import CONFIGURATIONS, STRIDES, SignsConfig
 from flcav.perception.signs.detect import Detections, detect
 from flcav.perception.signs.evaluate import ClassPrecision, Truth, mean_average_precision
-from flcav.perception.signs.loss import BOX, CLASS, LEVELS, OBJECT, detection_loss
+from flcav.perception.signs.loss import BOX, CLASS, LEVELS, MOST_TIMES, OBJECT, assign, detection_loss
 from flcav.perception.signs.model import SignDetector, boxes_of, decode
 from flcav.perception.signs.samples import Sample
-from flcav.perception.signs.targets import MOST_TIMES, assign
 from flcav.perception.signs.task import SIGNS, SignsTask
 from flcav.perception.task import fresh
 from flcav.perception.training import train

@@ -4,8 +4,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from flcav.perception.ops import rules as rules_module
-from flcav.perception.ops.rules import cells_of, keys_of, strided_rules, submanifold_rules
+from flcav.perception.ops import rulebook as rules_module
+from flcav.perception.ops.rulebook import cells_of, keys_of, strided_rules, submanifold_rules
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d, sparse_convolution
 
 GRIDS = [((9, 14, 11), 2, 0.15), ((5, 20, 7), 3, 0.4), ((4, 3, 3), 1, 1.0), ((6, 9, 8), 2, 0.01)]

@@ -8,13 +8,12 @@ import torch
 
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects import Sample, second_tiny
-from flcav.perception.objects.anchors import anchor_boxes
 from flcav.perception.objects.augment import augment, transformed
 from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.loss import second_loss
 from flcav.perception.objects.model import head_shape
 from flcav.perception.objects.samples import near_range
-from flcav.perception.objects.targets import assign, decode, direction_of, encode, free_cells
+from flcav.perception.objects.targets import anchor_boxes, assign, decode, direction_of, encode, free_cells
 
 CONFIG = second_tiny().config
 NO_POINTS = np.zeros((0, 4), dtype=np.float32)

@@ -15,7 +15,7 @@ from flcav.perception.metrics.tracks import Moment, amota, clear
 from flcav.perception.objects import second_tiny
 from flcav.perception.tracking import Tracker, evaluate_tracks
 from flcav.perception.tracking import evaluate as tracking_evaluation
-from flcav.perception.tracking.kalman import State, first_state, predicted, updated
+from flcav.perception.tracking.tracker import State, first_state, predicted, updated
 
 from .frames import detections, frame
 

@@ -8,12 +8,12 @@ from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.perception.client import TaskClient
 from flcav.perception.objects import detect_all
-from flcav.perception.objects.batch import batch_loss
 from flcav.perception.objects.evaluate import Asked, score_detections
+from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import configuration, fresh
 from flcav.perception.training import Checkpointing, Validation, batches, train, train_steps
-from flcav.perception.training.schedules import one_cycle
+from flcav.perception.training.loop import one_cycle
 from flcav.perception.weights import to_arrays
 
 from .toy import spin, toy_sample

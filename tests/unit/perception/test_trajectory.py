@@ -20,6 +20,7 @@ from flcav.perception.trajectory.cross_view import (
     SCALE_M,
     CrossAttention,
     CrossViewEncoder,
+    Inputs,
     met_ground,
     pixel_grid,
     place_grid,
@@ -30,8 +31,7 @@ from flcav.perception.trajectory.loss import forecast_loss, map_loss
 from flcav.perception.trajectory.model import Forecast
 from flcav.perception.trajectory.rasters import LAYERS, STATIC, cell_of, centres
 from flcav.perception.trajectory.roads import BEFORE_M, road_map
-from flcav.perception.trajectory.samples import present_at
-from flcav.perception.trajectory.surround import rescaled
+from flcav.perception.trajectory.samples import present_at, rescaled
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.trajectory.tracks import (
     check_instants,
@@ -41,9 +41,8 @@ from flcav.perception.trajectory.tracks import (
     tracks_around,
     tracks_at,
 )
-from flcav.perception.trajectory.views import Inputs
-from flcav.world.lanes import RASTER_LAYERS, map_layers, rasterise
-from flcav.world.town import load_town
+from flcav.world.map.lanes import RASTER_LAYERS, map_layers, rasterise
+from flcav.world.map.town import load_town
 from flcav.world.trace import Trace
 
 RADIUS_M, SPEED = 20.0, 8.0

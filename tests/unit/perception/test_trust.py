@@ -8,7 +8,7 @@ from flcav.geometry import Boxes
 from flcav.perception.metrics import calibration_error, fit_logistic
 from flcav.perception.objects.calibrate import trust
 from flcav.perception.objects.evaluate import Asked, score_detections
-from flcav.perception.objects.slices import slice_lines, sliced
+from flcav.perception.objects.results import slice_lines, sliced
 
 
 def cars(*xs, scores=None):

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from flcav.experiments.recording import record_split
 from flcav.experiments.studies import STUDIES, study_named
+from flcav.experiments.studies.run import record_split
 from flcav.pipeline import work
 from flcav.pipeline.steps.source_hash import PACKAGES, Sources, starts
 
@@ -181,7 +181,7 @@ def test_an_edit_of_flcav_makes_stale_what_it_should(tmp_path):
         by_loss := changed("perception/objects/loss.py")
     )
     assert by_loss.isdisjoint({"recording", "frames", "weather, learn", "signs, test"})
-    assert {"recording", "frames"} <= changed("sensors/lidar.py")
+    assert {"recording", "frames"} <= changed("sensors/lidar/lidar.py")
     for drawing in (copy / "report").glob("*.py"):
         assert not changed(f"report/{drawing.name}")
         break
@@ -193,7 +193,7 @@ def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches
     code = """
         import sys
         from pathlib import Path
-        from flcav.experiments.recording import record_split
+        from flcav.experiments.studies.run import record_split
         from flcav.pipeline.steps import Work
         ran = set()
         def trace(frame, event, argument):
@@ -218,4 +218,7 @@ def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches
 
 def test_a_recording_reaches_what_drives_the_traffic_in_a_process_beside_it():
     reached = Sources().hashes(starts(record_split))
-    assert {"flcav.world.sumo_process", "flcav.world.walking", "flcav.world.scenarios.director"} <= reached.keys()
+    assert {
+        "flcav.world.traffic.sumo_process",
+        "flcav.world.scenarios.director",
+    } <= reached.keys()

@@ -24,9 +24,9 @@ from flcav.pipeline.results import (
     Test,
     Tested,
 )
-from flcav.report.maps import ErrorMap, poles_of
-from flcav.report.sweeps import Detections, Sweep
-from flcav.world.town import load_town
+from flcav.report.pictures.clouds import Detections, Sweep
+from flcav.report.pictures.maps import ErrorMap, poles_of
+from flcav.world.map.town import load_town
 
 MEANS = {"grid": (0.412, 0.503, 0.511), "ring": (0.381, 0.447, 0.468)}
 BUDGETS = {"wireless": 230.0, "wireline": 135.0}

@@ -7,7 +7,7 @@ from PIL import Image
 
 from flcav.geometry import Boxes
 from flcav.report import style
-from flcav.report.birdseye import View, birdseye
+from flcav.report.pictures.birdseye import View, birdseye
 
 
 def view(**fields: object) -> View:

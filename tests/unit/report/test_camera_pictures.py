@@ -13,7 +13,7 @@ from PIL import Image
 from flcav.cli.main import run
 from flcav.dataset.store import Dataset
 from flcav.report import style
-from flcav.report.camera import Shot, camera_sheet, in_rows, shot, thermal_grey
+from flcav.report.pictures.camera import Shot, camera_sheet, in_rows, shot, thermal_grey
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import RIGS, Rig

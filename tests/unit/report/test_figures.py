@@ -10,7 +10,8 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
 from flcav.intervals import MeanOverSeeds
-from flcav.report import figures, style
+from flcav.report import style
+from flcav.report.charts import figures
 
 TESTED, ROUNDS = made_up_run.chart_rows(), made_up_run.rounds()
 BUDGETS, SENT = made_up_run.BUDGETS, made_up_run.sent()

@@ -6,8 +6,8 @@ import pytest
 from jinja2 import UndefinedError
 
 from flcav.pipeline.results import Finding
-from flcav.report.html import render
-from flcav.report.run_page import page
+from flcav.report.pages.html import render
+from flcav.report.pages.run_page import page
 
 PIXEL = b"\x89PNG made up"
 PICTURES: dict[str, bytes] = dict.fromkeys(("map_grid", "before_after", "rounds_objects", "megabytes"), PIXEL)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from flcav.geometry import Boxes
-from flcav.perception.camera_view import CameraView
+from flcav.perception.images import CameraView
 from flcav.perception.marks import Bars, CloudBoxes, Light, Mark, Mode, Paths, PictureBoxes, RoadUser
 from flcav.perception.objects.infer import ObjectsFound
 from flcav.perception.task import Finding
 from flcav.report import style
-from flcav.report.inference import DRAWERS, draw
+from flcav.report.pictures.inference import DRAWERS, draw
 
 PICTURE = np.full((60, 90, 3), 128, np.uint8)
 CLOUD = np.random.default_rng(0).uniform((1, -9, -2, 0), (40, 9, 1, 1), (200, 4)).astype(np.float32)

@@ -6,10 +6,24 @@ from scipy.constants import speed_of_light
 from scipy.integrate import quad
 from scipy.special import beta
 
-from flcav.sensors.air import Air, air_in, through_air
-from flcav.sensors.echoes import under_water
-from flcav.sensors.fog import PULSE_S, QUANTILES, SPREAD_M, STEP_M, SURFACE_PER_SR, soft_returns
-from flcav.sensors.rain import DROP_REFLECTANCE, N0, NEAREST_M, drops, rain_extinction, rain_range_noise
+from flcav.sensors.lidar.air import (
+    DROP_REFLECTANCE,
+    N0,
+    NEAREST_M,
+    PULSE_S,
+    QUANTILES,
+    SPREAD_M,
+    STEP_M,
+    SURFACE_PER_SR,
+    Air,
+    air_in,
+    drops,
+    rain_extinction,
+    rain_range_noise,
+    soft_returns,
+    through_air,
+)
+from flcav.sensors.lidar.returns import under_water
 from flcav.world.weather import Weather
 
 LEAST = 0.7 * 0.9 / 300.0**2

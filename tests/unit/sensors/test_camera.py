@@ -6,15 +6,15 @@ import pytest
 from scipy.spatial import Delaunay
 
 from flcav.geometry import inverse, pose, transform_points
-from flcav.sensors.camera import Camera, Exposure, photograph
-from flcav.sensors.infrared import Infrared, thermal_image
-from flcav.sensors.lens import BODY_FROM_OPTICAL, directions, project
-from flcav.sensors.shading.appearance import SEMANTICS
-from flcav.sensors.shading.render import render
+from flcav.sensors.camera.camera import Camera, Exposure, photograph
+from flcav.sensors.camera.infrared import Infrared, thermal_image
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, directions, project
+from flcav.sensors.rendering.appearance import SEMANTICS
+from flcav.sensors.rendering.render import render
+from flcav.world.map.signals import Signals
+from flcav.world.map.town import Signs, Town
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
-from flcav.world.signals import Signals
-from flcav.world.town import Signs, Town
 from flcav.world.trace import Trace
 from flcav.world.weather import WEATHERS, Weather
 

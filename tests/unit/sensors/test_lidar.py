@@ -6,12 +6,12 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.geometry import pose
-from flcav.sensors.lidar import Lidar, cast, draw_passes, ray_pattern, scan
+from flcav.sensors.lidar.lidar import Lidar, cast, draw_passes, ray_pattern, scan
 from flcav.sensors.rig import RIGS, Rig
+from flcav.world.map.town import Town
 from flcav.world.materials import REFLECTIVITY, Material
 from flcav.world.scene import Scene
 from flcav.world.shapes import SHAPES
-from flcav.world.town import Town
 from flcav.world.trace import Trace
 
 PERFECT: dict[str, Any] = {"noise_m": 0.0, "dropout": 0.0, "sensitivity_m": 1e4}

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flcav.geometry import pose
-from flcav.sensors.lidar import Lidar, scan
+from flcav.sensors.lidar.lidar import Lidar, scan
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, Material
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene, Surfaces

@@ -8,15 +8,14 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.geometry import pose, transform_points
-from flcav.sensors.beams import BEAMS
-from flcav.sensors.carla import CarlaReturns
-from flcav.sensors.lidar import Lidar, point_times_s, ray_pattern, scan
+from flcav.sensors.lidar.beams import BEAMS, CarlaReturns
+from flcav.sensors.lidar.lidar import Lidar, point_times_s, ray_pattern, scan
+from flcav.sensors.lidar.rolling import Motion
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
-from flcav.sensors.rolling import Motion
+from flcav.world.map.town import Town
 from flcav.world.materials import REFLECTIVITY, Material
 from flcav.world.scene import Scene
-from flcav.world.town import Town
 from flcav.world.trace import Trace
 from flcav.world.weather import WEATHERS, Weather
 

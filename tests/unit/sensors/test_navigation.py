@@ -9,13 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import pose
-from flcav.sensors.drift import STEP_S, walk, wander
-from flcav.sensors.geodesy import geodetic
-from flcav.sensors.gnss import Gnss, fix
-from flcav.sensors.imu import Imu, reading
-from flcav.world.parameters import GeoReference
+from flcav.sensors.navigation import STEP_S, Gnss, Imu, fix, geodetic, reading, walk, wander
+from flcav.world.map.parameters import GeoReference
+from flcav.world.map.town import Town
 from flcav.world.scene import Scene
-from flcav.world.town import Town
 from flcav.world.trace import Trace
 
 G = 9.80665

@@ -7,18 +7,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.config import InputError
-from flcav.dataset.image_checks import check_images
+from flcav.dataset.checks.images import check_images
 from flcav.geometry import inverse, points_in_boxes, pose
 from flcav.sensors.calibration import CalibrationError
-from flcav.sensors.camera import Camera
-from flcav.sensors.lens import project
-from flcav.sensors.lidar import Lidar, cast, draw_passes, ray_pattern
+from flcav.sensors.camera.camera import Camera
+from flcav.sensors.camera.lens import project
+from flcav.sensors.lidar.lidar import Lidar, cast, draw_passes, ray_pattern
+from flcav.sensors.lidar.visibility import rays_into_box
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import RIGS, MountedLidar, Rig
-from flcav.sensors.visibility import rays_into_box
+from flcav.world.map.town import Signs, Town
 from flcav.world.scene import Scene
 from flcav.world.shapes import SHAPES
-from flcav.world.town import Signs, Town
 from flcav.world.trace import Trace
 
 EVERY_SHAPE = [(category, index) for category in SHAPES for index in range(len(SHAPES[category]))]

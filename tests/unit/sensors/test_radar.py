@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 
 from flcav.geometry import pose
-from flcav.sensors.radar import Radar, cross_sections, radar_sweep, rays_of
-from flcav.sensors.radar_detector import Cells, detect, false_alarms, snr_per_m2
-from flcav.sensors.rcs import ECHOES, actor_rcs, silhouette
+from flcav.sensors.radar.detector import ECHOES, Cells, actor_rcs, detect, false_alarms, silhouette, snr_per_m2
+from flcav.sensors.radar.radar import Radar, cross_sections, radar_sweep, rays_of
+from flcav.world.map.town import Town
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
-from flcav.world.town import Town
 from flcav.world.trace import CATEGORIES, Trace
 from flcav.world.weather import WEATHERS
 

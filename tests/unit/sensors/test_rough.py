@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from flcav.sensors.echoes import rough_cosine
-from flcav.sensors.lidar import Lidar, _report_intensity
+from flcav.sensors.lidar.lidar import Lidar, _report_intensity
+from flcav.sensors.lidar.returns import rough_cosine
 
 
 def test_a_smooth_surface_is_lambertian():

@@ -9,21 +9,22 @@ from scipy.ndimage import label
 from shapely.geometry import MultiPolygon, Point, Polygon
 
 from flcav.geometry import pose
-from flcav.sensors.camera import Camera, photograph
-from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, directions
-from flcav.sensors.shading import antialias, memory
-from flcav.sensors.shading.appearance import appearance_of
-from flcav.sensors.shading.glare import add_sun_glare
-from flcav.sensors.shading.light import light_of
-from flcav.sensors.shading.markings import markings_of, paint_at
-from flcav.sensors.shading.openness import DARKEST, openness
-from flcav.sensors.shading.rain import add_drops
-from flcav.sensors.shading.survey import survey
-from flcav.sensors.shading.tone import develop, grain
-from flcav.world.layers import Arrow, Crossing, MapLayers, Marking
-from flcav.world.paint import painted
+from flcav.sensors.camera.camera import Camera, photograph
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens, directions
+from flcav.sensors.camera.tone import develop, grain
+from flcav.sensors.rendering import render as memory
+from flcav.sensors.rendering import supersampling as antialias
+from flcav.sensors.rendering.ambient_occlusion import DARKEST, openness
+from flcav.sensors.rendering.appearance import appearance_of
+from flcav.sensors.rendering.gbuffer import survey
+from flcav.sensors.rendering.glare import add_sun_glare
+from flcav.sensors.rendering.ground import markings_of, paint_at
+from flcav.sensors.rendering.light import light_of
+from flcav.sensors.rendering.rain import add_drops
+from flcav.world.map.layers import Arrow, Crossing, MapLayers, Marking
+from flcav.world.map.paint import painted
+from flcav.world.map.town import Town
 from flcav.world.scene import Scene
-from flcav.world.town import Town
 from flcav.world.trace import Trace
 from flcav.world.weather import WEATHERS, Weather
 

@@ -9,14 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import inverse, pose, transform_points
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens, directions, project
 from flcav.sensors.labels.outlines import amodal_boxes, clipped, hull
-from flcav.sensors.labels.regions import actor_regions, thing_regions
-from flcav.sensors.labels.views import view_actors
-from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, directions, project
+from flcav.sensors.labels.views import actor_regions, thing_regions, view_actors
+from flcav.world.map.town import Town
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
 from flcav.world.shapes import SHAPES
-from flcav.world.town import Town
 from flcav.world.trace import Trace
 
 LENS = Lens(width=160, height=96, fov_deg=80.0)

@@ -6,7 +6,7 @@ import pytest
 from flcav.config import InputError, parse_config, read_config
 from flcav.sensors.rig import RIGS
 from flcav.sources.recipe import Recipe, find_recipe, load_recipe, recipe_path
-from flcav.world.town import load_town
+from flcav.world.map.town import load_town
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 

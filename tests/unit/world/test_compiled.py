@@ -3,16 +3,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-INNER = "from flcav.world.rays.compiled import inlined\n@inlined\ndef inner(x):\n    return x + {}\n"
+INNER = "from flcav.compiled import inlined\n@inlined\ndef inner(x):\n    return x + {}\n"
 MIDDLE = """
-from flcav.world.rays.compiled import inlined
+from flcav.compiled import inlined
 from inner import inner
 @inlined
 def middle(x):
     return inner(x)
 """
 OUTER = """
-from flcav.world.rays.compiled import compiled
+from flcav.compiled import compiled
 from middle import middle
 @compiled
 def outer(x):

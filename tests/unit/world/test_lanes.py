@@ -13,12 +13,11 @@ from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
 from flcav.geometry import pose
-from flcav.world.lanes import RASTER_LAYERS, map_layers, rasterise
-from flcav.world.layers import MapLayers
-from flcav.world.paint import painted
-from flcav.world.raster import fill
-from flcav.world.roads import RoadNet, read_net
-from flcav.world.town import TOWNS, Town, load_town
+from flcav.world.map.lanes import RASTER_LAYERS, fill, map_layers, rasterise
+from flcav.world.map.layers import MapLayers
+from flcav.world.map.paint import painted
+from flcav.world.map.roads import RoadNet, read_net
+from flcav.world.map.town import TOWNS, Town, load_town
 
 
 @pytest.fixture(scope="module", params=TOWNS)

@@ -11,15 +11,15 @@ from shapely.geometry import LineString, Polygon
 
 from flcav.config import InputError, read_config
 from flcav.sources.recipe import Recipe
-from flcav.world.lanes import map_layers
+from flcav.world.map.lanes import map_layers
+from flcav.world.map.parameters import TownParameters
+from flcav.world.map.roads import read_net
+from flcav.world.map.surfaces import footprint
+from flcav.world.map.town import Town, load_town
 from flcav.world.opendrive.document import read_document
 from flcav.world.opendrive.georeference import geo_reference, inverse_mercator
 from flcav.world.opendrive.importing import Imported, import_town
-from flcav.world.parameters import TownParameters
-from flcav.world.roads import read_net
-from flcav.world.surfaces import footprint
-from flcav.world.town import Town, load_town
-from flcav.world.traffic import simulate
+from flcav.world.traffic.traffic import simulate
 
 CROSS = Path(__file__).parents[2] / "data" / "cross.xodr"
 REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[3].parent / "shared" / "data")) / "carla_maps"

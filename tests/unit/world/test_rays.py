@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flcav.compiled import compiled
 from flcav.geometry import inverse, pose, transform_points
-from flcav.world.rays.compiled import compiled
 from flcav.world.rays.embree import Assembly, Embree, Solid
 from flcav.world.rays.loader import embree_library
 from flcav.world.rays.packets import trace_packets

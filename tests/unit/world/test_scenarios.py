@@ -12,14 +12,14 @@ from flcav.config import InputError, read_config
 from flcav.geometry import wrap_angle
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.world.roads import read_net
+from flcav.world.map.roads import read_net
+from flcav.world.map.surfaces import footprint
+from flcav.world.map.town import Town, load_town
+from flcav.world.scenarios.director import SCRIPTS
 from flcav.world.scenarios.scenario import Scenario
-from flcav.world.scenarios.scripts import SCRIPTS
 from flcav.world.shapes import SHAPES
-from flcav.world.surfaces import footprint
-from flcav.world.town import Town, load_town
 from flcav.world.trace import Event, Trace
-from flcav.world.traffic import simulate
+from flcav.world.traffic.traffic import simulate
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 STEP_S = 0.1

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from flcav.geometry import pose
+from flcav.world.map.town import Town
 from flcav.world.materials import PAINT_REFLECTIVITY, Material
 from flcav.world.scene import Scene
-from flcav.world.town import Town
 from flcav.world.trace import Trace
 
 AHEAD = np.array([[1.0, 0.0, 0.0]], np.float32)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from flcav.geometry import pose
+from flcav.world.map.parameters import CLUTTER as PLACED_CLUTTER
+from flcav.world.map.town import TOWNS, Poles, Signs, Town, load_town
 from flcav.world.materials import Material
 from flcav.world.meshes.furniture import CLUTTER, clutter
 from flcav.world.meshes.mesh import Mesh
-from flcav.world.parameters import CLUTTER as PLACED_CLUTTER
 from flcav.world.rays.embree import Solid
 from flcav.world.static import GROUND_M, KERB_M, town_mesh
-from flcav.world.town import TOWNS, Poles, Signs, Town, load_town
 
 
 def look(mesh: Mesh, origin: tuple[float, float, float], direction: tuple[float, float, float]):

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flcav.world import sumo
-from flcav.world.demand import write_demand
-from flcav.world.roads import read_net
-from flcav.world.town import load_town
+from flcav.world.map.roads import read_net
+from flcav.world.map.town import load_town
+from flcav.world.traffic import sumo
+from flcav.world.traffic.demand import write_demand
 
 ASK = """
 import sys

@@ -12,10 +12,10 @@ from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from flcav.config import InputError
-from flcav.world.parameters import CLUTTER
-from flcav.world.roads import read_net
-from flcav.world.surfaces import footprint
-from flcav.world.town import TOWNS, Town, load_town
+from flcav.world.map.parameters import CLUTTER
+from flcav.world.map.roads import read_net
+from flcav.world.map.surfaces import footprint
+from flcav.world.map.town import TOWNS, Town, load_town
 
 
 @pytest.fixture(scope="module", params=TOWNS)

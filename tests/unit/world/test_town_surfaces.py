@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
-from flcav.world.surfaces import footprint, simple_polygons
+from flcav.world.map.surfaces import footprint, simple_polygons
 
 holes = st.lists(st.tuples(st.floats(1, 16), st.floats(1, 16), st.floats(0.5, 3), st.floats(0, 3)), max_size=4)
 

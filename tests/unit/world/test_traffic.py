@@ -10,13 +10,13 @@ from shapely.geometry import Polygon
 from flcav.config import InputError
 from flcav.geometry import wrap_angle
 from flcav.seeds import child_seed
-from flcav.world.density import mean_actors
+from flcav.world.map.census import mean_actors
+from flcav.world.map.surfaces import footprint
+from flcav.world.map.town import KERB_M, TOWNS, Town, load_town
 from flcav.world.shapes import SHAPES
-from flcav.world.surfaces import footprint
-from flcav.world.town import KERB_M, TOWNS, Town, load_town
 from flcav.world.trace import CATEGORIES, Trace
-from flcav.world.traffic import simulate
-from flcav.world.walking import HURRY_MPS, Walkers
+from flcav.world.traffic.sumo_process import HURRY_MPS, Walkers
+from flcav.world.traffic.traffic import simulate
 
 TIMES_S = 60.0 + 0.1 * np.arange(300)
 ROUGHLY = {

@@ -12,10 +12,9 @@ import numpy as np
 from faster_coco_eval.core import mask as coco_mask
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks
-from flcav.dataset.formats.rectangles import CLASSES, rectangles
-from flcav.dataset.formats.splits import split_scenes
+from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks, split_scenes
 from flcav.dataset.payloads import encode_png
+from flcav.dataset.rectangles import CLASSES, rectangles
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
 from flcav.sensors.frame import Frame

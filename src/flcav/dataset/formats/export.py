@@ -9,7 +9,7 @@ from pathlib import Path
 from flcav.config import InputError
 from flcav.dataset.formats.coco import export_coco
 from flcav.dataset.formats.exporter import Exported, Exporter, ExportOptions
-from flcav.dataset.formats.kitti.export import export_kitti
+from flcav.dataset.formats.kitti.write import export_kitti
 from flcav.dataset.formats.mcap import export_mcap
 from flcav.dataset.formats.nuscenes import export_nuscenes
 from flcav.dataset.formats.opv2v import export_opv2v

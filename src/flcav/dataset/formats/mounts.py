@@ -1,4 +1,4 @@
-"""Which of an agent's sensors is which, by where it looks; and rotations as other formats write them."""
+"""Where sensors stand on their agent, and how the agent moved, in the terms of other formats."""
 
 from collections.abc import Mapping
 
@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
+from flcav.dataset.store import Dataset
 from flcav.geometry import wrap_angle
 
 LEVEL_RAD = np.radians(2.0)  # a camera tilted or rolled by less is level
@@ -45,3 +46,18 @@ def quaternion(matrix: NDArray[np.float64]) -> list[float]:
     """Return w, x, y, z of the rotation in a (3, 3) or (4, 4) transform."""
     x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True).tolist()
     return [w, x, y, z]
+
+
+def agent_velocities(dataset: Dataset, scene: str) -> dict[tuple[str, int], NDArray[np.float64]]:
+    """Return (agent, spin) -> (3,) velocity, world [m/s]; zero of an agent that is not in the scene's traffic."""
+    keys = [dataset.keys[i] for i in dataset.select(scenes=[scene])]
+    velocities = {(key.agent, key.index): np.zeros(3) for key in keys}
+    trace = dataset.trace(scene)
+    if trace is None:
+        return velocities
+    actors = {name: a for a, name in enumerate(trace.actor.tolist())}
+    for key in keys:
+        if key.agent in actors:
+            t = int(np.argmin(np.abs(trace.time_s - key.time_s)))
+            velocities[key.agent, key.index] = trace.velocity[t, actors[key.agent]]
+    return velocities

@@ -19,16 +19,15 @@ from flcav.dataset.formats.exporter import (
     lacks,
     points_in_each_box,
     read_frame,
+    split_validated,
 )
-from flcav.dataset.formats.motion import agent_velocities
-from flcav.dataset.formats.mounts import channels, optical_yaw
-from flcav.dataset.formats.splits import split_validated
+from flcav.dataset.formats.mounts import agent_velocities, channels, optical_yaw
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
 from flcav.progress import Report
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Frame
-from flcav.sensors.lens import BODY_FROM_OPTICAL
 
 Array = NDArray[np.float64]
 

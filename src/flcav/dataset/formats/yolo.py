@@ -8,10 +8,9 @@ from pathlib import Path
 
 import yaml
 
-from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks
-from flcav.dataset.formats.rectangles import CLASSES, Rectangles, rectangles
-from flcav.dataset.formats.splits import split_validated
+from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks, split_validated
 from flcav.dataset.payloads import encode_png
+from flcav.dataset.rectangles import CLASSES, Rectangles, rectangles
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
 

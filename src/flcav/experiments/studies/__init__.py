@@ -11,7 +11,7 @@ from flcav.config import InputError
 from flcav.plugins import load_own
 
 if TYPE_CHECKING:
-    from flcav.experiments.task_study import Study, StudyResult
+    from flcav.experiments.studies.run import Study, StudyResult
 
 STUDIES: tuple[str, ...] = tuple(sorted(found.name.replace("_", "-") for found in iter_modules(__path__)))
 
@@ -23,7 +23,7 @@ def study_named(name: str) -> "Study":
     """
     if name in STUDIES:
         return import_module(f"{__name__}.{name.replace('-', '_')}").STUDY
-    from flcav.experiments.task_study import Study
+    from flcav.experiments.studies.run import Study
     from flcav.perception.study import Studied
     from flcav.perception.task import Task
 
@@ -39,7 +39,7 @@ def study_named(name: str) -> "Study":
 def draw_numbers(results: "StudyResult") -> bytes:
     """Return a PNG with a panel per test: a bar for the mean of each number, a dot for each seed."""
     from flcav.report import style
-    from flcav.report.precision import Bar, precisions
+    from flcav.report.charts.studies import Bar, precisions
 
     panels = {
         test: [

@@ -1,18 +1,93 @@
-"""The study of the object task: its tracks are followed besides, and AP drawn by class, distance and occlusion."""
+"""The study of the object task: its picture, and the tables of its page."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from flcav.dataset.store import Dataset
-from flcav.experiments.task_study import Study, StudyResult
+from flcav.experiments.studies.run import Study, StudyResult, training_rows
+from flcav.markdown import bullets, table
+from flcav.perception.objects.evaluate import Score
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.results import ObjectsEvaluation
+from flcav.perception.objects.results import ObjectsEvaluation, SlicePrecision
 from flcav.perception.objects.study import TRACKS
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.tracking import evaluate_tracks
 from flcav.report import style
-from flcav.report.precision import Bar, precisions
+from flcav.report.charts.studies import Bar, precisions
+from flcav.verdicts import aim_sentence
+
+WANTED = {  # of cars on other scenes of the towns that were learned from
+    "Car AP 3d at 0.5": (0.85, "Car AP3D@0.5 of 0.85"),
+    "Car right headings": (0.9, "90 % of the cars found at 3D IoU 0.5 within 90 degrees of their heading"),
+}
+HEADINGS = ("AOS3D at 0.5", "right headings")  # of those found in 3D at IoU 0.5
+MEASURES = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
+
+
+def tables(results: StudyResult[ObjectsEvaluation]) -> dict[str, str]:
+    """Return the page's tables by name, from what `run_study` returned."""
+    heads = [f"{kind} at {overlap}" for kind, overlap in MEASURES]
+    return {
+        "findings": bullets(_findings(results)),
+        "classes": table(("test", "class", "to find", *heads, *HEADINGS, "calibration error"), _classes(results)),
+        "slices": table(("test", "cars", "to find", *heads), _slices(results)),
+        "training": table(
+            ("seed", "sweeps", "steps", "validation, mean AP3D@0.5 of the classes, after each epoch; the best is kept"),
+            training_rows(results),
+        ),
+        "tracks": table(("class", "MOTA", "AMOTA", "id switches", "velocity off by [m/s]"), _tracks(results)),
+    }
+
+
+def _findings(results: StudyResult[ObjectsEvaluation]) -> list[str]:
+    seeds, said = len(results.seeds), []
+    for test in dict.fromkeys(str(recipe["town"]) for recipe in results.recipes.train):
+        for name, (wanted, claim) in WANTED.items():
+            said.append(aim_sentence(f"{claim} on {test}", wanted, results.summary[test][name], seeds) + ".")
+    return said
+
+
+def _classes(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
+    rows = []
+    for test in results.summary:
+        tested = results.tested(test)
+        for name in (trust.label for trust in tested[0].trust):
+            of_class = [[row for row in one.scores if row.label == name] for one in tested]
+            errors = [row.ece for one in tested for row in one.trust if row.label == name]
+            half = [row for rows in of_class for row in rows if (row.kind, row.iou) == MEASURES[0]]
+            headings = [_mean(row.aos for row in half), _mean(row.right_headings for row in half)]
+            rows.append([test, name, str(of_class[0][0].targets), *_measures(of_class), *headings, _mean(errors)])
+    return rows
+
+
+def _slices(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
+    rows = []
+    for test in results.summary:
+        tested = [[row for row in one.slices if row.label == "Car"] for one in results.tested(test)]
+        for by, name in dict.fromkeys((row.by, row.slice) for row in tested[0]):
+            own = [[row for row in one if (row.by, row.slice) == (by, name)] for one in tested]
+            rows.append([test, f"{by} {name}", str(own[0][0].targets), *_measures(own)])
+    return rows
+
+
+def _tracks(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
+    rows = []
+    for seeds in zip(*(found.tracks.scores for found in results.tested("tracks") if found.tracks)):
+        numbers = zip(*((row.mota, row.amota, row.id_switches, row.velocity_error_mps) for row in seeds))
+        rows.append([seeds[0].label, *map(_mean, numbers)])
+    return rows
+
+
+def _measures(seeds: Sequence[Sequence[Score | SlicePrecision]]) -> list[str]:
+    """Return the mean AP over seeds of each measure; seeds: the rows of each."""
+    return [_mean(row.ap for rows in seeds for row in rows if (row.kind, row.iou) == measure) for measure in MEASURES]
+
+
+def _mean(values: Iterable[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return f"{np.mean(known):.3f}" if known else ""
 
 
 def followed(found: ObjectsEvaluation, network: Second, data: Dataset) -> ObjectsEvaluation:

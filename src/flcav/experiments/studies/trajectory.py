@@ -1,15 +1,88 @@
-"""The studies of the trajectory task, on rasters and through cameras: final errors are drawn by slice."""
+"""The studies of the trajectory task, on rasters and through cameras: their picture, and the tables of their pages."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flcav.experiments.task_study import Study, StudyResult
+from flcav.experiments.studies.run import SeedResult, Study, StudyResult
+from flcav.intervals import MeanOverSeeds
+from flcav.markdown import bullets, table
 from flcav.perception.trajectory import study
-from flcav.perception.trajectory.evaluate import PathErrors, TrajectoryEvaluation
+from flcav.perception.trajectory.evaluate import ALL, PathErrors, TrajectoryEvaluation
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.report import style
-from flcav.report.path_errors import Bar, path_errors
+from flcav.report.charts.studies import ErrorBar, path_errors
+from flcav.verdicts import aim_sentence
+
+WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # of constant velocity's final error at junctions, at most
+SLICE = "at junctions"
+PREDICTORS = {
+    "single path": ("single_ADE", "single_FDE", "miss_rate_single"),
+    "likeliest mode": ("minADE_1", "minFDE_1", "miss_rate_1"),
+    "best of six modes": ("minADE_K", "minFDE_K", "miss_rate_K"),
+    "constant velocity": ("constant_velocity_ADE", "constant_velocity_FDE", "miss_rate_constant_velocity"),
+}
+
+
+def tables(results: StudyResult[TrajectoryEvaluation]) -> dict[str, str]:
+    """Return the page's tables by name, from what `run_study` returned."""
+    return {
+        "findings": bullets(
+            _finding(wanted, test, means, len(results.seeds))
+            for test, means in results.summary.items()
+            for wanted in WANTED[results.network]
+        ),
+        "errors": table(
+            (
+                "test",
+                "slice",
+                "who predicts",
+                "average error m",
+                "final error m",
+                "missed by 2 m",
+                "of constant velocity",
+            ),
+            [row for test, means in results.summary.items() for row in _errors(test, means)],
+        ),
+        "training": table(
+            (
+                "seed",
+                "samples",
+                "steps",
+                "loss of the last epoch",
+                "validation, final error m: likeliest mode, best of six",
+            ),
+            [_trained(seed) for seed in results.seeds],
+        ),
+    }
+
+
+def _finding(wanted: float, test: str, means: Mapping[str, MeanOverSeeds], seeds: int) -> str:
+    ratio = means[f"{SLICE}, ratio_single"]
+    aim = f"A final error of {wanted} times constant velocity's at junctions, {test}"
+    said = aim_sentence(aim, wanted, ratio, seeds, at_most=True)
+    best, plain = (means[f"{SLICE}, {key}"].mean for key in ("minFDE_K", "constant_velocity_FDE"))
+    return f"{said}. Of six modes the best ends {best:.2f} m off, constant velocity {plain:.2f} m."
+
+
+def _errors(test: str, means: Mapping[str, MeanOverSeeds]) -> list[list[str]]:
+    rows = []
+    for name in dict.fromkeys(key.rpartition(", ")[0] for key in means):
+        count = round(means[f"{name}, samples"].mean)
+        for who, (ade, fde, missed) in PREDICTORS.items():
+            average, final, misses = (means[f"{name}, {key}"] for key in (ade, fde, missed))
+            share = final.mean / means[f"{name}, constant_velocity_FDE"].mean
+            shown = final.told() if final.high > final.low else f"{final.mean:.3f}"
+            numbers = [f"{average.mean:.2f}", shown, f"{misses.mean:.1%}", f"{share:.2f}"]
+            rows.append([test, f"{name} ({count})", who, *numbers])
+    return rows
+
+
+def _trained(seed: SeedResult[TrajectoryEvaluation]) -> list[str]:
+    every = TrajectoryEvaluation.of_json(seed.card.metrics, "card").slices[ALL]
+    known = "" if every is None else f"{every.minFDE_1:.2f}, {every.minFDE_K:.2f}"
+    learning = seed.card.learning
+    return [str(seed.seed), str(seed.card.samples), str(learning.steps), f"{learning.loss:.2f}", known]
 
 
 def _draw(results: StudyResult[TrajectoryEvaluation]) -> bytes:
@@ -32,9 +105,9 @@ def _draw(results: StudyResult[TrajectoryEvaluation]) -> bytes:
     return style.png(path_errors(panels))
 
 
-def _bar(name: str, seeds: Sequence[float | None]) -> Bar:
+def _bar(name: str, seeds: Sequence[float | None]) -> ErrorBar:
     known = [value for value in seeds if value is not None]
-    return Bar(name, float(np.mean(known)), known)
+    return ErrorBar(name, float(np.mean(known)), known)
 
 
 STUDY = Study(TRAJECTORY, TRAJECTORY.study(), draw=_draw)

@@ -1,17 +1,78 @@
-"""The study of the weather task: the whole space is tested by the nearest class besides; confusions are drawn."""
+"""The study of the weather task: its picture, and the tables of its page."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from flcav.dataset.store import Dataset
-from flcav.experiments.task_study import Study, StudyResult
+from flcav.experiments.studies.run import Study, StudyResult
+from flcav.intervals import Estimate
+from flcav.markdown import bullets, table
 from flcav.perception.weather.evaluate import Classification
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.study import WHOLE_SPACE
 from flcav.perception.weather.task import WEATHER, over_the_whole_space
 from flcav.report import style
-from flcav.report.confusion import confusions
+from flcav.report.charts.studies import confusions
+from flcav.verdicts import aim_sentence
+
+WANTED = 0.95  # accuracy
+
+
+def tables(results: StudyResult[Classification]) -> dict[str, str]:
+    """Return Markdown by name: findings, accuracy, recall, seeds."""
+    return {
+        "findings": bullets(_findings(results)),
+        "accuracy": _accuracy(results),
+        "recall": _recall(results),
+        "seeds": _seeds(results),
+    }
+
+
+def _findings(results: StudyResult[Classification]) -> list[str]:
+    said = []
+    for test, numbers in results.summary.items():
+        for name, mean in numbers.items():
+            where = "within the classes' regions" if name == "accuracy" else "by the nearest class, everywhere"
+            aim = f"Accuracy of {WANTED} on {test}, {where}"
+            said.append(aim_sentence(aim, WANTED, mean, len(results.seeds)) + ".")
+    return said
+
+
+def _accuracy(results: StudyResult[Classification]) -> str:
+    rows = []
+    for test, numbers in results.summary.items():
+        tested = results.tested(test)
+        for name, mean in numbers.items():
+            each = [found if name == "accuracy" else found.nearest or found for found in tested]
+            over_scenes = ", ".join(Estimate(one.accuracy, one.low, one.high).told() for one in each)
+            what = "within the regions" if name == "accuracy" else "everywhere, nearest class"
+            rows.append([test, what, each[0].pictures, each[0].scenes, mean.told(), over_scenes])
+    header = ("test", "pictures", "number", "scenes", "accuracy, over seeds", "each seed, over its scenes")
+    return table(header, rows)
+
+
+def _recall(results: StudyResult[Classification]) -> str:
+    tests = [test for test in results.summary if results.tested(test)[0].nearest is None]
+    classes = results.tested(tests[0])[0].classes
+    rows = []
+    for number, name in enumerate(classes):
+        cells = []
+        for test in tests:
+            matrix = np.sum([found.confusion for found in results.tested(test)], axis=0)[number]
+            others = {classes[i]: int(matrix[i]) for i in np.argsort(-matrix, kind="stable") if i != number}
+            taken = ", ".join(f"{other} {count}" for other, count in others.items() if count)
+            cells.append(f"{matrix[number] / matrix.sum():.3f}" + (f" ({taken})" if taken else ""))
+        rows.append([name, *cells])
+    return table(("class", *(f"recall, {test} (taken for)" for test in tests)), rows)
+
+
+def _seeds(results: StudyResult[Classification]) -> str:
+    rows = []
+    for seed in results.seeds:
+        validated = Classification.of_json(seed.card.metrics, "card")
+        rows.append([seed.seed, seed.card.samples, seed.card.learning.steps, f"{validated.accuracy:.3f}"])
+    return table(("seed", "training pictures", "steps", "accuracy on validation"), rows)
 
 
 def with_nearest(found: Classification, network: Classifier, data: Dataset) -> Classification:

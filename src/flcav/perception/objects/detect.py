@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.geometry import Boxes, concatenate
-from flcav.perception.objects.anchors import anchor_boxes, anchor_classes
-from flcav.perception.objects.batch import predict
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.loss import LOG_VARIANCES
+from flcav.perception.objects.loss import LOG_VARIANCES, predict
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.targets import decode, decoded_variance
+from flcav.perception.objects.targets import anchor_boxes, anchor_classes, decode, decoded_variance
 from flcav.perception.ops.rotated import nms
 
 CANDIDATES = 256  # best-scoring anchors per class that suppression looks at

@@ -14,7 +14,7 @@ from flcav.dataset.formats.kitti import read_points
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
-from flcav.perception.camera_view import CameraView, recorded_view, view_beside
+from flcav.perception.images import CameraView, recorded_view, view_beside
 from flcav.perception.objects.samples import checked_points
 from flcav.perception.objects.truth import only_lidar
 from flcav.perception.task import Result

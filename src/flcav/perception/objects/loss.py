@@ -1,23 +1,17 @@
-"""The loss of SECOND: focal on classes, smooth L1 with the sine of the yaw error on boxes, cross-entropy on direction.
-
-Yan et al. 2018, sec. 3.3, eqs. 1-4, with the published weights 1 and 2. The direction's is 1 instead of 0.2: with the
-published one a third of the cars found head the wrong way, since front and back differ by a few points.
-
-Predicted variances learn from the Gaussian likelihood of the residuals' errors (the variance's part of He et al.,
-"Bounding Box Regression with Uncertainty", CVPR 2019, eq. 9), which they do not change: a network finds the same boxes
-with them as without.
-"""
+"""The loss of a batch: focal loss of classes, smooth L1 of residuals, cross entropy of directions."""
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
-from flcav.perception.objects.anchors import anchor_classes
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.model import HeadOutput
-from flcav.perception.objects.targets import Targets
+from flcav.perception.objects.model import HeadOutput, Second
+from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.targets import Targets, anchor_classes, assign
 
 ALPHA, GAMMA = 0.25, 2.0
 BOX_WEIGHT, DIRECTION_WEIGHT, VARIANCE_WEIGHT = 2.0, 1.0, 0.2
@@ -68,3 +62,18 @@ def focal(logits: Tensor, wanted: Tensor) -> Tensor:
     signed = torch.where(wanted > 0, logits, -logits)
     balance = torch.where(wanted > 0, ALPHA, 1 - ALPHA)
     return -balance * torch.sigmoid(-signed) ** GAMMA * F.logsigmoid(signed)
+
+
+def batch_loss(network: Second, samples: Sequence[Sample]) -> Tensor:
+    """Return the loss of a batch, differentiable in the network's parameters."""
+    targets = [assign(sample, network.config) for sample in samples]
+    return second_loss(predict(network, [sample.points for sample in samples]), targets, network.config)
+
+
+def predict(network: Second, clouds: Sequence[NDArray[np.float32]]) -> HeadOutput:
+    """Return the raw predictions for a batch of point clouds (N_i, 4), LiDAR frame."""
+    device = network.head.weight.device
+    points = torch.from_numpy(np.concatenate(clouds)).to(device)
+    sizes = torch.tensor([len(cloud) for cloud in clouds], device=device)
+    sample = torch.repeat_interleave(torch.arange(len(clouds), device=device), sizes)
+    return network(network.voxels(points, sample, len(clouds)))

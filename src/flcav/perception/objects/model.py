@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from flcav.config import InputError
+from flcav.perception.device import bfloat16
 from flcav.perception.objects.config import ANCHORS, KITTI_CAR, Anchor, Augmentation, SecondConfig
 from flcav.perception.ops.norm import NormReLU
-from flcav.perception.ops.precision import bfloat16
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d
 from flcav.perception.ops.voxels import grid_shape, voxelize
 

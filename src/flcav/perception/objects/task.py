@@ -12,20 +12,18 @@ from flcav.geometry import Boxes
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.marks import CloudBoxes
 from flcav.perception.objects.area import rules
-from flcav.perception.objects.augment import augment
-from flcav.perception.objects.batch import batch_loss
+from flcav.perception.objects.augment import Cutouts, augment, cut, pasted
 from flcav.perception.objects.calibrate import calibrate, trust
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
 from flcav.perception.objects.errors import register_errors
 from flcav.perception.objects.evaluate import detections_and_truths, score_detections
 from flcav.perception.objects.infer import ObjectsFound, box_rows, point_clouds
+from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.outcomes import ObjectsOutcomes
-from flcav.perception.objects.paste import Cutouts, cut, pasted
-from flcav.perception.objects.results import ObjectsEvaluation
+from flcav.perception.objects.results import ObjectsEvaluation, sliced
 from flcav.perception.objects.samples import RecordedSweeps, Sample, fitting_frames
-from flcav.perception.objects.slices import sliced
 from flcav.perception.objects.truth import only_lidar
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice

@@ -7,7 +7,7 @@ size from which BLAS would wake its other threads.
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.world.rays.compiled import compiled
+from flcav.compiled import compiled
 
 Array = NDArray[np.floating]
 Int32s = NDArray[np.int32]

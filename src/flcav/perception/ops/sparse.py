@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from flcav.perception.ops import blocks
-from flcav.perception.ops.rules import Groups, Rules, Triple, cells_of, strided_rules, submanifold_rules
+from flcav.perception.ops.rulebook import Groups, Rules, Triple, cells_of, strided_rules, submanifold_rules
 
 
 @dataclass(frozen=True)

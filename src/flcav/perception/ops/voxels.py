@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from flcav.perception.ops.rules import Triple, keys_of
+from flcav.perception.ops.rulebook import Triple, keys_of
 
 
 def grid_shape(range_m: Sequence[float], voxel_m: Sequence[float]) -> Triple:

@@ -5,7 +5,7 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from flcav.dataset.formats.rectangles import SIGNS
+from flcav.dataset.rectangles import SIGNS
 
 STRIDES = (8, 16, 32)  # pixels between the cells of each level
 Side = Annotated[float, Field(gt=0, le=8192)]

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from flcav.perception.device import bfloat16
 from flcav.perception.images import Picture
-from flcav.perception.ops.precision import bfloat16
 from flcav.perception.ops.rectangles import nms
 from flcav.perception.signs.augment import GREY
 from flcav.perception.signs.config import STRIDES

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.formats.rectangles import CLASSES, HALF_PX, rectangles
+from flcav.dataset.rectangles import CLASSES, HALF_PX, rectangles
 from flcav.dataset.store import Dataset
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry, keep_first
 from flcav.perception.images import checked_picture
@@ -17,8 +17,8 @@ from flcav.perception.signs.detect import Detections, detect
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.samples import size_px, wanted_boxes
 from flcav.progress import Report, silent
+from flcav.sensors.camera.lens import unprojected
 from flcav.sensors.frame import Frame
-from flcav.sensors.lens import unprojected
 from flcav.world.rays.embree import Embree, Solid
 from flcav.world.static import Things, static_world, town_things
 

@@ -1,7 +1,9 @@
-"""The loss of the detector: complete IoU of boxes, cross entropies of objectness and class."""
+"""The loss of the sign detector, and which cells answer for which sign."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -9,7 +11,66 @@ from torch.nn import functional
 from flcav.perception.ops.rectangles import complete_iou
 from flcav.perception.signs.config import STRIDES, SignsConfig
 from flcav.perception.signs.model import boxes_of
-from flcav.perception.signs.targets import Targets
+from flcav.perception.signs.samples import Sample
+
+MOST_TIMES = 4.0  # by which a box's width and height may differ from its anchor's: what `decode` can reach
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What one level of a batch is to predict at P places."""
+
+    image: Tensor  # (P,)
+    anchor: Tensor  # (P,)
+    row: Tensor  # (P,)
+    column: Tensor  # (P,)
+    box: Tensor  # (P, 4) x1 y1 x2 y2 [px]
+    label: Tensor  # (P,)
+    counted: Tensor  # (B, rows, columns) whether a cell's objectness is asked for
+
+
+def assign(samples: Sequence[Sample], config: SignsConfig) -> list[Targets]:
+    """Return the targets at each of `STRIDES` for pictures of one size.
+
+    A box is assigned to every anchor whose width and height are within a factor of four of its own, in the cell of its
+    centre and in the nearer neighbour to the side and above or below. Cells within ignored boxes are not counted.
+    """
+    height, width = samples[0].picture.shape[:2]
+    image = np.repeat(np.arange(len(samples)), [len(sample.boxes) for sample in samples])
+    box = torch.from_numpy(np.concatenate([sample.boxes for sample in samples])).float()
+    label = torch.from_numpy(np.concatenate([sample.label for sample in samples]))
+    levels = []
+    for level, stride in enumerate(STRIDES):
+        grid = torch.tensor([width // stride, height // stride])
+        number, anchor, cell = _places(box, torch.tensor(config.anchors_px[level]), stride, grid)
+        counted = torch.stack([_counted(sample, stride, grid) for sample in samples])
+        levels.append(
+            Targets(
+                torch.from_numpy(image)[number], anchor, cell[:, 1], cell[:, 0], box[number], label[number], counted
+            )
+        )
+    return levels
+
+
+def _places(box: Tensor, anchors: Tensor, stride: int, grid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return (P,) box, (P,) anchor, (P, 2) column and row of every assignment."""
+    ratio = (box[:, 2:] - box[:, :2])[:, None] / anchors  # (N, A, 2)
+    number, anchor = (torch.maximum(ratio, 1 / ratio).amax(2) < MOST_TIMES).nonzero(as_tuple=True)
+    center = ((box[:, :2] + box[:, 2:]) / 2 / stride)[number]
+    own = torch.minimum(center.long(), grid - 1)
+    toward = torch.where(center - own < 0.5, -1, 1)  # the nearer neighbour along each axis
+    steps = torch.stack((torch.zeros_like(toward), toward * torch.tensor([1, 0]), toward * torch.tensor([0, 1])))
+    cell = own + steps  # (3, P, 2)
+    inside = ((cell >= 0) & (cell < grid)).all(2)
+    return number.expand(3, -1)[inside], anchor.expand(3, -1)[inside], cell[inside]
+
+
+def _counted(sample: Sample, stride: int, grid: Tensor) -> Tensor:
+    counted = torch.ones(int(grid[1]), int(grid[0]), dtype=torch.bool)
+    for x1, y1, x2, y2 in sample.ignore / stride:
+        counted[int(y1) : int(np.ceil(y2)), int(x1) : int(np.ceil(x2))] = False
+    return counted
+
 
 BOX, OBJECT, CLASS = 1.0, 10.0, 8.0  # weights of the parts
 LEVELS = (4.0, 1.0, 0.4)  # of objectness: finer levels have more cells, of which fewer hold an object

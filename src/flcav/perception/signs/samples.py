@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.formats.rectangles import CLASSES, rectangles
+from flcav.dataset.rectangles import CLASSES, rectangles
 from flcav.dataset.store import Dataset
 from flcav.perception.images import Picture, checked_picture
 from flcav.perception.signs.config import SignsConfig

@@ -9,20 +9,19 @@ import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.perception.client import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.images import pictures
 from flcav.perception.marks import PictureBoxes
-from flcav.perception.sharing import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
 from flcav.perception.signs.detect import boxes_found, detect, predict
 from flcav.perception.signs.errors import register_errors
 from flcav.perception.signs.evaluate import SignsEvaluation, mean_average_precision
-from flcav.perception.signs.loss import detection_loss
+from flcav.perception.signs.loss import assign, detection_loss
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.outcomes import SignsOutcomes, by_picture
 from flcav.perception.signs.samples import RecordedPictures, Sample
-from flcav.perception.signs.targets import assign
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.progress import Report, silent

@@ -1,19 +1,74 @@
-"""Detections to tracks: predict, assign, update, begin, end.
-
-The loop of AB3DMOT (Weng et al., IROS 2020): a Kalman filter per object, the Hungarian method between predictions and
-detections. The cost of a pair is the negative log-likelihood of the detection under the prediction, and pairs beyond a
-gate are out (Chiu et al., "Probabilistic 3D Multi-Object Tracking for Autonomous Driving", 2020), so that the variances
-a detector predicts weigh in, and frames may be any time apart.
-"""
+"""Multi-object tracking: a Kalman filter per object, and assignment by likelihood."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from flcav.geometry import Boxes
-from flcav.perception.tracking.kalman import Array, State, first_state, innovation, predicted, updated
+from flcav.geometry import Boxes, wrap_angle
+
+Array = NDArray[np.float64]
+
+MEASURED, STATES = 7, 9
+YAW = 6
+ACCELERATION = 3.0  # standard deviation [m/s^2]
+DRIFT = np.array((0, 0, 0.2, 0.05, 0.05, 0.05, 0.3))  # of z, size and yaw [per root second]
+FIRST_SPEED = 8.0  # standard deviation of a velocity of which nothing is known [m/s]
+LEAST_VARIANCE = np.array((0.1, 0.1, 0.1, 0.2, 0.1, 0.1, 0.15)) ** 2  # of a detection's x, y, z, size, yaw
+
+
+class State(NamedTuple):
+    """What is known of one object."""
+
+    mean: Array  # (9,)
+    covariance: Array  # (9, 9)
+
+
+def first_state(box: Array, variance: Array) -> State:
+    """Return the state of an object seen once, as box (7,) with `variance` (7,); nothing is known of its velocity."""
+    spread = np.concatenate((np.maximum(variance, LEAST_VARIANCE), np.full(2, FIRST_SPEED**2)))
+    return State(np.concatenate((box, np.zeros(2))), np.diag(spread))
+
+
+def predicted(state: State, after_s: float) -> State:
+    """Return the state `after_s` later."""
+    step = np.eye(STATES)
+    step[0, 7] = step[1, 8] = after_s
+    noise = np.zeros((STATES, STATES))
+    noise[range(MEASURED), range(MEASURED)] = DRIFT**2 * after_s
+    for place, speed in ((0, 7), (1, 8)):
+        noise[place, place] += after_s**4 / 4
+        noise[speed, speed] += after_s**2
+        noise[place, speed] = noise[speed, place] = after_s**3 / 2
+    both = np.ix_((0, 1, 7, 8), (0, 1, 7, 8))
+    noise[both] *= ACCELERATION**2
+    return State(step @ state.mean, step @ state.covariance @ step.T + noise)
+
+
+def innovation(state: State, box: Array, variance: Array) -> tuple[Array, Array]:
+    """Return how far box (7,) is from what `state` expects (7,), and the covariance of that (7, 7).
+
+    A heading that is opposite to the expected one is taken for a mistake of the detector and turned.
+    """
+    off = box - state.mean[:MEASURED]
+    turn = float(wrap_angle(off[YAW]))
+    off[YAW] = turn if abs(turn) <= np.pi / 2 else float(wrap_angle(turn + np.pi))
+    return off, state.covariance[:MEASURED, :MEASURED] + np.diag(np.maximum(variance, LEAST_VARIANCE))
+
+
+def updated(state: State, box: Array, variance: Array) -> State:
+    """Return the state after it was seen as box (7,) with `variance` (7,)."""
+    off, spread = innovation(state, box, variance)
+    gain = np.linalg.solve(spread, state.covariance[:MEASURED]).T
+    mean = state.mean + gain @ off
+    mean[YAW] = wrap_angle(mean[YAW])
+    rest = np.eye(STATES)
+    rest[:, :MEASURED] -= gain
+    noise = np.diag(np.maximum(variance, LEAST_VARIANCE))
+    return State(mean, rest @ state.covariance @ rest.T + gain @ noise @ gain.T)  # Joseph's form: stays symmetric
+
 
 GATE = 9.21  # squared Mahalanobis distance in x, y that 99 % of true pairs stay below
 FASTEST = 40.0  # [m/s] no pair is further apart than this allows

@@ -1,6 +1,7 @@
-"""The training loop: samples in, changed weights out, the same for the same seed, wherever it was interrupted."""
+"""The training loop: batches, learning rates, the loss, the score after each epoch."""
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +15,28 @@ from torch import nn
 from flcav.config import InputError
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 from flcav.perception.training.checkpoint import Progress, load_checkpoint, save_checkpoint
-from flcav.perception.training.schedules import SCHEDULES
 from flcav.progress import Report, silent
 from flcav.seeds import stream
+
+
+def constant(done: float) -> float:
+    """Return 1: the learning rate stays."""
+    return 1.0
+
+
+def one_cycle(done: float) -> float:
+    """Return the share of the peak learning rate when a share `done` in [0, 1] of the steps is over.
+
+    From 1/25 up to 1 over the first 30 %, then down to 1/10000, both along a cosine (Smith and Topin, 2018).
+    """
+    warm, low, floor = 0.3, 1 / 25, 1e-4
+    if done < warm:
+        return 1 - (1 - low) * (1 + math.cos(math.pi * done / warm)) / 2
+    return floor + (1 - floor) * (1 + math.cos(math.pi * (done - warm) / (1 - warm))) / 2
+
+
+SCHEDULES: dict[str, Callable[[float], float]] = {"constant": constant, "one_cycle": one_cycle}
+
 
 CLIP_NORM = 10.0
 

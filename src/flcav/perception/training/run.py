@@ -1,6 +1,7 @@
-"""A whole training of any task, from datasets to a file of weights with its card."""
+"""A training from datasets to a file of weights, its card and TensorBoard's events."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,35 @@ from flcav.perception.agents import Chosen, choose_frames
 from flcav.perception.card import Card, DataEntry, data_entry, write_card
 from flcav.perception.device import CPU, processor_of
 from flcav.perception.task import Calibrates, Evaluated, Task, configuration, fresh
-from flcav.perception.training.events import event_files
-from flcav.perception.training.loop import Checkpointing, Validation, train
-from flcav.perception.training.settings import Settings, finished_card, part_of
+from flcav.perception.training.checkpoint import Settings, finished_card, part_of
+from flcav.perception.training.loop import Checkpointing, Validation, Watch, train
 from flcav.perception.weights import save_network
 from flcav.progress import Report, silent
+
+
+@contextlib.contextmanager
+def event_files(folder: Path) -> Iterator[Watch]:
+    """Yield a `Watch` that writes scalars below `folder`, which is made with the first one.
+
+    A run that goes on from a checkpoint hides what an interrupted one wrote after it.
+    """
+    writer: Any = None
+
+    def watch(step: int, values: Mapping[str, float]) -> None:
+        nonlocal writer
+        if writer is None:
+            from torch.utils.tensorboard import SummaryWriter
+
+            writer = SummaryWriter(folder, purge_step=step)
+        for name, value in values.items():
+            writer.add_scalar(name, value, step)
+
+    try:
+        yield watch
+    finally:
+        if writer is not None:
+            writer.close()
+
 
 WEIGHTS, CARD, CHECKPOINT, EVENTS = "weights.safetensors", "card.md", "checkpoint.pt", "events"
 

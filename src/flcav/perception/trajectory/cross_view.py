@@ -1,21 +1,70 @@
-"""A cross-view transformer: pictures of several cameras to features and a map of the ground.
+"""Cross-view attention from surround cameras to a bird's-eye map."""
 
-Zhou and Kraehenbuehl, "Cross-view Transformers for Real-time Map-view Semantic Segmentation", CVPR 2022, sec. 3: the
-ground attends to all places of all pictures at once, by the cosine of what they are (eq. 3); a place in a picture is
-known by what is seen there, from where, and in which direction (eq. 2). Besides, it is known where its ray meets a flat
-ground, and the ground first looks at what lies near: a Gaussian of that distance, as wide as each head learns, after
-Chen et al., "Efficient and Robust 2D-to-BEV Representation Learning via Geometry-guided Kernel Transformer", 2022.
-Small convolutions take the place of EfficientNet, there are one or two rounds of attention to one resolution, and the
-ground lies around the road user that is predicted instead of the vehicle with the cameras.
-"""
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from flcav.perception.trajectory.config import CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.rasters import OTHERS
-from flcav.perception.trajectory.views import Inputs, Seen, Summary, conv
+from flcav.perception.trajectory.rasters import LAYERS, OTHERS
+
+COARSE = 8  # cells along each side of the map that is summed up
+
+
+class Inputs(NamedTuple):
+    """A batch as the network takes it."""
+
+    past: Tensor  # (B, PAST + 1, 4) x, y, yaw, speed
+    raster: Tensor | None = None  # (B, LAYERS, cells, cells) of zeros and ones
+    pictures: Tensor | None = None  # (B, n, 3, height, width) in [-1, 1]
+    intrinsics: Tensor | None = None  # (B, n, 3, 3)
+    camera_from_frame: Tensor | None = None  # (B, n, 4, 4)
+
+
+class Seen(NamedTuple):
+    """The surroundings as features."""
+
+    summary: Tensor  # (B, summary) of all of them
+    ground: Tensor  # (B, maps[1], h, w) of each place in the patch, row 0 ahead and column 0 on the left
+    map_logits: Tensor | None = None  # of the map, where it had to be learned
+
+
+class Summary(nn.Module):
+    """From maps of the patch to one vector that still knows what is where."""
+
+    def __init__(self, maps: int, out: int, size: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            conv(maps, out, 2), nn.AdaptiveMaxPool2d(COARSE), nn.Flatten(), nn.Linear(out * COARSE**2, size), nn.ReLU()
+        )
+
+    def forward(self, ground: Tensor) -> Tensor:
+        """Return (B, size) of (B, maps, h, w)."""
+        return self.layers(ground)
+
+
+class RasterEncoder(nn.Module):
+    """Convolutions over rasters of the map and the tracks."""
+
+    def __init__(self, config: TrajectoryConfig) -> None:
+        super().__init__()
+        fine, ground, coarse = config.maps
+        self.summary = 2 * config.hidden
+        self.layers = nn.Sequential(conv(len(LAYERS), fine, 2), conv(fine, ground, 2))
+        self.sum_up = Summary(ground, coarse, self.summary)
+
+    def forward(self, inputs: Inputs) -> Seen:
+        """Return what is seen on (B, LAYERS, cells, cells) rasters; places are 4 x 4 cells."""
+        assert inputs.raster is not None
+        ground = self.layers(inputs.raster)
+        return Seen(self.sum_up(ground), ground)
+
+
+def conv(maps: int, out: int, stride: int | tuple[int, int] = 1) -> nn.Sequential:
+    """Return a 3 x 3 convolution with its normalisation over groups of maps, and a rectifier."""
+    return nn.Sequential(nn.Conv2d(maps, out, 3, stride, 1, bias=False), nn.GroupNorm(out // 8, out), nn.ReLU())
+
 
 LEARNED = {"road": 1.0, "lane": 1.0, "crossing": 5.0, "way": 3.0, "red": 10.0, "green": 10.0, OTHERS[0]: 8.0}
 """Layers of the raster that cameras are taught to see, and how much more a cell in one weighs: some are rare."""

@@ -20,7 +20,7 @@ from flcav.perception.trajectory.roads import STATIC_ROWS, RoadMap, roads_of
 from flcav.perception.trajectory.samples import Samples, present_at, seen_from, traffic
 from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame
 from flcav.records import Class
-from flcav.world.lanes import rasterise
+from flcav.world.map.lanes import rasterise
 from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]

@@ -1,8 +1,8 @@
 """An LSTM encoder-decoder over tracks that looks at its surroundings: where it is, and again wherever it goes.
 
-Encoder: an LSTM over the past, and a bird's-eye view (`flcav.perception.trajectory.views`). Decoder: one LSTM per mode,
-all with the same weights, begun differently; at each step it sees the features of the ground at the position that it
-has reached, and changes its last displacement. Without any change a path keeps heading and speed.
+Encoder: an LSTM over the past, and a bird's-eye view (`flcav.perception.trajectory.cross_view`). Decoder: one LSTM per
+mode, all with the same weights, begun differently; at each step it sees the features of the ground at the position that
+it has reached, and changes its last displacement. Without any change a path keeps heading and speed.
 """
 
 from typing import NamedTuple
@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from flcav.perception.trajectory.config import FUTURE, STEP_S, TrajectoryConfig
-from flcav.perception.trajectory.cross_view import CrossViewEncoder
-from flcav.perception.trajectory.views import Inputs, RasterEncoder, Seen
+from flcav.perception.trajectory.cross_view import CrossViewEncoder, Inputs, RasterEncoder, Seen
 
 SCALE_M = 10.0  # positions and speeds are divided by this
 TRACK = 6  # features of a point of the past

@@ -34,7 +34,7 @@ def rasters(
     """Return (N, len(LAYERS), cells, cells) views of the surroundings of the `predicted` (N,) actors of `trace`.
 
     `tracks` hold the past, the present at `PAST`; `lit` (L,) are the letters of the lights at present. Row 0 is
-    farthest ahead and column 0 farthest left, as in `flcav.world.raster`.
+    farthest ahead and column 0 farthest left, as in `flcav.world.map.lanes`.
     """
     frame = np.concatenate((tracks.position[PAST, predicted], tracks.yaw[PAST, predicted, None]), axis=1)
     sheets = Sheets(frame, patch)

@@ -13,9 +13,9 @@ from shapely.geometry import LineString
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose, wrap_angle
-from flcav.world.lanes import RASTER_LAYERS, map_layers, rasterise
-from flcav.world.layers import MapLane, MapLayers
-from flcav.world.town import Town
+from flcav.world.map.lanes import RASTER_LAYERS, map_layers, rasterise
+from flcav.world.map.layers import MapLane, MapLayers
+from flcav.world.map.town import Town
 
 Array = NDArray[np.float64]
 

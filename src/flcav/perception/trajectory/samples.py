@@ -1,9 +1,9 @@
-"""What the predictor learns from: road users' past and future in the frame of their present, and their surroundings."""
+"""Samples of the trajectory task: a vehicle's past, its surroundings, and its future."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
-from typing import overload
+from functools import lru_cache, partial
+from typing import NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,64 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
+from flcav.geometry import inverse, pose
 from flcav.perception.agents import POLE, kind_of
+from flcav.perception.images import Picture, checked_picture, resized
 from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.rasters import rasters
 from flcav.perception.trajectory.roads import BEFORE_M, RoadMap, roads_of
-from flcav.perception.trajectory.surround import Surround, surround
 from flcav.perception.trajectory.tracks import check_instants, into_frame, tracks_around
 from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+
+CAMERAS = 6  # around a vehicle, as a rule
+KEPT_BYTES = 2**30  # of pictures at hand
+
+Pictured = tuple[NDArray[np.uint8], Array, Array]  # pictures, intrinsics and views, without the road user
+
+
+class Surround(NamedTuple):
+    """The pictures of n cameras around a road user at one instant."""
+
+    pictures: NDArray[np.uint8]  # (n, height, width, 3)
+    intrinsics: Array  # (n, 3, 3) of the pictures as they are here [px]
+    camera_from_frame: Array  # (n, 4, 4) from the road user's frame to the optical one: x right, y down, z forward
+
+
+def surround(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
+    """Return what the cameras of frame `number` see, as the agent believes them to be, around `present` x, y, yaw."""
+    pictures, intrinsics, camera_from_world = _kept(settings)(data, number)
+    world_from_frame = pose(float(present[0]), float(present[1]), yaw=float(present[2]))
+    return Surround(pictures, intrinsics, camera_from_world @ world_from_frame)
+
+
+@lru_cache(maxsize=2)
+def _kept(settings: CrossView) -> Callable[[Dataset, int], Pictured]:
+    """Return `_read` that keeps the frames read last, as many as fit into `KEPT_BYTES`."""
+    frame_bytes = CAMERAS * settings.height_px * settings.width_px * 3
+    return lru_cache(maxsize=KEPT_BYTES // frame_bytes)(partial(_read, settings))
+
+
+def _read(settings: CrossView, data: Dataset, number: int) -> Pictured:
+    frame = data.frame(number)
+    pictures, intrinsics, views = [], [], []
+    for camera in data.cameras(number):
+        rgb = checked_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}/{camera}")
+        pictures.append(resized(rgb, settings.width_px, settings.height_px))
+        intrinsics.append(rescaled(frame.assumed.intrinsics[camera], rgb, settings))
+        views.append(inverse(frame.assumed_world_from_sensor(camera)))
+    return np.stack(pictures), np.stack(intrinsics), np.stack(views)
+
+
+def rescaled(intrinsics: Array, rgb: Picture, settings: CrossView) -> Array:
+    """Return the (3, 3) intrinsics of the picture resized; the centre of a picture's first pixel is at (0, 0)."""
+    scale = np.array((settings.width_px / rgb.shape[1], settings.height_px / rgb.shape[0]))
+    out = intrinsics.copy()
+    out[:2] *= scale[:, None]
+    out[:2, 2] += (scale - 1) / 2
+    return out
+
 
 SEEN_M = 25.0  # from the cameras to a road user whose way is predicted through them
 LOOKED_AT_AGAIN = 4  # so many sets of samples are kept, so that validation does not extract its own anew

@@ -13,7 +13,6 @@ from flcav.dataset.store import Dataset
 from flcav.perception.errors import Registry
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
-from flcav.perception.trajectory.batch import futures_of, inputs_of, rasters_of
 from flcav.perception.trajectory.config import CONFIGURATIONS, TrajectoryConfig
 from flcav.perception.trajectory.errors import register_errors
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, metrics
@@ -21,7 +20,7 @@ from flcav.perception.trajectory.infer import findings
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.outcomes import TrajectoryOutcomes
-from flcav.perception.trajectory.predict import predict
+from flcav.perception.trajectory.predict import futures_of, inputs_of, predict, rasters_of
 from flcav.perception.trajectory.samples import Sample, samples_of, watching_frames
 from flcav.progress import Report, silent
 

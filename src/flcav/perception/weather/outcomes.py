@@ -8,7 +8,7 @@ from flcav.dataset.store import Dataset
 from flcav.intervals import REDRAWS
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
 from flcav.perception.weather.model import Classifier
-from flcav.perception.weather.probabilities import probabilities
+from flcav.perception.weather.predict import probabilities
 from flcav.perception.weather.samples import labelled
 from flcav.progress import Report, silent
 

@@ -11,16 +11,16 @@ from torch import Tensor
 from torch.nn import functional
 
 from flcav.dataset.store import Dataset
+from flcav.perception.client import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.images import pictures
 from flcav.perception.marks import Bars
-from flcav.perception.sharing import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice, Result
 from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
 from flcav.perception.weather.evaluate import Classification, classification
 from flcav.perception.weather.model import Classifier, LeNet
 from flcav.perception.weather.outcomes import WeatherOutcomes
-from flcav.perception.weather.probabilities import probabilities, tensor_of
+from flcav.perception.weather.predict import probabilities, tensor_of
 from flcav.perception.weather.samples import Sample, augment, labelled, small
 from flcav.progress import Report, silent
 from flcav.records import Class

@@ -1,8 +1,7 @@
 """An experiment as named steps that leave files: what is done stands, what is independent runs side by side."""
 
-from flcav.pipeline.steps.record import STALE, Stale
 from flcav.pipeline.steps.run import ENGINES, run_side_by_side, run_steps, stopwatch
-from flcav.pipeline.steps.step import FINISHED, Notify, Step, Work
+from flcav.pipeline.steps.step import FINISHED, STALE, Notify, Stale, Step, Work
 
 __all__ = [
     "ENGINES",

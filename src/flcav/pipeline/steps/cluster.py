@@ -20,12 +20,11 @@ from pathlib import Path
 from queue import Queue, SimpleQueue
 from typing import IO, Any
 
-from flcav.dataset.ray_engine import ray_session
+from flcav.dataset.recording.ray_engine import ray_session
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.steps.engines import KILLED, Engine, Hands, perform
-from flcav.pipeline.steps.record import Record, aside, remove, value_of
 from flcav.pipeline.steps.source_hash import package_hash
-from flcav.pipeline.steps.step import Step
+from flcav.pipeline.steps.step import Record, Step, aside, remove, value_of
 from flcav.threads import use_threads
 
 PIECE_BYTES = 8_000_000

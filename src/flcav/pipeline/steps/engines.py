@@ -9,10 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from flcav.dataset.workers import end_with_parent
+from flcav.dataset.recording.workers import end_with_parent
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.steps.record import Record, value_of, write_done, write_started
-from flcav.pipeline.steps.step import Step, Work
+from flcav.pipeline.steps.step import Record, Step, Work, value_of, write_done, write_started
 from flcav.progress import Report
 from flcav.threads import use_threads
 

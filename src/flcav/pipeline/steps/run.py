@@ -21,9 +21,22 @@ from typing import Any
 from flcav.config import InputError, read_json
 from flcav.files import write_json
 from flcav.pipeline.steps.engines import Engine, Processes
-from flcav.pipeline.steps.record import DONE, STALE, Record, aside, held_in, refusal, remove, value_of
 from flcav.pipeline.steps.source_hash import Sources, starts
-from flcav.pipeline.steps.step import DONE_BEFORE, DONE_NOW, KEPT, Notify, Step
+from flcav.pipeline.steps.step import (
+    DONE,
+    DONE_BEFORE,
+    DONE_NOW,
+    KEPT,
+    STALE,
+    Notify,
+    Record,
+    Step,
+    aside,
+    held_in,
+    refusal,
+    remove,
+    value_of,
+)
 
 
 @contextlib.contextmanager

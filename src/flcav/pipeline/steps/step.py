@@ -1,11 +1,15 @@
-"""One unit of an experiment's work, and what it is given."""
+"""A step of a run, what it works with, and the record of one that is done."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from flcav.pipeline.steps.record import digest, value_of
+from flcav.config import InputError, read_json
+from flcav.files import write_json
 from flcav.progress import Report
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
@@ -45,3 +49,106 @@ def _named(value: Any) -> list[Any]:
     if not is_dataclass(value):
         raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a dataclass of them")
     return [type(value).__module__, type(value).__qualname__, {f.name: getattr(value, f.name) for f in fields(value)}]
+
+
+DONE, STARTED = "done.json", "started.json"
+Stale = str  # one of STALE
+STALE = ("refuse", "redo", "keep")  # what becomes of steps that other code began or finished
+NAMED = 3  # steps, and modules, that a sentence names
+
+
+@dataclass(frozen=True)
+class Record:
+    """What a step is."""
+
+    fingerprint: str  # of what was asked: function, arguments, and those of the steps it needs
+    code: Mapping[str, str]  # hash of what it reaches of each module, see `flcav.pipeline.steps.source_hash`
+    lineage: str  # of its code and of the lineages of the steps it needs; "" where the code is not known
+
+    @classmethod
+    def of(cls, fingerprint: str, code: Mapping[str, str], needs: Iterable["Record"]) -> "Record":
+        """Return the record of a step that this code does, on top of `needs`."""
+        return cls(fingerprint, code, digest([sorted(code.items()), *(need.lineage for need in needs)]))
+
+
+def digest(value: Any, **how: Any) -> str:
+    """Return a short hash of a JSON value."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, **how).encode()).hexdigest()[:16]
+
+
+def held_in(folder: Path) -> Record | None:
+    """Return by which record the step in `folder` was done, or else begun; None where it was neither.
+
+    Steps that were done before code was recorded have none: their lineage is "".
+    """
+    for path in (folder / DONE, folder / STARTED):
+        if path.exists():
+            values: Any = read_json(path)
+            if not isinstance(values, dict) or not isinstance(values.get("fingerprint"), str):
+                raise InputError(f"{path}: not the record of a step; choose another folder")
+            return Record(values["fingerprint"], values.get("code") or {}, values.get("lineage") or "")
+    return None
+
+
+def value_of(folder: Path) -> Any:
+    """Return the value of the finished step in `folder`."""
+    return json.loads((folder / DONE).read_text())["value"]
+
+
+def write_started(folder: Path, record: Record) -> None:
+    """Write that the step in `folder` has begun."""
+    write_json(folder / STARTED, asdict(record))
+
+
+def write_done(folder: Path, record: Record, value: Any, provenance: Mapping[str, Any]) -> None:
+    """Write that the step in `folder` is finished."""
+    write_json(folder / DONE, asdict(record) | {"value": value, "provenance": provenance})
+
+
+def changed_modules(held: Record, wanted: Record) -> list[str]:
+    """Return the modules of which two records of a step reach other code; none where one does not know its code."""
+    if not held.code:
+        return []
+    return [name for name in sorted({*held.code, *wanted.code}) if held.code.get(name) != wanted.code.get(name)]
+
+
+def refusal(folder: Path, outdated: Mapping[str, tuple[Record, Record]]) -> InputError:
+    """Return the refusal of a folder whose steps `outdated` (held, wanted) were begun or done by other code."""
+    modules = {name: changed_modules(*records) for name, records in outdated.items()}
+    unknown = [name for name, (held, _) in outdated.items() if not held.code]
+    changed = [name for name in outdated if modules[name]]
+    after = [name for name in outdated if name not in unknown and name not in changed]
+    which = sorted({module for found in modules.values() for module in found})
+    told = [
+        f"{_some(changed)} by other code ({_some(which)} changed)" if changed else "",
+        f"{_some(unknown)} by code that was not recorded" if unknown else "",
+        f"{_some(after)} on top of other code" if after else "",
+    ]
+    return InputError(
+        f"{folder}: did {', '.join(filter(None, told))}; choose another folder, or --stale redo to do that again, or "
+        "--stale keep to take it as it is"
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    """Return a few names in words, and how many more there are."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def remove(folder: Path) -> None:
+    """Remove a step's folder, at once as far as one can see; of a link, the link."""
+    if folder.is_symlink():
+        folder.unlink()
+        return
+    old = aside(folder, "old")
+    if folder.exists():
+        folder.rename(old)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def aside(folder: Path, what: str) -> Path:
+    """Return a new hidden name beside a step's folder; what an interrupted run left there is removed."""
+    path = folder.with_name(f".{folder.name}.{what}")
+    shutil.rmtree(path, ignore_errors=True)
+    return path

@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes
+from flcav.sensors.camera.lens import Lens
 from flcav.sensors.frame import Annotations, Array
-from flcav.sensors.labels.regions import actor_regions
 from flcav.sensors.labels.signs import view_signs
-from flcav.sensors.labels.views import view_actors
-from flcav.sensors.lens import Lens
-from flcav.sensors.lidar import Lidar
-from flcav.sensors.visibility import occluded_rays
+from flcav.sensors.labels.views import actor_regions, view_actors
+from flcav.sensors.lidar.lidar import Lidar
+from flcav.sensors.lidar.visibility import occluded_rays
 from flcav.world.scene import Scene
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.frame import Array, SignViews
-from flcav.sensors.labels.regions import thing_regions
+from flcav.sensors.labels.views import thing_regions
 from flcav.world.scene import Scene
 
 READABLE = np.cos(np.radians(80.0))  # of the angle between the line of sight and where the sign faces

@@ -3,10 +3,9 @@
 from collections.abc import Callable
 from functools import lru_cache
 
-from flcav.world.meshes.cars import car
-from flcav.world.meshes.heavy import bus, truck
 from flcav.world.meshes.mesh import Mesh, fitted
 from flcav.world.meshes.people import bicycle, motorcycle, pedestrian
+from flcav.world.meshes.vehicles import bus, car, truck
 from flcav.world.shapes import SHAPES, Shape
 
 __all__ = ["Mesh", "actor_mesh"]

@@ -1,11 +1,86 @@
-"""What stands along a street: masts, lamps, signs and clutter, each about its foot."""
+"""Meshes of street furniture: trees, traffic lights, signs, lamps, benches."""
 
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from flcav.world.materials import Material
-from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join, tube
+from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join, sheet, tube
+
+LEAVES = 360  # of a tree; each stands for a cluster
+LEAF = 0.38  # size of a cluster over the crown's radius: about two rays in three are caught
+
+
+def tree(height: float, crown_radius: float, rng: np.random.Generator) -> Mesh:
+    """Return a tree about the foot of its trunk."""
+    crown_foot = 0.32 * height
+    middle = np.array((0.0, 0.0, (height + crown_foot) / 2))
+    radii = np.array((crown_radius, crown_radius, (height - crown_foot) / 2))
+    trunk = tube((0, 0, 0), middle, 0.05 + 0.018 * height, Material.BARK, end_radius=0.05, sides=6, capped=False)
+    return join((trunk, leaves(middle, radii, LEAVES, LEAF * crown_radius, rng)))
+
+
+def leaves(center: ArrayLike, radii: ArrayLike, count: int, size_m: float, rng: np.random.Generator) -> Mesh:
+    """Return `count` loose triangles of about `size_m`, densest towards the outside of an ellipsoid."""
+    direction = rng.standard_normal((count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    inside = 1 - size_m / 2 / np.min(radii)
+    place = np.asarray(center) + direction * rng.random((count, 1)) ** 0.2 * np.asarray(radii) * inside
+    corners = rng.standard_normal((count, 3, 3))
+    corners *= size_m / 2 / np.linalg.norm(corners, axis=2, keepdims=True)
+    vertices = (place[:, None] + corners).reshape(-1, 3).astype(np.float32)
+    return Mesh(vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3), np.full(count, Material.LEAF, np.uint8))
+
+
+HEAD_M = (0.20, 0.36, 1.04)  # depth, width, height of the housing
+LENS_RADIUS_M = 0.125
+LENS_PITCH_M = 0.32
+VISOR_M = 0.20
+LIGHT_MAST_BEHIND_M = 0.22  # the mast stands behind the head's centre
+LENSES = (Material.LENS_RED, Material.LENS_AMBER, Material.LENS_GREEN)  # from above
+
+
+def signal_head(height: float) -> Mesh:
+    """Return a head of three lenses under visors, its centre `height` above the origin, facing +x."""
+    front = HEAD_M[0] / 2
+    parts = [box((0, 0, height), HEAD_M, Material.TRIM)]
+    for place, material in zip((1, 0, -1), LENSES):
+        middle = np.array((front + 0.005, 0.0, height + place * LENS_PITCH_M))
+        parts += [_lens(middle, material), _visor(middle)]
+    return join(parts)
+
+
+def signal_mast(height: float, reach: float = 0.0) -> Mesh:
+    """Return the mast of a head `height` above the origin; with a `reach` to its left, it hangs from an arm there."""
+    foot = np.array((-LIGHT_MAST_BEHIND_M, 0.0, 0.0))
+    top = np.array((-LIGHT_MAST_BEHIND_M, 0.0, height + 0.25))
+    mast = tube(foot, top, 0.075, Material.METAL, sides=8)
+    bracket = box((-LIGHT_MAST_BEHIND_M / 2 - 0.04, reach, height), (LIGHT_MAST_BEHIND_M, 0.08, 0.08), Material.METAL)
+    if not reach:
+        return join((mast, bracket))
+    arm = tube(
+        (-LIGHT_MAST_BEHIND_M, 0, height),
+        (-LIGHT_MAST_BEHIND_M, reach, height),
+        0.06,
+        Material.METAL,
+        end_radius=0.04,
+        sides=6,
+    )
+    return join((mast, arm, bracket))
+
+
+def _lens(middle: np.ndarray, material: Material) -> Mesh:
+    angle = np.linspace(0, 2 * np.pi, 13)
+    rim = np.stack((0 * angle, np.cos(angle), np.sin(angle)), axis=1) * LENS_RADIUS_M + middle
+    return sheet(np.stack((rim, rim * 0 + middle)), material)
+
+
+def _visor(middle: np.ndarray) -> Mesh:
+    angle = np.linspace(-0.15 * np.pi, 1.15 * np.pi, 9)
+    rim = np.stack((0 * angle, np.cos(angle), np.sin(angle)), axis=1) * (LENS_RADIUS_M + 0.015) + middle
+    return sheet(np.stack((rim, rim + np.array((VISOR_M, 0, 0)))), Material.TRIM)
+
 
 SIGN_RADIUS_M = 0.36
 MAST_BEHIND_M = 0.40  # a roadside sensor stands this far in front of its mast

@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString
 
-from flcav.world.parameters import GeoReference, MapSource, PoleParameters, StreetParameters, TownParameters
-from flcav.world.roads import Edge, RoadNet
+from flcav.world.map.parameters import GeoReference, MapSource, PoleParameters, StreetParameters, TownParameters
+from flcav.world.map.roads import Edge, RoadNet
 
 VEHICLES_PER_KM = 9.0  # of driving lane
 PEDESTRIANS_PER_KM = 10.0  # of sidewalk

@@ -6,7 +6,7 @@ an accuracy of a few nanometers", J. Geodesy 85, 2011, eqs. 11, 15, 36).
 
 import math
 
-from flcav.world.parameters import GeoReference
+from flcav.world.map.parameters import GeoReference
 
 EQUATOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
 UTM_SCALE, UTM_FALSE_EASTING_M, UTM_FALSE_NORTHING_M = 0.9996, 500_000.0, 10_000_000.0

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import InputError
+from flcav.world.map.roads import read_net
 from flcav.world.opendrive.document import OPEN_ROADS, Document, Road
-from flcav.world.roads import read_net
 
 FAR_M = 5000.0  # a map farther from its origin than this is moved there
 SIDEWALK_M = 2.0  # width of an added sidewalk

@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from flcav.world.rays.compiled import compiled
+from flcav.compiled import compiled
 
 # RTCRayHit16: rows of 16 float32 (or int32)
 ORIGIN, NEAR, DIRECTION, TIME, FAR, MASK, RAY_ID, FLAGS = 0, 3, 4, 7, 8, 9, 10, 11

@@ -1,13 +1,26 @@
-"""Runs the scripts of the scenarios along with SUMO."""
+"""The director of scenarios: which are staged, when, and how they go on."""
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
-from flcav.world.roads import read_net
-from flcav.world.scenarios.scenario import Scenario
-from flcav.world.scenarios.scripts import SCRIPTS
+from flcav.world.map.roads import read_net
+from flcav.world.scenarios import breakdowns, manoeuvres, overtaking, pedestrians
+from flcav.world.scenarios.scenario import Kind, Scenario
 from flcav.world.scenarios.stage import STEP_S, Stage, State
+
+Cast = Callable[[Stage, Scenario], Any]  # the roles, or None while nobody fits
+Act = Callable[[Stage, Scenario, Any], Generator[None, None, None]]
+
+SCRIPTS: dict[Kind, tuple[Cast, Act]] = {
+    "cut_in": (manoeuvres.cast_cut_in, manoeuvres.cut_in),
+    "overtaking": (overtaking.cast_overtaking, overtaking.overtake),
+    "pedestrian_behind_van": (pedestrians.cast_behind_van, pedestrians.run_out),
+    "red_light_runner": (manoeuvres.cast_runner, manoeuvres.run_the_light),
+    "stalled_vehicle": (breakdowns.cast_stalled, breakdowns.stall),
+    "crash": (breakdowns.cast_crash, breakdowns.crash),
+}
+
 
 ALONE_S = 15.0  # so long nothing else begins before a vehicle under test
 LOOKS_AGAIN = 3  # steps after which a scenario tries again to find its place

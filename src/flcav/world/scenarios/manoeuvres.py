@@ -4,7 +4,7 @@ import math
 from collections.abc import Generator
 from typing import NamedTuple
 
-from flcav.world.roads import Lane
+from flcav.world.map.roads import Lane
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Spot, Stage
 from flcav.world.shapes import SHAPES

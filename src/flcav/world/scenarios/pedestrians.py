@@ -4,7 +4,7 @@ import math
 from collections.abc import Generator
 from typing import NamedTuple
 
-from flcav.world.roads import Edge
+from flcav.world.map.roads import Edge
 from flcav.world.scenarios.manoeuvres import KERB_GAP_M, length_of, width_of
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import CAREFUL_MPS2, STEP_S, Spot, Stage

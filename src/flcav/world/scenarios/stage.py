@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flcav.world.roads import Edge, Lane, RoadNet
+from flcav.world.map.roads import Edge, Lane, RoadNet
 from flcav.world.scenarios.scenario import NEAR_M, Scenario
 
 State = tuple[float, float, float, float]

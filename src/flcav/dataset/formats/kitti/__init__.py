@@ -3,9 +3,10 @@
 Geiger et al., Are we ready for autonomous driving? CVPR 2012, and the benchmark's development kit.
 """
 
-from flcav.dataset.formats.kitti.folder import KittiFolder, KittiFrame
-from flcav.dataset.formats.kitti.frame import (
+from flcav.dataset.formats.kitti.read import (
     Calibration,
+    KittiFolder,
+    KittiFrame,
     Objects,
     read_calibration,
     read_labels,

@@ -1,5 +1,5 @@
 """MCAP files with Foxglove's schemas: they open in Foxglove, and in whatever reads MCAP."""
 
-from flcav.dataset.formats.mcap.export import export_mcap
+from flcav.dataset.formats.mcap.write import export_mcap
 
 __all__ = ["export_mcap"]

@@ -15,7 +15,7 @@ from flcav.dataset.formats.nuscenes.tables import CAMERAS, CATEGORIES, RADARS, R
 from flcav.dataset.payloads import encode_png
 from flcav.geometry import pose, transform_points, yaw_of
 from flcav.sensors.frame import Frame
-from flcav.sensors.radar import echo_directions
+from flcav.sensors.radar.radar import echo_directions
 
 Array = NDArray[np.float64]
 

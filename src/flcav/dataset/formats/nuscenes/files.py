@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from flcav.sensors.radar import echo_directions
-from flcav.world.town import Town
+from flcav.sensors.radar.radar import echo_directions
+from flcav.world.map.town import Town
 
 OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # theirs: x right, y ahead
 RESOLUTION_M = 0.1  # of the map

@@ -1,0 +1,1 @@
+"""Commands about datasets: record, validate, view, draw, export."""

@@ -1,0 +1,50 @@
+"""flcav birdseye: a frame from above, as a picture."""
+
+from pathlib import Path
+
+import typer
+
+from flcav.cli.options import finite
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(birdseye)
+
+
+def birdseye(
+    folder: Path = typer.Argument(metavar="DIR", help="A dataset."),
+    out: Path = typer.Option(..., "--out", help="The PNG file to write."),
+    frame: str | None = typer.Option(
+        None, "--frame", help="Key of the frame, as the point clouds are named; else the first."
+    ),
+    range_m: float = typer.Option(
+        50.0, "--range", min=5.0, max=500.0, callback=finite, help="How far from the agent to show [m]."
+    ),
+) -> None:
+    """Draw a frame of a dataset from above: its points by height, its boxes, its agent."""
+    import numpy as np
+
+    from flcav.dataset.store import Dataset
+    from flcav.files import write_bytes
+    from flcav.geometry import inverse, transform_points
+    from flcav.report import style
+    from flcav.report.pictures.birdseye import View, birdseye
+    from flcav.world.shapes import SHAPES
+
+    sedan = next(shape for shape in SHAPES["car"] if shape.name == "sedan")
+    dataset = Dataset.open(folder)
+    seen = dataset.frame(0 if frame is None else dataset.number(frame))
+    agent_from_world = inverse(seen.world_from_agent)
+    points = [transform_points(seen.agent_from_sensor[name], cloud[:, :3]) for name, cloud in seen.lidar.items()]
+    ground_m = -seen.world_from_agent[2, 3]
+    view = View(
+        points=np.concatenate(points) - (0.0, 0.0, ground_m),
+        truth=seen.annotations.boxes.transformed(agent_from_world),
+        returns=seen.annotations.returns,
+        title=f"{seen.key} · {seen.time_s:.1f} s",
+        range_m=range_m,
+        agent_size=(sedan.length, sedan.width) if seen.agent.startswith("cav") else None,
+    )
+    write_bytes(out, style.png(birdseye(view)))
+    typer.echo(f"{out}: {seen.key}, {sum(map(len, points))} points, {len(seen.annotations)} annotated actors")

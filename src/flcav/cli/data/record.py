@@ -1,0 +1,54 @@
+"""flcav record: a recipe to a dataset."""
+
+from pathlib import Path
+
+import typer
+
+from flcav.cli.options import ENGINE, Engine
+from flcav.cli.terminal import when_interrupted
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(record)
+
+
+@when_interrupted()
+def record(
+    recipe: Path = typer.Argument(help="Recipe (YAML): town, traffic, vehicles, poles, sensors."),
+    out: Path = typer.Option(..., "--out", help="Folder of the dataset; an interrupted recording goes on."),
+    frames: int | None = typer.Option(None, "--frames", help="Record exactly this many frames instead."),
+    seed: int | None = typer.Option(None, "--seed", help="Seed instead of the recipe's."),
+    jobs: int = typer.Option(1, "--jobs", help="Workers; the dataset is the same whatever their number."),
+    engine: Engine = ENGINE,
+) -> None:
+    """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
+    from flcav import progress
+    from flcav.config import parse_config
+    from flcav.dataset.layout import read_manifest, trace_path
+    from flcav.dataset.recording.recorder import record as write
+    from flcav.files import check_writable
+    from flcav.sources.embedded import EmbeddedSource
+    from flcav.sources.recipe import Recipe, find_recipe, load_recipe
+    from flcav.world.trace import Trace
+
+    check_writable(out)
+    recipe = find_recipe(recipe)
+    changes = {name: value for name, value in (("frames", frames), ("seed", seed)) if value is not None}
+    asked = load_recipe(recipe)
+    source = EmbeddedSource(parse_config(Recipe, asked.model_dump() | changes, str(recipe)), recipe.parent)
+    with progress.live(f"record {out}") as report:
+        written = write(source, out, jobs=jobs, engine=engine, progress=report)
+    manifest = read_manifest(out)
+    counts = manifest.counts
+    done = "recorded" if written else "already recorded, nothing to do:"
+    size_mb = (counts.payload_bytes + sum(entry.bytes for entry in manifest.tables.values())) / 1e6
+    typer.echo(
+        f"{out}: {done} {counts.frames} frames of {counts.scenes} scenes, "
+        f"{counts.annotations} annotations, {counts.points} points, {counts.images} images, {size_mb:.1f} MB"
+    )
+    if source.recipe.scenarios:
+        happened = [event.kind for scene in manifest.scenes for event in Trace.load(out / trace_path(scene)).events]
+        asked_for = counts.scenes * len(source.recipe.scenarios)
+        each = ", ".join(f"{happened.count(kind)} {kind}" for kind in sorted(set(happened)))
+        typer.echo(f"corner cases: {len(happened)} of {asked_for} found their moment ({each or 'none'})")

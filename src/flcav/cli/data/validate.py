@@ -1,0 +1,31 @@
+"""flcav validate: every check of datasets."""
+
+from pathlib import Path
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(validate)
+
+
+def validate(
+    folders: list[Path] = typer.Argument(metavar="DIR...", help="Datasets; several are also checked for leakage."),
+) -> None:
+    """Check datasets: files, tables, boxes against points and traffic, leakage between splits. Exit 1 on a problem."""
+    from flcav import progress
+    from flcav.dataset.checks.validate import leaks
+    from flcav.dataset.checks.validate import validate as problems_of
+    from flcav.dataset.layout import read_manifest
+
+    manifests = {folder: read_manifest(folder) for folder in folders}
+    problems = leaks({str(folder): manifest for folder, manifest in manifests.items()})
+    for folder in folders:
+        with progress.live(f"validate {folder}") as report:
+            problems += problems_of(folder, progress=report)
+    for problem in problems:
+        typer.echo(problem)
+    if problems:
+        raise typer.Exit(1)
+    typer.echo(f"{sum(manifest.counts.frames for manifest in manifests.values())} frames, no problems")

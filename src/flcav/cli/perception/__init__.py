@@ -1,0 +1,1 @@
+"""Commands about tasks: train, evaluate, infer, register errors."""

@@ -1,0 +1,54 @@
+"""flcav evaluate: how good a network is on a dataset."""
+
+import json
+from pathlib import Path
+
+import typer
+
+from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device
+from flcav.threads import use_threads
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(evaluate)
+
+
+def evaluate(
+    task: str = typer.Argument(metavar="TASK", help=f"What was learned: {ANY_TASK}."),
+    data: Path = typer.Option(..., "--data", help="Dataset folder."),
+    weights: Path | None = typer.Option(
+        None, "--weights", help="Weights that flcav train wrote; by default those of the package."
+    ),
+    device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
+    tracks: bool = typer.Option(False, "--tracks", help="objects: also MOTA, AMOTA and id switches of their tracks."),
+    agents: str | None = AGENTS,
+    within: str | None = typer.Option(
+        None,
+        "--range",
+        metavar="AHEAD,SIDE",
+        help="objects: ask only for those so many metres ahead and to either side, as 48,24; by default the network's "
+        "range. Networks of different ranges are compared so.",
+    ),
+    threads: int = THREADS,
+    as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
+) -> None:
+    """Evaluate a network on recorded frames.
+
+    Accuracy of weather, mAP of signs, average precision of objects, errors of predicted paths.
+    """
+    use_threads(threads)
+    from flcav import progress
+    from flcav.perception import networks
+    from flcav.perception.tasks import task_named
+
+    learned = task_named(task)
+    with progress.live(f"evaluate {learned.name}") as report:
+        found = networks.evaluate(
+            learned, data, weights, agents=agents, within=within, tracks=tracks, device=device, progress=report
+        )
+    origin = networks.origin_of(learned, weights)
+    if as_json:
+        typer.echo(json.dumps(vars(origin) | found.chosen.summary() | dict(found.numbers), allow_nan=False))
+        return
+    typer.echo("\n".join([found.chosen.sentence, str(origin), *found.lines]))

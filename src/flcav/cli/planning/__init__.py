@@ -1,0 +1,1 @@
+"""Commands about plans: fit learning curves, allocate resources, place sensors."""

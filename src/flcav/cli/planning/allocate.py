@@ -1,0 +1,168 @@
+"""`flcav allocate`: samples, edge rounds and cloud rounds per task under both uplink budgets (MLGRA)."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from flcav.cli.options import listed
+
+if TYPE_CHECKING:
+    from flcav.optimization.allocation.allocate import Allocation
+    from flcav.optimization.allocation.baselines import Baseline
+    from flcav.optimization.allocation.budget_sweep import Saving
+    from flcav.optimization.allocation.problem import Problem
+    from flcav.optimization.vehicles import VehicleShare
+
+    Shares = Mapping[str, Sequence[VehicleShare]]
+
+
+class Compared(StrEnum):
+    """What the optimum can be compared with."""
+
+    equal_stages = "equal-stages"
+    equal_tasks = "equal-tasks"
+    max_throughput = "max-throughput"
+    article = "article"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command("allocate")(allocate)
+
+
+def allocate(
+    problem: Path = typer.Argument(
+        ..., help="YAML: budgets, sizes, limits and learning curves of every task; or a three-layer graph."
+    ),
+    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
+    baseline: Compared | None = typer.Option(
+        None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {listed(Compared)}."
+    ),
+    progress: Path | None = typer.Option(
+        None, "--progress", help="YAML: what is spent and observed so far; the plan goes on from there."
+    ),
+    out: Path | None = typer.Option(None, "--out", help="Write a page about the plan (HTML): where megabytes go, why."),
+) -> None:
+    """Split both uplink budgets over tasks and training stages so that they err least, by the problem's objective."""
+    from flcav.config import read_config
+    from flcav.optimization.allocation.allocate import Infeasible
+    from flcav.optimization.allocation.baselines import baseline as compared
+    from flcav.optimization.allocation.budget_sweep import savings
+    from flcav.optimization.allocation.replanning import Progress, going_on
+    from flcav.optimization.fleet import allocate_fleet
+    from flcav.optimization.graph import load_problem, read_graph
+    from flcav.sources.recipe import find_recipe
+
+    problem = find_recipe(problem)
+    asked = load_problem(problem)
+    if progress is not None:
+        asked = going_on(asked, read_config(Progress, progress))
+    try:
+        plan, shares = allocate_fleet(asked)
+    except Infeasible as error:
+        if as_json:
+            typer.echo(json.dumps({"status": "infeasible", "message": str(error)}))
+        raise
+    more = savings(asked, plan)
+    if out is not None:
+        from flcav.files import write_bytes
+        from flcav.report.pages.plan_page import plan_page
+
+        write_bytes(out, plan_page(asked, plan, shares, more, read_graph(problem)).encode())
+    beside = None if baseline is None else compared(asked, baseline.value)
+    if as_json:
+        beside_it = {} if beside is None else {"baseline": _plain(beside)}
+        typer.echo(json.dumps(_as_json(plan, shares, more) | beside_it))
+        return
+    _show(asked, plan, more)
+    _show_vehicles(shares)
+    if beside is not None:
+        _show_baseline(beside, plan)
+
+
+def _as_json(plan: "Allocation", shares: "Shares", more: "Sequence[Saving]") -> dict[str, Any]:
+    values = _plain(plan) | {"savings": [dataclasses.asdict(each) for each in more]}
+    for task in values["tasks"]:
+        if task["name"] in shares:
+            task["vehicles"] = [dataclasses.asdict(share) for share in shares[task["name"]]]
+    return values
+
+
+def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
+    """Return the plan as JSON has it: links by name, and without optional fields that say nothing."""
+    values = dataclasses.asdict(plan)
+    values["tasks"] = [_given(task, "upper_error", "members") for task in values["tasks"]]
+    for name in ("used_mb", "marginal_error_per_gb"):
+        if name in values:
+            values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
+    return _given(values, "note", "warnings")
+
+
+def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name not in optional or value}
+
+
+def _show(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> None:
+    from flcav.cli.terminal import plain_console
+    from flcav.optimization.allocation.problem_file import MEASURES, meaning
+
+    console, measure = plain_console(), MEASURES[problem.objective]
+    console.print(_table(plan))
+    console.print(f"{measure} {plan.objective:.6g}, {plan.status} ({_proven(plan.gap)})")
+    console.print(f"{measure.capitalize()}: {meaning(problem, plan.objective)}")
+    verb = "adds" if problem.objective == "area" else "saves"
+    for link in ("wireless", "wireline"):
+        used, budget = getattr(plan.used_mb, f"{link}_mb"), getattr(problem.budgets_mb, link)
+        console.print(f"{link}: {used:.1f} of {budget:.6g} MB")
+        for each in (each for each in more if each.link == link):
+            saved = f"{each.saved:.3g}" if each.saved else "nothing"
+            budget = f"{each.added:.0%} more ({each.added_mb:.6g} MB)"
+            console.print(f"  {budget}, solved anew: {verb} {saved} ({_proven(each.gap)})")
+    for sentence in filter(None, (plan.note, *plan.warnings)):
+        console.print(sentence)
+
+
+def _proven(gap: float | None) -> str:
+    return "no certificate" if gap is None else f"proven within {gap:.2%}"
+
+
+def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
+    from flcav.cli.terminal import plain_console
+
+    console = plain_console()
+    console.print(_table(beside))
+    note = f" ({beside.note})" if beside.note else ""
+    console.print(f"{beside.name}: {beside.objective:.6g}{note}; the plan above: {plan.objective:.6g}")
+
+
+def _table(plan: "Allocation | Baseline") -> Any:
+    from rich.table import Table
+
+    table = Table("task", *("samples", "edge rounds", "cloud rounds", "error", "wireless MB", "wireline MB"))
+    for task in plan.tasks:
+        counts = (str(task.samples), str(task.edge_rounds), str(task.cloud_rounds))
+        error = f"{task.predicted_error:.4f}" + ("" if task.upper_error is None else f" (up to {task.upper_error:.4f})")
+        table.add_row(task.name, *counts, error, f"{task.wireless_mb:.1f}", f"{task.wireline_mb:.1f}")
+        for member in task.members:
+            table.add_row(f"  {member.name}", "", "", "", f"{member.predicted_error:.4f}", "", "")
+    return table
+
+
+def _show_vehicles(shares: "Shares") -> None:
+    from rich.table import Table
+
+    from flcav.cli.terminal import plain_console
+
+    if not shares:
+        return
+    table = Table("task", "vehicle", "samples", "rounds joined", "wireless MB")
+    for task, own in shares.items():
+        for share in own:
+            cells = (str(share.samples), str(len(share.rounds)), f"{share.wireless_mb:.1f}")
+            table.add_row(task, share.vehicle, *cells)
+    plain_console().print(table)

@@ -1,0 +1,201 @@
+"""`flcav fit`: learning curves from a history of training runs."""
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from flcav.cli.options import finite, refuse_unused
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from flcav.optimization.allocation.problem_file import Learned
+    from flcav.optimization.curves.fitting import Fit
+
+
+class Model(StrEnum):
+    """How the stages add up."""
+
+    additive = "additive"
+    effective = "effective"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command("fit")(fit)
+
+
+def fit(
+    history: Path = typer.Argument(
+        ..., help="CSV: task, stage (pretrain, edge, cloud), resource, accuracy[, weight]; or [task,] samples, "
+        "edge_rounds, cloud_rounds, accuracy[, weight]. error = 1 - accuracy may stand for accuracy."
+    ),
+    problem: Path | None = typer.Option(
+        None, "--problem", help="YAML: put the curves into this problem for `flcav allocate`; where there is no such "
+        "file, write one with the rest to fill in."
+    ),
+    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
+    model: Model = typer.Option(Model.additive, "--model", help="How the stages add up."),
+    at: list[str] = typer.Option(
+        [], "--at", metavar="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]]", help="Where to predict the error; may be given "
+        "several times."
+    ),
+    group_samples: float = typer.Option(
+        0.0, "--group-samples", min=0, max=1e9, callback=finite, help="effective: samples that vehicles hold."
+    ),
+    alpha: float = typer.Option(
+        0.1, "--alpha", min=1e-9, max=1e9, callback=finite, help="effective: worth of a pretraining sample."
+    ),
+    beta: float | None = typer.Option(
+        None, "--beta", min=0, max=1e9, callback=finite, help="effective: worth of a held sample; else fitted."
+    ),
+    k: int = typer.Option(
+        1, "--edge-rounds-per-cloud-round", "-k", min=0, max=10**9, help="effective: edge rounds in a cloud round."
+    ),
+    level: float = typer.Option(
+        0.9, "--level", min=0.01, max=0.999, callback=finite, help="Share of repeats between the bands."
+    ),
+    repeats: int = typer.Option(200, "--repeats", min=20, max=10**5, help="Bootstrap repeats of the bands."),
+    seed: int = typer.Option(0, "--seed", min=0, help="Seed of the bootstrap."),
+) -> None:  # fmt: skip
+    """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
+    from flcav.cli.tables import read_table
+    from flcav.config import InputError
+    from flcav.optimization.allocation.problem_file import learned
+    from flcav.optimization.curves import fitting as learning_curve
+    from flcav.optimization.curves.bands import bands, upper_curve
+    from flcav.optimization.curves.history import histories
+
+    if model is Model.additive:
+        refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
+
+    asked = [_counts(text) for text in at]
+    held, unnamed = _held(problem, history.stem)
+    answers, shown, found_of = [], [], {}
+    for task, points in histories(read_table(history, ()).to_pydict(), str(history), unnamed).items():
+        try:
+            found = learning_curve.fit(
+                points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta
+            )
+        except InputError as error:
+            raise InputError(f"{history}: task {task!r}: {error}") from None
+        band = bands(found, level=level, repeats=repeats, seed=seed, k=k)
+        upper = None if band is None else upper_curve(found, band)
+        answers.append(_answer(task, found, band, upper, points.resources, asked, k))
+        shown.append(found)
+        found_of[task] = learned(found, points.resources, upper)
+    if problem is not None:
+        _write(problem, held, found_of, k, history.name)
+    if as_json:
+        typer.echo(json.dumps({"curves": answers}))
+        return
+    _show(answers, shown)
+    if problem is not None:
+        typer.echo(_next(problem, list(found_of)))
+
+
+def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
+    """Return the text of the problem, if there is one, and what a history is of that does not name its task.
+
+    That is the only task of the problem, or what the history's file is called.
+    """
+    from flcav.config import InputError, read_yaml
+    from flcav.optimization.allocation.problem_file import task_names
+
+    if problem is None or not problem.exists():
+        return None, stem
+    if problem.suffix == ".json":
+        raise InputError(f"{problem}: --problem writes YAML")
+    read_yaml(problem)  # refuses what is none
+    text = problem.read_bytes().decode("utf-8")
+    names = task_names(text, str(problem))
+    return text, names[0] if len(names) == 1 else stem
+
+
+def _write(problem: Path, held: str | None, found: "Mapping[str, Learned]", k: int, history: str) -> None:
+    from flcav.files import write_bytes
+    from flcav.optimization.allocation.problem_file import new_problem, with_curves
+
+    text = new_problem(found, k, history) if held is None else with_curves(held, found, k, str(problem))
+    write_bytes(problem, text.encode())
+
+
+def _next(problem: Path, tasks: list[str]) -> str:
+    """Return what was written, and whether a plan can be made of it."""
+    from flcav.config import InputError
+    from flcav.optimization.graph import load_problem
+
+    told = f"{problem}: now has the curve{'s' if len(tasks) > 1 else ''} of {', '.join(tasks)}"
+    try:
+        load_problem(problem)
+    except InputError as error:
+        return f"{told}; not yet what `flcav allocate` takes: {str(error).removeprefix(f'{problem}: ')}"
+    return f"{told}; next: flcav allocate {problem}"
+
+
+def _counts(text: str) -> list[float]:
+    from flcav.config import InputError
+
+    try:
+        counts = [float(part) for part in text.split(",")]
+    except ValueError:
+        counts = []
+    if not 1 <= len(counts) <= 3 or not all(0 <= count <= 1e9 for count in counts):
+        raise InputError(f"--at {text!r} must be SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]], each from 0 to 1e+09")
+    return counts + [0.0] * (3 - len(counts))
+
+
+def _answer(
+    task: str, fit: "Fit[Any]", found: Any, upper: Any, measured: Any, asked: list[list[float]], k: int
+) -> dict[str, Any]:  # fmt: skip
+    import numpy as np
+
+    from flcav.optimization.curves.bands import METHOD, pointwise
+
+    band = None
+    if found is not None:
+        band = {
+            **{"method": METHOD, "level": found.level, "repeats": len(found.curves), "seed": found.seed},
+            "at": pointwise(fit, found, np.unique(measured, axis=0), k),
+        }
+    predicted = pointwise(fit, found, np.array(asked).reshape(-1, 3), k)
+    extrapolated = [fit.beyond(*counts) for counts in asked]
+    return {
+        "task": task,
+        **fit.curve.model_dump(),
+        **{"rmse": fit.rmse, "points": fit.points, "r_squared": fit.r_squared, "aicc": fit.aicc},
+        "measured": fit.measured,
+        "band": band,
+        "upper": None if upper is None else upper.model_dump(),
+        "asked": [{**row, "warning": warning} for row, warning in zip(predicted, extrapolated)],
+        "warnings": [*fit.warnings, *filter(None, extrapolated)],
+    }
+
+
+def _show(answers: list[dict[str, Any]], fits: list["Fit[Any]"]) -> None:
+    from rich.table import Table
+
+    from flcav.cli.terminal import plain_console
+    from flcav.optimization.curves.curves import Effective
+
+    console = plain_console()
+    rounds = "t rounds" if isinstance(fits[0].curve, Effective) else "y edge, z cloud rounds"
+    table = Table("task", f"error after x samples, {rounds}", "rmse", "R²", "points")
+    for answer, fit in zip(answers, fits):
+        explained = "–" if fit.r_squared is None else f"{fit.r_squared:.3f}"
+        table.add_row(answer["task"], str(fit.curve), f"{fit.rmse:.4f}", explained, str(fit.points))
+    console.print(table)
+    for answer in answers:
+        for row in answer["asked"]:
+            between = (
+                ""
+                if row["low"] is None
+                else f", {answer['band']['level']:.0%} band {row['low']:.4f} to {row['high']:.4f}"
+            )
+            counts = f"{row['samples']:g} samples, {row['edge_rounds']:g} edge, {row['cloud_rounds']:g} cloud rounds"
+            console.print(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}")
+        for warning in answer["warnings"]:
+            console.print(f"{answer['task']}: {warning}")

@@ -1,0 +1,151 @@
+"""Validation of a dataset: what is wrong with it, one sentence per problem."""
+
+import contextlib
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+
+from flcav.config import InputError
+from flcav.dataset.checks.calibration import check_calibrations
+from flcav.dataset.checks.frames import check_measurements, check_points, check_sweeps, check_traffic, check_values
+from flcav.dataset.checks.images import check_images
+from flcav.dataset.checks.scenes import Sight, check_motion
+from flcav.dataset.layout import FILES, MANIFEST, FrameKey, Manifest, read_manifest, table_path, trace_path
+from flcav.dataset.store import Dataset
+from flcav.dataset.tables import read_table
+from flcav.files import sha256
+from flcav.progress import Report, silent
+from flcav.sensors.frame import Frame
+from flcav.world.trace import Trace
+
+
+def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
+    """Return the problems of the dataset in the folder `path`, one sentence each; none is the good case.
+
+    Raises `InputError` where there is no finished dataset at all.
+
+    >>> from flcav import validate
+    >>> validate("data")
+    []
+    """
+    folder = Path(path)
+    manifest = read_manifest(folder)
+    listed = _listed_files(folder, manifest)
+    damaged = {name: problem for name, entry in listed.items() if (problem := _damage(folder / name, *entry))}
+    problems = [f"{folder / name}: {problem}" for name, problem in damaged.items()]
+    problems += _extra_files(folder, listed)
+    try:
+        dataset = Dataset.open(folder, checked=False)
+    except InputError as error:
+        return [*problems, str(error)]
+    problems += check_order(dataset.keys)
+    problems += _other_counts(dataset)
+    problems += check_calibrations(dataset.calibrations, manifest.recipe)
+
+    traces: dict[str, Trace | None] = {}
+    sight = Sight()
+    for i, key in enumerate(dataset.keys):
+        if key.scene not in traces:
+            trace = _trace(dataset, key.scene, damaged)
+            traces = {key.scene: trace}
+            problems += check_motion(key.scene, trace) if trace is not None else ()
+        try:
+            frame = dataset.frame(i)
+            problems += _frame_problems(frame, traces[key.scene])
+            sight.add(frame)
+        except InputError as error:  # a file that cannot be read
+            if not any(str(error).startswith(str(folder / name)) for name in damaged):
+                problems.append(str(error))
+        progress(i + 1, len(dataset), "")
+    return [*problems, *sight.problems()]
+
+
+def _frame_problems(frame: Frame, trace: Trace | None) -> Iterator[str]:
+    yield from check_values(frame)
+    yield from check_sweeps(frame)
+    yield from check_points(frame, trace)
+    yield from check_measurements(frame)
+    yield from check_images(frame)
+    if trace is not None:
+        yield from check_traffic(frame, trace)
+
+
+def check_order(keys: Sequence[FrameKey]) -> list[str]:
+    """Return where time does not run: forward from spin to spin, one time per spin, each agent once in each."""
+    problems = []
+    agents: dict[tuple[str, int], set[str]] = defaultdict(set)
+    last: dict[str, FrameKey] = {}
+    for key in keys:
+        name = f"scene '{key.scene}', spin {key.index}, {key.agent}"
+        before = last.get(key.scene, key)
+        if key.index < before.index or key.time_s < before.time_s:
+            problems.append(f"{name}: time runs backward, from {before.time_s} s at spin {before.index}")
+        elif (key.index == before.index) != (key.time_s == before.time_s):
+            problems.append(f"{name}: time {key.time_s} s does not go with {before.time_s} s at spin {before.index}")
+        if key.agent in agents[key.scene, key.index]:
+            problems.append(f"{name}: recorded more than once")
+        agents[key.scene, key.index].add(key.agent)
+        last[key.scene] = key
+    return problems
+
+
+def _listed_files(folder: Path, manifest: Manifest) -> dict[str, tuple[int, str]]:
+    """Return the bytes and the hash of every file of the dataset but the manifest."""
+    listed = {name: (entry.bytes, entry.sha256) for name, entry in manifest.tables.items()}
+    with contextlib.suppress(InputError):  # named as damaged
+        files = read_table(folder / table_path(FILES), FILES).to_pydict()
+        listed |= {name: (size, digest) for name, size, digest in zip(files["path"], files["bytes"], files["sha256"])}
+    return listed
+
+
+def _damage(path: Path, recorded_bytes: int, recorded_hash: str) -> str | None:
+    if not path.is_file():
+        return "missing"
+    size = path.stat().st_size
+    if size != recorded_bytes:
+        return f"truncated or grown: {size} bytes, recorded were {recorded_bytes}"
+    return None if sha256(path) == recorded_hash else "altered: its hash is not the recorded one"
+
+
+def _extra_files(folder: Path, listed: Collection[str]) -> Iterator[str]:
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if not path.is_dir() and name != MANIFEST and name not in listed:
+            yield f"{path}: not part of the dataset"
+
+
+def _other_counts(dataset: Dataset) -> Iterator[str]:
+    scenes = list(dict.fromkeys(key.scene for key in dataset.keys))
+    if scenes != dataset.manifest.scenes:
+        yield f"{dataset.folder / MANIFEST}: its scenes are not those of the frames"
+    if len(dataset) != dataset.manifest.counts.frames:
+        yield f"{dataset.folder / MANIFEST}: counts {dataset.manifest.counts.frames} frames of {len(dataset)}"
+
+
+def _trace(dataset: Dataset, scene: str, damaged: Collection[str]) -> Trace | None:
+    """Return a scene's traffic where there is any and it can be trusted."""
+    return None if trace_path(scene) in damaged else dataset.trace(scene)
+
+
+def leaks(manifests: Mapping[str, Manifest]) -> list[str]:
+    """Return a sentence for every two datasets (name -> manifest) of different splits that share traffic.
+
+    Frames of one scene show the same cars at the same places, so a scene belongs to one split; and a traffic seed
+    drives a town the same way in every recipe that uses it.
+    """
+    return [sentence for pair in combinations(manifests.items(), 2) for sentence in _shared(*pair)]
+
+
+def _shared(one: tuple[str, Manifest], other: tuple[str, Manifest]) -> Iterator[str]:
+    (name, manifest), (other_name, other_manifest) = one, other
+    recipe, other_recipe = manifest.recipe, other_manifest.recipe
+    split, other_split = recipe.get("split"), other_recipe.get("split")
+    if split == other_split:
+        return
+    where = f"{name} (split '{split}') and {other_name} (split '{other_split}')"
+    scenes = sorted(set(manifest.scenes) & set(other_manifest.scenes))
+    if scenes:
+        yield f"{where}: leakage, they share {len(scenes)} scenes, the first is '{scenes[0]}'"
+    elif (recipe.get("town"), recipe.get("seed")) == (other_recipe.get("town"), other_recipe.get("seed")):
+        yield f"{where}: leakage, they share the traffic seed {recipe.get('seed')} in '{recipe.get('town')}'"

@@ -1,0 +1,159 @@
+"""A dataset in the layout of KITTI's 3D object benchmark, as OpenPCDet and the development kit read it.
+
+A frame is one spin of an agent that has a LiDAR and a level camera ahead. The camera takes the place of all four of
+KITTI's, and its optical frame that of the rectified camera frame.
+"""
+
+import csv
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.dataset.formats.exporter import (
+    SPLITS,
+    Exported,
+    ExportOptions,
+    check_rectified,
+    lacks,
+    points_in_each_box,
+    read_frame,
+    split_scenes,
+)
+from flcav.dataset.formats.mounts import front_camera
+from flcav.dataset.payloads import encode_png
+from flcav.dataset.store import Dataset
+from flcav.geometry import inverse, transform_points, wrap_angle
+from flcav.progress import Report
+from flcav.sensors.frame import Frame
+
+CLASSES = {
+    "car": "Car",
+    "van": "Van",
+    "truck": "Truck",
+    "bus": "Truck",
+    "motorcycle": "Cyclist",
+    "bicycle": "Cyclist",
+    "pedestrian": "Pedestrian",
+}
+PARTLY, LARGELY = 0.1, 0.5  # occlusion from which an object counts as partly and as largely occluded
+UNKNOWN = 3  # KITTI's occlusion of what shows no pixel
+NOTHING = "DontCare -1 -1 -10 0 0 1 1 -1 -1 -1 -1000 -1000 -1000 -10"  # of a frame without labels: readers want a line
+FRAMES = "frames.csv"  # which frame of the dataset each number is
+
+
+def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
+    """Write `dataset` as `training` (or, recorded for testing, `testing`) and `ImageSets`: see `Exporter`."""
+    split_of = split_scenes(dataset, options)
+    numbers: dict[str, list[str]] = defaultdict(list)
+    rows = []
+    exported = Exported(Counter(frames=0, objects=0, DontCare_regions=0))
+    counts = exported.counts
+    for i, key in enumerate(dataset.keys):
+        frame = read_frame(dataset, i, options)
+        camera = front_camera({name: frame.calibration.agent_from_sensor[name] for name in frame.images})
+        if camera is None or not frame.lidar:
+            exported.left_out["no level camera that looks ahead" if frame.lidar else "no LiDAR", frame.agent] += 1
+        else:
+            split, number = split_of[key.scene], f"{counts['frames']:06d}"
+            folder = out / ("testing" if split == "test" else "training")
+            objects, regions = _write_frame(frame, camera, folder, number, options.min_points)
+            numbers[split].append(number)
+            counts.update(frames=1, objects=objects, DontCare_regions=regions)
+            rows.append((number, split, frame.key, frame.agent, f"{frame.time_s:.3f}", camera))
+        progress(i + 1, len(dataset), "")
+    if not rows:
+        raise lacks(dataset, "KITTI", "agents with a LiDAR and a level camera that looks ahead")
+    for split in SPLITS:
+        _write_lines(out / "ImageSets" / f"{split}.txt", numbers[split])
+    _write_lines(out / "ImageSets" / "trainval.txt", sorted(numbers["train"] + numbers["val"]))
+    with (out / FRAMES).open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([("number", "split", "frame", "agent", "time_s", "camera"), *rows])
+    return exported
+
+
+def _write_frame(frame: Frame, camera: str, folder: Path, number: str, min_points: int) -> tuple[int, int]:
+    lidar = next(iter(frame.lidar))
+    mounts = frame.calibration.agent_from_sensor
+    check_rectified(frame, camera, "KITTI")
+    objects, regions = label_lines(frame, camera, lidar, min_points)
+    _write_lines(folder / "label_2" / f"{number}.txt", objects + regions or [NOTHING])
+    _write_lines(
+        folder / "calib" / f"{number}.txt",
+        calibration_lines(
+            frame.calibration.intrinsics[camera],
+            camera_from_lidar=inverse(frame.world_from_sensor(camera)) @ frame.world_from_sensor(lidar),
+            lidar_from_imu=inverse(mounts[lidar]) @ mounts.get(next(iter(frame.imu), ""), np.eye(4)),
+        ),
+    )
+    _write(folder / "velodyne" / f"{number}.bin", frame.lidar[lidar].astype("<f4").tobytes())
+    _write(folder / "image_2" / f"{number}.png", encode_png(frame.images[camera].rgb))
+    return len(objects), len(regions)
+
+
+def label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -> tuple[list[str], list[str]]:
+    """Return KITTI's labels of the actors in the image, and the DontCare regions where others show.
+
+    Labelled is what has at least `min_points` of the LiDAR in its box and, where that is 0, at least shows.
+    """
+    truth, views = frame.annotations, frame.annotations.views[camera]
+    height, width = frame.images[camera].rgb.shape[:2]
+    edge = (width - 1, height - 1, width - 1, height - 1)
+    rectangle = np.clip(views.amodal_box, 0, edge)
+    within = (rectangle[:, 2:] > rectangle[:, :2]).all(axis=1)  # false where the box is not a number
+    camera_from_world = inverse(frame.world_from_sensor(camera))
+    boxes = truth.boxes
+    bottom = transform_points(camera_from_world, boxes.center - boxes.size * (0, 0, 0.5))
+    heading = np.stack((np.cos(boxes.yaw), np.sin(boxes.yaw), np.zeros(len(boxes))), axis=1)
+    ahead = heading @ camera_from_world[:3, :3].T
+    rotation = wrap_angle(np.arctan2(-ahead[:, 2], ahead[:, 0]))
+    alpha = wrap_angle(rotation - np.arctan2(bottom[:, 0], bottom[:, 2]))
+    level = occlusion_levels(views.occlusion, views.pixels)
+    points, shows = points_in_each_box(frame, lidar, frame.lidar[lidar]), views.pixels > 0
+    labelled = within & (bottom[:, 2] > 0) & (points >= min_points) & (shows | (points > 0))
+    lines = []
+    for i in np.flatnonzero(labelled):
+        length, breadth, tall = boxes.size[i]
+        numbers = (*rectangle[i], tall, breadth, length, *bottom[i], rotation[i])
+        lines.append(
+            f"{CLASSES[str(boxes.label[i])]} {views.truncation[i]:.4f} {level[i]} {alpha[i]:.4f} "
+            + " ".join(f"{number:.4f}" for number in numbers)
+        )
+    regions = [dont_care(np.clip(views.visible_box[i], 0, edge)) for i in np.flatnonzero(shows & ~labelled)]
+    return lines, regions
+
+
+def dont_care(rectangle: NDArray[np.float64]) -> str:
+    """Return KITTI's line for a region [px] in which objects are not labelled."""
+    left, top, right, bottom = (f"{number:.4f}" for number in rectangle)
+    return f"DontCare -1 -1 -10 {left} {top} {right} {bottom} -1 -1 -1 -1000 -1000 -1000 -10"
+
+
+def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (M,) KITTI's levels: 0 fully visible, 1 partly occluded, 2 largely, 3 unknown."""
+    level = np.digitize(occlusion, (PARTLY, LARGELY))
+    return np.where(pixels > 0, level, UNKNOWN)
+
+
+def calibration_lines(
+    intrinsics: NDArray[np.float64], camera_from_lidar: NDArray[np.float64], lidar_from_imu: NDArray[np.float64]
+) -> list[str]:
+    """Return the lines of a calibration file, in the order that readers count on."""
+    projection = np.column_stack((intrinsics, np.zeros(3)))
+    matrices = {
+        **{f"P{i}": projection for i in range(4)},
+        "R0_rect": np.eye(3),
+        "Tr_velo_to_cam": camera_from_lidar[:3],
+        "Tr_imu_to_velo": lidar_from_imu[:3],
+    }
+    return [f"{name}: " + " ".join(f"{value:.12e}" for value in matrix.flat) for name, matrix in matrices.items()]
+
+
+def _write_lines(path: Path, lines: list[str]) -> None:
+    _write(path, "".join(f"{line}\n" for line in lines).encode())
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)

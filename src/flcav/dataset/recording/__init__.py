@@ -1,0 +1,1 @@
+"""Recording of datasets: jobs, workers, and the recorder that resumes."""

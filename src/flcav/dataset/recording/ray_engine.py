@@ -1,0 +1,114 @@
+"""An engine on a Ray cluster: the same tasks, done by actors on any of its machines.
+
+The dataset's folder has to be on storage that all of them see, and flcav installed on each. The cluster is the one that
+RAY_ADDRESS names; where it names none, Ray is started on this machine.
+"""
+
+import contextlib
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from flcav.config import InputError
+from flcav.dataset.recording.jobs import Engine, Part, Task, perform
+from flcav.extras import installation
+from flcav.sources.source import Source
+from flcav.threads import VARIABLES
+
+STORE_BYTES = 128_000_000  # of a Ray started here; only tasks, and pieces of files, pass through it
+
+
+@contextlib.contextmanager
+def ray_cluster(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
+    """Yield an engine of `jobs` actors that calls `wrote` with the number of frames written so far.
+
+    Raises `InputError` where Ray is not installed.
+    """
+    with ray_session(jobs) as ray:
+        shared = ray.put(source)
+        actors = [ray.remote(num_cpus=1)(_Worker).remote(shared, work.absolute()) for _ in range(jobs)]
+        yield _Actors(actors, wrote)
+
+
+@contextlib.contextmanager
+def ray_session(jobs: int) -> Iterator[Any]:
+    """Yield the package `ray`, connected to the cluster or, where RAY_ADDRESS names none, to one of `jobs` processors.
+
+    Its workers compute on one thread each. Raises `InputError` where Ray is not installed.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray warns without
+    try:
+        import ray  # pyright: ignore[reportMissingImports]: an extra
+    except ImportError:
+        raise InputError(f"--engine ray needs Ray, which is not installed: {installation('ray')}") from None
+    variables: dict[str, str] = dict.fromkeys(VARIABLES, "1")
+    local: dict[str, Any] = {}
+    if "RAY_ADDRESS" not in os.environ:
+        local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
+        variables["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # modules are found as they are here
+    ray.init(
+        **local,
+        runtime_env={"env_vars": variables},
+        log_to_driver=False,
+        logging_level=logging.ERROR,
+    )
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+class _Worker:
+    """On one of the machines: does one task after another, and keeps the scene that it has built."""
+
+    def __init__(self, source: Source, work: Path) -> None:
+        self._source, self._work = source, work
+
+    def perform(self, task: Task) -> None:
+        if not self._work.is_dir():
+            raise OSError(
+                f"{self._work}: not seen from {os.uname().nodename}; record into storage that all nodes share"
+            )
+        perform(self._source, task, self._work, lambda: None)
+
+
+class _Actors:
+    """Tasks in actors, each of which takes as many as it is given, in turn."""
+
+    def __init__(self, actors: list[Any], wrote: Callable[[int], None]) -> None:
+        self.slots = len(actors)
+        self._idle, self._wrote = actors, wrote
+        self._waiting: list[Task] = []
+        self._busy: dict[Any, tuple[Any, Task]] = {}  # reference -> actor, task
+        self._count = 0
+
+    def submit(self, task: Task) -> None:
+        self._waiting.append(task)
+        self._hand_out()
+
+    def wait(self) -> list[Task]:
+        import ray  # pyright: ignore[reportMissingImports]: an extra
+        from ray.exceptions import RayActorError, RayTaskError  # pyright: ignore[reportMissingImports]
+
+        (done,), _ = ray.wait(list(self._busy), num_returns=1)
+        actor, task = self._busy.pop(done)
+        try:
+            ray.get(done)
+        except RayTaskError as error:
+            raise error.cause from None
+        except RayActorError:
+            raise OSError("a worker was killed from outside, most often for want of memory: try fewer jobs") from None
+        self._idle.append(actor)
+        self._hand_out()
+        self._count += task.frames if isinstance(task, Part) else 0
+        self._wrote(self._count)
+        return [task]
+
+    def _hand_out(self) -> None:
+        while self._idle and self._waiting:
+            actor, task = self._idle.pop(), self._waiting.pop(0)
+            self._busy[actor.perform.remote(task)] = actor, task

@@ -1,0 +1,216 @@
+"""Any source to a dataset folder: resumable, and the same bytes whoever does the work.
+
+Everything is first written below the hidden `.recording`: a part of a scene appears there when it is whole. When all
+have, their files move into the folder, their tables are joined, and the manifest comes last. An interruption at any
+point costs the parts that were under way.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from flcav.config import InputError
+from flcav.dataset.layout import (
+    CALIBRATION,
+    FILES,
+    FORMAT,
+    MANIFEST,
+    WORK,
+    package_versions,
+    read_manifest,
+    table_path,
+    town_path,
+    trace_path,
+)
+from flcav.dataset.recording.jobs import PAYLOADS, TRAFFIC, parts, pending, record_scenes
+from flcav.dataset.recording.ray_engine import ray_cluster
+from flcav.dataset.recording.workers import processes
+from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, join_tables, write_table
+from flcav.files import sha256, write_bytes, write_json
+from flcav.progress import Report, silent
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+from flcav.sources.source import Located, Source
+
+ENGINES = {"processes": processes, "ray": ray_cluster}
+HEADER = "recipe.json"
+JOINED = "joined"  # below `.recording`: what becomes of the parts
+
+
+def record(
+    source: Source | Recipe,
+    out: Path | str,
+    *,
+    jobs: int = 1,
+    engine: str = "processes",
+    progress: Report = silent,
+) -> bool:
+    """Record a source, or what a recipe asks for, into the folder `out` by `jobs` workers of one of ENGINES.
+
+    Returns whether anything was left to record.
+
+    False says that `out` already held this very dataset. A folder whose recording was interrupted is finished.
+    Raises `InputError` where `out` holds anything else, `OSError` where it cannot be written.
+
+    >>> from flcav import Recipe, record
+    >>> recipe = Recipe(town="ring", cavs=1, spins_per_scene=1, warmup_s=5.0)
+    >>> record(recipe, "ring"), record(recipe, "ring")
+    (True, False)
+    """
+    if jobs < 1:
+        raise InputError(f"jobs = {jobs}: must be at least 1")
+    if engine not in ENGINES:
+        raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
+    if isinstance(source, Recipe):
+        source = EmbeddedSource(source)
+    out = Path(out)
+    header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))
+    try:
+        if not _claim(out, header):
+            return False
+        _write(source, out / WORK, jobs, engine, progress)
+        _assemble(source, out, header)
+    except OSError as error:
+        if error.strerror and error.filename is None:  # a write does not know its file
+            error.filename = str(out)
+        raise
+    return True
+
+
+def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report) -> None:
+    """Do what is left of the recording below `.recording`."""
+    total = sum(source.frame_count(scene) for scene in source.scenes())
+    missing = sum(part.frames for scene in source.scenes() for part in pending(source, scene, work))
+    start = time.perf_counter()
+
+    def wrote(count: int) -> None:
+        rate = count / max(time.perf_counter() - start, 1e-9)
+        progress(total - missing + count, total, f"{rate:.1f} frames/s")
+
+    with ENGINES[engine](source, work, jobs, wrote) as hands:
+        record_scenes(source, hands, work)
+
+
+def _claim(out: Path, header: dict[str, Any]) -> bool:
+    """Make `out` the folder of this recording; False where it is finished already."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; a dataset needs a folder")
+    if (out / MANIFEST).exists():
+        _refuse_other(out, "holds another dataset", {"recipe": read_manifest(out).recipe}, header)
+        shutil.rmtree(out / WORK, ignore_errors=True)
+        return False
+    begun = out / WORK / HEADER
+    if begun.exists():
+        _refuse_other(out, "holds the unfinished recording of another", json.loads(begun.read_text()), header)
+    elif out.exists() and any(path.name != WORK for path in out.iterdir()):
+        raise InputError(f"{out}: holds other files; record into a new or empty folder")
+    else:
+        write_json(begun, header)
+    return True
+
+
+def _refuse_other(out: Path, what: str, held: dict[str, Any], wanted: dict[str, Any]) -> None:
+    different = [
+        name
+        for part in held
+        for name in sorted(held[part].keys() | wanted[part].keys())
+        if held[part].get(name) != wanted[part].get(name)
+    ]
+    if different:
+        raise InputError(f"{out}: {what} (different: {', '.join(different)}); record into another folder")
+
+
+def _assemble(source: Source, out: Path, header: dict[str, Any]) -> None:
+    """Make the dataset of the parts below `.recording`; may be repeated after an interruption."""
+    work, scenes = out / WORK, list(source.scenes())
+    joined = work / JOINED
+    joined.mkdir(exist_ok=True)
+    folders = [part.folder(work) for scene in scenes for part in parts(source, scene)]
+    listings = [work / table_path(FILES)] if _write_town(source, work, out) else []
+    listings += [listing for scene in scenes if (listing := _move_traffic(work / scene, scene, out))]
+    for folder in folders:
+        listings.append(folder / table_path(FILES))
+        for name in pq.ParquetFile(listings[-1]).read()["path"].to_pylist():
+            if (folder / PAYLOADS / name).exists():
+                _move(folder / PAYLOADS / name, out / name)
+
+    join_tables(listings, FILES_SCHEMA, joined / table_path(FILES))
+    rows = {
+        name: join_tables([folder / table_path(name) for folder in folders], schema, joined / table_path(name))
+        for name, schema in SCHEMAS.items()
+    }
+    write_json(joined / CALIBRATION, _calibrations(folders))
+    names = (CALIBRATION, *map(table_path, (*SCHEMAS, FILES)))
+    manifest = {
+        "format": FORMAT,
+        **header,
+        "scenes": scenes,
+        "counts": {
+            "scenes": len(scenes),
+            "frames": rows["frames"],
+            "annotations": rows["annotations"],
+            "points": int(_values(joined / table_path("frames"), "points").to_numpy().sum()),
+            "images": len(_values(joined / table_path("frames"), "cameras")),
+            "payload_bytes": int(_values(joined / table_path(FILES), "bytes").to_numpy().sum()),
+        },
+        "tables": {name: {"bytes": (joined / name).stat().st_size, "sha256": sha256(joined / name)} for name in names},
+    }
+    for name in names:
+        _move(joined / name, out / name)
+    write_json(work / MANIFEST, manifest)
+    _move(work / MANIFEST, out / MANIFEST)
+    shutil.rmtree(work)
+
+
+def _write_town(source: Source, work: Path, out: Path) -> bool:
+    """Write the files of a town that the dataset brings with it, and their listing; return whether there are any."""
+    files = source.town_files() if isinstance(source, Located) else {}
+    if not files:
+        return False
+    folder = town_path(str(source.describe()["town"]))
+    for name, data in files.items():
+        write_bytes(out / folder / name, data)
+    _list({f"{folder}/{name}": out / folder / name for name in files}, work)
+    return True
+
+
+def _list(files: Mapping[str, Path], folder: Path) -> None:
+    """Write the listing of `files` by what they are called in the dataset into `folder`."""
+    rows = [(name, path.stat().st_size, sha256(path)) for name, path in files.items()]
+    write_table(pa.table(dict(zip(FILES_SCHEMA.names, zip(*rows))), schema=FILES_SCHEMA), folder / table_path(FILES))
+
+
+def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
+    """Move the traffic of a scene into the dataset and return its listing; None of a scene that has none."""
+    traffic, listing = folder / TRAFFIC, folder / table_path(FILES)
+    if traffic.exists():
+        _list({trace_path(scene): traffic}, folder)
+        _move(traffic, out / trace_path(scene))
+    return listing if listing.exists() else None
+
+
+def _calibrations(folders: list[Path]) -> dict[str, Any]:
+    """Return the calibrations of all agents in all parts."""
+    found: dict[str, Any] = {}
+    for folder in folders:
+        for agent, calibration in json.loads((folder / CALIBRATION).read_text()).items():
+            if found.setdefault(agent, calibration) != calibration:
+                raise ValueError(f"{folder.parent.name}: {agent} is calibrated otherwise than in another scene")
+    return found
+
+
+def _values(path: Path, column: str) -> pa.Array:
+    """Return the values of a column; of one of lists, their elements."""
+    values = pq.ParquetFile(path).read(columns=[column])[column].combine_chunks()
+    return values.flatten() if isinstance(values, pa.ListArray) else values
+
+
+def _move(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    source.replace(target)

@@ -1,0 +1,144 @@
+"""Engines on one machine: this process, or several beside it."""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from flcav.dataset.recording.jobs import Engine, Task, perform
+from flcav.sources.source import Source
+from flcav.threads import VARIABLES
+
+POLL_S = 0.2
+
+_job: Any = None  # in a worker: the source, the folder, and the count of frames that all workers share
+
+
+@contextlib.contextmanager
+def processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
+    """Yield an engine of `jobs` processes that calls `wrote` with the number of frames written so far.
+
+    One job works in this process. More are processes of their own, which end with this one however it ends.
+    """
+    if jobs == 1:
+        yield _Here(source, work, wrote)
+        return
+    context = multiprocessing.get_context("spawn")
+    written = context.Value("q", 0)
+    with (
+        _threads_per_process(max(1, (os.cpu_count() or 1) // jobs)),
+        ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(source, work, written)) as pool,
+        _children_end_on_error(),
+    ):
+        yield _Pool(jobs, pool, lambda: wrote(written.value))
+
+
+class _Here:
+    """One task after another in this process."""
+
+    slots = 1
+
+    def __init__(self, source: Source, work: Path, wrote: Callable[[int], None]) -> None:
+        self._source, self._work, self._wrote = source, work, wrote
+        self._tasks: deque[Task] = deque()
+        self._count = 0
+
+    def submit(self, task: Task) -> None:
+        self._tasks.append(task)
+
+    def wait(self) -> list[Task]:
+        task = self._tasks.popleft()
+        perform(self._source, task, self._work, self._count_frame)
+        return [task]
+
+    def _count_frame(self) -> None:
+        self._count += 1
+        self._wrote(self._count)
+
+
+class _Pool:
+    """Tasks in processes."""
+
+    def __init__(self, slots: int, pool: ProcessPoolExecutor, report: Callable[[], None]) -> None:
+        self.slots, self._pool, self._report = slots, pool, report
+        self._tasks: dict[Future[None], Task] = {}
+
+    def submit(self, task: Task) -> None:
+        self._tasks[self._pool.submit(_perform, task)] = task
+
+    def wait(self) -> list[Task]:
+        done: set[Future[None]] = set()
+        while not done:
+            done, _ = wait(self._tasks, timeout=POLL_S, return_when=FIRST_COMPLETED)
+            self._report()
+        for future in done:
+            _raise_failure(future)
+        return [self._tasks.pop(future) for future in done]
+
+
+def _raise_failure(future: Future[None]) -> None:
+    try:
+        future.result()
+    except BrokenProcessPool:
+        raise OSError("a worker was killed from outside, most often for want of memory: try fewer jobs") from None
+
+
+def _begin(source: Source, work: Path, written: Any) -> None:
+    global _job
+    _job = source, work, written
+    end_with_parent()
+
+
+def end_with_parent() -> None:
+    """In a worker: leave Ctrl-C, which reaches the whole group, to the parent, and end when it has, however it did."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_exit_after_parent, daemon=True).start()
+
+
+def _exit_after_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _perform(task: Task) -> None:
+    source, work, written = _job
+
+    def count_frame() -> None:
+        with written.get_lock():
+            written.value += 1
+
+    perform(source, task, work, count_frame)
+
+
+@contextlib.contextmanager
+def _children_end_on_error() -> Iterator[None]:
+    before = set(multiprocessing.active_children())
+    try:
+        yield
+    except BaseException:
+        for child in set(multiprocessing.active_children()) - before:
+            child.terminate()
+        raise
+
+
+@contextlib.contextmanager
+def _threads_per_process(count: int) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in VARIABLES}
+    os.environ.update(dict.fromkeys(VARIABLES, str(count)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,1 @@
+"""The demo with several arms over seeds: what each stage and sensor is worth."""

@@ -1,0 +1,219 @@
+"""What each step buys, against its alternatives: the arms of recipes/runs/arms.yaml on the same frames, over seeds.
+
+Every arm takes as many optimiser steps as the vehicles of stage II take together, and has a ledger of its own. Within a
+seed, intervals redraw test scenes; over seeds, they are Student's t, so they hold what training and traffic vary too.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from flcav.config import read_config
+from flcav.files import Json
+from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
+from flcav.pipeline.findings import in_words
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results import Pole, Run
+from flcav.pipeline.running import run_seeds
+from flcav.pipeline.steps import Notify, Stale
+from flcav.records import LEFT_OUT, Record
+from flcav.report import style
+from flcav.report.charts import figures
+from flcav.sources.recipe import recipe_path
+
+TASK = "objects"
+ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: what the page calls an arm's stage
+    "grid": {
+        "pretrained": (MAIN, PRETRAIN),
+        "more pretraining": ("more", CENTRAL),
+        "edge FL, no road sensor": ("no_pole", EDGE),
+        "edge FL, densest pole": ("densest", EDGE),
+        "edge FL, VRCSP pole": (MAIN, EDGE),
+        "edge + cloud FL": (MAIN, CLOUD),
+        "oracle": ("oracle", CENTRAL),
+    },
+    "ring": {
+        "pretrained": (MAIN, PRETRAIN),
+        "more pretraining": ("more", CENTRAL),
+        "edge FL, VRCSP pole": (MAIN, EDGE),
+        "edge + cloud FL": (MAIN, CLOUD),
+    },
+}
+COMPARED = (  # (after, before): claims of the article and controls
+    ("edge FL, VRCSP pole", "pretrained"),
+    ("edge FL, VRCSP pole", "more pretraining"),
+    ("edge FL, VRCSP pole", "edge FL, no road sensor"),
+    ("edge FL, VRCSP pole", "edge FL, densest pole"),
+    ("edge + cloud FL", "edge FL, VRCSP pole"),
+)
+
+
+@dataclass(frozen=True)
+class Reached:
+    """AP of a network, at IoU 0.5 with its interval over test scenes, and at 0.7."""
+
+    ap50: float
+    ap50_low: float | None
+    ap50_high: float | None
+    ap70: float | None
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How much of each stage was planned."""
+
+    samples: int
+    edge_rounds: int
+    cloud_rounds: int
+
+
+@dataclass(frozen=True)
+class Pretraining:
+    """How stage I went."""
+
+    steps: int
+    threshold: float | None  # from which score on its detections serve as labels
+    curve: tuple[Mapping[str, float], ...]  # of every `Block`
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a region's roadside sensor stands."""
+
+    chosen: int
+    densest: int  # pole of the densest traffic
+    coverage: tuple[Pole, ...]
+    errors: int
+    covered: int
+    range_m: float
+
+
+@dataclass(frozen=True)
+class ArmsSeed:
+    """What one seed came to; by town: by arm, as `ARMS` calls them."""
+
+    seed: int
+    plan: Counts
+    pretraining: Pretraining
+    placement: Mapping[str, Placement]  # by town
+    ap: Mapping[str, Mapping[str, Reached]]  # by town and arm
+    differences: Mapping[str, Estimate]  # "town: after - before", over test scenes
+    gap_closed: Mapping[str, float]  # by arm
+    used_mb: Mapping[str, Mapping[str, float]]  # by arm and link
+
+
+@dataclass(frozen=True)
+class ArmsSummary:
+    """Means over seeds."""
+
+    ap50: Mapping[str, Mapping[str, MeanOverSeeds]]  # by town and arm
+    ap70: Mapping[str, Mapping[str, MeanOverSeeds]]
+    differences: Mapping[str, MeanOverSeeds]
+    gap_closed: Mapping[str, MeanOverSeeds]
+
+
+@dataclass(frozen=True)
+class ArmsResult(Record):
+    """The numbers of the comparison of arms."""
+
+    seeds: tuple[ArmsSeed, ...]
+    summary: ArmsSummary
+    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: not in results of before
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    note: str = "road labels come from an ideal road detector: arms with a pole are upper bounds"
+
+
+def study_recipe(name: str, scale: str) -> RunRecipe:
+    """Return the committed recipe of a comparison: "paper" as it stands, "quick" of the demo's size."""
+    recipe = read_config(RunRecipe, recipe_path(f"runs/{name}"))
+    return recipe if scale == "paper" else recipe.model_copy(update={"size": "demo"})
+
+
+def run_arms(
+    recipe: RunRecipe,
+    out: Path,
+    *,
+    seeds: int,
+    jobs: int,
+    notify: Notify,
+    stale: Stale = "refuse",
+    engine: str = "processes",
+) -> ArmsResult:
+    """Run or finish all arms of each seed in folders below `out` and return the results."""
+    runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    rows = tuple(one_seed(run) for run in runs)
+    return ArmsResult(rows, summarise(rows), recipe.model_dump(mode="json", exclude={"seed"}), provenance())
+
+
+def one_seed(run: Run) -> ArmsSeed:
+    """Return what the page tells of a seed."""
+    main, pretrained = run.arms[MAIN], run.pretrained[0]
+    own, plan = main.links, main.plan.tasks[TASK]
+    ap = {town: {arm: _tested(run, town, *stage) for arm, stage in arms.items()} for town, arms in ARMS.items()}
+    found = {
+        (each.region, each.arm, each.stage, each.before_arm, each.before_stage): each.estimate
+        for each in run.differences
+    }
+    differences = {
+        f"{town}: {after} - {before}": found[town, *arms[after], *arms[before]]
+        for town, arms in ARMS.items()
+        for after, before in COMPARED
+        if {after, before} <= set(arms)
+    }
+    closed = {
+        arm: run.gap_closed[name]
+        for arm, stage in ARMS["grid"].items()
+        if (name := f"grid, {TASK}: {in_words(*stage)}") in run.gap_closed
+    }
+    curve = tuple(vars(block) for block in pretrained.blocks)
+    return ArmsSeed(
+        seed=run.recipe.seed,
+        plan=Counts(plan.samples, plan.edge_rounds, plan.cloud_rounds),
+        pretraining=Pretraining(pretrained.steps, pretrained.threshold, curve),
+        placement={placed.region: _placed(run, placed.region) for placed in main.placed},
+        ap=ap,
+        differences=differences,
+        gap_closed=closed,
+        used_mb={"edge + cloud FL": {link: use.used_mb for link, use in own.items()}},
+    )
+
+
+def _tested(run: Run, town: str, arm: str, stage: str) -> Reached:
+    test = run.test(arm=arm, stage=stage, region=town, task=TASK)
+    return Reached(test.estimate.mean, test.estimate.low, test.estimate.high, test.numbers["AP70"])
+
+
+def _placed(run: Run, town: str) -> Placement:
+    placed = next(each for each in run.arms[MAIN].placed if each.region == town)
+    return Placement(placed.chosen[0], placed.densest, placed.poles, placed.errors, placed.covered, placed.range_m)
+
+
+def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
+    """Return means over seeds with their 95 % intervals."""
+
+    def means(number: Callable[[Reached], float | None]) -> dict[str, dict[str, MeanOverSeeds]]:
+        return {
+            town: {arm: mean_over_seeds([_known(number(seed.ap[town][arm])) for seed in seeds]) for arm in arms}
+            for town, arms in seeds[0].ap.items()
+        }
+
+    return ArmsSummary(
+        ap50=means(lambda reached: reached.ap50),
+        ap70=means(lambda reached: reached.ap70),
+        differences={
+            name: mean_over_seeds([seed.differences[name].mean for seed in seeds]) for name in seeds[0].differences
+        },
+        gap_closed={arm: mean_over_seeds([seed.gap_closed[arm] for seed in seeds]) for arm in seeds[0].gap_closed},
+    )
+
+
+def _known(number: float | None) -> float:
+    assert number is not None  # every town has cars to find
+    return number
+
+
+def draw_arms(results: ArmsResult) -> bytes:
+    """Return the forest plot of all arms' AP over seeds as a PNG."""
+    return style.png(figures.arms(results.summary.ap50))

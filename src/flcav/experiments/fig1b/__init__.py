@@ -1,0 +1,1 @@
+"""Fig. 1b of the article: four tasks on one scene."""

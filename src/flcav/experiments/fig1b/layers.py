@@ -1,0 +1,88 @@
+"""What the layers of a network hold while it looks at something: the same layers for every network of a task."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+from flcav.experiments.fig1b.columns import Layer
+from flcav.perception.ops.sparse import SparseTensor
+
+Named = Mapping[str, nn.Module]
+
+LENET = (1, 2, 4, 5, 7, 10)  # after the rectifiers
+
+
+def weather_layers(network: Any) -> Named:
+    """Return the layers of a LeNet-5 by their names in the paper."""
+    return {name: network.layers[place] for name, place in zip(("C1", "S2", "C3", "S4", "C5", "F6"), LENET)}
+
+
+def signs_layers(network: Any) -> Named:
+    """Return the backbone's three scales and the finest of the neck."""
+    stages = {"CSP, 1/8": network.to_8, "CSP, 1/16": network.to_16, "SPPF, 1/32": network.to_32}
+    return {**stages, "PAN, 1/8": network.down_8}
+
+
+def objects_layers(network: Any) -> Named:
+    """Return the sparse layers' end seen from above, the two scales after it, and both together."""
+    ahead = network.birds_eye
+    return {"sparse 3D": network.backbone, "BEV, 1/8": ahead.near, "BEV, 1/16": ahead.far, "both": ahead}
+
+
+def trajectory_layers(network: Any) -> Named:
+    """Return what encodes the surroundings and the past, and what decodes the future."""
+    convolutions = {f"conv {number}": layer for number, layer in enumerate(network.view.layers, 1)}
+    return {**convolutions, "LSTM": network.track, "context": network.context, "decoder": network.decoder}
+
+
+LAYERS: dict[str, Callable[[Any], Named]] = {
+    "weather": weather_layers,
+    "signs": signs_layers,
+    "objects": objects_layers,
+    "trajectory": trajectory_layers,
+}
+
+
+@contextlib.contextmanager
+def watched(layers: Named) -> Iterator[dict[str, Layer]]:
+    """Yield a record that holds, by name, what each layer last put out for the first sample of its batch."""
+    seen: dict[str, Layer] = {}
+
+    def keep(name: str) -> Callable[[nn.Module, Any, Any], None]:
+        def kept(module: nn.Module, given: Any, out: Any) -> None:
+            seen[name] = Layer(name, _values(out))
+
+        return kept
+
+    hooks = [layer.register_forward_hook(keep(name)) for name, layer in layers.items()]
+    try:
+        yield seen
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+@contextlib.contextmanager
+def given_to(layer: nn.Module) -> Iterator[list[Any]]:
+    """Yield a list that holds the arguments that `layer` was last called with."""
+    seen: list[Any] = []
+    hook = layer.register_forward_pre_hook(lambda module, given: seen.__setitem__(slice(None), given))
+    try:
+        yield seen
+    finally:
+        hook.remove()
+
+
+def _values(out: Any) -> NDArray[np.float32]:
+    """Return (C, H, W) or (C,) of the first sample; of a recurrent layer its last state."""
+    if isinstance(out, SparseTensor):
+        out = out.birds_eye()
+    if isinstance(out, tuple):
+        out = out[0]
+    first = out[0, -1] if out.dim() == 3 else out[0]
+    values = first.detach().float().cpu().numpy()
+    return values.reshape(-1) if values.shape[1:] == (1, 1) else values

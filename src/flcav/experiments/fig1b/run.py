@@ -1,0 +1,218 @@
+"""Fig. 1b of Wang et al. (IEEE Network 37(3), 2023), of our own: four tasks on one recorded scene.
+
+From top to bottom: what the sensor saw, what became of it on the way into the network, what the network's layers hold
+while they look at it, and what it says. The networks are those that come with the package.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from flcav.config import parse_config
+from flcav.dataset.layout import payload_path
+from flcav.dataset.payloads import POINTS
+from flcav.dataset.recording.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.experiments.fig1b import columns as page
+from flcav.experiments.fig1b.layers import LAYERS, given_to, watched
+from flcav.geometry import inverse, transform_points
+from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
+from flcav.perception.networks import network_of
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.signs.config import STRIDES
+from flcav.perception.signs.task import SIGNS
+from flcav.perception.task import Finding, Task
+from flcav.perception.tasks import task_named
+from flcav.perception.trajectory.rasters import LAYERS as RASTER_LAYERS
+from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.perception.weather.samples import small
+from flcav.perception.weather.task import WEATHER
+from flcav.progress import Report, silent
+from flcav.report import style
+from flcav.report.pictures.clouds import draw_boxes, draw_points
+from flcav.report.pictures.inference import boxes_in_picture
+from flcav.report.pictures.predicted_paths import MAP_COLOURS, paths_on_map
+from flcav.sensors.rig import RIGS
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+
+WIDE, NARROW, LIDAR = "wide", "narrow", "velodyne"
+CAMERA = {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 640, "height": 384}}
+PRESENT = 5  # the spin that is shown: 2.5 s after the first, 3.5 s before the last
+RECIPE: Mapping[str, Any] = {
+    "town": "grid",
+    "seed": 79,
+    "warmup_s": 75.0,
+    "spins_per_scene": 13,
+    "every_s": 0.5,
+    "cavs": 4,
+    "vehicle_rig": {
+        "lidars": RIGS["kitti_lidar"].model_dump(mode="json")["lidars"],
+        "cameras": {
+            WIDE: {**CAMERA, "settings": {**CAMERA["settings"], "fov_deg": 90.0}},
+            NARROW: {**CAMERA, "settings": {**CAMERA["settings"], "fov_deg": 45.0}},
+        },
+    },
+    "weather": "clear",
+}
+MAP_M = 50.0  # to either side of the observer
+SCORE = 0.3  # lowest that is shown
+CELL_M = 0.4  # of the voxels drawn: four of the network's, whose own would be too small to see
+WAY, SELF, OTHERS, PEDESTRIAN = (0.75, 0.87, 0.95), (0.84, 0.37, 0), (0.0, 0.45, 0.7), (0.8, 0.47, 0.65)
+RASTER_COLOURS = {
+    **dict(zip(("road", "lane", "crossing"), MAP_COLOURS, strict=True)),
+    "way": WAY,
+    "self": SELF,
+    "pedestrian": PEDESTRIAN,
+    **{name: OTHERS for name in RASTER_LAYERS if name.startswith("others")},
+}
+
+
+def fig1b(out: Path, progress: Report = silent) -> bytes:
+    """Record the scene into `out`, look at it with the networks of the package, and return the figure as a PNG.
+
+    Raises `InputError` where one of the tasks has no weights in the package.
+    """
+    networks = {name: network_of(task_named(name), None) for name in LAYERS}
+    record(EmbeddedSource(parse_config(Recipe, dict(RECIPE), "fig1b")), out / "data", progress=progress)
+    data = Dataset.open(out / "data")
+    number = most_to_see(data)
+    columns = [
+        _weather(networks["weather"], data.plane_path(number, WIDE, "rgb")),
+        _signs(networks["signs"], data.plane_path(number, NARROW, "rgb")),
+        _objects(networks["objects"], data.folder / payload_path(LIDAR, data.name(number), POINTS)),
+        _trajectory(networks["trajectory"], data, number),
+    ]
+    return style.png(page.task_columns(columns), dpi=130)
+
+
+def most_to_see(data: Dataset) -> int:
+    """Return the frame of the present with the most signs that can be read and objects near ahead."""
+
+    def worth(number: int) -> float:
+        frame = data.frame(number)
+        truth = frame.annotations
+        ahead, left, _ = transform_points(inverse(frame.world_from_agent), truth.boxes.center).T
+        near = (truth.returns >= 30) & (ahead > 4) & (ahead < 32) & (np.abs(left) < 20)
+        signs = int((truth.signs[NARROW].pixels >= 100).sum())
+        return 2 * min(signs, 6) + min(int(near.sum()), 20)
+
+    return max(data.select(spins=[PRESENT]), key=worth)
+
+
+def _weather(network: Any, picture: Path) -> page.Column:
+    finding, layers = _looked(WEATHER, network, picture)
+    (bars,) = (mark for mark in finding.marks if isinstance(mark, Bars))
+    return page.Column(
+        "Weather",
+        {
+            "sensor": partial(page.show_picture, picture=finding.seen),
+            "processing": partial(page.show_picture, picture=small(finding.seen), smooth=False),
+            "network": partial(page.show_layers, layers=layers),
+            "output": partial(page.show_probabilities, probabilities=bars.share),
+        },
+        {
+            "sensor": "camera, 90°",
+            "processing": "32 × 32 pixels, means of areas",
+            "network": "LeNet-5",
+            "output": "probability of each class",
+        },
+    )
+
+
+def _signs(network: Any, picture: Path) -> page.Column:
+    finding, layers = _looked(SIGNS, network, picture)
+    (boxes,) = (mark for mark in finding.marks if isinstance(mark, PictureBoxes))
+
+    def output(axes: Axes) -> None:
+        page.show_picture(axes, finding.seen)
+        boxes_in_picture(axes, boxes)
+
+    anchors = [size for level in network.config.anchors_px for size in level]
+    return page.Column(
+        "Signs and lights",
+        {
+            "sensor": partial(page.show_picture, picture=finding.seen),
+            "processing": partial(page.show_anchors, picture=finding.seen, stride=STRIDES[-1], anchors=anchors),
+            "network": partial(page.show_layers, layers=layers),
+            "output": output,
+        },
+        {
+            "sensor": "camera, 45°",
+            "processing": f"cells of 8, 16 and {STRIDES[-1]} pixels; nine anchors",
+            "network": "YOLOv5-style: CSP, SPPF, PAN",
+            "output": f"boxes with class and score: {len(boxes.box)}",
+        },
+    )
+
+
+def _objects(network: Any, points: Path) -> page.Column:
+    finding, layers = _looked(OBJECTS, network, points)
+    cloud, range_m, ground_m = finding.seen, network.config.range_m, network.config.ground_z_m
+    (boxes,) = (mark.boxes for mark in finding.marks if isinstance(mark, CloudBoxes))
+
+    def output(axes: Axes) -> None:
+        draw_points(axes, cloud, ground_m, (range_m[0], range_m[3], range_m[4]))
+        draw_boxes(axes, boxes, style.VERMILLION, width=1.6)
+        axes.set(**page.FROM_ABOVE)
+
+    return page.Column(
+        "Objects",
+        {
+            "sensor": partial(page.show_sweep, points=cloud, range_m=range_m, height_m=-ground_m),
+            "processing": partial(page.show_voxels, points=cloud, range_m=range_m, cell_m=CELL_M),
+            "network": partial(page.show_layers, layers=layers),
+            "output": output,
+        },
+        {
+            "sensor": f"LiDAR, {len(cloud):,} points",
+            "processing": f"voxels of {network.config.voxel_m[0]:g} m, from above (drawn at {CELL_M:g} m)",
+            "network": "SECOND",
+            "output": f"boxes, from above: {len(boxes)}",
+        },
+    )
+
+
+def _trajectory(network: Any, data: Dataset, number: int) -> page.Column:
+    """Return the column of the rasters that one road user's future is predicted from, and the futures of all."""
+    with watched(LAYERS["trajectory"](network)) as seen, given_to(network.view) as given:
+        finding = next(islice(TRAJECTORY.infer(network, data.folder), number, None))
+    raster = given[0].raster[0].cpu().numpy()
+    (paths,) = (mark for mark in finding.marks if isinstance(mark, Paths))
+    colours = [RASTER_COLOURS.get(name) for name in RASTER_LAYERS]
+
+    def on_map(shown: Paths) -> page.Draw:
+        def draw(axes: Axes) -> None:
+            paths_on_map(axes, finding.seen, shown)
+            axes.set(ylim=(-0.4 * MAP_M, 0.8 * MAP_M), xlim=(-MAP_M, MAP_M), aspect="auto")
+
+        return draw
+
+    still = replace(paths, users=tuple(replace(user, modes=(), truth=None) for user in paths.users))
+    return page.Column(
+        "Trajectories",
+        {
+            "sensor": on_map(still),
+            "processing": partial(page.show_raster, raster=raster, colours=colours),
+            "network": partial(page.show_layers, layers=list(seen.values())),
+            "output": on_map(paths),
+        },
+        {
+            "sensor": "tracks on the map; dashed: constant velocity",
+            "processing": f"{len(raster)} layers around one road user, 2 s of past",
+            "network": "convolutions, LSTM encoder and decoder",
+            "output": f"{network.config.modes} futures of {paths.times_s[-1]:g} s; black: what came",
+        },
+    )
+
+
+def _looked(task: Task, network: Any, path: Path) -> tuple[Finding, list[page.Layer]]:
+    with watched(LAYERS[task.name](network)) as seen:
+        finding = next(task.infer(network, path, SCORE))
+    return finding, list(seen.values())

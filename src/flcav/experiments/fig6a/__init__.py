@@ -1,0 +1,1 @@
+"""Fig. 6a of the article: joint allocation against equal stages."""

@@ -1,0 +1,162 @@
+"""What the comparison of two plans says, in sentences computed from its numbers."""
+
+from collections.abc import Mapping
+
+from flcav.experiments.fig6a.results import EQUAL, JOINT, TOWN, AllocationResult, AllocationSeed, PlanFinding
+from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, signed, verdict, verdict_words
+
+STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"}
+COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
+
+
+def allocation_findings(results: AllocationResult) -> tuple[PlanFinding, ...]:
+    """Return findings about `results`."""
+    return (_better(results), _ranking(results), _every_stage(results), _accuracy(results), _budgets(results))
+
+
+def _better(results: AllocationResult) -> PlanFinding:
+    realised = results.summary.realised[TOWN]
+    difference, how = _difference(results)
+    decided = verdict(difference.low, difference.high)
+    words = verdict_words(decided, len(results.seeds))
+    sentence = (
+        f"On {TOWN}, AP50 after the last stage was {realised[EQUAL]['cloud'].mean:.3f} with equal stages and "
+        f"{realised[JOINT]['cloud'].mean:.3f} with the joint plan: {signed(difference.mean)}, 95 % interval "
+        f"{signed(difference.low)} to {signed(difference.high)} {how}; {words}."
+    )
+    return _finding("Does the joint plan beat equal shares for every stage?", decided, sentence)
+
+
+def _difference(results: AllocationResult) -> tuple[MeanOverSeeds, str]:
+    """Return the paired difference after the last stage: over seeds, or over the scenes of the only one."""
+    seeds = results.seeds
+    if len(seeds) == 1:
+        own = seeds[0].differences[TOWN]["cloud"]
+        assert own.low is not None  # there are several test scenes
+        assert own.high is not None
+        how = "over test scenes of one seed, in which training does not vary"
+        return MeanOverSeeds(own.mean, own.low, own.high), how
+    return results.summary.realised_difference[TOWN]["cloud"], f"over {len(seeds)} seeds, paired"
+
+
+def _ranking(results: AllocationResult) -> PlanFinding:
+    predicted = results.summary.predicted_difference["cloud"]
+    difference, _ = _difference(results)
+    question = "Does the prediction rank the two plans rightly?"
+    if predicted == 0:
+        return _finding(question, UNDECIDED, "Both plans are predicted to reach the same: there is nothing to rank.")
+    seeds = results.seeds
+    agree = sum(predicted * (_ap(seed, JOINT, "cloud") - _ap(seed, EQUAL, "cloud")) > 0 for seed in seeds)
+    expected = f"The curve predicts {signed(predicted)} for the joint plan; {agree} of {len(seeds)} seeds agree in sign"
+    towards = sorted((difference.low * _sign(predicted), difference.high * _sign(predicted)))
+    decided = verdict(*towards)
+    if difference.mean * predicted > 0 and decided != NOT_HELD:
+        sure = "with an interval off 0" if decided == HELD else "but its interval contains 0"
+        return _finding(question, decided, f"{expected}, and so does their mean, {sure}.")
+    sure = ", but its interval contains 0" if decided == UNDECIDED else ""
+    return _finding(question, decided, f"{expected}, and their mean does not{sure}. {_why(results)}")
+
+
+def _why(results: AllocationResult) -> str:
+    """Return where prediction and training part most, and whether the plans go beyond what history holds."""
+    summary = results.summary
+    predicted = _gains(summary.predicted_difference)
+    realised = _gains({stage: each.mean for stage, each in summary.realised_difference[TOWN].items()})
+    stage = max(STAGE_NAMES, key=lambda name: abs(predicted[name] - realised[name]))
+    sentence = (
+        f"They part most in {STAGE_NAMES[stage]}: of what that stage adds, the joint plan was to have "
+        f"{signed(predicted[stage])} more than equal stages, and had {signed(realised[stage])}."
+    )
+    beyond = [
+        f"{COUNT_NAMES[count]} {plans[name].counts[count]} of the {name} plan (history: {low:g} to {high:g})"
+        for count, (low, high) in results.history.items()
+        for plans in (results.seeds[0].plans,)
+        for name in (EQUAL, JOINT)
+        if not low <= plans[name].counts[count] <= high
+    ]
+    return sentence + (f" The curve is extrapolated for {'; '.join(beyond)}." if beyond else "")
+
+
+def _every_stage(results: AllocationResult) -> PlanFinding:
+    """Return what each stage of federation added in each plan: the curves fall always and cannot foresee a loss."""
+    gains = {(name, stage): _gain(results, TOWN, name, stage) for name in (EQUAL, JOINT) for stage in ("edge", "cloud")}
+    plans = results.seeds[0].plans
+    rounds = {(name, stage): plans[name].counts[f"{stage}_rounds"] for name, stage in gains}
+    told = [
+        f"{STAGE_NAMES[stage]} of the {name} plan ({rounds[name, stage]} round{'s' * (rounds[name, stage] != 1)}) "
+        f"{_interval(gain)}"
+        for (name, stage), gain in gains.items()
+    ]
+    sentences = [f"On {TOWN}, over the stage before it: {'; '.join(told)}."]
+    verdicts = {key: verdict(gain.low, gain.high) for key, gain in gains.items()}
+    lost = [key for key, each in verdicts.items() if each == NOT_HELD]
+    if lost:
+        sentences.append("The curves fall with every round, so no plan made from them foresees a loss.")
+    for name, stage in (key for key in lost if key[1] == "cloud"):
+        beside = "; ".join(
+            f"on {town} the same stage brought {_interval(_gain(results, town, name, stage))}"
+            for town in results.summary.realised
+            if town != TOWN
+        )
+        sentences.append(f"The cloud's average of all regions' networks serves them all: {beside}.")
+    decided = NOT_HELD if lost else HELD if set(verdicts.values()) == {HELD} else UNDECIDED
+    return _finding("Did every stage raise the accuracy?", decided, " ".join(sentences))
+
+
+def _gain(results: AllocationResult, town: str, name: str, stage: str) -> MeanOverSeeds:
+    """Return what a stage added to what was there before it, over seeds; a single seed decides nothing."""
+    before = {"edge": "pretrain", "cloud": "edge"}[stage]
+    rows = [seed.realised[town][name] for seed in results.seeds]
+    gain = mean_over_seeds([row[stage].ap50 - row[before].ap50 for row in rows])
+    return gain if len(rows) > 1 else MeanOverSeeds(gain.mean, -1.0, 1.0)
+
+
+def _interval(gain: MeanOverSeeds) -> str:
+    return f"{signed(gain.mean)} ({signed(gain.low)} to {signed(gain.high)})"
+
+
+def _gains(after: Mapping[str, float]) -> dict[str, float]:
+    """Return what each stage adds to what was there before it."""
+    before = {"pretrain": 0.0, "edge": after["pretrain"], "cloud": after["edge"]}
+    return {stage: after[stage] - before[stage] for stage in STAGE_NAMES}
+
+
+def _accuracy(results: AllocationResult) -> PlanFinding:
+    errors = [
+        _ap(seed, name, "cloud") - seed.predicted[name]["cloud"] for seed in results.seeds for name in (EQUAL, JOINT)
+    ]
+    wide = sum(abs(error) for error in errors) / len(errors)
+    claimed = abs(results.summary.predicted_difference["cloud"])
+    decided = HELD if wide < claimed else NOT_HELD
+    compared = "less" if wide < claimed else "no less"
+    sentence = (
+        f"Over {len(errors)} runs, AP50 after the last stage was off its prediction by {wide:.3f} on average (from "
+        f"{signed(min(errors))} to {signed(max(errors))}): {compared} than the {claimed:.3f} that are predicted to "
+        f"lie between the plans."
+    )
+    return _finding("Is the prediction exact enough to tell the plans apart?", decided, sentence)
+
+
+def _budgets(results: AllocationResult) -> PlanFinding:
+    rows = [row for seed in results.seeds for book in seed.ledger.values() for row in book.values()]
+    within = all(row.used_mb <= row.budget_mb for row in rows)
+    off = [row.used_mb - row.planned_mb for row in rows]
+    spent = [row.used_mb / row.budget_mb for row in rows]
+    sentence = (
+        f"Every ledger ends {'within' if within else 'above'} its budgets, at {min(spent):.0%} to {max(spent):.0%} of "
+        f"a link's; what was sent differs from the plan's price by {signed(min(off), 2)} to {signed(max(off), 2)} MB."
+    )
+    return _finding("Did the runs keep their budgets?", HELD if within else NOT_HELD, sentence)
+
+
+def _ap(seed: AllocationSeed, name: str, stage: str) -> float:
+    return seed.realised[TOWN][name][stage].ap50
+
+
+def _finding(question: str, decided: str, sentence: str) -> PlanFinding:
+    return PlanFinding(question, decided, sentence)
+
+
+def _sign(value: float) -> int:
+    return 1 if value > 0 else -1

@@ -1,0 +1,165 @@
+"""Proof by training of MLGRA (Wang et al., IEEE Network 37(3), 2023, Fig. 6a): equal stages against the joint plan.
+
+Both plans, the arms of recipes/runs/allocation.yaml, have the demo's budgets, the same learning curve, and the same
+limits, wider than the demo's, so that budgets and not time bind. They share their recorded frames; each places its own
+poles, as the errors of its own pretrained network ask. What the curve predicts after each stage stands beside what
+training reached.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from flcav.experiments.fig6a.findings import allocation_findings
+from flcav.experiments.fig6a.results import (
+    COUNTS,
+    EQUAL,
+    JOINT,
+    TOWN,
+    AllocationResult,
+    AllocationSeed,
+    AllocationSummary,
+    Planned,
+    Reached,
+)
+from flcav.intervals import Estimate, mean_over_seeds
+from flcav.pipeline.planning import history_of
+from flcav.pipeline.provenance import provenance
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results import Run
+from flcav.pipeline.running import run_seeds
+from flcav.pipeline.steps import Notify, Stale
+from flcav.report import style
+from flcav.report.charts import plans
+
+TASK = "objects"
+PLANS = (EQUAL, JOINT)
+ARM_OF = {EQUAL: "equal", JOINT: MAIN}
+STAGES = (PRETRAIN, EDGE, CLOUD)
+
+
+def run_allocation(
+    recipe: RunRecipe,
+    out: Path,
+    *,
+    seeds: int,
+    jobs: int,
+    notify: Notify,
+    stale: Stale = "refuse",
+    engine: str = "processes",
+) -> AllocationResult:
+    """Run or finish both plans of each seed in folders below `out` and return the results."""
+    runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    rows = tuple(one_seed(run) for run in runs)
+    asked = recipe.model_dump(mode="json", exclude={"seed"})
+    results = AllocationResult(_history_ranges(), rows, summarise(rows), recipe=asked, provenance=provenance())
+    return replace(results, findings=allocation_findings(results))
+
+
+def one_seed(run: Run) -> AllocationSeed:
+    """Return what the page tells of a seed."""
+    towns = run.recipe.with_role("federate")
+    arms = {name: run.arms[arm] for name, arm in ARM_OF.items()}
+    plan_of = {name: arm.plan.tasks[TASK] for name, arm in arms.items()}
+    found = {
+        (each.region, each.stage): each.estimate
+        for each in run.differences
+        if (each.arm, each.before_arm) == (MAIN, ARM_OF[EQUAL])
+    }
+    predicted = {name: dict(plan.predicted or {}) for name, plan in plan_of.items()}
+    return AllocationSeed(
+        seed=run.recipe.seed,
+        plans={
+            name: Planned(
+                plan.samples,
+                plan.edge_rounds,
+                plan.cloud_rounds,
+                plan.wireless_mb,
+                plan.wireline_mb,
+                predicted_error=1 - predicted[name][CLOUD],
+            )
+            for name, plan in plan_of.items()
+        },
+        predicted=predicted,
+        realised={
+            town: {
+                name: {stage: Reached(_ap50(run, arm, stage, town)) for stage in STAGES} for name, arm in ARM_OF.items()
+            }
+            for town in towns
+        },
+        differences={town: {stage: _difference(found.get((town, stage))) for stage in STAGES} for town in towns},
+        poles={name: {placed.region: placed.chosen[0] for placed in arm.placed} for name, arm in arms.items()},
+        ledger={name: arm.links for name, arm in arms.items()},
+    )
+
+
+def _ap50(run: Run, arm: str, stage: str, town: str) -> float:
+    return run.test(arm=arm, stage=stage, region=town, task=TASK).estimate.mean
+
+
+def _difference(estimate: Estimate | None) -> Estimate:
+    """Return a difference; none where both plans are the same and share their steps."""
+    return Estimate(0.0, 0.0, 0.0) if estimate is None else estimate
+
+
+def _history_ranges() -> dict[str, tuple[float, float]]:
+    """Return the least and the most of each count in the history that both plans were predicted from."""
+    columns = history_of(TASK).resources.T
+    return {name: (float(column.min()), float(column.max())) for name, column in zip(COUNTS, columns, strict=True)}
+
+
+def summarise(seeds: Sequence[AllocationSeed]) -> AllocationSummary:
+    """Return means over seeds with their 95 % intervals; differences are joint minus equal stages, paired by seed."""
+
+    towns = tuple(seeds[0].realised)
+
+    def realised(town: str, name: str, stage: str) -> list[float]:
+        return [seed.realised[town][name][stage].ap50 for seed in seeds]
+
+    def predicted(name: str, stage: str) -> list[float]:
+        return [seed.predicted[name][stage] for seed in seeds]
+
+    return AllocationSummary(
+        predicted={name: {stage: float(np.mean(predicted(name, stage))) for stage in STAGES} for name in PLANS},
+        realised={
+            town: {name: {stage: mean_over_seeds(realised(town, name, stage)) for stage in STAGES} for name in PLANS}
+            for town in towns
+        },
+        predicted_difference={
+            stage: float(np.mean(np.subtract(predicted(JOINT, stage), predicted(EQUAL, stage)))) for stage in STAGES
+        },
+        realised_difference={
+            town: {
+                stage: mean_over_seeds(np.subtract(realised(town, JOINT, stage), realised(town, EQUAL, stage)).tolist())
+                for stage in STAGES
+            }
+            for town in towns
+        },
+    )
+
+
+def draw_allocation(results: AllocationResult) -> bytes:
+    """Return predicted and realised AP of both plans, and their paired differences, as a PNG."""
+    summary, seeds = results.summary, results.seeds
+    ap = {
+        name: {
+            stage: plans.StageReached(
+                summary.predicted[name][stage],
+                summary.realised[TOWN][name][stage],
+                tuple(seed.realised[TOWN][name][stage].ap50 for seed in seeds),
+            )
+            for stage in STAGES
+        }
+        for name in PLANS
+    }
+    differences = {
+        stage: plans.StageReached(
+            summary.predicted_difference[stage],
+            summary.realised_difference[TOWN][stage],
+            tuple(seed.differences[TOWN][stage].mean for seed in seeds),
+        )
+        for stage in STAGES
+    }
+    return style.png(plans.predicted_and_realised(ap, differences, TOWN))

@@ -1,0 +1,1 @@
+"""The detector trained in simulation, on real sweeps."""

@@ -1,0 +1,69 @@
+"""What a LiDAR's clouds are like, in numbers that real and simulated ones can be compared by.
+
+Only what a camera ahead shows is looked at: KITTI keeps no more of its clouds.
+"""
+
+import itertools
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.geometry import Boxes, points_in_boxes
+from flcav.perception.objects.augment import in_view
+from flcav.report.pictures.clouds import CloudNumbers, SeenCar, Street
+
+RANGES_M = (0, 5, 10, 15, 20, 25, 30, 40, 50, 60, 80)
+GROUND_M = (5, 8, 12, 16, 20, 25)  # limits of the stretches of street ahead
+ASIDE_M = 4.0  # half the width of the street that is looked at
+LOW_M = -1.2  # what lies lower is taken for ground [sensor frame]
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+NO_INTENSITY = 0.005
+
+Labelled = tuple[NDArray[np.float32], Boxes]  # points (N, 4) and cars of a frame, LiDAR frame
+
+
+def describe(frames: Iterable[Labelled]) -> CloudNumbers:
+    """Return the numbers of some frames."""
+    frames = [(points[in_view(points)], cars) for points, cars in frames]
+    points = np.concatenate([points for points, _ in frames])
+    distance = np.linalg.norm(points[:, :3], axis=1)
+    per_range = np.histogram(distance, RANGES_M)[0] / len(frames)
+    return CloudNumbers(
+        frames=len(frames),
+        returns=len(points) / len(frames),
+        returns_per_range=dict(zip(_names(RANGES_M), per_range.round(1).tolist(), strict=True)),
+        intensity_quantiles=tuple(np.quantile(points[:, 3], QUANTILES).round(3).tolist()),
+        without_intensity=float((points[:, 3] < NO_INTENSITY).mean()),
+        ground=_ground(points),
+        cars=tuple(car for cloud, cars in frames for car in _cars(cloud, cars)),
+    )
+
+
+def _ground(points: NDArray[np.float32]) -> tuple[Street, ...]:
+    """Return median height and intensity, and the spread of height, of the street at several distances."""
+    low = points[(np.abs(points[:, 1]) < ASIDE_M) & (points[:, 2] < LOW_M)]
+    rows = []
+    for near, far in itertools.pairwise(GROUND_M):
+        own = low[(low[:, 0] >= near) & (low[:, 0] < far)]
+        if len(own):
+            height, intensity = float(np.median(own[:, 2])), float(np.median(own[:, 3]))
+            spread = float(np.subtract(*np.quantile(own[:, 2], (0.75, 0.25))))
+            rows.append(Street(f"{near}-{far}", height, spread, intensity))
+    return tuple(rows)
+
+
+def _cars(points: NDArray[np.float32], cars: Boxes) -> list[SeenCar]:
+    """Return distance, returns, size and share of returns without intensity of each car that has returns."""
+    inside = points_in_boxes(points, cars)
+    rows = []
+    for box, own in zip(cars.array(), inside, strict=True):
+        if own.any():
+            without = float((points[own, 3] < NO_INTENSITY).mean())
+            length, width, height = box[3:6].round(2).tolist()
+            rows.append(SeenCar(float(np.hypot(*box[:2])), int(own.sum()), length, width, height, without))
+    return rows
+
+
+def _names(limits: tuple[int, ...]) -> list[str]:
+    return [f"{low}-{high} m" for low, high in itertools.pairwise(limits)]

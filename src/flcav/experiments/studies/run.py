@@ -1,0 +1,215 @@
+"""The study of one task: frames recorded from recipes, a network per seed, each tested once on frames of other scenes.
+
+The epoch that is kept is chosen on the validation frames; the test frames are used for nothing else.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, is_dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Generic, TypeVar, cast, get_type_hints
+
+from flcav.config import InputError, parse_config
+from flcav.dataset.recording.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.files import Json
+from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.perception.card import Card
+from flcav.perception.study import RecipeFields, StudyRecipe
+from flcav.perception.task import Evaluated, Task
+from flcav.perception.training.run import WEIGHTS, Request, train_network
+from flcav.perception.weights import load_network
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.steps import Notify, Step, Work, run_steps
+from flcav.records import LEFT_OUT, of_json, to_json
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+
+EvaluationT = TypeVar("EvaluationT", bound=Evaluated)
+VALIDATION = "validation"
+
+
+@dataclass(frozen=True)
+class SeedResult(Generic[EvaluationT]):
+    """What one seed came to."""
+
+    seed: int
+    card: Card
+    tests: Mapping[str, EvaluationT]  # by name
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What was recorded."""
+
+    train: tuple[RecipeFields, ...]
+    validation: RecipeFields
+    tests: Mapping[str, RecipeFields]  # by name
+
+
+@dataclass(frozen=True)
+class StudyResult(Generic[EvaluationT]):
+    """The numbers of a study: of its seeds, and their means."""
+
+    task: str
+    network: str
+    scale: str
+    epochs: int
+    patience: int
+    recipes: Recorded
+    seeds: tuple[SeedResult[EvaluationT], ...]
+    summary: Mapping[str, Mapping[str, MeanOverSeeds]]  # test -> name of a number
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # always there, but in results of before
+
+    def tested(self, test: str) -> list[EvaluationT]:
+        """Return the evaluations of a test, one per seed."""
+        return [seed.tests[test] for seed in self.seeds]
+
+
+@dataclass(frozen=True)
+class Study(Generic[EvaluationT]):
+    """What is recorded, trained and tested; functions are module-level ones, since steps run in other processes.
+
+    Fields that two studies are not compared by are of no step: what they reach makes none stale.
+    """
+
+    task: Task
+    recipe: StudyRecipe
+    draw: Callable[[StudyResult[EvaluationT]], bytes] = field(compare=False)  # -> PNG
+    extra: Mapping[str, Callable[[EvaluationT, Any, Dataset], EvaluationT]] = field(default_factory=dict)  # by test
+
+    @property
+    def evaluation(self) -> type[EvaluationT]:
+        """Return the record that the task's `evaluate` is annotated to return; raises `InputError` for no such."""
+        found = get_type_hints(self.task.evaluate).get("return")
+        if not (isinstance(found, type) and issubclass(found, Evaluated) and is_dataclass(found)):
+            raise InputError(f"task '{self.task.name}': its evaluate() has no annotation of the dataclass it returns")
+        return cast("type[EvaluationT]", found)
+
+    def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> Json:
+        """Train one seed, going on where an interrupted run left off; return its card."""
+        data = [opened(work, step) for step in _training_steps(self)]
+        request = Request(data, opened(work, VALIDATION), network, epochs, patience, seed)
+        return train_network(self.task, request, work.folder, work.report).model_dump(mode="json")
+
+    def test(self, work: Work, *, seed: int) -> Json:
+        """Return what the network of one seed reaches on each test."""
+        network = load_network(self.task, work.inputs[_seed_step(seed)] / WEIGHTS)
+        return {name: self._tested(name, network, opened(work, _test_step(name)), work) for name in self.recipe.tests}
+
+    def _tested(self, name: str, network: Any, data: Dataset, work: Work) -> Mapping[str, Json]:
+        result = self.task.evaluate(network, data, progress=work.report)
+        assert isinstance(result, self.evaluation)
+        more = self.extra.get(name)
+        return (more(result, network, data) if more else result).as_json()
+
+
+def run_study(
+    study: Study[EvaluationT],
+    out: Path,
+    *,
+    seeds: Sequence[int],
+    scale: str = "full",
+    jobs: int,
+    notify: Notify,
+    stale: str = "refuse",
+    engine: str = "processes",
+) -> StudyResult[EvaluationT]:
+    """Run what of the study is not done yet in `out`, as `run_steps`; return its numbers: of seeds, and their means.
+
+    Raises `InputError` for an unknown scale, where `out` holds another study, and where the task does not say which
+    record its evaluation returns.
+    """
+    recipe = study.recipe.at_scale(scale)
+    study = replace(study, recipe=recipe)
+    assert study.evaluation  # before hours of work
+    values = run_steps(steps_of(study, seeds), out, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    runs = tuple(_seed_result(study, seed, values) for seed in seeds)
+    return StudyResult(
+        study.task.name,
+        recipe.network,
+        scale,
+        recipe.epochs,
+        recipe.patience,
+        Recorded(recipe.train, recipe.validation, recipe.tests),
+        runs,
+        {name: _means([run.tests[name].numbers() for run in runs]) for name in recipe.tests},
+        provenance(),
+    )
+
+
+def results_as_json(study: Study[EvaluationT], results: StudyResult[EvaluationT]) -> Json:
+    """Return the results of a study as JSON has them."""
+    return to_json(results, _kind(study))
+
+
+def results_of_json(study: Study[EvaluationT], values: Json, origin: str) -> StudyResult[EvaluationT]:
+    """Return what `results_as_json` returned as a record again; raises `InputError` where it is no such."""
+    return of_json(_kind(study), values, origin)
+
+
+def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int, str]]:
+    """Return of each seed of a study's results: its number, samples, steps, and the score after each epoch."""
+    rows = []
+    for run in results.seeds:
+        scores = ", ".join(f"{score:.2f}" for score in run.card.learning.scores)
+        rows.append((run.seed, run.card.samples, run.card.learning.steps, scores))
+    return rows
+
+
+def steps_of(study: Study, seeds: Sequence[int]) -> list[Step]:
+    """Return the steps: a recording per recipe, a training and a test per seed."""
+    recipe = study.recipe
+    recipes = dict(zip(_training_steps(study), recipe.train, strict=True)) | {VALIDATION: recipe.validation}
+    tests = {_test_step(name): fields for name, fields in recipe.tests.items()}
+    steps = [Step(name, record_split, {"recipe": fields}) for name, fields in {**recipes, **tests}.items()]
+    trained = {"network": recipe.network, "epochs": recipe.epochs, "patience": recipe.patience}
+    for seed in seeds:
+        steps.append(Step(_seed_step(seed), study.learn, {"seed": seed, **trained}, tuple(recipes)))
+        steps.append(Step(_tested_step(seed), study.test, {"seed": seed}, (_seed_step(seed), *tests)))
+    return steps
+
+
+def _training_steps(study: Study) -> list[str]:
+    return [f"train-{number}" for number in range(len(study.recipe.train))]
+
+
+def _test_step(name: str) -> str:
+    return f"test-{name}"
+
+
+def _seed_step(seed: int) -> str:
+    return f"seed-{seed}"
+
+
+def _tested_step(seed: int) -> str:
+    return f"seed-{seed}-tested"
+
+
+def _seed_result(study: Study[EvaluationT], seed: int, values: Mapping[str, Any]) -> SeedResult[EvaluationT]:
+    tests = values[_tested_step(seed)]
+    evaluations = {name: study.evaluation.of_json(tests[name], f"test on {name}") for name in study.recipe.tests}
+    return SeedResult(seed, Card.model_validate(values[_seed_step(seed)]), evaluations)
+
+
+def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, MeanOverSeeds]:
+    """Return the means of the numbers that all seeds have."""
+    return {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
+
+
+def _kind(study: Study[EvaluationT]) -> type[StudyResult[EvaluationT]]:
+    return StudyResult[study.evaluation]  # pyright: ignore[reportInvalidTypeArguments]
+
+
+DATA = "data"
+
+
+def record_split(work: Work, recipe: dict[str, Any]) -> dict[str, int]:
+    """Record one split."""
+    source = EmbeddedSource(parse_config(Recipe, recipe, work.folder.name))
+    record(source, work.folder / DATA, progress=work.report)
+    return {"frames": len(Dataset.open(work.folder / DATA))}
+
+
+def opened(work: Work, step: str) -> Dataset:
+    """Return what `record_split` made in the step `step`."""
+    return Dataset.open(work.inputs[step] / DATA)

@@ -1,0 +1,201 @@
+"""MLGRA: how many samples, edge rounds and cloud rounds each task gets, under both uplink budgets, to err least.
+
+Every plan is in whole numbers and within the budgets. What is best is the weighted error (`weighted`), the largest
+error (`fairness`) or the area of the accuracy polygon (`area`); the first two come with a proven lower bound.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.network.plan import Price
+from flcav.optimization.allocation.area import area, largest_area
+from flcav.optimization.allocation.problem import Problem, Task
+from flcav.optimization.curves.curves import Curve, Shared
+from flcav.optimization.solvers.fairness import least_largest
+from flcav.optimization.solvers.instance import Infeasible as Infeasible
+from flcav.optimization.solvers.instance import Instance, cost_of, instance
+from flcav.optimization.solvers.instance import stage_plan as stage_plan
+from flcav.optimization.solvers.weighted import least_weighted
+
+Array = NDArray[np.float64]
+
+MB_PER_GB = 1000.0
+EXACT = 1e-9  # gap sought for few tasks
+EXACT_TASKS = 4
+AREA_GAP = 1e-4  # of the steps towards a large area, which has no certificate anyway
+NO_CERTIFICATE = "the area is not concave in the plan: this is the best of several local optima, with no certificate"
+
+
+@dataclass(frozen=True)
+class LearnerError:
+    """What one of the tasks that share a network is predicted to err."""
+
+    name: str
+    predicted_error: float
+
+
+@dataclass(frozen=True)
+class TaskPlan:
+    """What one task gets."""
+
+    name: str
+    samples: int
+    edge_rounds: int
+    cloud_rounds: int
+    predicted_error: float  # of a cluster: the weighted mean of its members' errors
+    wireless_mb: float
+    wireline_mb: float
+    upper_error: float | None = None  # robust plans: by the upper band
+    members: tuple[LearnerError, ...] = ()  # of a cluster
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """A plan for all tasks and its certificate."""
+
+    status: str  # optimal: within the gap asked for; feasible: the gap is wider, or there is none
+    objective: (
+        float  # weighted: sum of the errors; max-min: the largest; area: of the polygon of accuracies, to be large
+    )
+    lower_bound: float | None  # proven: no plan has less; none for the area
+    gap: float | None  # (objective - lower_bound) / lower_bound
+    tasks: tuple[TaskPlan, ...]
+    used_mb: Price
+    marginal_error_per_gb: Price  # derivative by each budget, per 1000 MB: see `allocate`
+    note: str | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Best:
+    x: Array
+    objective: float
+    lower: float | None
+    rates: Array
+
+
+def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
+    """Return the best plan within both budgets, proven to a relative `gap` (few tasks: to 1e-9).
+
+    Robust plans minimise the upper bands of the curves. `marginal_error_per_gb` is the derivative of the optimum over
+    quantities that need not be whole, times 1000 MB: a price at these budgets, no forecast of what 1000 MB more bring,
+    for which see `budget_sweep.savings`. Raises `Infeasible`, naming the budget, the least that the limits allow, and
+    by how much that is over. MLGRA of Wang et al., IEEE Network 37(3), 2023, solved exactly.
+
+    >>> from flcav import allocate, load_problem
+    >>> plan = allocate(load_problem("recipes/allocation/objects.yaml"))
+    >>> plan.status, plan.tasks[0].name, plan.used_mb.wireless_mb <= 4000
+    ('optimal', 'objects', True)
+    """
+    asked = resolved(problem)
+    sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
+    best = _METHODS[problem.objective](asked, instance(asked), sought)
+    plans = described(problem, best.x)
+    lower = None if best.lower is None else min(best.lower, best.objective)
+    achieved = None if lower is None else relative_gap(best.objective, lower)
+    return Allocation(
+        status="optimal" if achieved is not None and achieved <= gap else "feasible",
+        objective=best.objective,
+        lower_bound=lower,
+        gap=achieved,
+        tasks=plans,
+        used_mb=used(plans),
+        marginal_error_per_gb=Price(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates)),
+        note=NO_CERTIFICATE if lower is None else None,
+        warnings=_beyond(problem, plans),
+    )
+
+
+def relative_gap(objective: float, lower: float) -> float:
+    """Return by what share `objective` is above the bound `lower`; above one of 0, by all of it."""
+    return (objective - lower) / lower if lower > 0 else float(objective > 0)
+
+
+def resolved(problem: Problem) -> Problem:
+    """Return the problem to solve: robust, it has upper bands for curves; given `performance`, importances for weights.
+
+    The importance of a task is the performance lost when it is left out; importances sum to 1.
+    """
+    tasks = problem.tasks
+    if problem.robust:
+        tasks = tuple(task.model_copy(update={"curve": task.upper}) for task in tasks)
+    if problem.performance is not None:
+        lost = np.array([problem.performance - float(task.performance_without or 0.0) for task in tasks])
+        lost = np.maximum(lost, 0) / np.maximum(lost, 0).sum()
+        tasks = tuple(task.model_copy(update={"weight": float(weight)}) for task, weight in zip(tasks, lost))
+    return problem.model_copy(update={"tasks": tasks})
+
+
+def described(problem: Problem, x: Array) -> tuple[TaskPlan, ...]:
+    """Return the plans that x (3N,) stands for."""
+    return tuple(_task_plan(problem, task, row) for task, row in zip(problem.tasks, x.reshape(-1, 3)))
+
+
+def _task_plan(problem: Problem, task: Task, row: Array) -> TaskPlan:
+    samples, edge_rounds, cloud_rounds = (int(count) for count in row)
+    cost = cost_of(problem, task, (samples, edge_rounds, cloud_rounds))
+
+    def error(curve: Curve) -> float:
+        return float(curve.error(samples, edge_rounds, cloud_rounds, problem.edge_rounds_per_cloud_round))
+
+    members = [LearnerError(each.name, error(each.curve)) for each in task.learners]
+    return TaskPlan(
+        *(task.name, samples, edge_rounds, cloud_rounds, error(task.curve), cost.wireless_mb, cost.wireline_mb),
+        upper_error=error(task.upper) if problem.robust and task.upper is not None else None,
+        members=tuple(members) if isinstance(task.curve, Shared) else (),
+    )
+
+
+def used(plans: tuple[TaskPlan, ...]) -> Price:
+    """Return what the plans cost together."""
+    return Price(sum(plan.wireless_mb for plan in plans), sum(plan.wireline_mb for plan in plans))
+
+
+def weighted_error(problem: Problem, plans: Sequence[TaskPlan]) -> float:
+    """Return the weighted sum of the predicted errors, of the upper ones where they are what counts."""
+    errors = (plan.predicted_error if plan.upper_error is None else plan.upper_error for plan in plans)
+    return sum(task.weight * error for task, error in zip(problem.tasks, errors, strict=True))
+
+
+def score(problem: Problem, plans: Sequence[TaskPlan]) -> float:
+    """Return what the problem's objective makes of the plans: a weighted or the largest error, or an area."""
+    if problem.objective == "weighted":
+        return weighted_error(problem, plans)
+    counts = [(plan.samples, plan.edge_rounds, plan.cloud_rounds) for plan in plans]
+    k = problem.edge_rounds_per_cloud_round
+    errors = [
+        float(learner.curve.error(*own, k=k)) for task, own in zip(problem.tasks, counts) for learner in task.learners
+    ]
+    return max(errors) if problem.objective == "max-min" else area(1 - np.array(errors))
+
+
+def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:
+    """Return a sentence for each quantity that is planned beyond what its curve was measured to."""
+    return tuple(
+        f"task {task.name!r}: {getattr(plan, name)} {name.replace('_', ' ')} are beyond the {most:g} that its curve "
+        "was measured to"
+        for task, plan in zip(problem.tasks, plans)
+        for name in ("samples", "edge_rounds", "cloud_rounds")
+        if (most := getattr(task.measured, name)) is not None and getattr(plan, name) > most
+    )
+
+
+def _weighted(problem: Problem, made: Instance, gap: float) -> _Best:
+    found = least_weighted(made, gap)
+    return _Best(found.x, weighted_error(problem, described(problem, found.x)), found.bound + made.floor, found.rates)
+
+
+def _fair(problem: Problem, made: Instance, gap: float) -> _Best:
+    found = least_largest(problem, made, gap)
+    return _Best(found.x, found.level, found.bound, found.rates)
+
+
+def _area(problem: Problem, made: Instance, gap: float) -> _Best:
+    found = largest_area(problem, max(gap, AREA_GAP))
+    return _Best(found.x, found.area, None, found.rates)
+
+
+_METHODS = {"weighted": _weighted, "max-min": _fair, "area": _area}

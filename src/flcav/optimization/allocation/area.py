@@ -1,0 +1,85 @@
+"""The area of the polygon whose corners are the tasks' accuracies on equally spaced axes (the article's Fig. 6b).
+
+With N >= 3 corners it is sin(2 pi / N) / 2 times the sum of the products of neighbours. Its gradient weighs each task
+by its neighbours' accuracies, so a plan of least weighted error under those weights is tried next, from several starts.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.optimization.allocation.problem import Problem
+from flcav.optimization.curves.curves import Shared
+from flcav.optimization.solvers.instance import instance
+from flcav.optimization.solvers.weighted import least_weighted
+
+Array = NDArray[np.float64]
+
+STEPS = 12  # from each start
+EMPHASIS = 3.0  # on one corner, in its start
+MOST_EMPHASISED = 6  # corners
+LEAST_WEIGHT = 1e-6
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """Whole quantities and the area that they are predicted to reach."""
+
+    x: Array  # (n,)
+    area: float
+    rates: Array  # (2,) area gained per MB of each link
+
+
+def area(accuracy: Array) -> float:
+    """Return the area of the polygon with the (N,) accuracies as corners, in order; below 0 counts as 0."""
+    corners = np.maximum(accuracy, 0)
+    return 0.5 * float(np.sin(2 * np.pi / len(corners)) * (corners @ np.roll(corners, -1)))
+
+
+def largest_area(problem: Problem, gap: float) -> Polygon:
+    """Return the plan of largest area among local optima from several starts: the area is not concave."""
+    corners = sum(len(task.learners) for task in problem.tasks)
+    starts = [np.ones(corners)]
+    if corners <= MOST_EMPHASISED:
+        starts += [1 + (EMPHASIS - 1) * np.eye(corners)[corner] for corner in range(corners)]
+    return max((_climb(problem, start, gap) for start in starts), key=lambda found: found.area)
+
+
+def _climb(problem: Problem, weights: Array, gap: float) -> Polygon:
+    best = Polygon(np.zeros(0), -np.inf, np.zeros(2))
+    for _ in range(STEPS):
+        weighed = _weighed(problem, np.maximum(weights, LEAST_WEIGHT))
+        found = least_weighted(instance(weighed), gap)
+        accuracy = _accuracy(problem, found.x)
+        reached = Polygon(found.x, area(accuracy), found.rates)
+        if reached.area <= best.area * (1 + gap):
+            return max(best, reached, key=lambda polygon: polygon.area)
+        best, corners = reached, np.maximum(accuracy, 0)
+        weights = 0.5 * np.sin(2 * np.pi / len(corners)) * (np.roll(corners, 1) + np.roll(corners, -1))
+    return best
+
+
+def _accuracy(problem: Problem, x: Array) -> Array:
+    k = problem.edge_rounds_per_cloud_round
+    return 1 - np.array(
+        [
+            float(learner.curve.error(*counts, k=k))
+            for task, counts in zip(problem.tasks, x.reshape(-1, 3))
+            for learner in task.learners
+        ]
+    )
+
+
+def _weighed(problem: Problem, weights: Array) -> Problem:
+    """Return `problem` with other weights of what is learned, in order."""
+    left = iter(weights.tolist())
+    tasks = []
+    for task in problem.tasks:
+        own = [next(left) for _ in task.learners]
+        update: dict[str, object] = {"weight": sum(own)}
+        if isinstance(task.curve, Shared):
+            members = (member.model_copy(update={"weight": w}) for member, w in zip(task.curve.members, own))
+            update["curve"] = task.curve.model_copy(update={"members": tuple(members)})
+        tasks.append(task.model_copy(update=update))
+    return problem.model_copy(update={"tasks": tuple(tasks)})

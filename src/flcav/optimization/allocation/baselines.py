@@ -1,0 +1,129 @@
+"""Plans to compare with: what one would do without joint optimisation, in whole numbers and within the budgets."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import Bounds, LinearConstraint, milp
+
+from flcav.network.plan import Price
+from flcav.optimization.allocation.allocate import Infeasible, TaskPlan, described, resolved, score, used
+from flcav.optimization.allocation.problem import Problem
+from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
+from flcav.optimization.solvers.instance import Instance, instance
+from flcav.optimization.solvers.rounding import trim
+from flcav.optimization.solvers.separable import relax
+from flcav.optimization.solvers.weighted import least_weighted, terms_of
+from flcav.optimization.vehicles import vehicle_shares
+
+Array = NDArray[np.float64]
+
+GAP = 1e-4
+LONGEST_S = 5.0  # of the search for most messages
+NOT_CARRIED = "its vehicles do not hold the samples for it, or their links do not carry it within horizon_s"
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A plan and what it is predicted to reach, by the same measure as the optimum."""
+
+    name: str
+    objective: float
+    tasks: tuple[TaskPlan, ...]
+    used_mb: Price
+    note: str | None = None  # why it cannot be carried out, if it cannot
+
+
+def baseline(problem: Problem, name: str) -> Baseline:
+    """Return the plan of `BASELINES[name]`; it knows the budgets alone, not what each vehicle holds and sends.
+
+    Raises `Infeasible` as `allocate` does.
+    """
+    asked = resolved(problem)
+    plans = described(problem, BASELINES[name](asked, instance(asked)))
+    try:
+        vehicle_shares(problem, plans)
+    except Infeasible:
+        return Baseline(name, score(asked, plans), plans, used(plans), NOT_CARRIED)
+    return Baseline(name, score(asked, plans), plans, used(plans))
+
+
+def equal_stages(problem: Problem, made: Instance) -> Array:
+    """Return the plan that shares each link equally over the stages that use it, beyond what the least plan takes.
+
+    Within its share each stage is split over the tasks as well as possible: stage I first, then II, then III.
+    """
+    low, high = made.low.reshape(-1, 3), made.high.reshape(-1, 3)
+    cost = made.cost.reshape(-1, 3, 2)
+    uses = np.any(cost > 0, axis=0)  # (3, 2)
+    share = (made.budget - made.low @ made.cost) / np.maximum(uses.sum(axis=0), 1)
+    x = low.copy()
+    for stage in range(3):
+        most = np.where(np.arange(3) == stage, high, x)
+        budget = x.ravel() @ made.cost + np.where(uses[stage, :], share, 0.0)
+        limited = _limited(problem, x, most, budget)
+        x = least_weighted(instance(limited), GAP).x.reshape(-1, 3)
+    return x.ravel()
+
+
+def equal_tasks(problem: Problem, made: Instance) -> Array:
+    """Return the plan that shares each link equally over the tasks, beyond the least plan, each task planned alone."""
+    low, high = made.low.reshape(-1, 3), made.high.reshape(-1, 3)
+    cost = made.cost.reshape(-1, 3, 2)
+    share = (made.budget - made.low @ made.cost) / len(low)
+    x = low.copy()
+    for number, task in enumerate(problem.tasks):
+        alone = problem.model_copy(update={"tasks": (task,)})
+        own = slice(number, number + 1)
+        limited = _limited(alone, low[own], high[own], low[number] @ cost[number] + share)
+        x[number] = least_weighted(instance(limited), GAP).x
+    return x.ravel()
+
+
+def max_throughput(problem: Problem, made: Instance) -> Array:
+    """Return the plan that gets the most messages through, whatever they teach: samples and model updates count 1."""
+    k = problem.edge_rounds_per_cloud_round
+    groups = [task.edge_groups for task in problem.tasks]
+    messages = np.array([(1, sum(own), len(own) + k * sum(own)) for own in groups], dtype=np.float64).ravel()
+    found = milp(
+        -messages,
+        integrality=np.ones(len(messages)),
+        bounds=Bounds(made.low, made.high),  # pyright: ignore[reportArgumentType]
+        constraints=LinearConstraint(made.cost.T / made.budget[:, None], ub=1.0),  # pyright: ignore[reportArgumentType]
+        options={"mip_rel_gap": GAP, "time_limit": LONGEST_S},
+    )
+    x = made.low if found.x is None else np.round(found.x)
+    return trim(made, x, messages)
+
+
+def article(problem: Problem, made: Instance) -> Array:
+    """Return the continuous optimum rounded down, as the article's allocator ends."""
+    if made.effective is None:
+        x = relax(made.separable).x
+    else:
+        program = Program(terms_of(made), made.low, made.high, made.cost, made.budget)
+        starts = [made.low + (made.high - made.low) * share for share in np.linspace(0, 1, 6) ** 3]
+        x, _, _ = continuous_optimum(program, starts, GAP)
+    return trim(made, np.clip(np.floor(x + 1e-9), made.low, made.high), np.ones(len(x)))
+
+
+def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Problem:
+    """Return `problem` with other limits (N, 3) and budgets (2,)."""
+    tasks = []
+    for task, least, most in zip(problem.tasks, low, high):
+        limits = {
+            name: (int(a), int(b))
+            for name, a, b in zip(("samples", "edge_rounds", "cloud_rounds"), least, most, strict=True)
+        }
+        tasks.append(task.model_copy(update={"limits": task.limits.model_copy(update=limits)}))
+    budgets = problem.budgets_mb.model_copy(update=dict(zip(("wireless", "wireline"), budget.tolist())))
+    return problem.model_copy(update={"budgets_mb": budgets, "tasks": tuple(tasks)})
+
+
+BASELINES: dict[str, Callable[[Problem, Instance], Array]] = {
+    "equal-stages": equal_stages,
+    "equal-tasks": equal_tasks,
+    "max-throughput": max_throughput,
+    "article": article,
+}

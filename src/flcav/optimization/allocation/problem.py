@@ -1,0 +1,219 @@
+"""An allocation problem as a user writes it: budgets, message sizes, limits and learning curves per task."""
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from flcav.config import Config
+from flcav.optimization.curves.curves import STAGES, Additive, Curve, Effective, NonNegative, Positive, Shared
+
+MOST = 10**9  # of anything that is counted
+WORST = 1e6  # error that a curve may predict anywhere within the limits; of one that was fitted it is about 1
+Count = Annotated[int, Field(ge=0, le=MOST)]
+Vehicles = Annotated[int, Field(ge=1, le=MOST)]
+Range = tuple[Count, Count]  # least and most, both allowed
+Share = Annotated[float, Field(ge=0, le=1)]
+Name = Annotated[str, Field(min_length=1)]
+Objective = Literal["weighted", "max-min", "area"]
+
+
+class Quantities(Config):
+    """Base of what an allocation problem is made of."""
+
+    magnitudes: ClassVar[tuple[float, float]] = (1e-9, 1e9)
+
+
+class Limits(Config):
+    """Least and most of each quantity, both allowed."""
+
+    samples: Range
+    edge_rounds: Range
+    cloud_rounds: Range
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for name in Limits.model_fields:
+            least, most = getattr(self, name)
+            if least > most:
+                raise ValueError(f"{name} from {least} to {most} is empty")
+        return self
+
+
+class Uplink(Quantities):
+    """What one vehicle can send [Mbit/s]."""
+
+    wireless: Positive
+    wireline: Positive | None = None  # what its edge server passes on for it; None: as much as it sends
+
+
+class Learner(NamedTuple):
+    """What is learned with a task's resources: the task itself, or a member of its cluster."""
+
+    name: str
+    weight: float
+    curve: Additive | Effective
+
+
+class Measured(Config):
+    """Most of each quantity that the curve's history covers; a plan beyond it is a guess, and says so."""
+
+    samples: NonNegative | None = None
+    edge_rounds: NonNegative | None = None
+    cloud_rounds: NonNegative | None = None
+
+
+class Task(Quantities):
+    """One task, or a cluster of them: what its messages weigh, who takes part, and what its training brings.
+
+    Tasks that share a network and its data are one task here, with a `shared` curve: the mean of theirs by weight.
+    """
+
+    name: Name
+    weight: Positive = 1.0
+    sample_mb: Positive
+    model_mb: Positive
+    edge_groups: Annotated[tuple[Vehicles, ...], Field(min_length=1)]  # per edge server
+    uplink_mbps: Mapping[str, Uplink] | None = None  # by vehicle, in the order of the edge groups
+    samples_held: Mapping[str, Count] = {}  # by vehicle; one that is not named holds as many as are asked for
+    data_quality: Mapping[str, Positive] = {}  # by vehicle: what a sample of its is worth; 1 if not named
+    limits: Limits
+    curve: Curve
+    upper: Curve | None = None  # the upper band of `curve`, for robust plans
+    measured: Measured = Measured()
+    performance_without: Share | None = None  # of the whole system when this task is left out
+
+    @property
+    def learners(self) -> tuple[Learner, ...]:
+        """Return what is learned; the weights sum to the task's."""
+        if not isinstance(self.curve, Shared):
+            return (Learner(self.name, self.weight, self.curve),)
+        total = sum(member.weight for member in self.curve.members)
+        return tuple(
+            Learner(member.name, self.weight * member.weight / total, member.curve) for member in self.curve.members
+        )
+
+    @model_validator(mode="after")
+    def _vehicles(self) -> Self:
+        known = self.uplink_mbps or {}
+        if self.uplink_mbps is not None and len(known) != sum(self.edge_groups):
+            raise ValueError(
+                f"uplink_mbps of task {self.name!r} names {len(known)} vehicles, edge_groups have "
+                f"{sum(self.edge_groups)}"
+            )
+        for field in ("samples_held", "data_quality"):
+            for vehicle in getattr(self, field):
+                if vehicle not in known:
+                    raise ValueError(f"{field} of task {self.name!r} names {vehicle!r}, which uplink_mbps does not")
+        return self
+
+    @model_validator(mode="after")
+    def _finite(self) -> Self:
+        limits = self.limits
+        ranges = (limits.samples, limits.edge_rounds, limits.cloud_rounds)
+        for field, curve in (("curve", self.curve), ("upper", self.upper or self.curve)):
+            for each in (member.curve for member in curve.members) if isinstance(curve, Shared) else (curve,):
+                if isinstance(each, Effective) and limits.samples[0] == 0:
+                    raise ValueError(
+                        f"limits.samples of task {self.name!r} must start at 1 or more: its error at 0 is infinite"
+                    )
+                decays = each.decays() if isinstance(each, Additive) else ()
+                for stage, decay, (_, most) in zip(STAGES, decays, ranges):
+                    if most == 0 and decay.infinite_at_0:
+                        raise ValueError(f"{field}.{stage}.x0 of task {self.name!r} is 0: its error at 0 is infinite")
+                least = [float(low) for low, _ in ranges]
+                for stage, decay in enumerate(decays):
+                    least[stage] = max(least[stage], decay.infinite_at_0)
+                with np.errstate(over="ignore"):
+                    error = float(each.error(*least, k=0))
+                if not error <= WORST:
+                    raise ValueError(
+                        f"{field} of task {self.name!r} predicts an error of {error:g} at its least limits: at most "
+                        f"{WORST:g} is taken for one"
+                    )
+        return self
+
+    @model_validator(mode="after")
+    def _same_members(self) -> Self:
+        if self.upper is not None and _members(self.curve) != _members(self.upper):
+            raise ValueError(f"upper of task {self.name!r} must have the members of its curve, with the same weights")
+        return self
+
+
+def _members(curve: Curve) -> list[tuple[str, float]]:
+    return [(member.name, member.weight) for member in curve.members] if isinstance(curve, Shared) else []
+
+
+class Budgets(Quantities):
+    """Uplink budgets [MB]."""
+
+    wireless: Positive
+    wireline: Positive
+
+
+class Problem(Quantities):
+    """How to split the budgets of both links over tasks and stages.
+
+    Fields are checked as a problem is made, by pydantic, whose ValidationError names the field.
+
+    >>> from flcav import Problem
+    >>> curve = {"model": "additive", "floor": 0.05, "pretrain": {"a": 0.51, "b": 0.1}}
+    >>> limits = {"samples": (100, 5000), "edge_rounds": (0, 0), "cloud_rounds": (0, 0)}
+    >>> sizes = {"sample_mb": 1.6, "model_mb": 60, "edge_groups": (4,)}
+    >>> task = {"name": "objects", **sizes, "limits": limits, "curve": curve}
+    >>> Problem(budgets_mb={"wireless": 4000, "wireline": 4000}, tasks=[task]).tasks[0].limits.samples
+    (100, 5000)
+    """
+
+    budgets_mb: Budgets
+    edge_rounds_per_cloud_round: Count = 1  # k: each cloud round runs, and pays, k edge rounds in every region
+    horizon_s: Positive | None = None  # how long each vehicle's own link may be busy with the plan
+    objective: Objective = "weighted"
+    robust: bool = False  # plan for the upper bands of the curves instead of the curves
+    performance: Share | None = None  # of the whole system with all tasks; then weights are what each task adds to it
+    tasks: Annotated[tuple[Task, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _one_link_per_vehicle(self) -> Self:
+        links: dict[str, Uplink] = {}
+        for task in self.tasks:
+            for vehicle, link in (task.uplink_mbps or {}).items():
+                if links.setdefault(vehicle, link) != link:
+                    raise ValueError(
+                        f"uplink_mbps of task {task.name!r} gives vehicle {vehicle!r} another link than an earlier task"
+                    )
+        return self
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        names = [learner.name for task in self.tasks for learner in task.learners]
+        for each in ([task.name for task in self.tasks], names):
+            name, times = Counter(each).most_common(1)[0]
+            if times > 1:
+                raise ValueError(f"{times} tasks are named {name!r}")
+        if self.edge_rounds_per_cloud_round == 0:
+            for task in self.tasks:
+                if task.limits.cloud_rounds[0] > 1:
+                    raise ValueError(
+                        f"task {task.name!r} asks for {task.limits.cloud_rounds[0]} cloud rounds or more, and "
+                        "edge_rounds_per_cloud_round = 0 allows one: models that no one trains in between are equal"
+                    )
+        return self
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.objective == "area" and sum(len(task.learners) for task in self.tasks) < 3:
+            raise ValueError("objective 'area' needs at least 3 tasks: the area has one corner per task")
+        for task in self.tasks:
+            if self.robust and task.upper is None:
+                raise ValueError(f"robust = true needs 'upper' beside the curve of task {task.name!r}")
+            if (self.performance is None) != (task.performance_without is None):
+                given, missing = ("performance_without", "performance")[:: 1 if self.performance is None else -1]
+                raise ValueError(f"task {task.name!r}: '{given}' is given, and '{missing}' is missing")
+        if self.performance is not None and all(
+            (task.performance_without or 0) >= self.performance for task in self.tasks
+        ):
+            raise ValueError(f"no task adds to performance = {self.performance:g}: there is nothing to weigh")
+        return self

@@ -1,0 +1,224 @@
+"""The YAML file of an allocation problem: variables that definitions name, and learned curves written back."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.optimization.allocation.allocate import resolved
+from flcav.optimization.allocation.problem import Problem
+from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.curves.fitting import QUANTITIES, CurveFit
+
+MEASURES = {"weighted": "weighted error", "max-min": "largest error", "area": "area"}  # by objective, as in `TERMS`
+STEPS = {  # what costs uplink megabytes
+    "samples": "labelled samples go from the vehicles over a wireless link to their edge server and over a wireline to "
+    "the cloud",
+    "edge round": "in an edge round every vehicle sends its network to its edge server",
+    "cloud round": "in a cloud round every edge server sends its network to the cloud",
+}
+CURVE = "A learning curve per task says how much error each of them takes away."
+TERMS = {
+    "error": "1 minus a task's accuracy, as its curve predicts it.",
+    "weighted error": "the errors of all tasks, each times its weight, added up: their mean only where the weights sum "
+    "to 1.",
+    "largest error": "the error of the task that errs most.",
+    "area": "that of the polygon whose corners are the tasks' accuracies on equally spaced axes; large where no task "
+    "is left behind.",
+    "budget": "what may go up over one type of link, from all vehicles together, during the whole training. What comes "
+    "down is not counted.",
+    "saved": "what a plan that is solved anew with more of one budget, the other as it is, does better than this one. "
+    "Plans are in whole samples and rounds, so more megabytes help in steps.",
+    "up to": "the upper band of a curve, which this plan makes least; the predicted error is the curve's own.",
+    "proven": "the solver also finds a bound that no plan can be below, so how far this one could still be improved is "
+    "known.",
+}
+
+
+def meaning(problem: Problem, objective: float) -> str:
+    """Return what the problem's measure is, in a sentence; of a weighted error that is no mean, also the mean."""
+    sentence = TERMS[MEASURES[problem.objective]]
+    weights = sum(task.weight for task in resolved(problem).tasks)
+    if problem.objective != "weighted" or abs(weights - 1) < 1e-9:
+        return sentence
+    return f"{sentence} Here they sum to {weights:.3g}, and the mean is {objective / weights:.4g}."
+
+
+Array = NDArray[np.float64]
+Edit = tuple[int, int, str]  # from, to, what stands there then
+DIGITS = 6
+ENDLESS = 10**9  # columns of a line
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a history says of one task."""
+
+    curve: Additive | Effective
+    upper: Additive | Effective | None  # of the upper band; None: too few points for one
+    limits: Mapping[str, list[int]]  # least and most of each quantity that the history covers
+    measured: Mapping[str, float]  # most of each quantity that varies
+
+
+def learned(fit: CurveFit, resources: Array, upper: Additive | Effective | None) -> Learned:
+    """Return what `fit` and its upper band say of a task whose history covers `resources` (n, 3)."""
+    least = np.ceil(resources.min(axis=0)).astype(int).tolist()
+    most = np.floor(resources.max(axis=0)).astype(int).tolist()
+    limits = {name: [low, max(low, high)] for name, low, high in zip(QUANTITIES, least, most, strict=True)}
+    return Learned(fit.curve, upper, limits, fit.measured)
+
+
+def new_problem(tasks: Mapping[str, Learned], k: int, history: str) -> str:
+    """Return a problem of `tasks`; what no history tells is empty, for its user to fill in."""
+    lines = [
+        f"# Learning curves of {history}. What is empty is yours to fill in; then `flcav allocate` takes this file.",
+        f"budgets_mb: {{wireless: , wireline: }} # [MB] {TERMS['budget']}",
+        f"edge_rounds_per_cloud_round: {k}",
+        "tasks:",
+    ]
+    for name, own in tasks.items():
+        limits, *fitted = [_entry(field, value) for field, value in _fields(own).items() if value is not None]
+        lines += [
+            f"  - {_entry('name', name)}",
+            "    weight: 1",
+            "    sample_mb: # [MB] one labelled sample",
+            "    model_mb: # [MB] the network, as it is sent in every round",
+            "    edge_groups: # vehicles per edge server, such as [4, 3]",
+            f"    {limits} # least and most; here what the history covers",
+            *(f"    {entry}" for entry in fitted),
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def task_names(text: str, origin: str) -> list[str]:
+    """Return the names of the tasks in a problem's `text`; raises `InputError` where it is none."""
+    return list(_tasks(text, origin)[1])
+
+
+def with_curves(text: str, tasks: Mapping[str, Learned], k: int, origin: str) -> str:
+    """Return the problem `text`, written as tasks or as a three-layer graph, with what was learned of `tasks`.
+
+    Limits that are there stand. `k` are the edge rounds per cloud round that effective samples were fitted with. Raises
+    `InputError` where the problem has none of a name or another `k`, or where its text cannot be changed in place.
+    """
+    (values, found), edits = _tasks(text, origin), []
+    planned = values.get("edge_rounds_per_cloud_round", 1)
+    if planned != k and any(isinstance(own.curve, Effective) for own in tasks.values()):
+        raise InputError(f"{origin}: edge_rounds_per_cloud_round = {planned}, and the curves are fitted with {k}")
+    for name, own in tasks.items():
+        if name not in found:
+            raise InputError(f"{origin}: the history is of task {name!r}, which is none of {', '.join(found)}")
+        held, node = found[name]
+        fields = {field: value for field, value in _fields(own).items() if _wanted(field, value, held)}
+        if "networks" in values:  # a graph, whose tasks have a curve and no more
+            fields = {"curve": fields["curve"]}
+        held |= fields
+        edits += _edits(text, node, fields)
+    for start, end, new in sorted(edits, reverse=True):
+        text = text[:start] + new + text[end:]
+    if _loaded(text) != values:
+        raise InputError(f"{origin}: curves cannot be put into YAML that is laid out like this: write a field per line")
+    return text
+
+
+def _fields(own: Learned) -> dict[str, Any]:
+    """Return the fields of a task in a problem."""
+    return {
+        "limits": dict(own.limits),
+        "curve": _written(own.curve),
+        "upper": None if own.upper is None else _written(own.upper),
+        "measured": _rounded(own.measured),
+    }
+
+
+def _wanted(field: str, value: Any, held: Mapping[str, Any]) -> bool:
+    if field == "limits":
+        return held.get(field) is None
+    return value is not None or field in held  # an upper band of older points does not outlive them
+
+
+def _tasks(text: str, origin: str) -> tuple[dict[str, Any], dict[str, tuple[dict[str, Any], yaml.MappingNode]]]:
+    """Return what `text` holds, and by name each of its tasks, within that, beside its node."""
+    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+        raise InputError(f"{origin}: curves cannot be put into YAML with aliases (*): write out what they stand for")
+    values, root = yaml.safe_load(text), yaml.compose(text)
+    tasks = values.get("tasks") if isinstance(values, dict) else None
+    node = _entries(root).get("tasks")
+    own: list[tuple[Any, Any, yaml.Node]]
+    if isinstance(tasks, dict):
+        own = [(name, tasks.get(name), each) for name, each in _entries(node).items()]
+    elif isinstance(tasks, list) and isinstance(node, yaml.SequenceNode):
+        own = [(task.get("name"), task, each) for task, each in zip(tasks, node.value) if isinstance(task, dict)]
+    else:
+        raise InputError(f"{origin}: not an allocation problem: it has no tasks")
+    return values, {
+        name: (task, each)
+        for name, task, each in own
+        if isinstance(name, str) and isinstance(task, dict) and isinstance(each, yaml.MappingNode)
+    }
+
+
+def _entries(node: yaml.Node | None) -> dict[str, yaml.Node]:
+    return {key.value: value for key, value in node.value} if isinstance(node, yaml.MappingNode) else {}
+
+
+def _edits(text: str, node: yaml.MappingNode, fields: Mapping[str, Any]) -> list[Edit]:
+    """Return what to change in `text` for `node` to hold `fields`."""
+    held, edits = {key.value: (key, value) for key, value in node.value}, []
+    for field, value in fields.items():
+        if field in held:
+            key, old = held[field]
+            edits.append((key.start_mark.index, _end(old), _entry(field, value)))
+    added = [_entry(field, value) for field, value in fields.items() if field not in held]
+    if added:
+        end = _end(node.value[-1][1])
+        if node.flow_style:
+            edits.append((end, end, "".join(f", {entry}" for entry in added)))
+        else:
+            line = text.find("\n", end)
+            place = len(text) if line < 0 else line
+            edits.append((place, place, "".join(f"\n{' ' * node.start_mark.column}{entry}" for entry in added)))
+    return edits
+
+
+def _end(node: yaml.Node) -> int:
+    """Return where the text of `node` ends: a block's own mark lies behind the blank lines and comments after it."""
+    if not isinstance(node, yaml.CollectionNode) or node.flow_style or not node.value:
+        return node.end_mark.index
+    last = node.value[-1]
+    return _end(last[1] if isinstance(last, tuple) else last)
+
+
+def _written(curve: Additive | Effective) -> dict[str, Any]:
+    return {"model": curve.model} | _rounded(curve.model_dump(exclude_defaults=True, exclude={"model"}))
+
+
+def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `values` with numbers of `DIGITS` digits, whole ones without a point."""
+    return {name: _rounded(value) if isinstance(value, dict) else _number(value) for name, value in values.items()}
+
+
+def _number(value: float) -> float:
+    short = float(f"{value:.{DIGITS}g}")
+    return int(short) if short.is_integer() and abs(short) < 10**DIGITS else short
+
+
+def _entry(name: str, value: Any) -> str:
+    return f"{name}: {_flow(value)}"
+
+
+def _flow(value: Any) -> str:
+    """Return `value` as YAML on one line."""
+    dumped = yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=ENDLESS, allow_unicode=True)
+    return dumped.strip()[1:-1]
+
+
+def _loaded(text: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return None

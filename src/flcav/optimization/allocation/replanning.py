@@ -1,0 +1,127 @@
+"""Re-planning while a plan is carried out: what is spent is sunk, and the curves pass through what was observed.
+
+Stages follow each other: once edge rounds have run no sample is added, once cloud rounds have run no edge round is.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import Field
+
+from flcav.config import Config, InputError
+from flcav.optimization.allocation.allocate import Allocation, allocate
+from flcav.optimization.allocation.problem import Budgets, Count, Problem, Share, Task
+from flcav.optimization.curves.curves import Additive, Curve, Decay, Effective, NonNegative
+from flcav.optimization.solvers.instance import cost_of
+
+LEAST_ERROR = 1e-6  # that a perfect score is taken for: test sets are finite
+
+
+class Spent(Config):
+    """What one task has had so far, and what its network reaches now."""
+
+    samples: Count
+    edge_rounds: Count = 0
+    cloud_rounds: Count = 0
+    accuracy: Share | None = None  # None: not measured; of a cluster: the weighted mean of its members'
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Return samples, edge rounds, cloud rounds."""
+        return self.samples, self.edge_rounds, self.cloud_rounds
+
+
+class Sent(Config):
+    """Uplink megabytes that the ledger holds."""
+
+    wireless: NonNegative
+    wireline: NonNegative
+
+
+class Progress(Config):
+    """How far a plan has been carried out."""
+
+    tasks: Annotated[Mapping[str, Spent], Field(min_length=1)]
+    used_mb: Sent | None = None  # None: what the counts cost by the problem's sizes
+
+
+def replan(problem: Problem, progress: Progress, *, gap: float = 1e-4) -> Allocation:
+    """Return the best plan that goes on from `progress`; its counts are totals, what is spent included.
+
+    Raises `InputError` as `going_on` does, and `Infeasible` where what is spent leaves no plan.
+    """
+    return allocate(going_on(problem, progress), gap=gap)
+
+
+def going_on(problem: Problem, progress: Progress) -> Problem:
+    """Return the problem that is left: what is spent is the least of the limits, curves pass through what is observed.
+
+    A task's curve, floor included, is scaled to the accuracy observed. Where more megabytes were sent than the counts
+    cost, the budgets shrink by the difference. Raises `InputError` for a task that is not in the problem.
+    """
+    names = [task.name for task in problem.tasks]
+    for name in progress.tasks:
+        if name not in names:
+            raise InputError(f"progress.tasks names {name!r}, which is none of {', '.join(names)}")
+    tasks = tuple(
+        _continued(problem, task, progress.tasks[task.name]) if task.name in progress.tasks else task
+        for task in problem.tasks
+    )
+    return problem.model_copy(update={"tasks": tasks, "budgets_mb": _left(problem, progress)})
+
+
+def _continued(problem: Problem, task: Task, spent: Spent) -> Task:
+    fields = ("samples", "edge_rounds", "cloud_rounds")
+    limits = {}
+    for stage, (name, done) in enumerate(zip(fields, spent.counts)):
+        least, most = getattr(task.limits, name)
+        over = any(spent.counts[stage + 1 :])
+        limits[name] = (done, done) if over else (max(least, done), max(most, done))
+    update: dict[str, object] = {"limits": task.limits.model_copy(update=limits)}
+    if spent.accuracy is not None:
+        predicted = float(task.curve.error(*spent.counts, k=problem.edge_rounds_per_cloud_round))
+        if not 0 < predicted < float("inf"):
+            raise InputError(
+                f"progress.tasks.{task.name}.accuracy = {spent.accuracy:g}: its curve predicts an error of "
+                f"{predicted:g} there, which cannot be scaled to it"
+            )
+        factor = max(1 - spent.accuracy, LEAST_ERROR) / predicted
+        update["curve"] = _scaled(task.curve, factor)
+        update["upper"] = None if task.upper is None else _scaled(task.upper, factor)
+    return task.model_copy(update=update)
+
+
+def _scaled(curve: Curve, factor: float) -> Curve:
+    if isinstance(curve, Additive):
+        decays = {name: _smaller(getattr(curve, name), factor) for name in ("pretrain", "edge", "cloud")}
+        return curve.model_copy(update={"floor": curve.floor * factor, **decays})
+    if isinstance(curve, Effective):
+        return curve.model_copy(update={"floor": curve.floor * factor, "a": curve.a * factor})
+    members = (member.model_copy(update={"curve": _scaled(member.curve, factor)}) for member in curve.members)
+    return curve.model_copy(update={"members": tuple(members)})
+
+
+def _smaller(decay: Decay, factor: float) -> Decay:
+    return decay.model_copy(update={"a": decay.a * factor})
+
+
+def _left(problem: Problem, progress: Progress) -> Budgets:
+    """Return the budgets, less what was sent beyond what the counts cost."""
+    budgets = problem.budgets_mb
+    if progress.used_mb is None:
+        return budgets
+    done = [
+        cost_of(problem, task, progress.tasks[task.name].counts)
+        for task in problem.tasks
+        if task.name in progress.tasks
+    ]
+    left = {}
+    for link in ("wireless", "wireline"):
+        priced = sum(getattr(cost, f"{link}_mb") for cost in done)
+        left[link] = getattr(budgets, link) - (getattr(progress.used_mb, link) - priced)
+        if left[link] <= 0:
+            raise InputError(
+                f"progress.used_mb.{link} = {getattr(progress.used_mb, link):g} is more than budgets_mb.{link} = "
+                f"{getattr(budgets, link):g} can bear"
+            )
+    return budgets.model_copy(update=left)

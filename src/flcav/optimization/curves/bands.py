@@ -1,0 +1,83 @@
+"""Bands of learning curves: how far the curves of repeated histories would scatter, by the residual bootstrap.
+
+Every repeat draws from the residuals of the fit, with replacement and widened by sqrt(n / (n - P)) for the P parameters
+that flattened them, adds them to the fitted errors, and fits the same form again (Efron and Tibshirani 1993, 9.3).
+Cases are not drawn: of five points a draw often leaves too few different ones.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.curves.fitting import CurveFit, refitted
+from flcav.seeds import stream
+
+Array = NDArray[np.float64]
+
+METHOD = "residual bootstrap"
+BEYOND = (1.0, 2.0, 4.0)  # times the largest measured resources: where the upper curve has to be above the band
+
+
+@dataclass(frozen=True)
+class Bands:
+    """The curves of the repeats."""
+
+    level: float  # share of the repeats between the lower and the upper band
+    seed: int
+    curves: tuple[Additive | Effective, ...]
+    k: int
+
+    def between(self, resources: Array) -> tuple[Array, Array]:
+        """Return the lower and upper band of the error (n,) at `resources` (n, 3)."""
+        errors = np.array([curve.error(*resources.T, k=self.k) for curve in self.curves])
+        low, high = np.quantile(errors, (0.5 - self.level / 2, 0.5 + self.level / 2), axis=0)
+        return low, high
+
+
+def bands(fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 0, k: int = 1) -> Bands | None:
+    """Return the bands of `fit`; None where no residuals are left: no more points than parameters."""
+    fitted = fit.fitted
+    if fitted is None or fit.points <= len(fitted.parameters):
+        return None
+    predicted, root = fitted.form.predict(fitted.parameters, fitted.resources), np.sqrt(fitted.weight)
+    known = root > 0
+    residual = ((fitted.error - predicted) * root)[known]
+    residual = (residual - residual.mean()) * np.sqrt(fit.points / (fit.points - len(fitted.parameters)))
+    rng = stream(seed, "bands")
+    curves = []
+    for _ in range(repeats):
+        drawn = rng.choice(residual, len(predicted)) / np.where(known, root, 1.0)
+        curves.append(fitted.form.curve(refitted(fitted, np.maximum(predicted + drawn, 0.0))))
+    return Bands(level, seed, tuple(curves), k)
+
+
+def upper_curve(fit: CurveFit, found: Bands) -> Additive | Effective:
+    """Return a curve of the fit's form that is nowhere below the upper band, at the points and up to 4 times beyond.
+
+    It is fitted to the band, then lifted by raising its floor: what a robust plan should assume.
+    """
+    fitted = fit.fitted
+    assert fitted is not None
+    spent = fitted.resources
+    most = spent.max(axis=0)
+    checked = np.unique(np.concatenate((spent, *(np.maximum(spent, factor * most) for factor in BEYOND))), axis=0)
+    _, high = found.between(spent)
+    curve = fitted.form.curve(refitted(fitted, high))
+    _, band = found.between(checked)
+    lift = float(np.max(np.maximum(band - curve.error(*checked.T, k=found.k), 0.0)))
+    return curve.model_copy(update={"floor": curve.floor + lift})
+
+
+def pointwise(fit: CurveFit, found: Bands | None, resources: Array, k: int) -> list[dict[str, float | None]]:
+    """Return error, low and high at every row of `resources` (n, 3); without bands, low and high are None."""
+    errors = fit.curve.error(*resources.T, k=k)
+    edges: Sequence[Sequence[float | None]] = [[None] * len(errors)] * 2
+    if found is not None:
+        edges = [edge.tolist() for edge in found.between(resources)]
+    names = ("samples", "edge_rounds", "cloud_rounds", "error", "low", "high")
+    return [
+        dict(zip(names, (*row, error, *pair))) for row, error, *pair in zip(resources.tolist(), errors.tolist(), *edges)
+    ]

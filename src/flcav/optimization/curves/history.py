@@ -1,0 +1,109 @@
+"""History of training runs: what accuracy was reached after so many samples, edge rounds and cloud rounds.
+
+Two forms of table are read. Long: `task, stage, resource, accuracy[, weight]`, each row giving its own stage's
+resource; stages follow each other, so a row stands at the largest of the earlier stages and at 0 of the later ones.
+Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight]`, as our own runs write it. Either may say
+`error`, which is 1 - accuracy, in place of `accuracy`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+
+import numpy as np
+import pyarrow.csv
+from numpy.typing import ArrayLike, NDArray
+
+from flcav.config import InputError, shorten
+from flcav.optimization.curves.curves import STAGES
+
+Array = NDArray[np.float64]
+
+Table = Mapping[str, Sequence[str | float | None]]  # columns by name
+
+LONG = ("task", "stage", "resource", "accuracy")
+JOINT = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
+LEAST, MOST = 1e-9, 1e9  # of a number that is not 0
+ARTICLE = resources.files("flcav.optimization") / "data" / "article_history.csv"
+ROUNDED = 1.01e-3  # what accuracy and error, both rounded to three digits, may sum to beside 1
+
+
+@dataclass(frozen=True)
+class History:
+    """The points of one task."""
+
+    resources: Array  # (n, 3) samples, edge rounds, cloud rounds
+    accuracy: Array  # (n,) 0 ... 1
+    weight: Array  # (n,)
+
+
+def article_histories() -> dict[str, History]:
+    """Return the points of Wang et al., IEEE Network 37(3), 2023, Fig. 3a, by task."""
+    with ARTICLE.open("rb") as file:
+        return histories(pyarrow.csv.read_csv(file).to_pydict(), str(ARTICLE), "")
+
+
+def histories(columns: Table, origin: str, unnamed: str) -> dict[str, History]:
+    """Return the history of each task of a table in either form; `unnamed` is the task where no column says it.
+
+    Raises `InputError` naming `origin`, the row (from 1), the field and the value.
+    """
+    columns = _with_accuracy(columns, origin)
+    joint = "stage" not in columns
+    for name in JOINT if joint else LONG:
+        if name not in columns:
+            raise InputError(
+                f"{origin}: column '{name}' is missing; a history has {', '.join(LONG)}, or {', '.join(JOINT)}; "
+                "error may stand for accuracy"
+            )
+    accuracy = _numbers(columns, "accuracy", origin, most=1.0)
+    weight = _numbers(columns, "weight", origin) if "weight" in columns else np.ones(len(accuracy))
+    amounts = np.column_stack([_numbers(columns, name, origin) for name in (JOINT[:3] if joint else ("resource",))])
+    for row, stage in enumerate(columns.get("stage", ()), start=1):
+        if stage not in STAGES:
+            raise InputError(f"{origin}: row {row}: stage = {stage!r} must be one of {', '.join(STAGES)}")
+    names = [str(name) for name in columns.get("task", [unnamed] * len(accuracy))]
+    found = {}
+    for task in dict.fromkeys(names):
+        rows = [row for row, name in enumerate(names) if name == task]
+        own = amounts[rows]
+        if not joint:
+            own = resources_in_order([str(columns["stage"][row]) for row in rows], own[:, 0])
+        found[task] = History(own, accuracy[rows], weight[rows])
+    return found
+
+
+def _with_accuracy(columns: Table, origin: str) -> Table:
+    """Return `columns` with accuracies, from errors where there are none; raises `InputError` if both disagree."""
+    if "error" not in columns:
+        return columns
+    error = _numbers(columns, "error", origin, most=1.0)
+    if "accuracy" not in columns:
+        return {**columns, "accuracy": (1 - error).tolist()}
+    accuracy = _numbers(columns, "accuracy", origin, most=1.0)
+    for row in np.flatnonzero(np.abs(accuracy + error - 1) > ROUNDED):
+        raise InputError(
+            f"{origin}: row {row + 1}: accuracy = {accuracy[row]:g} and error = {error[row]:g} do not sum to 1"
+        )
+    return columns
+
+
+def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
+    """Return (n, 3) samples, edge rounds and cloud rounds of rows that give only their own stage's resource (n,)."""
+    amounts, number = np.asarray(resource, dtype=np.float64), np.array([STAGES.index(name) for name in stage])
+    largest = [amounts[number == s].max(initial=0.0) for s in range(3)]
+    own = np.where(number[:, None] == np.arange(3), amounts[:, None], 0.0)
+    return np.where(np.arange(3) < number[:, None], largest, own)
+
+
+def _numbers(columns: Table, name: str, origin: str, most: float = MOST) -> Array:
+    """Return column `name` as (n,) numbers from 0 to `most`."""
+    values = np.empty(len(columns[name]))
+    for row, value in enumerate(columns[name]):
+        try:
+            values[row] = np.nan if value is None else float(value)  # pyright: ignore[reportArgumentType]
+        except (TypeError, ValueError, OverflowError):
+            values[row] = np.nan
+        if not (values[row] == 0 or LEAST <= values[row] <= most):
+            raise InputError(f"{origin}: row {row + 1}: {name} = {shorten(value)} must be a number from 0 to {most:g}")
+    return values

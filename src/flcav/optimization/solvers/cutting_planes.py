@@ -1,0 +1,148 @@
+"""Convex functions of whole numbers under linear budgets, by outer approximation with HiGHS.
+
+Each convex term is bounded from below by straight lines, e.g. secants through neighbouring whole numbers, or tangents.
+Minimising the lines is a (mixed-integer) linear program; its optimum is a proven lower bound, and its solution says
+where the next lines are needed (Duran and Grossmann 1986).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import Bounds, LinearConstraint, linprog, milp
+from scipy.sparse import coo_array, csr_array
+
+from flcav.optimization.solvers.instance import variables
+
+Array = NDArray[np.float64]
+
+LARGE = 1e4  # the objective in the solver's eyes, whose tolerances are absolute, around 1e-6
+
+
+class Line(NamedTuple):
+    """A lower bound of a term: value + slope . x[of]."""
+
+    of: tuple[int, ...]
+    slope: tuple[float, ...]
+    value: float  # at x[of] = 0
+
+
+class Term(Protocol):
+    """A convex function of some of the quantities."""
+
+    def value(self, x: Array) -> float:
+        """Return the term at x (n,)."""
+        ...
+
+    def lines(self, x: Array) -> list[Line]:
+        """Return lower bounds that are tight at x (n,) or at its whole neighbours."""
+        ...
+
+
+@dataclass(frozen=True)
+class Program:
+    """Minimise the sum of the terms at whole x in [low, high] with x @ cost <= budget."""
+
+    terms: Sequence[Term]
+    low: Array  # (n,)
+    high: Array  # (n,)
+    cost: Array  # (n, 2)
+    budget: Array  # (2,)
+
+    def value(self, x: Array) -> float:
+        """Return the objective at x (n,)."""
+        return sum(term.value(x) for term in self.terms)
+
+
+class Cuts:
+    """The lines collected so far: the linear program that bounds a `Program` from below."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self._lines: dict[tuple[int, Line], None] = {}
+        self._scale = LARGE / max(program.value(program.low), 1e-12)
+
+    def add(self, x: Array) -> bool:
+        """Add the lines at x (n,); return whether any was new."""
+        known = len(self._lines)
+        for number, term in enumerate(self.program.terms):
+            self._lines.update(dict.fromkeys((number, line) for line in term.lines(x)))
+        return len(self._lines) > known
+
+    def relax(self) -> tuple[Array, float]:
+        """Return the optimum over fractional x and its value."""
+        matrix, limit = self._rows()
+        bounds = np.stack((self._low(), self._high()), axis=1)
+        result = linprog(self._objective(), A_ub=matrix, b_ub=limit, bounds=bounds, method="highs")
+        return variables(result)[: len(self.program.low)], float(result.fun) / self._scale
+
+    def solve(self, gap: float) -> tuple[Array, float]:
+        """Return the optimum over whole x to a relative `gap`, and the proven bound."""
+        matrix, limit = self._rows()
+        whole = np.r_[np.ones(len(self.program.low)), np.zeros(len(self.program.terms))]
+        result = milp(
+            self._objective(),
+            integrality=whole,
+            bounds=Bounds(self._low(), self._high()),  # pyright: ignore[reportArgumentType]
+            constraints=LinearConstraint(matrix, ub=limit),  # pyright: ignore[reportArgumentType]
+            options={"mip_rel_gap": gap},
+        )
+        return np.round(variables(result)[: len(self.program.low)]), float(result.mip_dual_bound) / self._scale
+
+    def _objective(self) -> Array:
+        return np.r_[np.zeros(len(self.program.low)), np.ones(len(self.program.terms))]
+
+    def _low(self) -> Array:
+        return np.r_[self.program.low, np.zeros(len(self.program.terms))]
+
+    def _high(self) -> Array:
+        return np.r_[self.program.high, np.full(len(self.program.terms), np.inf)]
+
+    def _rows(self) -> tuple[csr_array, Array]:
+        """Return the budgets, then slope . x - term <= -value for every line; the budgets in units of themselves."""
+        program, n = self.program, len(self.program.low)
+        link, quantity = np.repeat((0, 1), n), np.tile(np.arange(n), 2)
+        rows, columns, values = [*link], [*quantity], [*(program.cost / program.budget).T.ravel()]
+        for row, (number, line) in enumerate(self._lines, start=2):
+            rows += [row] * (len(line.of) + 1)
+            columns += [*line.of, n + number]
+            values += [*(self._scale * slope for slope in line.slope), -1.0]
+        limit = np.r_[1.0, 1.0, [-self._scale * line.value for _, line in self._lines]]
+        return coo_array((values, (rows, columns)), shape=(len(limit), n + len(program.terms))).tocsr(), limit
+
+
+def continuous_optimum(
+    program: Program, starts: Sequence[Array], gap: float, floor: float = 0.0
+) -> tuple[Array, float, Cuts]:
+    """Return the fractional x that is within `gap` of the least, a proven lower bound, and the lines that prove it."""
+    cuts = Cuts(program)
+    for x in starts:
+        cuts.add(x)
+    x, bound = cuts.relax()
+    for _ in range(40):
+        if program.value(x) - bound <= 0.1 * gap * (bound + floor) or not cuts.add(x):
+            break
+        x, bound = cuts.relax()
+    return x, bound, cuts
+
+
+def outer_approximation(
+    program: Program, starts: Sequence[Array], gap: float, floor: float = 0.0
+) -> tuple[list[Array], float]:
+    """Return the whole points visited and a proven lower bound.
+
+    A point may overspend by the solver's tolerance (1e-7 of a budget): the caller trims it. It ends when the best point
+    is within `gap` of the bound, relative to the bound plus `floor`, or adds no line: then it is optimal.
+    """
+    _, bound, cuts = continuous_optimum(program, starts, gap, floor)
+    visited: list[Array] = []
+    best = np.inf
+    for _ in range(40):
+        x, below = cuts.solve(gap / 2)
+        visited.append(x)
+        bound, best = max(bound, below), min(best, program.value(x))
+        if best - bound <= gap * (bound + floor) or not cuts.add(x):
+            break
+    return visited, bound

@@ -1,0 +1,206 @@
+"""Max-min fairness: the least common error level that every task can be held to, proven over whole plans.
+
+For a level e, every pair of edge and cloud rounds of a task has a least whole number of samples that holds the task to
+e, so it has a cost. At link prices at which both budgets together cost 1, the sum of the tasks' least prices is a lower
+bound of what any plan pays: above 1, the level is out of reach (Lagrangian duality, Everett 1963). Bisection finds the
+lowest level that is not; above it, tasks are put together until a plan is found.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain, repeat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.optimization.allocation.problem import Problem
+from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.solvers.instance import Instance
+from flcav.optimization.solvers.rounding import fill
+from flcav.optimization.solvers.separable import BUDGET_SLACK
+
+Array = NDArray[np.float64]
+
+MOST_CHOICES = 1_000_000  # pairs of rounds of one task
+MOST_MERGED = 4000  # sums kept while tasks are put together
+PROVEN = 1e-9  # of the budgets: what sums may err by
+ROUNDING = 1e-12  # relative, of the samples needed for a level
+SMALL = 1e-3  # change of the level by which its price is measured
+
+
+@dataclass(frozen=True)
+class Fair:
+    """Whole quantities and what is proven about the largest error."""
+
+    x: Array  # (n,)
+    level: float  # the largest predicted error
+    bound: float  # proven: no plan holds every task below
+    rates: Array  # (2,) how fast the level falls per MB of each link
+
+
+@dataclass(frozen=True)
+class Choices:
+    """The pairs of rounds of one task, and the curves that all have to be held to a level."""
+
+    rounds: Array  # (C, 2) edge rounds, cloud rounds
+    least: float  # samples
+    most: float  # samples
+    curves: tuple[Additive | Effective, ...]
+    k: int
+    cost: Array  # (3, 2) of one sample, edge round, cloud round on each link
+
+    def frontier(self, level: float) -> tuple[Array, Array]:
+        """Return the counts (P, 3) that hold every curve to `level` and that none undercuts, and their costs (P, 2)."""
+        needed = np.full(len(self.rounds), self.least)
+        for curve in self.curves:
+            needed = np.maximum(needed, np.ceil(_samples_for(curve, self.rounds, self.k, level) * (1 - ROUNDING)))
+        kept = needed <= self.most
+        counts = np.column_stack((needed[kept], self.rounds[kept]))
+        cost = counts @ self.cost
+        first = undominated(cost)
+        return counts[first], cost[first]
+
+
+def least_largest(problem: Problem, made: Instance, gap: float) -> Fair:
+    """Return a plan whose largest error is within a relative `gap` of the least possible, where it can be found.
+
+    Raises `InputError` where a task has more than a million pairs of rounds to choose from.
+    """
+    tasks = _choices(problem, made)
+    level, bound = (max(map(_largest, tasks, x.reshape(-1, 3))) for x in (made.low, made.high))
+    best, unreached = made.low, level
+    while unreached - bound > 0.1 * gap * bound:
+        middle = 0.5 * (unreached + bound)
+        if hold(tasks, middle, made.budget).out_of_reach:
+            bound = middle
+        else:
+            unreached = middle
+    tried, stride = bound, 0.1 * gap * bound
+    while level - tried > 0.1 * gap * tried:
+        trial = min(0.5 * (level + tried), tried + stride)
+        plan, excluded = together(hold(tasks, trial, made.budget))
+        if plan is not None:
+            best, level = plan.ravel(), max(map(_largest, tasks, plan))
+            continue
+        bound = trial if excluded and bound == tried else bound
+        tried, stride = trial, 2 * stride
+    held, below = (hold(tasks, level * share, made.budget) for share in (1, 1 - SMALL))
+    dearer = below.total(held.prices) - held.total(held.prices)
+    rates = SMALL * level / dearer * held.prices if 0 < dearer < np.inf else np.zeros(2)
+    best = fill(made, best, made.cost @ held.prices + 1e-300)
+    level = max(map(_largest, tasks, best.reshape(-1, 3)))
+    return Fair(best, level, min(bound, level), rates)
+
+
+@dataclass(frozen=True)
+class Held:
+    """What the tasks can choose from at one level, and the link prices at which the least of it costs most."""
+
+    counts: tuple[Array, ...]  # per task (P, 3)
+    costs: tuple[Array, ...]  # per task (P, 2)
+    budget: Array  # (2,)
+    prices: Array  # (2,) per MB; both budgets together cost 1
+    out_of_reach: bool  # proven: no plan holds every task to the level
+
+    def total(self, prices: Array) -> float:
+        """Return the sum of the least costs at `prices`; infinite where a task has nothing to choose from."""
+        return sum(float((cost @ prices).min()) if len(cost) else np.inf for cost in self.costs)
+
+
+def hold(tasks: Sequence[Choices], level: float, budget: Array) -> Held:
+    """Return what holds every task to `level`."""
+    counts, costs = zip(*(task.frontier(level) for task in tasks))
+    if not all(map(len, counts)):
+        return Held(counts, costs, budget, 0.5 / budget, out_of_reach=True)
+    joined = np.concatenate(costs) / budget
+    starts = np.cumsum([0, *map(len, costs[:-1])])
+    task = np.repeat(np.arange(len(costs)), list(map(len, costs)))
+    low, high, most, best = 0.0, 1.0, -np.inf, 0.5
+    for share in chain((0.0, 1.0), repeat(None, 40)):  # the total is concave in the wireless link's share of the price
+        share = 0.5 * (low + high) if share is None else share
+        priced = joined @ np.array((share, 1 - share))
+        least = np.minimum.reduceat(priced, starts)
+        if least.sum() > most:
+            most, best = float(least.sum()), share
+        chosen = np.flatnonzero(priced <= least[task])
+        wireless, wireline = joined[chosen[np.searchsorted(task[chosen], np.arange(len(starts)))]].sum(axis=0)
+        low, high = (max(low, share), high) if wireless > wireline else (low, min(high, share))
+    return Held(counts, costs, budget, np.array((best, 1 - best)) / budget, out_of_reach=most > 1 + PROVEN)
+
+
+def together(held: Held) -> tuple[NDArray[np.float64] | None, bool]:
+    """Return whole counts (N, 3) within the budgets, or None; and whether it is proven that there are none.
+
+    Task by task, the sums that no other sum undercuts on both links are kept. A choice whose price is more above its
+    task's least than the budgets have left cannot be part of a plan.
+    """
+    if held.out_of_reach:
+        return None, True
+    allowed = held.budget * (1 + BUDGET_SLACK)
+    least = np.array([cost.min(axis=0) for cost in held.costs])
+    prices = [cost @ held.prices - (cost @ held.prices).min() for cost in held.costs]
+    spare = 1 - held.total(held.prices) + 2 * PROVEN
+    sums, extra, exact = np.zeros((1, 2)), np.zeros(1), True
+    trail: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []  # per task: which earlier sum, which choice
+    for number, (cost, above) in enumerate(zip(held.costs, prices)):
+        usable = np.flatnonzero(above <= spare)
+        total = (sums[:, None] + cost[usable]).reshape(-1, 2)
+        more = (extra[:, None] + above[usable]).ravel()
+        kept = np.flatnonzero((more <= spare) & np.all(total + least[number + 1 :].sum(axis=0) <= allowed, axis=1))
+        kept = kept[undominated(total[kept])]
+        if not len(kept):
+            return None, exact
+        if len(kept) > MOST_MERGED:
+            exact = False
+            kept = kept[np.argsort(more[kept])[:MOST_MERGED]]
+        sums, extra = total[kept], more[kept]
+        trail.append((kept // len(usable), usable[kept % len(usable)]))
+    at, plan = int(np.argmin(extra)), []
+    for (earlier, choice), counts in zip(reversed(trail), reversed(held.counts)):
+        plan.append(counts[choice[at]])
+        at = int(earlier[at])
+    return np.array(plan[::-1]), False
+
+
+def undominated(cost: Array) -> NDArray[np.intp]:
+    """Return the rows of cost (n, 2) that no other row undercuts on both links, one of equals."""
+    order = np.lexsort((cost[:, 1], cost[:, 0]))
+    second = cost[order, 1]
+    before = np.minimum.accumulate(np.r_[np.inf, second[:-1]]) if len(order) else second
+    return order[second < before]
+
+
+def _choices(problem: Problem, made: Instance) -> list[Choices]:
+    low, high, cost = made.low.reshape(-1, 3), made.high.reshape(-1, 3), made.cost.reshape(-1, 3, 2)
+    found = []
+    for task, least, most, unit in zip(problem.tasks, low, high, cost):
+        pairs = int(np.prod(most[1:] - least[1:] + 1))
+        if pairs > MOST_CHOICES:
+            raise InputError(
+                f"objective 'max-min' tries every pair of edge and cloud rounds, and task {task.name!r} has {pairs}: "
+                f"set limits that leave at most {MOST_CHOICES}"
+            )
+        edge, cloud = (np.arange(least[stage], most[stage] + 1) for stage in (1, 2))
+        rounds = np.stack(np.meshgrid(edge, cloud, indexing="ij"), axis=-1).reshape(-1, 2)
+        curves = tuple(learner.curve for learner in task.learners)
+        found.append(Choices(rounds, least[0], most[0], curves, problem.edge_rounds_per_cloud_round, unit))
+    return found
+
+
+def _largest(task: Choices, counts: Array) -> float:
+    return max(float(curve.error(*counts, k=task.k)) for curve in task.curves)
+
+
+def _samples_for(curve: Additive | Effective, rounds: Array, k: int, level: float) -> Array:
+    """Return the samples (C,), fractional, at which the error after `rounds` (C, 2) is `level`."""
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        if isinstance(curve, Effective):
+            if level <= curve.floor:
+                return np.full(len(rounds), np.inf)
+            needed = ((level - curve.floor) / curve.a) ** (-1 / curve.b)
+            return (needed - curve.effective_samples(0, rounds[:, 0], rounds[:, 1], k)) / curve.alpha
+        left = level - curve.floor - curve.edge.at(rounds[:, 0]) - curve.cloud.at(rounds[:, 1])
+        if curve.pretrain.a == 0:
+            return np.where(left >= 0, 0.0, np.inf)
+        return np.where(left > 0, (left / curve.pretrain.a) ** (-1 / curve.pretrain.b) - curve.pretrain.x0, np.inf)

@@ -1,0 +1,172 @@
+"""An allocation problem in arrays: three quantities per task, what one of each costs, and what it saves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult
+
+from flcav.config import InputError, shorten
+from flcav.network.plan import MessageSizes, Price, StagePlan, price
+from flcav.optimization.allocation.problem import Problem, Task
+from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.solvers.effective import EffectiveTasks, effective_tasks
+from flcav.optimization.solvers.rounding import outermost
+from flcav.optimization.solvers.separable import BUDGET_SLACK, Separable, room
+
+Array = NDArray[np.float64]
+
+
+def variables(result: OptimizeResult) -> Array:
+    """Return the variables of a linear program's optimum; raises `InputError` where the solver found none."""
+    if result.x is None:
+        raise InputError(f"the solver fails on numbers of such different sizes: {shorten(result.message)}")
+    return result.x
+
+
+class Infeasible(InputError):
+    """Even the least plan that the limits allow costs more than a budget."""
+
+
+@dataclass(frozen=True)
+class Instance:
+    """Quantities 3 i, 3 i + 1, 3 i + 2 are the samples, edge rounds and cloud rounds of task i; n = 3 N in all."""
+
+    separable: Separable  # every additive curve, and all bounds, costs and budgets
+    effective: EffectiveTasks | None  # every effective-samples curve
+    floor: float  # weighted sum of the floors
+
+    @property
+    def low(self) -> Array:
+        """Least of each, (n,)."""
+        return self.separable.low
+
+    @property
+    def high(self) -> Array:
+        """Most of each, (n,)."""
+        return self.separable.high
+
+    @property
+    def cost(self) -> Array:
+        """Cost of one unit on each link, (n, 2)."""
+        return self.separable.cost
+
+    @property
+    def budget(self) -> Array:
+        """Budget of each link, (2,)."""
+        return self.separable.budget
+
+    def error(self, x: Array) -> float:
+        """Return the weighted error above the floors at x (n,)."""
+        own = 0.0 if self.effective is None else float(self.effective.error(x).sum())
+        return float(self.separable.error(x).sum()) + own
+
+    def change(self, x: Array, step: int) -> Array:
+        """Return by how much the error changes when each quantity alone changes by `step`, (n,)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change = self.separable.error(x + step) - self.separable.error(x)
+            if self.effective is not None:
+                before = self.effective.error(x)
+                for column in self.effective.quantity.T:
+                    moved = x.copy()
+                    moved[column] += step
+                    change[column] += self.effective.error(moved) - before
+        return change
+
+    def cheapest(self, multipliers: Array) -> tuple[Array, float]:
+        """Return the whole x (n,) of least error plus price at `multipliers` (2,), and the bound that this proves."""
+        problem, prices = self.separable, self.separable.prices(multipliers)
+        below = np.floor(problem.cheapest(multipliers))
+        above = np.minimum(below + 1, problem.high)
+        values = [problem.error(x) + prices * x for x in (below, above)]
+        x, value = np.where(values[0] <= values[1], below, above), np.minimum(*values)
+        total = float(value.sum())
+        if self.effective is not None:
+            own, least = self.effective.cheapest(multipliers)
+            quantity = self.effective.quantity
+            total += float(least.sum() - value[quantity].sum())
+            x[quantity] = own
+        return x, total - float(multipliers @ problem.budget)
+
+    def narrowed(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
+        """Return bounds (n,), (n,) outside which error plus price is more than `slack` above the least."""
+        problem, prices = self.separable, self.separable.prices(multipliers)
+        best, _ = self.cheapest(multipliers)
+        limit = problem.error(best) + prices * best + slack
+
+        def good(x: Array) -> NDArray[np.bool_]:
+            return problem.error(x) + prices * x <= limit
+
+        low, high = (outermost(good, best, edge) for edge in (problem.low, problem.high))
+        if self.effective is not None:
+            quantity = self.effective.quantity
+            low[quantity], high[quantity] = self.effective.within(multipliers, slack)
+        return low, high
+
+
+def instance(problem: Problem) -> Instance:
+    """Return `problem` in arrays; raises `Infeasible`, naming the budget, what the least plan costs, and the excess."""
+    low, high = (np.concatenate(edge) for edge in zip(*(_range(problem, task) for task in problem.tasks)))
+    rows: list[tuple[float, float, float, int]] = []
+    alone: list[tuple[int, float, Effective]] = []
+    for number, task in enumerate(problem.tasks):
+        for learner in task.learners:
+            if isinstance(learner.curve, Effective):
+                alone.append((number, learner.weight, learner.curve))
+                continue
+            for stage, decay in enumerate(learner.curve.decays()):
+                if decay.a > 0:
+                    rows.append((learner.weight * decay.a, decay.b, decay.x0, 3 * number + stage))
+    idle = np.setdiff1d(np.arange(len(low)), [row[3] for row in rows])
+    rows += [(0.0, 1.0, 1.0, int(quantity)) for quantity in idle]
+    a, b, x0, of = np.array(sorted(rows, key=lambda row: row[3])).T
+    budget = np.array((problem.budgets_mb.wireless, problem.budgets_mb.wireline))
+    own = None if len(of) == len(low) else of.astype(np.intp)
+    powers = Separable(a, b, x0, low, high, unit_costs(problem), budget, own)
+    _refuse(powers)
+    powers = replace(powers, high=np.minimum(high, low + room(powers)))
+    numbers, weights, curves = zip(*alone) if alone else ((), (), ())
+    k = problem.edge_rounds_per_cloud_round
+    effective = effective_tasks(numbers, weights, curves, k, low, powers.high, powers.cost) if alone else None
+    floor = sum(learner.weight * learner.curve.floor for task in problem.tasks for learner in task.learners)
+    return Instance(powers, effective, floor)
+
+
+def stage_plan(problem: Problem, task: Task, counts: Sequence[int]) -> StagePlan:
+    """Return the plan of `task` with `counts` = samples, edge rounds, cloud rounds."""
+    samples, edge_rounds, cloud_rounds = counts
+    return StagePlan(samples, edge_rounds, cloud_rounds, task.edge_groups, problem.edge_rounds_per_cloud_round)
+
+
+def cost_of(problem: Problem, task: Task, counts: Sequence[int]) -> Price:
+    """Return what `counts` of samples, edge rounds and cloud rounds of `task` cost."""
+    return price(stage_plan(problem, task, counts), MessageSizes(task.sample_mb, task.model_mb))
+
+
+def unit_costs(problem: Problem) -> Array:
+    """Return the (3N, 2) cost of one sample, edge round and cloud round of each task: `price` is linear."""
+    prices = [cost_of(problem, task, unit) for task in problem.tasks for unit in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    return np.array([(each.wireless_mb, each.wireline_mb) for each in prices])
+
+
+def _range(problem: Problem, task: Task) -> tuple[Array, Array]:
+    """Return least and most (3,) of a task; an infinite error is never chosen."""
+    limits = task.limits
+    ranges = np.array((limits.samples, limits.edge_rounds, limits.cloud_rounds), dtype=np.float64)
+    for learner in task.learners:
+        if isinstance(learner.curve, Additive):
+            infinite = [decay.infinite_at_0 for decay in learner.curve.decays()]
+            ranges[:, 0] = np.maximum(ranges[:, 0], infinite)
+    if problem.edge_rounds_per_cloud_round == 0:
+        ranges[2, 1] = min(ranges[2, 1], 1)
+    return ranges[:, 0], ranges[:, 1]
+
+
+def _refuse(problem: Separable) -> None:
+    for link, need, have in zip(("wireless", "wireline"), problem.spent(problem.low), problem.budget):
+        if need > have * (1 + BUDGET_SLACK):
+            raise Infeasible(
+                f"the least that the limits allow costs {need:.6g} MB of {link} uplink, {need - have:.6g} MB more than "
+                f"budgets_mb.{link} = {have:.6g}"
+            )

@@ -1,0 +1,83 @@
+"""Whole quantities within two budgets: units taken back where they lose least per price, added where they gain most."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.optimization.solvers.separable import BUDGET_SLACK
+
+Array = NDArray[np.float64]
+
+
+class Budgeted(Protocol):
+    """An error of n whole quantities, which falls as any of them grows, under two budgets."""
+
+    @property
+    def low(self) -> Array:
+        """Least of each, (n,)."""
+        ...
+
+    @property
+    def high(self) -> Array:
+        """Most of each, (n,)."""
+        ...
+
+    @property
+    def cost(self) -> Array:
+        """Cost of one unit on each link, (n, 2)."""
+        ...
+
+    @property
+    def budget(self) -> Array:
+        """Budget of each link, (2,)."""
+        ...
+
+    def change(self, x: Array, step: int) -> Array:
+        """Return by how much the total error changes when each quantity alone changes by `step`, (n,)."""
+        ...
+
+
+def trim(problem: Budgeted, x: Array, prices: Array) -> Array:
+    """Return whole x (n,) with units taken back, the least loss per price (n,) first, until it is within budgets."""
+    x = x.copy()
+    allowed = problem.budget * (1 + BUDGET_SLACK)
+    while np.any(over := x @ problem.cost > allowed):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            loss = problem.change(x, -1) / prices
+        useful = np.flatnonzero((x > problem.low) & (problem.cost[:, over] > 0).any(axis=1))
+        order = useful[np.argsort(loss[useful])]
+        freed = np.cumsum(problem.cost[order], axis=0)
+        needed = x @ problem.cost - allowed
+        enough = np.all(freed >= needed, axis=1)
+        x[order[: int(np.argmax(enough)) + 1 if enough.any() else len(order)]] -= 1
+    return x
+
+
+def fill(problem: Budgeted, x: Array, prices: Array) -> Array:
+    """Return whole x (n,) with units added, the most gain per price (n,) first, while any fits and gains."""
+    x = x.copy()
+    while True:
+        left = problem.budget * (1 + BUDGET_SLACK) - x @ problem.cost
+        possible = np.flatnonzero((x < problem.high) & np.all(problem.cost <= left, axis=1))
+        if not len(possible):
+            return x
+        gain = -problem.change(x, 1)[possible]
+        possible, gain = possible[gain > 0], gain[gain > 0]
+        if not len(possible):
+            return x
+        with np.errstate(divide="ignore"):
+            order = possible[np.argsort(-gain / prices[possible], kind="stable")]
+        fitting = np.all(np.cumsum(problem.cost[order], axis=0) <= left, axis=1)
+        x[order[: int(np.argmin(fitting)) if not fitting.all() else len(order)]] += 1
+
+
+def outermost(good: Callable[[Array], NDArray[np.bool_]], inside: Array, edge: Array) -> Array:
+    """Return the whole numbers nearest to `edge` that are good, where all from `inside` up to them are: bisection."""
+    while np.any(inside != edge):
+        middle = np.where(edge < inside, np.floor((edge + inside) / 2), np.ceil((edge + inside) / 2))
+        reached = good(middle)
+        edge = np.where(reached, edge, middle + np.sign(inside - middle))
+        inside = np.where(reached, middle, inside)
+    return inside

@@ -1,0 +1,191 @@
+"""The weighted sum of tasks' errors, minimised: its terms, and their solution."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+
+from flcav.optimization.curves.curves import effective_samples
+from flcav.optimization.solvers.cutting_planes import Line, Program, Term, outer_approximation
+from flcav.optimization.solvers.instance import Instance, variables
+from flcav.optimization.solvers.rounding import fill, trim
+from flcav.optimization.solvers.separable import Separable, newton_step, relax
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PowerTerm:
+    """weight * a * (x[index] + x0)^(-b); its lines are secants between neighbouring whole numbers."""
+
+    index: int
+    a: float
+    b: float
+    x0: float
+
+    def value(self, x: Array) -> float:
+        """Return the term at x (n,)."""
+        return self._at(x[self.index])
+
+    def lines(self, x: Array) -> list[Line]:
+        """Return the secants through the whole neighbours of x (n,)."""
+        below = np.floor(x[self.index] + 1e-9)
+        starts = {below} if x[self.index] - below > 1e-6 else {below, below - 1}
+        lines = []
+        for start in starts:
+            if start + self.x0 > 0:
+                slope = self._at(start + 1) - self._at(start)
+                lines.append(Line((self.index,), (slope,), self._at(start) - slope * start))
+        return lines
+
+    def _at(self, x: float) -> float:
+        return float(self.a * (x + self.x0) ** -self.b)
+
+
+@dataclass(frozen=True)
+class EffectiveTerm:
+    """gain * n^(-b), n the `effective_samples` of x[first : first + 3], t = y + k z; its lines are tangents."""
+
+    first: int
+    gain: float
+    b: float
+    alpha: float
+    group: float
+    k: int
+
+    def value(self, x: Array) -> float:
+        """Return the term at x (n,)."""
+        samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
+        return self.gain * self._effective(samples, edge_rounds + self.k * cloud_rounds) ** -self.b
+
+    def lines(self, x: Array) -> list[Line]:
+        """Return the tangent at x (n,)."""
+        samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
+        t = edge_rounds + self.k * cloud_rounds
+        per_round = self.group / (t + 1) ** 2
+        fall = self.gain * self.b * self._effective(samples, t) ** (-self.b - 1)
+        slope = -fall * np.array((self.alpha, per_round, self.k * per_round))
+        index = (self.first, self.first + 1, self.first + 2)
+        return [Line(index, tuple(map(float, slope)), self.value(x) - float(slope @ x[self.first : self.first + 3]))]
+
+    def _effective(self, samples: float, t: float) -> float:
+        return float(effective_samples(samples, t, self.alpha, self.group))
+
+
+def terms_of(instance: Instance) -> list[Term]:
+    """Return the terms whose sum is the weighted error above the floors."""
+    powers, effective = instance.separable, instance.effective
+    of = np.arange(len(powers.a)) if powers.of is None else powers.of
+    rows = zip(of.tolist(), powers.a.tolist(), powers.b.tolist(), powers.x0.tolist())
+    terms: list[Term] = [PowerTerm(*row) for row in rows if row[1] > 0]
+    if effective is not None:
+        columns = (effective.quantity, effective.gain, effective.b, effective.alpha, effective.group)
+        terms += [EffectiveTerm(*row, k=effective.k) for row in zip(*(column[:, 0].tolist() for column in columns))]
+    return terms
+
+
+CORRECTIONS = 6  # of the multipliers, towards whole quantities that spend the budgets
+PLANES = 60  # of the dual
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Whole quantities and what is proven about them."""
+
+    x: Array  # (n,)
+    error: float  # above the floors
+    bound: float  # above the floors: no whole quantities within the budgets have less
+    multipliers: Array  # (2,) at which the bound is proven
+    rates: Array  # (2,) error saved per MB more of each link, before rounding to whole quantities
+
+    def gap(self, floor: float) -> float:
+        """Return (error - bound) / bound, both with `floor`."""
+        bound = min(self.bound, self.error) + floor
+        if bound > 0:
+            return (self.error + floor - bound) / bound
+        return float(self.error > self.bound)
+
+
+def whole_plan(problem: Separable, gap: float = 1e-4) -> Solution:
+    """Return whole quantities of `problem` within a relative `gap` of the least error: on arrays, without any task."""
+    return least_weighted(Instance(problem, None, 0.0), gap)
+
+
+def least_weighted(instance: Instance, gap: float) -> Solution:
+    """Return whole quantities within a relative `gap` of the least error."""
+    best = Solution(instance.low, instance.error(instance.low), -np.inf, np.zeros(2), np.zeros(2))
+    bound_at = best.multipliers
+    for number, (multipliers, bound) in enumerate(_multipliers(instance, gap)):
+        x, proven = instance.cheapest(multipliers)
+        if max(proven, bound) > best.bound:
+            bound_at = multipliers
+        prices = instance.separable.prices(multipliers + 1e-9 * multipliers.sum() + 1e-300)
+        x = fill(instance, trim(instance, x, prices), prices)
+        error = instance.error(x)
+        best = Solution(
+            *((x, error) if error < best.error else (best.x, best.error)),
+            bound=max(best.bound, proven, bound),
+            multipliers=bound_at,
+            rates=best.rates if number else multipliers,
+        )
+        if best.gap(instance.floor) <= gap:
+            return best
+    return _closed(instance, best, gap)
+
+
+def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
+    """Yield multipliers near the best, and the bound that is known there; first those of the fractional optimum."""
+    if instance.effective is not None:
+        yield from _planes(instance, gap)
+        return
+    problem = instance.separable
+    relaxed = relax(problem)
+    multipliers = relaxed.multipliers
+    yield multipliers, relaxed.bound
+    binding = [int(link) for link in np.flatnonzero(multipliers > 0)]
+    for _ in range(CORRECTIONS if binding else 0):
+        x, _ = instance.cheapest(multipliers)
+        overspend = (problem.spent(x) - problem.budget)[binding]
+        step = newton_step(problem, problem.cheapest(multipliers), multipliers, binding, overspend)
+        multipliers = multipliers.copy()
+        multipliers[binding] *= np.exp(np.clip(step, -0.1, 0.1))
+        yield multipliers, -np.inf
+
+
+def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
+    """Yield the best few of the multipliers that Kelley's cutting planes try on the dual over whole quantities."""
+    left = instance.budget - instance.low @ instance.cost
+    largest = instance.error(instance.low) / np.maximum(left, 1e-9 * instance.budget)
+    rows, values, proven = [], [], []
+    multipliers = [0.01 * largest]
+    for _ in range(PLANES):
+        x, bound = instance.cheapest(multipliers[-1])
+        proven.append(bound)
+        rows.append(np.r_[1.0, (instance.budget - x @ instance.cost) * largest])
+        values.append(instance.error(x))
+        model = linprog([-1.0, 0, 0], A_ub=np.array(rows), b_ub=values, bounds=[(None, None), (0, 1), (0, 1)])
+        weights = variables(model)[1:]
+        if -model.fun - max(proven) <= 0.02 * gap * (max(proven) + instance.floor):
+            break
+        multipliers.append(weights * largest)
+    order = np.argsort(-np.array(proven))
+    yield from ((multipliers[i], proven[i]) for i in islice(order, CORRECTIONS))
+
+
+def _closed(instance: Instance, best: Solution, gap: float) -> Solution:
+    """Return `best` or better, within `gap`, by an exact program over what can still be in an optimal plan."""
+    _, bound = instance.cheapest(best.multipliers)
+    low, high = instance.narrowed(best.multipliers, (best.error - bound) * (1 + 1e-9) + 1e-15)
+    program = Program(terms_of(instance), low, high, instance.cost, instance.budget)
+    starts = [np.minimum(low + step, high) for step in range(int(min((high - low).max(), 40)) + 1)]
+    starts += [np.floor(low + (high - low) * share) for share in np.linspace(0, 1, 9)]
+    visited, proven = outer_approximation(program, [*starts, np.clip(best.x, low, high)], gap, instance.floor)
+    prices = instance.separable.prices(best.multipliers) + 1e-300
+    points = [best.x, *(fill(instance, trim(instance, x, prices), prices) for x in visited)]
+    errors = [instance.error(x) for x in points]
+    first = int(np.argmin(errors))
+    bound = max(best.bound, min(proven, best.error))
+    return Solution(points[first], errors[first], bound, best.multipliers, best.rates)

@@ -1,0 +1,1 @@
+"""Charts of runs, plans, curves and studies."""

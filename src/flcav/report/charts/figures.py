@@ -1,0 +1,90 @@
+"""The pictures: plain tables and arrays in, matplotlib figures out. `style.png` makes a file of one."""
+
+from collections.abc import Mapping, Sequence
+
+from matplotlib.figure import Figure
+
+from flcav.intervals import MeanOverSeeds
+from flcav.report import style
+from flcav.report.charts import runs as charts
+from flcav.report.charts.runs import Row
+from flcav.report.pictures import clouds as sweeps
+from flcav.report.pictures import maps
+
+WIDTH = 3.8  # [inch] hardly more than a phone shows; a desktop enlarges it
+EXTENT: sweeps.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: where the tiny detector looks
+
+
+@style.styled
+def town_map(scene: maps.ErrorMap) -> Figure:
+    """Return the town with its candidate poles, the registered errors, and what the placed pole covers."""
+    x_low, y_low, x_high, y_high = scene.town.bounds
+    figure = style.canvas(WIDTH, WIDTH * (y_high - y_low) / (x_high - x_low) + 0.3)
+    axes = figure.add_subplot()
+    maps.draw_errors(axes, scene)
+    style.key(figure, axes.get_legend_handles_labels()[0])
+    return figure
+
+
+@style.styled
+def before_after(sweep: sweeps.Sweep, extent: sweeps.Extent = EXTENT) -> Figure:
+    """Return the sweep twice, one above the other: what each of two networks found in it."""
+    figure = style.canvas(WIDTH, 2 * WIDTH)
+    for axes, found in zip(figure.subplots(2), (sweep.before, sweep.after), strict=True):
+        sweeps.draw_detections(axes, sweep, found, extent)
+        axes.set_title(found.title, fontweight="bold", pad=20)
+        style.key(axes, sweeps.key(found), loc="lower left", bbox_to_anchor=(-0.02, 0.98))
+        axes.set(xlabel="metres to the right", ylabel="metres ahead")
+    return figure
+
+
+@style.styled
+def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figure:
+    """Return a measure through the stages, a line per town; `tested` are rows of all towns, see `charts`."""
+    figure = style.canvas(WIDTH, 0.8 * WIDTH)
+    charts.draw_by_round(figure.add_subplot(), rounds, tested, measure)
+    return figure
+
+
+@style.styled
+def megabytes(ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
+    """Return what each stage sent over each link, against the budgets (link -> MB)."""
+    figure = style.canvas(WIDTH, 0.55 * WIDTH)
+    charts.draw_megabytes(figure.add_subplot(), ledger_by_stage, budgets)
+    return figure
+
+
+@style.styled
+def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
+    """Return a forest plot of AP50 by town and arm: a panel per town, one above the other."""
+    figure = style.canvas(6.4, 0.9 + 0.32 * sum(map(len, towns.values())))
+    panels = figure.subplots(len(towns), sharex=True, squeeze=False)[:, 0]
+    for axes, (town, rows) in zip(panels, towns.items(), strict=True):
+        charts.draw_arms(axes, town, rows)
+        axes.set_title(town, fontweight="bold")
+    figure.axes[-1].set_xlabel("AP50 (95 % interval)")
+    return figure
+
+
+@style.styled
+def overview(
+    scene: maps.ErrorMap, sweep: sweeps.Sweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
+) -> Figure:
+    """Return one wide picture of a run: errors and pole, a sweep before and after, a measure through the stages."""
+    figure = style.canvas(9.6, 4.4)
+    grid = figure.add_gridspec(1, 3, width_ratios=(4.1, 2.1, 3.4))
+    left, middle, right = (figure.add_subfigure(grid[column]) for column in range(3))
+    axes = left.add_subplot()
+    maps.draw_errors(axes, scene)
+    axes.set_title(f"{scene.town.name}: mistakes, and the pole placed for them", fontweight="bold")
+    style.key(left, axes.get_legend_handles_labels()[0])
+    for axes, found in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
+        sweeps.draw_detections(axes, sweep, found, EXTENT)
+        axes.set_title(found.title, fontweight="bold")
+        axes.set(xticks=[], yticks=[0, 20, 40])
+    middle.supylabel("metres ahead", fontsize=style.TEXT, color=style.MUTED)
+    style.key(middle, sweeps.key(), columnspacing=0.8)
+    axes = right.add_subplot()
+    charts.draw_by_round(axes, rounds, tested, measure)
+    axes.set_title(f"{measure} through the stages", fontweight="bold", pad=22)
+    return figure

@@ -1,0 +1,129 @@
+"""Charts of studies: confusion matrices, average precision and errors of paths."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from flcav.report import style
+
+SHADES = LinearSegmentedColormap.from_list("shares", ["white", style.BLUE])
+SIDE_IN, LABELS_IN = 3.6, 1.1
+
+
+@style.styled
+def confusions(counts: Mapping[str, NDArray[np.int64]], classes: Sequence[str]) -> Figure:
+    """Return a panel per title: of each class's pictures (row), the share that was taken for each class (column).
+
+    `counts` are (classes, classes) numbers of pictures; a class without pictures is an empty row.
+    """
+    names = [name.replace("_", " ") for name in classes]
+    figure = style.canvas(SIDE_IN * len(counts) + LABELS_IN, SIDE_IN + LABELS_IN)
+    panels = np.atleast_1d(figure.subplots(1, len(counts), sharey=True))
+    for axes, (title, matrix) in zip(panels, counts.items(), strict=True):
+        shares = matrix / np.maximum(matrix.sum(1, keepdims=True), 1)
+        axes.imshow(shares, cmap=SHADES, vmin=0, vmax=1)
+        for row, column in np.argwhere(matrix > 0):
+            share = shares[row, column]
+            ink = "white" if share > 0.5 else style.INK
+            place = {"ha": "center", "va": "center", "fontsize": style.SMALL - 1}
+            axes.text(column, row, f"{100 * share:.0f}" if share >= 0.005 else "·", color=ink, **place)
+        axes.set_xticks(range(len(names)), names, rotation=45, ha="right", rotation_mode="anchor")
+        axes.set_yticks(range(len(names)), names)
+        axes.set_xlabel("found")
+        axes.set_title(f"{title}: {np.trace(matrix) / matrix.sum():.1%} of {matrix.sum()}")
+    panels[0].set_ylabel("recorded; % of the row")
+    return figure
+
+
+PANEL_IN, ROW_IN, HEAD_IN = 4.2, 0.27, 0.9
+ABREAST = 3  # panels side by side, at most
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One number of a test."""
+
+    name: str
+    mean: float  # over seeds
+    seeds: tuple[float, ...]  # one each
+    targets: int | None = None  # how many there were to find; None: all of the others
+
+
+@style.styled
+def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precision at IoU 0.5") -> Figure:
+    """Return a panel per title: a bar for each number, a dot for each seed, from 0 to 1 where all are within."""
+    every = [value for bars in panels.values() for bar in bars for value in (bar.mean, *bar.seeds)]
+    rows = max(len(bars) for bars in panels.values())
+    columns = min(len(panels), ABREAST)
+    lines = -(-len(panels) // columns)
+    figure = style.canvas(PANEL_IN * columns, (HEAD_IN + ROW_IN * rows) * lines)
+    drawn = np.atleast_1d(figure.subplots(lines, columns)).ravel()
+    for axes in drawn[len(panels) :]:
+        axes.remove()
+    for axes, (title, bars) in zip(drawn, panels.items()):
+        for row, bar in enumerate(bars):
+            axes.barh(row, bar.mean, height=0.7, color=style.BLUE if bar.targets is None else style.SKY)
+            axes.plot(bar.seeds, [row] * len(bar.seeds), "o", color=style.INK, markersize=3, clip_on=False)
+        names = [bar.name if bar.targets is None else f"{bar.name} ({bar.targets})" for bar in bars]
+        axes.set_yticks(range(len(bars)), names)
+        axes.set_ylim(rows - 0.4, -0.6)
+        axes.set_xlim(min(0, *every), max(1, *every))
+        axes.set_xlabel(label)
+        axes.set_title(title)
+        axes.grid(axis="x")
+    return figure
+
+
+@dataclass(frozen=True)
+class ErrorBar:
+    """One error in metres, by seed."""
+
+    name: str  # of who predicts
+    mean: float
+    seeds: Sequence[float]
+
+
+Panels = Mapping[str, Mapping[str, Sequence[ErrorBar]]]  # test -> slice, with its number of samples -> bars
+
+COLOURS = (style.RULE, style.BLUE, style.SKY)
+THICK = 0.26
+
+
+@style.styled
+def path_errors(panels: Panels) -> Figure:
+    """Return a panel per test: for each slice the final error of each who predicts, every seed a dot."""
+    figure = style.canvas(8.6, 3.3)
+    axes_of = figure.subplots(1, len(panels), sharex=True, squeeze=False)[0]
+    for number, (axes, (test, slices)) in enumerate(zip(axes_of, panels.items(), strict=True)):
+        _draw(axes, slices)
+        axes.set_title(test)
+        axes.set_xlabel("final error after 3 s [m]")
+        if number == 0:
+            bars = next(iter(slices.values()))
+            handles = [axes.barh([0], [0], color=colour, label=bar.name) for bar, colour in zip(bars, COLOURS)]
+            style.key(figure, handles)  # pyright: ignore[reportArgumentType]
+    return figure
+
+
+def _draw(axes: Axes, slices: Mapping[str, Sequence[ErrorBar]]) -> None:
+    for place, bars in enumerate(slices.values()):
+        for number, (bar, colour) in enumerate(zip(bars, COLOURS, strict=True)):
+            y = place + (number - 1) * (THICK + 0.02)
+            axes.barh(y, bar.mean, THICK, color=colour)
+            axes.plot(bar.seeds, [y] * len(bar.seeds), "o", markersize=3, color=style.INK, markeredgewidth=0)
+            axes.annotate(
+                f"{bar.mean:.2f}",
+                (max(bar.mean, *bar.seeds), y),
+                (5, 0),
+                textcoords="offset points",
+                va="center_baseline",
+                fontsize=style.SMALL,
+            )
+    axes.set_yticks(range(len(slices)), list(slices))
+    axes.invert_yaxis()
+    axes.margins(x=0.14)

@@ -1,0 +1,216 @@
+"""The page about a plan: everything it shows, computed from the problem and the plan."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import networkx as nx
+
+from flcav.network.plan import MessageSizes, Price, StagePlan, price
+from flcav.optimization.allocation.allocate import Allocation, TaskPlan, resolved
+from flcav.optimization.allocation.baselines import baseline
+from flcav.optimization.allocation.budget_sweep import FACTORS, LINKS, BudgetPoint, Saving, budget_sweep
+from flcav.optimization.allocation.problem import Problem, Task
+from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, meaning
+from flcav.optimization.vehicles import VehicleShare
+from flcav.report import style
+from flcav.report.charts import curves as layers_chart
+from flcav.report.charts import plans as plan_charts
+from flcav.report.pages import html
+
+STAGES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
+SHOWN = 6  # tasks with a colour of their own; the others are drawn as one
+COARSE = (0.5, 1.0, 2.0)  # budgets that are tried where a plan takes seconds: one without a certificate, or by links
+BETTER = {  # what more megabytes do to the objective
+    "weighted": {"verb": "lower the weighted error", "gain": "weighted error saved"},
+    "max-min": {"verb": "lower the largest error", "gain": "largest error saved"},
+    "area": {"verb": "raise the area", "gain": "area gained"},
+}
+OTHERS = {
+    "equal-stages": "equal shares for every stage",
+    "equal-tasks": "equal shares for every task",
+    "max-throughput": "most messages, whatever they teach",
+    "article": "the continuous optimum, rounded down",
+}
+Shares = Mapping[str, Sequence[VehicleShare]]
+
+
+def plan_page(
+    problem: Problem, plan: Allocation, shares: Shares, more: Sequence[Saving], graph: nx.Graph | None = None
+) -> str:
+    """Return the page as HTML that needs nothing but itself; `graph`: what the problem was made from, if it was."""
+    results = plan_results(problem, plan, shares, more)
+    pictures = {
+        "megabytes": plan_charts.megabytes(results["parts"], results["links"]),
+        "budgets": plan_charts.best_by_budget(results["sweep"], results["measure"]["name"]),
+    }
+    if graph is not None:
+        pictures["layers"] = layers_chart.three_layers(graph)
+    return html.render(results, {name: style.png(figure) for name, figure in pictures.items()}, "plan.html.j2")
+
+
+def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Sequence[Saving]) -> dict[str, Any]:
+    """Return what the page shows: numbers and sentences."""
+    scaled = {"both links": LINKS, "wireless alone": ("wireless",), "wireline alone": ("wireline",)}
+    factors = FACTORS if plan.note is None else COARSE
+    sweep = {name: budget_sweep(problem, plan, links, factors) for name, links in scaled.items()}
+    links = {
+        link: {
+            "budget_mb": getattr(problem.budgets_mb, link),
+            "used_mb": getattr(plan.used_mb, f"{link}_mb"),
+            "share": getattr(plan.used_mb, f"{link}_mb") / getattr(problem.budgets_mb, link),
+            "more": [asdict(each) for each in more if each.link == link],
+        }
+        for link in LINKS
+    }
+    tasks = [
+        {**asdict(row), "weight": task.weight, "vehicles": sum(task.edge_groups)}
+        for task, row in zip(resolved(problem).tasks, plan.tasks, strict=True)
+    ]
+    values = {
+        "measure": {"name": MEASURES[problem.objective], "kind": problem.objective, **BETTER[problem.objective]},
+        "objective": plan.objective,
+        "lower_bound": plan.lower_bound,
+        "gap": plan.gap,
+        "status": plan.status,
+        "k": problem.edge_rounds_per_cloud_round,
+        "tasks": tasks,
+        "links": links,
+        "parts": _parts(problem, plan),
+        "sweep": {name: [asdict(point) for point in points] for name, points in sweep.items()},
+        "vehicles": _vehicles(problem, shares),
+        "horizon_s": problem.horizon_s,
+        "robust": problem.robust,
+        "note": plan.note,
+        "warnings": plan.warnings,
+        "words": {"steps": STEPS, "curve": CURVE, "terms": _terms(problem, plan)},
+        "others": [
+            {"name": name, "objective": other.objective, "note": other.note}
+            for key, name in OTHERS.items()
+            if len(tasks) > 1 or key != "equal-tasks"
+            for other in [baseline(problem, key)]
+        ],
+    }
+    return values | {"sentences": _sentences(values, sweep["both links"])}
+
+
+def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
+    """Return the words that the page has to define."""
+    measure, saved = MEASURES[problem.objective], "gained" if problem.objective == "area" else "saved"
+    terms = {"error": TERMS["error"], measure: meaning(problem, plan.objective), "budget": TERMS["budget"]}
+    terms[saved] = TERMS["saved"]
+    used = ["up to"] * problem.robust + ["proven"] * (plan.lower_bound is not None)
+    return terms | {name: TERMS[name] for name in used}
+
+
+def _parts(problem: Problem, plan: Allocation) -> list[plan_charts.Part]:
+    """Return megabytes by link, task and stage; tasks beyond the `SHOWN` largest are one."""
+    ordered = sorted(plan.tasks, key=lambda row: -(row.wireless_mb + row.wireline_mb))
+    shown = {row.name for row in ordered[: SHOWN if len(ordered) > SHOWN + 1 else len(ordered)]}
+    others = f"{len(ordered) - len(shown)} other tasks"
+    totals: dict[tuple[str, str, str], float] = {}
+    for task, row in zip(problem.tasks, plan.tasks, strict=True):
+        for stage, cost in _stage_prices(problem, task, row).items():
+            for link in LINKS:
+                key = (link, row.name if row.name in shown else others, stage)
+                totals[key] = totals.get(key, 0.0) + getattr(cost, f"{link}_mb")
+    return [{"link": link, "task": task, "stage": stage, "mb": mb} for (link, task, stage), mb in totals.items()]
+
+
+def _stage_prices(problem: Problem, task: Task, row: TaskPlan) -> dict[str, Price]:
+    sizes, k = MessageSizes(task.sample_mb, task.model_mb), problem.edge_rounds_per_cloud_round
+    none = StagePlan(0, 0, 0, task.edge_groups, k)
+    return {name: price(replace(none, **{field: getattr(row, field)}), sizes) for field, name in STAGES.items()}
+
+
+def _vehicles(problem: Problem, shares: Shares) -> list[dict[str, Any]]:
+    """Return a row per vehicle: what it uploads and joins for all tasks, and how long its wireless link is busy."""
+    rows: dict[str, dict[str, Any]] = {}
+    for task in problem.tasks:
+        for share in shares.get(task.name, ()):
+            mbps = (task.uplink_mbps or {})[share.vehicle].wireless
+            row = rows.setdefault(share.vehicle, {"vehicle": share.vehicle, "mbps": mbps, "mb": 0.0, "parts": []})
+            row["mb"] += share.wireless_mb
+            row["parts"].append({"task": task.name, "samples": share.samples, "rounds": len(share.rounds)})
+    most = {task: max(len(share.rounds) for share in own) for task, own in shares.items()}
+    for row in rows.values():
+        row["busy_s"] = 8 * row["mb"] / row["mbps"]
+        row["missed"] = sum(most[part["task"]] - part["rounds"] for part in row["parts"])
+    return list(rows.values())
+
+
+def _sentences(values: Mapping[str, Any], both: Sequence[BudgetPoint]) -> dict[str, str]:
+    return {
+        "proof": _proof(values),
+        "links": " ".join(_link(name, link, values["measure"]["verb"]) for name, link in values["links"].items()),
+        "stages": _stages(values["parts"]),
+        "budgets": _budgets(values["measure"]["name"], values["objective"], both),
+        "others": _others(values),
+        "vehicles": _stragglers(values["vehicles"], values["horizon_s"]),
+    }
+
+
+def _proof(values: Mapping[str, Any]) -> str:
+    if values["lower_bound"] is None:
+        return "Nothing is proven of it: it is the best of several local optima."
+    bound = f"no plan within these budgets has less than {values['lower_bound']:.6g}"
+    near = f", and this one has at most {100 * values['gap']:.2g} % more" if values["gap"] > 1e-9 else ""
+    return f"This is proven: {bound}{near}."
+
+
+def _link(name: str, link: Mapping[str, Any], verb: str) -> str:
+    """Return how much of a budget is used, and what more of it would bring."""
+    used = f"{link['used_mb']:,.0f} of {link['budget_mb']:,.0f} MB of the {name} budget are used"
+    if not any(each["saved"] for each in link["more"]):
+        most = max(each["added"] for each in link["more"])
+        return f"{used}; up to {most:.0%} more of it would not {verb}."
+    by = " or ".join(f"{each['saved']:.2g} ({each['added']:.0%} more)" for each in link["more"])
+    return f"{used}; more of it would {verb} by {by}."
+
+
+def _others(values: Mapping[str, Any]) -> str:
+    """Return how the plan compares with the best of the simpler ones that can be carried out."""
+    larger = values["measure"]["kind"] == "area"
+    carried = [other for other in values["others"] if other["note"] is None]
+    if not carried:
+        return "None of the simpler plans can be carried out: they know the budgets alone, not what each vehicle sends."
+    best = (max if larger else min)(carried, key=lambda other: other["objective"])
+    behind = (values["objective"] - best["objective"]) * (1 if larger else -1)
+    name = f"The best of the simpler plans is “{best['name']}”"
+    if behind > 0:
+        return f"{name}, with {best['objective']:.4g}: {behind / values['objective']:.2%} behind this plan."
+    return f"{name}, with {best['objective']:.4g}: no worse than this plan."
+
+
+def _stages(parts: Sequence[Mapping[str, Any]]) -> str:
+    sentences = []
+    for link in LINKS:
+        by_stage: dict[str, float] = {}
+        for part in parts:
+            if part["link"] == link:
+                by_stage[part["stage"]] = by_stage.get(part["stage"], 0.0) + part["mb"]
+        total = sum(by_stage.values())
+        split = ", ".join(f"{mb / total:.0%} {stage}" for stage, mb in by_stage.items() if mb > 0)
+        sentences.append(f"Of what goes over the {link} link: {split}." if total else f"Nothing goes over {link}.")
+    return " ".join(sentences)
+
+
+def _budgets(measure: str, objective: float, both: Sequence[BudgetPoint]) -> str:
+    at = {point.factor: point.objective for point in both}
+    half = "With half of both budgets no plan fits the limits"
+    if 0.5 in at:
+        half = f"With half of both budgets the {measure} would be {at[0.5]:.4f}"
+    return f"{half}; with these it is {objective:.4f}; with double, {at[2.0]:.4f}."
+
+
+def _stragglers(vehicles: Sequence[Mapping[str, Any]], horizon_s: float | None) -> str:
+    if not vehicles:
+        return ""
+    missing = [row for row in vehicles if row["missed"]]
+    slowest = max(vehicles, key=lambda row: row["busy_s"])
+    within = f", within the {horizon_s:,.0f} s that links may be busy" if horizon_s is not None else ""
+    busy = f"The busiest link is that of {slowest['vehicle']}: {slowest['busy_s']:,.0f} s{within}."
+    if not missing:
+        return f"Every vehicle joins every round. {busy}"
+    names = ", ".join(f"{row['vehicle']} ({row['missed']})" for row in missing)
+    return f"Rounds that a vehicle leaves out because its link cannot carry them: {names}. {busy}"

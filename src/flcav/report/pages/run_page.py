@@ -1,0 +1,202 @@
+"""The page and the pictures of a run, from its results and the tables that its steps left."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flcav.dataset.store import Dataset
+from flcav.files import write_bytes
+from flcav.geometry import Boxes
+from flcav.perception.errors import PerceptionError, load_errors
+from flcav.perception.objects.truth import only_lidar
+from flcav.pipeline.arms import Names, settings_of
+from flcav.pipeline.findings import WORDS
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.graph import LOOK
+from flcav.pipeline.labels import labels_of
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.pipeline.results import ERRORS, LinkUse, Looked, Placed, Run, Seen
+from flcav.pipeline.running import WORK
+from flcav.report import style
+from flcav.report.charts import figures
+from flcav.report.charts.runs import STAGES, Row
+from flcav.report.pages import html
+from flcav.report.pictures import clouds as sweeps
+from flcav.report.pictures import maps
+
+CHART_NAMES: dict[str, str] = dict(zip((PRETRAIN, EDGE, CLOUD), STAGES, strict=True))
+OBJECTS = "objects"
+
+
+def write_report(run: Run, out: Path | str) -> Path:
+    """Draw a run's pictures in `out`/pictures, write `out`/report.html, and return its path; `out` is the run's folder.
+
+    Raises `InputError` where the folders of its steps are gone.
+    """
+    out = Path(out)
+    pictures = draw(run, out / WORK)
+    for name, png in pictures.items():
+        write_bytes(out / "pictures" / f"{name}.png", png)
+    shown = {name: png for name, png in pictures.items() if name != "overview"}
+    write_bytes(out / "report.html", html.render(page(run), shown).encode())
+    return out / "report.html"
+
+
+def page(run: Run) -> dict[str, Any]:
+    """Return what the page tells, for its template."""
+    recipe, main = run.recipe, run.arms[MAIN]
+    first = recipe.with_role("federate")[0]
+    rows = [
+        {
+            "name": WORDS[test.stage] if test.arm == MAIN else f"{WORDS[test.stage]} ({test.arm})",
+            "region": test.region,
+            "task": test.task,
+            "measure": test.result.measure,
+            **vars(test.result.estimate),
+            "numbers": test.result.numbers,
+            "frames": test.result.frames,
+            "scenes": test.result.scenes,
+            "main": test.arm == MAIN,
+        }
+        for test in run.tested
+    ]
+    return {
+        "seed": recipe.seed,
+        "tasks": list(recipe.tasks),
+        "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
+        "first": first,
+        "stages": [row for row in rows if row["main"] and row["region"] == first],
+        "tests": rows,
+        "findings": run.findings,
+        "placed": main.placed,
+        "plan": main.plan,
+        "links": main.links,
+        "sent": {link: [main.sent_mb(task, link) for task in recipe.tasks] for link in main.links},
+        "gap_closed": run.gap_closed,
+        "differences": run.differences,
+        "caveats": run.caveats,
+        "elapsed_s": run.elapsed_s,
+        "provenance": run.provenance,
+    }
+
+
+def draw(run: Run, work: Path) -> dict[str, bytes]:
+    """Return the pictures as PNG files by name."""
+    main, drawn = run.arms[MAIN], {}
+    scenes = [(placed, scene) for placed in main.placed if (scene := _map(run, work, placed)) is not None]
+    for placed, scene in scenes:
+        drawn[f"map_{placed.region}"] = figures.town_map(scene)
+    charts = {task: (*_chart(run, task), _measure(run, task)) for task in run.recipe.tasks}
+    for task, chart in charts.items():
+        drawn[f"rounds_{_file_name(task)}"] = figures.by_round(*chart)
+    drawn["megabytes"] = figures.megabytes(_sent(run), {link: use.budget_mb for link, use in main.links.items()})
+    sweep = _sweep(work, _names(run), run) if (work / LOOK).is_dir() else None
+    if sweep is not None:
+        drawn["before_after"] = figures.before_after(sweep)
+        if scenes:
+            drawn["overview"] = figures.overview(scenes[0][1], sweep, *charts[OBJECTS])
+    return {name: style.png(figure) for name, figure in drawn.items()}
+
+
+def _file_name(task: str) -> str:
+    return task.replace(":", "_")
+
+
+def _names(run: Run) -> Names:
+    labels = {task: labels_of(task, own.labels) for task, own in run.recipe.tasks.items()}
+    return Names(settings_of(run.recipe, labels))
+
+
+def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
+    """Return a region's errors and poles; None where its town is not known."""
+    names, tasks = _names(run), run.recipe.placement.tasks
+    if not tasks:
+        return None
+    drive = Frames.open(work / names.recording(placed.region, "registry", tasks[0])).data
+    town = drive.town()
+    if town is None or not placed.poles:
+        return None
+    errors: list[PerceptionError] = []
+    for task in tasks:
+        errors += load_errors(work / names.errors(MAIN, placed.region, task) / ERRORS)
+    return maps.ErrorMap(
+        town,
+        np.array([(error.x, error.y, error.z) for error in errors]).reshape(-1, 3),
+        np.array([error.kind for error in errors], dtype=np.str_),
+        {number: at for number, at in maps.poles_of(town).items() if int(number) in {p.pole for p in placed.poles}},
+        tuple(str(pole) for pole in placed.chosen),
+        str(placed.densest),
+        placed.range_m,
+    )
+
+
+def _chart(run: Run, task: str) -> tuple[list[Row], list[Row]]:
+    """Return the rounds of a task and its tests, as the chart takes them."""
+    starts = " + ".join(run.recipe.with_role("pretrain"))
+    (pretrained,) = (each for each in run.pretrained if each.task == task)
+    rounds: list[Row] = [
+        {"stage": CHART_NAMES[PRETRAIN], "round": number, "town": starts, "score": block.score}
+        for number, block in enumerate(pretrained.blocks, start=1)
+    ]
+    for watched in run.watched:
+        if watched.task == task:
+            stage = CHART_NAMES[watched.stage]
+            rounds += [
+                {"stage": stage, "round": each.round, "town": watched.region, "score": each.score}
+                for each in watched.rounds
+                if each.round
+            ]
+    tested: list[Row] = [
+        {
+            "stage": CHART_NAMES[test.stage],
+            "town": test.region,
+            "score": test.result.estimate.mean,
+            "low": test.result.estimate.low,
+            "high": test.result.estimate.high,
+        }
+        for test in run.tested
+        if (test.arm, test.task) == (MAIN, task)
+    ]
+    return rounds, tested
+
+
+def _measure(run: Run, task: str) -> str:
+    return next(test.result.measure for test in run.tested if test.task == task)
+
+
+def _sent(run: Run) -> Sequence[Row]:
+    """Return what the run itself sent over each link, by stage."""
+    stages = dict.fromkeys(spent.stage for spent in run.arms[MAIN].spent)
+    links: dict[str, LinkUse] = dict(run.arms[MAIN].links)
+    return [
+        {
+            "stage": CHART_NAMES[stage],
+            "link": link,
+            "mb": sum(spent.mb for spent in run.arms[MAIN].spent if (spent.stage, spent.link) == (stage, link)),
+        }
+        for stage in stages
+        for link in links
+    ]
+
+
+def _sweep(work: Path, names: Names, run: Run) -> sweeps.Sweep:
+    looked = Looked.load(work / LOOK)
+    region = run.recipe.with_role("federate")[0]
+    data: Dataset = Frames.open(work / names.recording(region, "test", OBJECTS)).data
+    frame = data.frame(looked.frame)
+    lidar = only_lidar(frame)
+    ground_m = -float(frame.world_from_sensor(lidar)[2, 3])
+    before, after = _detections("pretrained", looked.before), _detections("after the last stage", looked.after)
+    return sweeps.Sweep(frame.lidar[lidar], ground_m, _boxes(looked.targets), before, after)
+
+
+def _detections(title: str, seen: Seen) -> sweeps.Detections:
+    return sweeps.Detections(
+        title, _boxes(seen.boxes), np.array(seen.hit, dtype=bool), np.array(seen.found, dtype=bool)
+    )
+
+
+def _boxes(rows: Sequence[Sequence[float]]) -> Boxes:
+    return Boxes.from_array(np.array(rows, dtype=np.float64).reshape(-1, 7), "Car")

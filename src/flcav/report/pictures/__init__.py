@@ -1,0 +1,1 @@
+"""Pictures of what sensors see and networks find."""

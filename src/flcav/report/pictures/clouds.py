@@ -1,0 +1,190 @@
+"""Point clouds seen from above, with boxes: one sweep, and two compared."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from flcav.geometry import Boxes
+from flcav.perception.images import CameraView
+from flcav.report import style
+from flcav.report.pictures.camera import boxes_on_picture, show_view
+
+GROUND_M = 0.25  # returns less than this above the ground are drawn as ground
+Extent = tuple[float, float, float]  # shown behind (negative), ahead, aside [m]
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What one network found in a sweep, matched with the sweep's targets by whoever evaluated it."""
+
+    title: str
+    boxes: Boxes  # (N,) without those of neutral objects
+    hit: NDArray[np.bool_]  # (N,) matched with a target; else a false positive
+    found: NDArray[np.bool_]  # (M,) targets that a detection matched; else missed
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One sweep seen by two networks. One frame for all: x forward, y left, at the sensor or its vehicle."""
+
+    points: NDArray[np.float32]  # (P, >=3) x, y, z [m]
+    ground_m: float  # z of the ground there
+    targets: Boxes  # (M,)
+    before: Detections
+    after: Detections
+
+
+def on_page(xy: NDArray) -> NDArray:
+    """Return (..., 2) x ahead, y left as picture coordinates: across, up."""
+    return np.stack((-xy[..., 1], xy[..., 0]), axis=-1)
+
+
+def draw_points(axes: Axes, points: NDArray[np.float32], ground_m: float, extent: Extent) -> None:
+    """Draw the (P, >=3) points within `extent`, what stands on the ground darker than it, and set the axes to it."""
+    behind, ahead, aside = extent
+    shown = points[(points[:, 0] > behind) & (points[:, 0] < ahead) & (np.abs(points[:, 1]) < aside)]
+    low = shown[:, 2] < ground_m + GROUND_M
+    for part, colour, size in ((shown[low], style.GROUND, 0.5), (shown[~low], style.POINT, 1.0)):
+        axes.scatter(*on_page(part[:, :2]).T, s=size, color=colour, linewidths=0, rasterized=True)
+    axes.set(xlim=(-aside, aside), ylim=(behind, ahead), aspect="equal")
+
+
+def draw_boxes(
+    axes: Axes, boxes: Boxes, colour: str, *, fill: float = 0.0, width: float = 1.2, dashed: bool = False
+) -> None:
+    """Draw the ground outlines of `boxes`, filled with opacity `fill`, each with a tick through its front."""
+    ahead = np.stack((np.cos(boxes.yaw), np.sin(boxes.yaw)), axis=1)
+    tip = boxes.center[:, :2] + ahead * (boxes.size[:, :1] / 2 + 0.6)
+    ticks = on_page(np.stack((boxes.center[:, :2], tip), axis=1))
+    outlines = on_page(boxes.corners()[:, :4, :2])
+    look = {"edgecolor": colour, "linewidth": width, "zorder": 3}
+    dash = (0, (3, 2)) if dashed else "solid"
+    axes.add_collection(PolyCollection(list(outlines), facecolor=(colour, fill), linestyle=[dash], **look))
+    axes.add_collection(LineCollection(list(ticks), **look))
+
+
+def draw_detections(axes: Axes, sweep: Sweep, found: Detections, extent: Extent) -> None:
+    """Draw the sweep, its targets and what one network found: hits, misses and false positives told apart."""
+    draw_points(axes, sweep.points, sweep.ground_m, extent)
+    draw_boxes(axes, sweep.targets, style.INK)
+    draw_boxes(axes, sweep.targets[~found.found], style.MISSED, fill=0.6)
+    draw_boxes(axes, found.boxes[found.hit], style.HIT, fill=0.35)
+    draw_boxes(axes, found.boxes[~found.hit], style.FALSE, fill=0.2, dashed=True)
+    axes.plot(0, 0, "^", color=style.INK, markersize=7, clip_on=False, zorder=5)
+
+
+def key(found: Detections | None = None) -> list[Patch]:
+    """Return legend entries of what `draw_detections` draws, with counts where `found` is given."""
+    entries = (("found", style.HIT, 0.35), ("missed", style.MISSED, 0.6), ("false", style.FALSE, 0.2))
+    counts = ("", "", "") if found is None else (found.found.sum(), (~found.found).sum(), (~found.hit).sum())
+    return [
+        Patch(facecolor=(colour, fill), edgecolor=colour, label=f"{count} {word}".strip())
+        for count, (word, colour, fill) in zip(counts, entries, strict=True)
+    ]
+
+
+COLOURS = (style.INK, style.BLUE, style.ORANGE)
+EXTENT = (0.0, 60.0, 22.0)
+
+
+@dataclass(frozen=True)
+class Street:
+    """The street at some distance ahead; medians."""
+
+    ahead_m: str  # "near-far"
+    height_m: float  # sensor frame
+    spread_m: float  # of height: between quartiles
+    intensity: float
+
+
+@dataclass(frozen=True)
+class SeenCar:
+    """A car that has returns."""
+
+    distance_m: float
+    returns: int
+    length_m: float
+    width_m: float
+    height_m: float
+    without_intensity: float  # share of its returns
+
+
+@dataclass(frozen=True)
+class CloudNumbers:
+    """What the clouds of some frames are like; means per frame."""
+
+    frames: int
+    returns: float
+    returns_per_range: Mapping[str, float]  # "near-far m" -> returns
+    intensity_quantiles: tuple[float, ...]  # 5, 25, 50, 75 and 95 %
+    without_intensity: float  # share of returns
+    ground: tuple[Street, ...]
+    cars: tuple[SeenCar, ...]
+
+
+@style.styled
+def compare(clouds: Mapping[str, CloudNumbers]) -> Figure:
+    """Return four panels: returns per range, intensities, the street ahead, returns per car."""
+    figure = style.canvas(9.0, 6.4)
+    ranges, intensity, ground, cars = figure.subplots(2, 2).ravel()
+    for numbers, colour in zip(clouds.values(), COLOURS, strict=False):
+        width = 1.8 if colour == style.INK else 1.4
+        per_range = numbers.returns_per_range
+        ranges.plot(range(len(per_range)), list(per_range.values()), "o-", color=colour, linewidth=width, markersize=3)
+        ranges.set_xticks(range(len(per_range)), [key.removesuffix(" m") for key in per_range], rotation=45)
+        intensity.plot(numbers.intensity_quantiles, (5, 25, 50, 75, 95), "o-", color=colour, linewidth=width)
+        street = numbers.ground
+        middle = [np.mean([float(limit) for limit in row.ahead_m.split("-")]) for row in street]
+        ground.plot(middle, [row.intensity for row in street], "o-", color=colour, linewidth=width)
+        dots = np.array([(car.distance_m, car.returns) for car in numbers.cars]).reshape(-1, 2)
+        size = 34 if colour == style.INK else 9
+        cars.scatter(*dots.T, s=size, color=colour, linewidths=0, zorder=3 if colour == style.INK else 2)
+    _name(ranges, "returns of a frame", "distance [m]")
+    _name(intensity, "share of returns below [%]", "intensity")
+    _name(ground, "median intensity of the street", "distance ahead [m]")
+    _name(cars, "returns of a car", "distance [m]")
+    cars.set_yscale("log")
+    ground.set_ylim(bottom=0)
+    handles = [
+        Line2D([], [], color=colour, marker="o", label=name) for name, colour in zip(clouds, COLOURS, strict=False)
+    ]
+    style.key(figure, handles)
+    return figure
+
+
+@style.styled
+def real_frame(
+    name: str, points: NDArray[np.float32], view: CameraView, cars: Boxes, hit: NDArray[np.bool_], found: Boxes
+) -> Figure:
+    """Return a real frame's cloud from above beside its image, with the labelled cars and the boxes found.
+
+    `hit` (cars,): which were found at IoU 0.5.
+    """
+    figure = style.canvas(11.0, 4.9)
+    above, ahead = figure.subplots(1, 2, width_ratios=(1, 1.55))
+    draw_points(above, points, -1.7, EXTENT)
+    draw_boxes(above, cars[hit], style.GREEN, fill=0.25, width=1.0)
+    draw_boxes(above, cars[~hit], style.MISSED, fill=0.35, width=1.0)
+    draw_boxes(above, found, style.BLUE, width=1.4)
+    style.bare(above)
+    style.scale_bar(above, 10)
+    above.set_title(f"{name}: {hit.sum()} of {len(cars)} cars found at IoU 0.5")
+    show_view(ahead, view)
+    for boxes, colour in ((cars[hit], style.GREEN), (cars[~hit], style.MISSED), (found, style.BLUE)):
+        boxes_on_picture(ahead, boxes, view, colour, width=1.0)
+    colours = {"labelled, found": style.GREEN, "labelled, missed": style.MISSED, "detection": style.BLUE}
+    style.key(figure, [Line2D([], [], color=colour, label=name) for name, colour in colours.items()])
+    return figure
+
+
+def _name(axes: Axes, y: str, x: str) -> None:
+    axes.set_ylabel(y)
+    axes.set_xlabel(x)
+    axes.grid(axis="y")

@@ -1,0 +1,202 @@
+"""What a network found in one input, drawn on that input: a drawer per kind of mark, whatever the task."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+from matplotlib.patches import Patch, Rectangle
+from numpy.typing import NDArray
+
+from flcav.geometry import Boxes
+from flcav.perception.images import CameraView
+from flcav.perception.marks import Bars, CloudBoxes, Mark, Paths, PictureBoxes
+from flcav.perception.task import Finding
+from flcav.report import style
+from flcav.report.pictures.camera import boxes_on_picture, points_on_picture, show_view
+from flcav.report.pictures.clouds import draw_boxes, on_page
+from flcav.report.pictures.predicted_paths import paths_key, paths_on_map
+
+WIDTH_IN = 8.0
+ABOVE_IN = 6.5  # side of a cloud from above
+MAP_IN = 7.2  # side of a map
+BARS_IN = 3.6  # width of bars beside what was seen
+COLOURS = {  # of classes that people know by a colour
+    "Car": style.BLUE,
+    "Pedestrian": style.VERMILLION,
+    "Cyclist": style.GREEN,
+    "light_red": style.VERMILLION,
+    "light_yellow": style.ORANGE,
+    "light_green": style.GREEN,
+}
+BOX: dict[str, Any] = {"facecolor": "none", "linewidth": 1.4}
+
+
+@dataclass(frozen=True)
+class Panels:
+    """Where marks are drawn."""
+
+    seen: Axes  # the picture, the cloud from above, or the map
+    ahead: tuple[Axes, CameraView] | None  # above a cloud: a camera's picture of the same scene
+
+
+@style.styled
+def draw(finding: Finding) -> Figure:
+    """Return what was seen with all its marks: shares beside it, above a cloud a camera's picture where there is one.
+
+    Clouds and maps are drawn from above, ahead of the observer up. On a camera's picture above it the cloud is coloured
+    by distance, and boxes have their edges.
+    """
+    shares = [mark for mark in finding.marks if isinstance(mark, Bars)]
+    view = finding.view() if finding.seen.ndim == 2 else None
+    width, height = _size(finding.seen, view)
+    figure = style.canvas(width + BARS_IN * len(shares), height)
+    own: FigureBase = figure
+    if shares:
+        ratios = (width, *(BARS_IN for _ in shares))
+        own, *beside = figure.subfigures(1, 1 + len(shares), width_ratios=ratios, squeeze=False)[0]
+        for page, mark in zip(beside, shares, strict=True):
+            show_bars(page.add_subplot(), mark)
+    captions = " · ".join(mark.caption for mark in finding.marks)
+    panels = _show(own, finding.seen, view, f"{finding.path.name} · {captions}" if captions else finding.path.name)
+    handles: list[Artist] = []
+    for mark in finding.marks:
+        if not isinstance(mark, Bars):
+            handles += DRAWERS[type(mark)](panels, finding.seen, mark)
+    if finding.seen.ndim == 2:
+        _frame_from_above(panels.seen, finding.marks)
+    if handles:
+        style.key(own, handles)
+    return figure
+
+
+def _size(seen: NDArray[Any], view: CameraView | None) -> tuple[float, float]:
+    """Return width and height [inch] of what was seen, with its title."""
+    if seen.ndim == 2:
+        if view is None:
+            return ABOVE_IN, ABOVE_IN + 0.6
+        return WIDTH_IN, WIDTH_IN * view.picture.shape[0] / view.picture.shape[1] + ABOVE_IN + 1.2
+    if seen.dtype == np.bool_:
+        return MAP_IN, MAP_IN + 0.7
+    return WIDTH_IN, WIDTH_IN * seen.shape[0] / seen.shape[1] + 0.4
+
+
+def _show(page: FigureBase, seen: NDArray[Any], view: CameraView | None, title: str) -> Panels:
+    """Show what was seen; of a map, which its marks show, only the axes."""
+    if view is None:
+        axes = page.subplots()
+        axes.set_title(title)
+        if seen.ndim == 2:
+            _cloud_from_above(axes, seen)
+        elif seen.dtype != np.bool_:
+            _picture(axes, seen)
+        return Panels(axes, None)
+    height = WIDTH_IN * view.picture.shape[0] / view.picture.shape[1]
+    ahead, above = page.subplots(2, 1, height_ratios=(height, ABOVE_IN))
+    ahead.set_title(title)
+    show_view(ahead, view)
+    bar = page.colorbar(
+        points_on_picture(ahead, seen, view),
+        ax=ahead,
+        location="bottom",
+        extend="max",
+        fraction=0.03,
+        pad=0.01,
+        aspect=70,
+    )
+    bar.set_label("distance of a return [m]")
+    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    _cloud_from_above(above, seen)
+    return Panels(above, (ahead, view))
+
+
+def _picture(axes: Axes, picture: NDArray[np.uint8]) -> None:
+    height, width = picture.shape[:2]
+    axes.imshow(picture, extent=(0, width, height, 0))  # pixels by their edges
+    style.bare(axes)
+
+
+def _cloud_from_above(axes: Axes, points: NDArray[np.float32]) -> None:
+    axes.scatter(*on_page(points[:, :2]).T, s=0.4, color=style.POINT, linewidths=0, rasterized=True)
+    axes.plot(0, 0, "^", color=style.INK, markersize=6)
+    style.bare(axes)
+
+
+def _frame_from_above(axes: Axes, marks: Iterable[Mark]) -> None:
+    """Set the axes of a cloud so that all boxes are seen, and put a scale bar into them."""
+    boxes = [mark.boxes for mark in marks if isinstance(mark, CloudBoxes)]
+    corners = [on_page(each.corners()[..., :2]).reshape(-1, 2) for each in boxes]
+    across, up = np.concatenate([np.zeros((0, 2)), *corners]).T
+    aside, ahead = (float(np.max(ends, initial=least) + 2) for ends, least in ((np.abs(across), 28), (up, 52)))
+    axes.set(xlim=(-aside, aside), ylim=(-6, ahead), aspect="equal")
+    style.scale_bar(axes, 10)
+
+
+def show_bars(axes: Axes, bars: Bars) -> None:
+    """Draw a bar per name, the largest share in colour."""
+    names, best = list(bars.share), bars.caption
+    colours = [style.BLUE if name == best else style.RULE for name in names]
+    drawn = axes.barh(names, list(bars.share.values()), color=colours)
+    axes.bar_label(drawn, fmt="%.2f", padding=3, fontsize=style.SMALL, color=style.INK)
+    axes.set(xlim=(0, 1.15), xticks=[])
+    axes.invert_yaxis()
+    axes.spines["bottom"].set_visible(False)
+    axes.set_title(bars.title)
+
+
+def boxes_in_picture(axes: Axes, mark: PictureBoxes) -> None:
+    """Draw the rectangles on a picture that `axes` show; each names its class and score."""
+    width = max(axes.get_xlim())
+    for (x1, y1, x2, y2), name, score in zip(mark.box.tolist(), mark.label, mark.score, strict=True):
+        colour = COLOURS.get(str(name), style.BLUE)
+        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linewidth=1.4))
+        right = x1 > 0.7 * width  # the name stays within the picture
+        axes.annotate(
+            f"{name.replace('_', ' ')} {score:.2f}",
+            (x2 if right else x1, y1),
+            (0, 2),
+            textcoords="offset points",
+            ha="right" if right else "left",
+            fontsize=style.SMALL,
+            color="white",
+            bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8},
+        )
+
+
+def _draw_picture_boxes(panels: Panels, seen: NDArray[Any], mark: PictureBoxes) -> list[Artist]:
+    boxes_in_picture(panels.seen, mark)
+    return []
+
+
+def _draw_cloud_boxes(panels: Panels, seen: NDArray[Any], mark: CloudBoxes) -> list[Artist]:
+    handles: list[Artist] = []
+    for name, own in _by_class(mark.boxes).items():
+        colour = COLOURS.get(name, style.PURPLE)
+        draw_boxes(panels.seen, own, colour, width=1.4)
+        if panels.ahead is not None:
+            boxes_on_picture(panels.ahead[0], own, panels.ahead[1], colour)
+        handles.append(Patch(edgecolor=colour, label=f"{len(own)} {name}", **BOX))
+    return handles
+
+
+def _by_class(boxes: Boxes) -> dict[str, Boxes]:
+    """Return the boxes of each class that there is, those with a colour of their own first."""
+    found = set(boxes.label.tolist())
+    names = [name for name in COLOURS if name in found] + sorted(found - COLOURS.keys())
+    return {name: boxes[boxes.label == name] for name in names}
+
+
+def _draw_paths(panels: Panels, seen: NDArray[Any], mark: Paths) -> list[Artist]:
+    paths_on_map(panels.seen, seen, mark)
+    style.scale_bar(panels.seen, 10)
+    return [*paths_key(mark)]
+
+
+DRAWERS: Mapping[type, Callable[[Panels, NDArray[Any], Any], list[Artist]]] = {
+    PictureBoxes: _draw_picture_boxes,
+    CloudBoxes: _draw_cloud_boxes,
+    Paths: _draw_paths,
+}

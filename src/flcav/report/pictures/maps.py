@@ -1,0 +1,106 @@
+"""A town from above, with what a placement is about."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection, PolyCollection
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+
+from flcav.geometry import Boxes
+from flcav.report import style
+from flcav.world.map.town import Town
+
+Array = NDArray[np.float64]
+
+MISS: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 5,
+    "color": style.MISSED,
+    "markeredgecolor": "white",
+    "markeredgewidth": 0.5,
+}
+FALSE_POSITIVE: dict[str, Any] = {"marker": "x", "markersize": 5, "color": style.FALSE, "markeredgewidth": 1.3}
+FINAL_ERROR: dict[str, Any] = {**MISS, "marker": "^", "color": style.ORANGE}
+OTHER: dict[str, Any] = {**MISS, "marker": "D", "markersize": 4, "color": style.INK}
+KINDS = {
+    "miss": ("missed", MISS),
+    "false_positive": ("false positive", FALSE_POSITIVE),
+    "final_error": ("final error", FINAL_ERROR),
+}
+NOTE_M = 15.0  # about where a note stands above its pole
+WIDE = 3.0  # a note is so much wider than high
+HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
+
+
+@dataclass(frozen=True)
+class ErrorMap:
+    """Where a network erred in a town, and where a roadside sensor is put for it."""
+
+    town: Town
+    errors: Array  # (E, 3) world [m]
+    kind: NDArray[np.str_]  # (E,) a key of KINDS, or what the user calls it
+    poles: Mapping[str, Array]  # candidate sites by id: (3,) world [m]
+    chosen: Collection[str] = ()  # ids of the poles that were placed
+    densest: str | None = None  # id of the pole with most actors within range
+    range_m: float = 0.0  # of the sensors that were placed
+
+
+def poles_of(town: Town) -> dict[str, Array]:
+    """Return a town's candidate sites by id."""
+    return {str(number): xyz for number, xyz in zip(town.poles.id, town.poles.position, strict=True)}
+
+
+def draw_town(axes: Axes, town: Town) -> None:
+    """Draw roads, buildings and trees of `town`, and a scale bar."""
+    x_low, y_low, x_high, y_high = town.bounds
+    axes.set(xlim=(x_low, x_high), ylim=(y_low, y_high), aspect="equal")
+    style.bare(axes)
+    axes.add_collection(PolyCollection(list(town.sidewalks), facecolor=style.SIDEWALK, linewidth=0))
+    axes.add_collection(PolyCollection(list(town.roads), facecolor=style.ROAD, edgecolor=style.ROAD, linewidth=0.5))
+    trees = [Circle((x, y), radius) for x, y, _, radius in town.trees]
+    axes.add_collection(PatchCollection(trees, facecolor=style.TREE, linewidth=0))
+    x, y, yaw, length, width, height = town.buildings.T
+    houses = Boxes.from_array(np.c_[x, y, height / 2, length, width, height, yaw], "building")
+    outlines = houses.corners()[:, :4, :2]
+    axes.add_collection(PolyCollection(list(outlines), facecolor=style.BUILDING, linewidth=0))
+    style.scale_bar(axes, 50)
+
+
+def draw_errors(axes: Axes, scene: ErrorMap) -> None:
+    """Draw the town, its registered errors, and its poles: the chosen with what they cover, the densest marked."""
+    draw_town(axes, scene.town)
+    for number in scene.chosen:
+        at = scene.poles[number]
+        reach = np.sqrt(max(scene.range_m**2 - at[2] ** 2, 0.0))  # of the sphere, at ground level
+        axes.add_patch(Circle(tuple(at[:2]), reach, facecolor=style.BLUE, alpha=0.10, linewidth=0))
+        axes.add_patch(Circle(tuple(at[:2]), reach, fill=False, edgecolor=style.BLUE, linewidth=1.2))
+    for kind in dict.fromkeys([*KINDS, *scene.kind.tolist()]):
+        label, look = KINDS.get(kind, (kind, OTHER))
+        xyz = scene.errors[scene.kind == kind]
+        if not len(xyz):
+            continue
+        axes.plot(*xyz[:, :2].T, linestyle="none", label=f"{label} ({len(xyz)})", **look)
+    notes: list[Array] = []  # where they stand
+    for number, (x, y, _) in scene.poles.items():
+        chosen, densest = number in scene.chosen, number == scene.densest
+        face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)
+        axes.plot(x, y, "s" if densest else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
+        axes.text(x, y, number, ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
+        if note := " and ".join(word for word, said in (("placed", chosen), ("densest traffic", densest)) if said):
+            others = [xyz[:2] for other, xyz in scene.poles.items() if other != number]
+            notes.append(_write_beside(axes, note, np.array([x, y]), np.array([*others, *notes]).reshape(-1, 2)))
+
+
+def _write_beside(axes: Axes, note: str, at: Array, others: Array) -> Array:
+    """Write `note` above or below the pole `at`, whichever is farther from the `others` (N, 2); return where (2,)."""
+    places = [at + np.array((0.0, side * NOTE_M)) for side in (1, -1)]
+    above, below = (np.hypot(*((others - place) / (WIDE, 1.0)).T).min(initial=np.inf) for place in places)
+    look = {"fontsize": style.SMALL, "fontweight": "bold", "path_effects": HALO, "zorder": 6}
+    offset, align = (10, "bottom") if above >= below else (-10, "top")
+    axes.annotate(note, (at[0], at[1]), (0, offset), textcoords="offset points", ha="center", va=align, **look)
+    return places[0] if above >= below else places[1]

@@ -1,0 +1,192 @@
+"""A scene as a Rerun recording: map, agents and their sensors' data, actors and the tracks they leave.
+
+Everything lies below `world` (ENU, z up); an agent at `world/agents/<agent>`, its sensors below it. There are two time
+lines: `spin`, and `time` of the simulation.
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from io import BytesIO
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+import rerun as rr  # pyright: ignore[reportMissingImports] # of the extra `view`
+import rerun.blueprint as rrb  # pyright: ignore[reportMissingImports]
+from matplotlib import colormaps
+from numpy.typing import NDArray
+from PIL import Image
+
+from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
+from flcav.dataset.store import Dataset
+from flcav.geometry import inverse
+from flcav.progress import Report, silent
+from flcav.sensors.frame import Frame
+from flcav.sensors.radar.radar import echo_directions
+from flcav.world.map.layers import MapLayers
+
+Array = NDArray[np.float64]
+
+LIDAR_COLOURS = colormaps["turbo"]
+RADAR_COLOURS = colormaps["coolwarm"]
+RADAR_M_S = 15.0  # Doppler at which the colours end
+BEHIND_M = (-28.0, 0.0, 16.0)  # where the eye is at first, in the agent's frame
+AGENTS = "world/agents"
+
+
+def log_scene(
+    recording: Any,
+    dataset: Dataset,
+    selected: Sequence[int],
+    layers: MapLayers | None,
+    progress: Report = silent,
+) -> None:
+    """Log the frames `selected` of one scene into a `rerun.RecordingStream`; `layers` is the map of its town."""
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    if layers is not None:
+        _log_map(recording, layers)
+    tracks: dict[str, list[Array]] = defaultdict(list)
+    done = 0
+    for spin, numbers in groupby(selected, key=lambda i: dataset.keys[i].index):
+        frames = [dataset.frame(i) for i in numbers]
+        recording.set_time("spin", sequence=spin)
+        recording.set_time("time", duration=frames[0].time_s)
+        for frame in frames:
+            _log_agent(recording, frame)
+        _log_actors(recording, frames, tracks)
+        done += len(frames)
+        progress(done, len(selected), "")
+
+
+def blueprint(spin: Sequence[Frame]) -> Any:
+    """Return the layout in which a scene opens: the world seen from above and behind one agent, beside it its cameras.
+
+    The agent is the first of the frames `spin` that has cameras, or the first of all.
+    """
+    frame = next((frame for frame in spin if frame.images or frame.infrared), spin[0])
+    behind, agent = frame.world_from_agent @ (*BEHIND_M, 1.0), frame.world_from_agent[:3, 3]
+    eye = rrb.EyeControls3D(position=behind[:3], look_target=agent, eye_up=(0, 0, 1))
+    world = rrb.Spatial3DView(origin="world", name="world", eye_controls=eye)
+    pictures = [
+        rrb.Spatial2DView(origin=f"{AGENTS}/{frame.agent}/{name}", name=f"{frame.agent} {name}")
+        for name in (*frame.images, *frame.infrared)
+    ]
+    views = rrb.Horizontal(world, rrb.Grid(*pictures), column_shares=[3, 2]) if pictures else world
+    return rrb.Blueprint(views, rrb.TimePanel(state="collapsed", timeline="spin"), collapse_panels=True)
+
+
+def _log_map(recording: Any, layers: MapLayers) -> None:
+    outlines = {
+        "roads": (layers.roads, (110, 110, 115)),
+        "sidewalks": (layers.sidewalks, (150, 140, 120)),
+        "crossings": ([crossing.outline for crossing in layers.crossings], (220, 220, 220)),
+    }
+    for name, (polygons, colour) in outlines.items():
+        _log_lines(recording, f"world/map/{name}", [np.vstack((line, line[:1])) for line in polygons], colour)
+    lanes = [lane.centre_line for lane in layers.lanes if lane.kind != "walkingarea"]
+    _log_lines(recording, "world/map/lanes", lanes, (35, 60, 80))
+    _log_lines(recording, "world/map/markings", [marking.line for marking in layers.markings], (235, 235, 235))
+
+
+def _log_lines(recording: Any, path: str, lines: Sequence[Array], colour: tuple[int, int, int]) -> None:
+    strips = [np.column_stack((line, np.zeros(len(line)))) for line in lines]
+    recording.log(path, rr.LineStrips3D(strips, colors=colour, radii=0.05), static=True)
+
+
+def _log_agent(recording: Any, frame: Frame) -> None:
+    path = f"{AGENTS}/{frame.agent}"
+    _log_pose(recording, path, frame.world_from_agent)
+    agent_from_world = inverse(frame.world_from_agent)
+    for name in frame.calibration.agent_from_sensor:
+        _log_pose(recording, f"{path}/{name}", agent_from_world @ frame.world_from_sensor(name))
+    for name, points in frame.lidar.items():
+        colours = LIDAR_COLOURS(np.sqrt(np.clip(points[:, 3], 0, 1)), bytes=True)
+        recording.log(f"{path}/{name}", rr.Points3D(points[:, :3], colors=colours, radii=0.03))
+    for name, echoes in frame.radar.items():
+        _log_radar(recording, f"{path}/{name}", echoes)
+    for name, picture in frame.images.items():
+        _log_pinhole(recording, f"{path}/{name}", frame.calibration.intrinsics[name], picture.rgb)
+        _log_picture(recording, f"{path}/{name}", picture.rgb)
+        _log_rectangles(recording, f"{path}/{name}", frame, name)
+    for name, picture in frame.infrared.items():
+        _log_pinhole(recording, f"{path}/{name}", frame.calibration.intrinsics[name], picture)
+        low, high = np.percentile(picture, (1, 99))
+        grey = np.clip((picture - low) / max(high - low, 1) * 255, 0, 255).astype(np.uint8)
+        _log_picture(recording, f"{path}/{name}", grey)
+    for name, (latitude, longitude, _) in frame.gnss.items():
+        recording.log(f"gnss/{frame.agent}/{name}", rr.GeoPoints(lat_lon=[[latitude, longitude]]))
+    for name, reading in frame.imu.items():
+        recording.log(f"imu/{frame.agent}/{name}", rr.Scalars(reading))
+
+
+def _log_pose(recording: Any, path: str, parent_from_child: Array) -> None:
+    recording.log(path, rr.Transform3D(translation=parent_from_child[:3, 3], mat3x3=parent_from_child[:3, :3]))
+
+
+def _log_radar(recording: Any, path: str, echoes: NDArray[np.float32]) -> None:
+    colours = RADAR_COLOURS(0.5 + echoes[:, 3] / (2 * RADAR_M_S), bytes=True)
+    recording.log(path, rr.Points3D(echoes[:, :1] * echo_directions(echoes), colors=colours, radii=0.12))
+
+
+def _log_pinhole(recording: Any, path: str, intrinsics: Array, picture: NDArray) -> None:
+    height, width = picture.shape[:2]
+    pinhole = rr.Pinhole(
+        image_from_camera=intrinsics,
+        resolution=[width, height],
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=1.2,
+    )
+    recording.log(path, pinhole)
+
+
+def _log_picture(recording: Any, path: str, pixels: NDArray[np.uint8]) -> None:
+    data = BytesIO()
+    Image.fromarray(pixels).save(data, "jpeg", quality=90)
+    recording.log(f"{path}/image", rr.EncodedImage(contents=data.getvalue(), media_type="image/jpeg"))
+
+
+def _log_rectangles(recording: Any, path: str, frame: Frame, camera: str) -> None:
+    truth = frame.annotations
+    views, signs = truth.views.get(camera), truth.signs.get(camera)
+    if views is not None:
+        shown = np.flatnonzero(views.pixels)
+        colours = [COLOURS.get(label, OTHER) for label in truth.boxes.label[shown].tolist()]
+        _log_boxes(recording, f"{path}/image/actors", views.visible_box[shown], truth.track[shown].tolist(), colours)
+    if signs is not None:
+        names = [f"{kind} {state}".strip() for kind, state in zip(signs.kind, signs.state)]
+        _log_boxes(recording, f"{path}/image/signs", signs.box, names, [SIGN] * len(signs))
+
+
+def _log_boxes(recording: Any, path: str, boxes: Array, labels: list[str], colours: list) -> None:
+    from_corner = boxes.reshape(-1, 4) + 0.5  # Rerun's first pixel begins, ours has its centre at 0
+    rectangles = rr.Boxes2D(
+        array=from_corner, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=colours, show_labels=False
+    )
+    recording.log(path, rectangles)
+
+
+def _log_actors(recording: Any, spin: list[Frame], tracks: dict[str, list[Array]]) -> None:
+    """Log every actor that any agent's labels hold, and its track as a line up to here."""
+    actors = {}
+    for frame in spin:
+        boxes = frame.annotations.boxes
+        for i, track in enumerate(frame.annotations.track.tolist()):
+            actors[track] = (boxes.center[i], boxes.size[i], boxes.yaw[i], str(boxes.label[i]))
+    for track, (center, size, _, _) in actors.items():
+        tracks[track].append(center - (0, 0, size[2] / 2))
+    colours = [COLOURS.get(label, OTHER) for *_, label in actors.values()]
+    yaw = np.array([yaw for _, _, yaw, _ in actors.values()])
+    turned = np.stack((0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)), axis=1)
+    boxes = rr.Boxes3D(
+        centers=np.array([center for center, *_ in actors.values()]).reshape(-1, 3),
+        sizes=np.array([size for _, size, *_ in actors.values()]).reshape(-1, 3),
+        quaternions=turned,
+        colors=colours,
+        labels=[f"{label} {track}" for track, (*_, label) in actors.items()],
+        show_labels=False,
+    )
+    recording.log("world/actors", boxes)
+    lines = [np.array(tracks[track]) for track in actors]
+    recording.log("world/tracks", rr.LineStrips3D(lines, colors=colours, radii=0.08))

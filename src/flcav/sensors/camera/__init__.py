@@ -1,0 +1,1 @@
+"""Cameras: lens, exposure and tone, infrared."""

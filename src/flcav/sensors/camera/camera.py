@@ -1,0 +1,76 @@
+"""A colour camera: deferred shading of what its rays meet, and the truth about every pixel from the same rays."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.compiled import compiled
+from flcav.sensors.camera.lens import Lens, directions
+from flcav.sensors.camera.tone import GRAINS, develop, grain
+from flcav.sensors.rendering.appearance import SEMANTICS
+from flcav.sensors.rendering.rain import add_drops
+from flcav.sensors.rendering.render import Picture, render
+from flcav.world.scene import Scene
+from flcav.world.weather import Weather
+
+
+class Camera(Lens):
+    """What a camera is built like; its pose is the rig's."""
+
+    noise: float = Field(default=0.8, ge=0, le=20)  # standard deviation of a colour value from 0 to 255
+    drops: bool = True  # whether rain leaves drops on the lens
+
+
+class Exposure(NamedTuple):
+    """One image and the truth about its pixels, each from the ray through the pixel's centre."""
+
+    rgb: NDArray[np.uint8]  # (H, W, 3) sRGB
+    depth_m: NDArray[np.float32]  # (H, W) along the optical axis; inf for the sky
+    semantic: NDArray[np.uint8]  # (H, W) one of SEMANTICS
+    instance: NDArray[np.int32]  # (H, W) 0 none, a + 1 = the trace's actor a, -(t + 1) = thing t of `town_things`
+
+
+def photograph(
+    scene: Scene,
+    world_from_camera: NDArray[np.float64],
+    camera: Camera,
+    weather: Weather,
+    rng: np.random.Generator,
+    *,
+    hidden: int | None = None,
+) -> Exposure:
+    """Return the image at the scene's instant, as if the actor `hidden` (the carrier) were not there.
+
+    `world_from_camera` (4, 4) places the optical frame (x right, y down, z forward): for a sensor mounted by body axes
+    it is `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments, and the same state of `rng`, give the same bytes.
+    """
+    picture = render(scene, world_from_camera, camera, weather, rng, hidden=hidden)
+    shape = (camera.height, camera.width)
+    if camera.drops and weather.rain_mm_h > 0:
+        add_drops(picture.radiance.reshape(*shape, 3), weather.rain_mm_h, rng)
+    rgb = np.empty((*shape, 3), np.uint8)
+    shift = int(rng.integers(GRAINS))
+    develop(picture.radiance, picture.exposure, grain(), shift, np.float32(camera.noise), rgb.reshape(-1, 3))
+    semantic, instance = _labels(picture)
+    depth = picture.seen.distance * directions(camera)[:, 2]
+    return Exposure(rgb, depth.reshape(shape), semantic.reshape(shape), instance.reshape(shape))
+
+
+def _labels(picture: Picture) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    semantic, instance = np.empty(len(picture.seen), np.uint8), np.empty(len(picture.seen), np.int32)
+    sky, line = SEMANTICS["sky"], SEMANTICS["road_line"]
+    _label(picture.seen, picture.appearance, picture.painted, sky, line, semantic, instance)
+    return semantic, instance
+
+
+@compiled
+def _label(seen, appearance, painted, sky, road_line, semantic, instance):
+    for ray in range(len(semantic)):
+        row = seen.row[ray]
+        if row < 0:
+            semantic[ray], instance[ray] = sky, 0
+        else:
+            semantic[ray] = road_line if painted[ray] else appearance.semantic[row]
+            instance[ray] = appearance.thing[row] if seen.instance[ray] == 0 else seen.instance[ray]

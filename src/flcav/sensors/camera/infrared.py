@@ -1,0 +1,209 @@
+"""A thermal camera: the temperature each pixel seems to have in the long-wave infrared (8 to 14 um).
+
+What a pixel shows is t * (e * T + (1 - e) * T_mirrored) + (1 - t) * T_air: the surface's own temperature T, weighted by
+its emissivity e, what it mirrors for the rest, and the air between, which transmits t = exp(-extinction * distance).
+Temperatures are mixed linearly instead of by radiance: within 30 K of each other that is right to about 1 K.
+
+T = T_air + warmth: a surface in the sun is up to `sun_k` warmer (times the cosine of incidence and what clouds let
+through), one that faces a clear night sky up to `sky_k` colder, rain takes most of both away. Vehicles that move are
+warm where engine, tyres, brakes and lamps are; people are as warm as skin and clothes are. Rain and fog hide heat
+less than light: the extinction of fog in the long-wave infrared is taken as 0.6 of that of light, the clear air's as
+0.2 per km. What other things hide from the sky cools less. Window panes mirror what is before them; the ground and
+walls are not as warm everywhere. The lens is no sharper than `BLUR_PX`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.ndimage import gaussian_filter
+
+from flcav.compiled import compiled
+from flcav.sensors.camera.lens import Lens, directions
+from flcav.sensors.rendering.ambient_occlusion import openness
+from flcav.sensors.rendering.appearance import Appearance, appearance_of
+from flcav.sensors.rendering.facade import wall_at
+from flcav.sensors.rendering.gbuffer import Survey, survey
+from flcav.sensors.rendering.light import light_of, soften, sunlit
+from flcav.sensors.rendering.noise import noise_at
+from flcav.world.materials import Material
+from flcav.world.scene import Scene
+from flcav.world.static import Part
+from flcav.world.weather import Weather
+
+Array = NDArray[np.float64]
+
+FAR_M = 1000.0
+KELVIN_STEP = 0.01  # of a thermal image
+FOG_SHARE, CLEAR_AIR_PER_M, RAIN_PER_M = 0.6, 0.0002, 0.0012
+ENGINE_SHARE = 0.28  # of a vehicle's length, from its front
+LAMP_K = 14.0  # how much warmer a lamp is that is on
+BLUR_PX = 0.6  # standard deviation of what the lens makes of a point
+PATCHES_K = 1.6  # between the warmest and the coldest spots of one surface
+PANE_EMISSIVITY = 0.85
+
+
+class Warmth(NamedTuple):
+    """How a material's temperature differs from the air's."""
+
+    sun_k: float = 10.0  # face on to a clear sun at noon
+    sky_k: float = 4.0  # how far below the air it cools under a clear night sky
+    emissivity: float = 0.94
+    moving_k: float = 0.0  # when its vehicle drives
+    body_c: float | None = None  # of living things: as warm as this, whatever the weather
+
+
+WARMTH: dict[Material, Warmth] = {
+    Material.GROUND: Warmth(sun_k=9, sky_k=6),
+    Material.ROAD: Warmth(sun_k=22, sky_k=-2),  # asphalt stays warm at night
+    Material.SIDEWALK: Warmth(sun_k=15, sky_k=0),
+    Material.WALL: Warmth(sun_k=14, sky_k=-2),
+    Material.ROOF: Warmth(sun_k=24, sky_k=7),
+    Material.BARK: Warmth(sun_k=6, sky_k=1),
+    Material.LEAF: Warmth(sun_k=3, sky_k=2),
+    Material.METAL: Warmth(sun_k=16, sky_k=6, emissivity=0.75),
+    Material.SIGN: Warmth(sun_k=12, sky_k=6, emissivity=0.85),
+    Material.PAINT: Warmth(sun_k=20, sky_k=6, emissivity=0.90, moving_k=1.5),
+    Material.GLASS: Warmth(sun_k=8, sky_k=5, emissivity=0.85, moving_k=2),
+    Material.TYRE: Warmth(sun_k=12, sky_k=2, moving_k=16),
+    Material.RIM: Warmth(sun_k=10, sky_k=4, emissivity=0.60, moving_k=28),
+    Material.HEADLAMP: Warmth(sun_k=8, sky_k=4, emissivity=0.85),
+    Material.TAILLAMP: Warmth(sun_k=8, sky_k=4, emissivity=0.90),
+    Material.PLATE: Warmth(sun_k=12, sky_k=5, emissivity=0.85),
+    Material.TRIM: Warmth(sun_k=14, sky_k=3, moving_k=12),
+    Material.INTERIOR: Warmth(sun_k=4, sky_k=1, moving_k=5),
+    Material.SKIN: Warmth(sun_k=1, sky_k=0, body_c=32.0),
+    Material.CLOTH: Warmth(sun_k=5, sky_k=0, body_c=25.0),
+    Material.TROUSERS: Warmth(sun_k=5, sky_k=0, body_c=23.0),
+    Material.LAMP: Warmth(sun_k=8, sky_k=5),
+    Material.LENS_RED: Warmth(sun_k=8, sky_k=4),
+    Material.LENS_AMBER: Warmth(sun_k=8, sky_k=4),
+    Material.LENS_GREEN: Warmth(sun_k=8, sky_k=4),
+}
+WALL, BUILDING = int(Material.WALL), int(Part.BUILDING)
+_SUN, _SKY, _EMISSIVITY, _MOVING = np.array([WARMTH[material][:4] for material in Material]).T
+_BODY = np.array([np.nan if WARMTH[material].body_c is None else WARMTH[material].body_c for material in Material])
+
+
+class Infrared(Lens):
+    """What a thermal camera is built like; its pose is the rig's."""
+
+    noise_k: float = Field(default=0.06, ge=0, le=5)  # standard deviation of a pixel
+
+
+def thermal_image(
+    scene: Scene,
+    world_from_camera: Array,
+    infrared: Infrared,
+    weather: Weather,
+    rng: np.random.Generator,
+    *,
+    hidden: int | None = None,
+) -> NDArray[np.uint16]:
+    """Return (height, width) apparent temperatures [0.01 K], as if the actor `hidden` (the carrier) were not there.
+
+    `world_from_camera` (4, 4) places the optical frame, as for `camera.photograph`.
+    """
+    rays = directions(infrared)
+    appearance, light = appearance_of(scene), light_of(weather)
+    hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden)
+    seen = survey(scene, appearance, world_from_camera, rays, hits)
+    lit = soften(sunlit(scene, seen, light, hidden), seen, infrared.width)
+    free = openness(scene, seen, infrared, hidden)
+    pane, patch = _texture_of(seen, appearance, infrared)
+    met = seen.row >= 0
+    material = appearance.material[np.maximum(seen.row, 0)]
+    air = air_temperature(weather)
+    heat = lit * np.clip(seen.normal @ np.array(light.to_sun), 0, 1) * _sunshine(weather)
+    cold = free * (0.5 + 0.5 * seen.normal[:, 2]) * (1 - 0.9 * weather.cloud_cover)
+    night = float(np.clip((8.0 - weather.sun_elevation_deg) / 14.0, 0, 1))
+    dry = 1 - 0.8 * max(weather.wetness, min(weather.rain_mm_h / 5.0, 1.0))
+    own = _SUN[material] * heat - night * _SKY[material] * np.where(_SKY[material] > 0, cold, 1.0) + PATCHES_K * patch
+    own = air + dry * own + _living(seen, material, air) + _driving(scene, seen, material, bool(light.lamps > 0.5))
+    rise = seen.ray[:, 2] - 2 * np.einsum("ij,ij->i", seen.ray, seen.normal) * seen.normal[:, 2]
+    mirrored = np.where(rise > 0, sky_temperature(weather, rise), air)
+    emissivity = np.where(pane > 0, 1 - pane * (1 - PANE_EMISSIVITY), _EMISSIVITY[material])
+    shown = emissivity * own + (1 - emissivity) * mirrored
+    shown = np.where(met, shown, sky_temperature(weather, seen.ray[:, 2]))
+    extinction = FOG_SHARE * weather.fog_per_m + CLEAR_AIR_PER_M + RAIN_PER_M * weather.rain_mm_h**0.6
+    passes = np.where(met, np.exp(-extinction * np.where(met, seen.distance, 0)), np.exp(-extinction * 500.0))
+    shape = (infrared.height, infrared.width)
+    kelvin = gaussian_filter((passes * shown + (1 - passes) * air).reshape(shape), BLUR_PX)
+    kelvin += infrared.noise_k * rng.standard_normal(shape, np.float32)
+    return np.rint(kelvin / KELVIN_STEP).clip(0, 65535).astype(np.uint16)
+
+
+def air_temperature(weather: Weather) -> float:
+    """Return the air's temperature [K]: mild, warmer the higher the sun, cooler under cloud and in rain."""
+    warm = 9.0 * np.sin(np.radians(np.clip(weather.sun_elevation_deg, -30, 90)))
+    return float(286.0 + warm - 2.5 * weather.cloud_cover * (warm > 0) - min(weather.rain_mm_h / 10.0, 1.0) * 2.0)
+
+
+def sky_temperature(weather: Weather, rise: NDArray[np.float32] | float) -> Array:
+    """Return the sky's apparent temperature [K] where a ray's sine of elevation is `rise`; clouds warm it."""
+    clear = 42.0 * np.clip(rise, 0, 1) ** 0.5 + 6.0
+    return air_temperature(weather) - clear * (1 - 0.85 * weather.cloud_cover)
+
+
+def _sunshine(weather: Weather) -> float:
+    """Return the sun's heat over that of a clear noon."""
+    height = max(np.sin(np.radians(weather.sun_elevation_deg)), 0.0)
+    return float(np.clip(height * 3, 0, 1) * (1 - 0.85 * np.clip((weather.cloud_cover - 0.3) / 0.6, 0, 1)))
+
+
+def _living(seen: Survey, material: NDArray[np.uint8], air: float) -> Array:
+    """Return how much warmer people are than the air [K]: clothes lie between the two."""
+    body = _BODY[material] + 273.15
+    clothed = np.where(material == Material.SKIN, 1.0, 0.7)
+    return np.where(np.isnan(body) | (seen.instance < 1), 0.0, clothed * (body - air))
+
+
+def _driving(scene: Scene, seen: Survey, material: NDArray[np.uint8], lamps_on: bool) -> Array:
+    """Return how much warmer the parts of vehicles under way are [K]."""
+    trace = scene.trace
+    warm = np.zeros(len(seen))
+    for actor in np.unique(seen.instance[seen.instance > 0]) - 1:
+        if trace.category[actor] in ("pedestrian", "bicycle") or str(trace.actor[actor]).startswith("parked"):
+            continue
+        rows = np.flatnonzero(seen.instance == actor + 1)
+        body = scene.world_from_actor(int(actor))
+        along = (seen.position[rows] - body[:3, 3]) @ body[:3, 0] / trace.size[actor, 0]
+        low = seen.position[rows, 2] - body[2, 3] < 0.62 * trace.size[actor, 2]
+        bonnet = np.clip((along - 0.5 + ENGINE_SHARE) / 0.08, 0, 1) * low
+        own = material[rows]
+        warm[rows] = _MOVING[own] + np.where(own == Material.PAINT, 9.0 * bonnet, 0) + 5.0 * bonnet
+        if lamps_on:
+            warm[rows] += LAMP_K * ((own == Material.HEADLAMP) | (own == Material.TAILLAMP))
+    return warm
+
+
+def _texture_of(
+    seen: Survey, appearance: Appearance, infrared: Infrared
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the share (N,) of window panes in each pixel, and by how much (N,) its spot is warmer, -0.5 to 0.5."""
+    pane, patch = np.zeros(len(seen), np.float32), np.zeros(len(seen), np.float32)
+    _texture(seen, appearance, np.float32(1 / infrared.intrinsics()[0, 0]), pane, patch)
+    return pane, patch
+
+
+@compiled
+def _texture(seen, appearance, pixel_angle, pane, patch):
+    table = appearance.noise
+    for ray in range(len(pane)):
+        row = seen.row[ray]
+        if row < 0 or seen.instance[ray] > 0:
+            continue
+        x, y, z = seen.position[ray, 0], seen.position[ray, 1], seen.position[ray, 2]
+        broad = noise_at(table, (x + z) * 0.25, (y - z) * 0.25)
+        patch[ray] = (
+            np.float32(0.7) * broad + np.float32(0.3) * noise_at(table, (x + z) * 2.1, (y - z) * 2.1) - np.float32(0.5)
+        )
+        if appearance.material[row] == WALL and appearance.part[row] == BUILDING:
+            nx, ny = seen.normal[ray, 0], seen.normal[ray, 1]
+            facing = -(seen.ray[ray, 0] * nx + seen.ray[ray, 1] * ny + seen.ray[ray, 2] * seen.normal[ray, 2])
+            across = seen.distance[ray] * pixel_angle
+            slant = across / max(facing, np.float32(0.02))
+            building = appearance.part_row[row]
+            found = wall_at(building, x, y, z, nx, ny, across, slant, appearance.facades, table)
+            pane[ray] = found[3]

@@ -1,0 +1,1 @@
+"""LiDAR: beams, returns, weather, motion during a spin."""

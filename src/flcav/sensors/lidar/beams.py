@@ -1,0 +1,67 @@
+"""Beam patterns of LiDARs: elevations by name, and the sensor of CARLA."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.config import Config
+
+
+class Beams(NamedTuple):
+    """What the name of a LiDAR stands for."""
+
+    elevations_deg: tuple[float, ...]  # of each channel, from the highest
+    azimuth_steps: int  # firings per spin
+    range_m: float
+
+
+def _even(high: float, low: float, count: int) -> tuple[float, ...]:
+    return tuple(float(elevation) for elevation in np.linspace(high, low, count).round(3))
+
+
+_HDL64E = (*_even(2.0, 2.0 - 31 / 3, 32), *_even(-8.83, -24.33, 32))  # an upper and a lower block of lasers
+_VLS128 = (
+    *(15.0, 11.75, 9.7, 8.43, 7.58, 6.98, 6.48, 6.08, 5.73, 5.43, 5.18, 4.98),
+    *_even(4.83, -6.5, 104),
+    *(-6.65, -6.85, -7.15, -7.65, -8.352, -9.244, -10.346, -11.742, -13.565, -16.042, -19.582, -25.0),
+)
+
+BEAMS: dict[str, Beams] = {
+    "vlp16": Beams(_even(15.0, -15.0, 16), 1800, 100.0),
+    "hdl32e": Beams(_even(10.67, -30.67, 32), 2170, 100.0),
+    "hdl64e": Beams(_HDL64E, 2083, 120.0),  # as on KITTI's car
+    "os1_128": Beams(_even(22.5, -22.5, 128), 1024, 120.0),
+    "vls128": Beams(_VLS128, 1800, 245.0),
+}
+
+
+class CarlaReturns(Config):
+    """CARLA's sensor attributes and their defaults."""
+
+    atmosphere_attenuation_rate: float = Field(default=0.004, ge=0, le=10)  # a of exp(-a distance) [1/m]
+    dropoff_general_rate: float = Field(default=0.45, ge=0, le=1)  # share of all rays that is lost
+    dropoff_intensity_limit: float = Field(default=0.8, ge=1e-6, le=1)  # weaker returns may be lost besides
+    dropoff_zero_intensity: float = Field(default=0.4, ge=0, le=1)  # share lost of returns of intensity 0
+
+
+def carla_returns(
+    settings: CarlaReturns,
+    directions: NDArray[np.float32],
+    distance: NDArray[np.float32],
+    noise_m: NDArray[np.float32],
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return (M, 4) points and (M,) the rays they come from.
+
+    `directions` (N, 3) and `distance` (N,) are those of the surfaces met (inf where none), `noise_m` (N,) the errors
+    of the measured ranges.
+    """
+    intensity = np.exp(-settings.atmosphere_attenuation_rate * distance)
+    at_zero, limit = settings.dropoff_zero_intensity, settings.dropoff_intensity_limit
+    lost = rng.random(len(distance)) < settings.dropoff_general_rate
+    lost |= rng.random(len(distance)) < np.where(intensity > limit, 0.0, at_zero * (1 - intensity / limit))
+    rays = np.flatnonzero(np.isfinite(distance) & ~lost)
+    measured = (distance[rays] + noise_m[rays])[:, None]
+    return np.concatenate((directions[rays] * measured, intensity[rays, None]), axis=1).astype(np.float32), rays

@@ -1,0 +1,232 @@
+"""A spinning LiDAR: its rays, what they meet through glass and air, and what the detector makes of the echoes.
+
+Power received from a surface, relative to a white one face on at 1 m: P = reflectivity * cos(incidence) / R^2,
+detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3). Rain, fog and wet roads change P; in clear
+weather they cost nothing and draw no random numbers.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flcav.config import Config
+from flcav.sensors.lidar.air import air_in, through_air
+from flcav.sensors.lidar.beams import BEAMS, CarlaReturns, carla_returns
+from flcav.sensors.lidar.returns import LEVELS, QUANTILES, Echoes, brightness, cast_through_glass, detect
+from flcav.sensors.lidar.rolling import sectors, time_in_spin_s
+from flcav.world.rays.raycaster import Hits
+from flcav.world.scene import OFFSET_S, Scene
+from flcav.world.weather import Weather
+
+CLEAR = Weather()
+
+
+class Lidar(Config):
+    """What a LiDAR is built like; its pose is the rig's."""
+
+    beams: str | None = None  # name of a model: its elevations, and its azimuth steps and range if not given
+    channels: int = Field(default=32, ge=1, le=256)  # beams above each other
+    azimuth_steps: int = Field(default=900, ge=4, le=8192)  # firings of each channel in a spin
+    range_m: float = Field(default=80.0, ge=0.1, le=1000)  # nothing further off is reported
+    up_deg: float = Field(default=3.0, ge=-90, le=90)  # elevation of the highest channel
+    down_deg: float = Field(default=-25.0, ge=-90, le=90)  # elevation of the lowest
+    elevations_deg: tuple[float, ...] | None = None  # of each channel, where they are not evenly spaced
+    rate_hz: float = Field(default=10.0, ge=0.1, le=100)  # spins a second
+    sensitivity_m: float = Field(
+        default=300.0, ge=0.1, le=1e5
+    )  # R_max: a white surface, face on, is detected up to here
+    noise_m: float = Field(default=0.02, ge=0, le=1)  # standard deviation of the measured range
+    dropout: float = Field(default=0.005, ge=0, lt=1)  # share of echoes lost whatever their power
+    glass_pass: float = Field(default=0.9, ge=0, le=1)  # share of rays that pass panes of glass
+    divergence_rad: float = Field(default=0.003, ge=1e-6, le=0.05)  # width of a beam over its range
+    roughness_rad: float = Field(default=0.0, ge=0, le=1.5)  # of ground, masonry, plants and cloth (Oren-Nayar)
+    intensity_gamma: float = Field(default=1.0, ge=0.01, le=2)  # brightness to this power is the intensity reported
+    intensity_floor: float = Field(default=0.0, ge=0, lt=1)  # intensities below are reported as 0
+    rolling: bool = False  # the world and the sensor move on while it spins
+    carla: CarlaReturns | None = None  # report as CARLA's LiDAR does, in place of the power equation
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_of_beams(cls, values: Any) -> Any:
+        name = values.get("beams") if isinstance(values, dict) else None
+        if not isinstance(name, str):
+            return values
+        if name not in BEAMS:
+            raise ValueError(f"no beams '{name}'; known beams: {', '.join(BEAMS)}")
+        known = BEAMS[name]
+        settled = {"channels": len(known.elevations_deg), "elevations_deg": known.elevations_deg}
+        for field, value in settled.items():
+            given = values.get(field)
+            if given is not None and (tuple(given) if isinstance(given, list) else given) != value:
+                raise ValueError(f"beams '{name}' settle {field}; leave it out")
+        return {"azimuth_steps": known.azimuth_steps, "range_m": known.range_m} | values | settled
+
+    @model_validator(mode="after")
+    def _check_spin(self) -> "Lidar":
+        if self.rolling and self.rate_hz < 0.5 / OFFSET_S:
+            raise ValueError(f"a rolling spin takes at most {2 * OFFSET_S} s: rate_hz must be {0.5 / OFFSET_S} or more")
+        return self
+
+    @model_validator(mode="after")
+    def _check_elevations(self) -> "Lidar":
+        if self.elevations_deg is not None:
+            if len(self.elevations_deg) != self.channels:
+                raise ValueError(
+                    f"{self.channels} channels need as many elevations_deg, not {len(self.elevations_deg)}"
+                )
+            if any(abs(elevation) > 90 for elevation in self.elevations_deg):
+                raise ValueError("every one of elevations_deg must lie within -90 and 90")
+        elif self.channels > 1 and self.down_deg >= self.up_deg:
+            raise ValueError(f"down_deg {self.down_deg} must be below up_deg {self.up_deg}")
+        return self
+
+
+def ray_pattern(lidar: Lidar) -> NDArray[np.float32]:
+    """Return (channels * azimuth_steps, 3) unit directions, sensor frame, channel after channel from the highest.
+
+    Within a channel, azimuth runs counter-clockwise once round from straight ahead.
+    """
+    return _ray_pattern(lidar.channels, lidar.up_deg, lidar.down_deg, lidar.elevations_deg, lidar.azimuth_steps)
+
+
+@lru_cache(maxsize=16)
+def _ray_pattern(
+    channels: int, up_deg: float, down_deg: float, elevations_deg: tuple[float, ...] | None, steps: int
+) -> NDArray[np.float32]:
+    even = np.linspace(up_deg, down_deg, channels)
+    elevation = np.radians(even if elevations_deg is None else np.sort(elevations_deg)[::-1])[:, None]
+    azimuth = np.arange(steps)[None] * (2 * np.pi / steps)
+    level = np.cos(elevation)
+    x, y, z = level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth
+    directions = np.stack((x, y, z), axis=-1).reshape(-1, 3).astype(np.float32)
+    directions.flags.writeable = False
+    return directions
+
+
+def draw_passes(lidar: Lidar, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Return, for each ray of the pattern, whether it passes the panes of glass it meets."""
+    return rng.random(lidar.channels * lidar.azimuth_steps, np.float32) < lidar.glass_pass
+
+
+def cast(
+    scene: Scene,
+    world_from_sensor: NDArray[np.float64],
+    lidar: Lidar,
+    passes: NDArray[np.bool_],
+    hidden: int | None = None,
+) -> Echoes:
+    """Return the first opaque surface within range of each ray, in a world without the actor `hidden`.
+
+    A rolling LiDAR is taken to ride on `hidden`, and to stand still where that is None.
+    """
+    pattern, surfaces = ray_pattern(lidar), scene.surfaces
+
+    def part(pose: NDArray[np.float64], rays: NDArray[np.int64] | slice) -> Echoes:
+        directions = pattern[rays]
+
+        def trace(rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
+            return scene.cast(pose, directions[rays], near_m=near_m, far_m=lidar.range_m, hidden=hidden)
+
+        return cast_through_glass(trace, passes[rays], surfaces.first, surfaces.material)
+
+    if not lidar.rolling:
+        return part(world_from_sensor, slice(None))
+    steps, whole = lidar.azimuth_steps, _room_for(len(pattern))
+    for columns, pose in sectors(scene, world_from_sensor, steps, 1 / lidar.rate_hz, hidden):
+        rays = (np.arange(lidar.channels)[:, None] * steps + columns).ravel()
+        for values, found in zip(whole, part(pose, rays)):
+            values[rays] = found
+    return whole
+
+
+def _room_for(rays: int) -> Echoes:
+    return Echoes(
+        np.empty(rays, np.float32),
+        np.empty(rays, np.int32),
+        np.empty(rays, np.int32),
+        np.empty(rays, np.uint8),
+        np.empty(rays, np.uint8),
+    )
+
+
+def measure(
+    scene: Scene,
+    world_from_sensor: NDArray[np.float64],
+    lidar: Lidar,
+    echoes: Echoes,
+    rng: np.random.Generator,
+    weather: Weather | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Return what the detector reports of `echoes`: see `scan`."""
+    rays = len(echoes.distance)
+    chance = rng.random(rays, np.float32)
+    noise = rng.integers(LEVELS, size=rays, dtype=np.uint16)
+    source = echoes.instance - 1
+    if lidar.carla is not None:
+        error_m = np.float32(lidar.noise_m) * QUANTILES[noise]
+        points, reported = carla_returns(lidar.carla, ray_pattern(lidar), echoes.distance, error_m, rng)
+        return points, source[reported]
+
+    weather = weather or CLEAR
+    sensor_from_instance = (world_from_sensor[:3, :3].T @ scene.world_from_instance()).astype(np.float32)
+    bright = brightness(
+        echoes, ray_pattern(lidar), scene.surfaces, sensor_from_instance, weather.wetness, lidar.roughness_rad
+    )
+    distance, least_power = echoes.distance, 0.9 / lidar.sensitivity_m**2
+    air = air_in(weather, lidar.divergence_rad, 0.7 * least_power)
+    if air is not None:
+        distance, bright, aerial = through_air(distance, bright, air, rng)
+        source = np.where(aerial, -1, source)
+    points = np.empty((rays, 4), np.float32)
+    actor = np.empty(rays, np.int32)
+    kept = detect(
+        ray_pattern(lidar),
+        distance,
+        bright,
+        source,
+        np.float32(lidar.sensitivity_m**2 / 0.9),
+        np.float32(1 - lidar.dropout),
+        chance,
+        noise,
+        np.float32(lidar.noise_m),
+        np.float32(air.range_noise if air else 0.0),
+        points,
+        actor,
+    )
+    _report_intensity(points[:kept], lidar)
+    return points[:kept], actor[:kept]
+
+
+def _report_intensity(points: NDArray[np.float32], lidar: Lidar) -> None:
+    if lidar.intensity_gamma != 1:
+        points[:, 3] **= np.float32(lidar.intensity_gamma)
+    if lidar.intensity_floor > 0:
+        points[points[:, 3] < lidar.intensity_floor, 3] = 0
+
+
+def scan(
+    scene: Scene,
+    world_from_sensor: NDArray[np.float64],
+    lidar: Lidar,
+    rng: np.random.Generator,
+    hidden: int | None = None,
+    weather: Weather | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Return one sweep at the scene's instant, as if the actor `hidden` (the carrier) were not there.
+
+    The first array is (N, 4): x, y, z [m] in the sensor frame and intensity in [0, 1]; the second (N,): the trace's
+    actor each return comes from, -1 for the town, rain and fog. Where no `weather` is given it is clear.
+    """
+    echoes = cast(scene, world_from_sensor, lidar, draw_passes(lidar, rng), hidden)
+    return measure(scene, world_from_sensor, lidar, echoes, rng, weather)
+
+
+def point_times_s(lidar: Lidar, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return (N,) how long after the middle of the spin each of `points` (N, >=2) was measured [s].
+
+    From -0.5 to 0.5 / `rate_hz` for a rolling LiDAR, else all 0.
+    """
+    return time_in_spin_s(points, 1 / lidar.rate_hz) if lidar.rolling else np.zeros(len(points), np.float32)

@@ -1,0 +1,194 @@
+"""From ray hits to echoes: through panes of glass, and into the detector."""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from flcav.compiled import compiled
+from flcav.world.materials import Material
+from flcav.world.rays.raycaster import Hits
+
+PANES = 6  # more panes than these stop a ray
+PANE_TRANSMISSION = 0.8  # of the power, there and back
+RETRO_GAIN = 4.0  # how much brighter than a white surface a retro-reflector is
+GLASS = int(Material.GLASS)
+ROAD, SIDEWALK = int(Material.ROAD), int(Material.SIDEWALK)
+WATER_INDEX = 1.33
+TURNED_BACK = 1 - (1 - 0.066) / WATER_INDEX**2  # share of diffuse light that water reflects back to what it covers
+AFTER_PANE_M = 0.002
+ROUGH = np.array(
+    [
+        name in ("GROUND", "ROAD", "SIDEWALK", "WALL", "ROOF", "BARK", "LEAF", "CLOTH", "TROUSERS")
+        for name in Material.__members__
+    ]
+)
+LEVELS = 4096
+QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of the normal distribution
+
+
+class Trace(Protocol):
+    """`Target.trace` with everything but the rays settled, of which it is told the numbers."""
+
+    def __call__(self, rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
+        """Return the first hits."""
+        ...
+
+
+class Echoes(NamedTuple):
+    """The surface each of N rays comes back from."""
+
+    distance: NDArray[np.float32]  # (N,) [m]; inf where none
+    instance: NDArray[np.int32]  # (N,) -1 where none
+    face: NDArray[np.int32]  # (N,)
+    material: NDArray[np.uint8]  # (N,) a Material; meaningless where none
+    panes: NDArray[np.uint8]  # (N,) panes of glass on the way
+
+
+def cast_through_glass(
+    trace: Trace,
+    passes: NDArray[np.bool_],
+    first: NDArray[np.int64],
+    material: NDArray[np.uint8],
+) -> Echoes:
+    """Return what comes back along N rays when those that `passes` (N,) marks go through glass.
+
+    Face f of instance i is of `material[first[i] + f]`.
+    """
+    hits = trace(slice(None))
+    found, through = _look_up(hits.instance, hits.face, first, material, passes, GLASS)
+    echoes = Echoes(*hits, found, np.zeros(len(passes), np.uint8))
+    for _ in range(PANES):
+        if not len(through):
+            break
+        beyond = trace(through, near_m=echoes.distance[through] + np.float32(AFTER_PANE_M))
+        found, again = _look_up(beyond.instance, beyond.face, first, material, passes[through], GLASS)
+        for known, further in zip(echoes, (*beyond, found)):
+            known[through] = further
+        echoes.panes[through] += 1
+        through = through[again]
+    return echoes
+
+
+@compiled
+def _look_up(instance, face, first, material, passes, glass):
+    """Return the materials met, and the numbers of the rays that meet glass and pass it."""
+    found = np.zeros(len(instance), np.uint8)
+    through = np.empty(len(instance), np.int64)
+    count = 0
+    for ray in range(len(instance)):
+        if instance[ray] >= 0:
+            found[ray] = material[first[instance[ray]] + face[ray]]
+            if found[ray] == glass and passes[ray]:
+                through[count] = ray
+                count += 1
+    return found, through[:count]
+
+
+@compiled
+def brightness(echoes, directions, surfaces, sensor_from_instance, wetness, roughness=0.0):
+    """Return how bright each ray's surface is seen: 1 for a white one face on, 0 where there is none. (N,) float32.
+
+    `sensor_from_instance` (I, 3, 3) turns normals. On roads a film of water dims it as `wetness` (0..1) grows. Ground,
+    masonry, plants and cloth are rough by `roughness` [rad], see `rough_cosine`.
+    """
+    _, instance, face, materials, panes = echoes
+    turn = sensor_from_instance.reshape(-1, 9)
+    out = np.zeros(len(directions), np.float32)
+    for ray in range(len(directions)):
+        i = instance[ray]
+        if i < 0:
+            continue
+        row = surfaces.first[i] + face[ray]
+        material = materials[ray]
+        x, y, z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        nx, ny, nz = surfaces.normal[row, 0], surfaces.normal[row, 1], surfaces.normal[row, 2]
+        cosine = abs(
+            x * (turn[i, 0] * nx + turn[i, 1] * ny + turn[i, 2] * nz)
+            + y * (turn[i, 3] * nx + turn[i, 4] * ny + turn[i, 5] * nz)
+            + z * (turn[i, 6] * nx + turn[i, 7] * ny + turn[i, 8] * nz)
+        )
+        seen = surfaces.reflectivity[i, material]
+        if wetness > 0 and material in (ROAD, SIDEWALK):
+            seen *= np.float32(1 - wetness * (1 - under_water(cosine, seen)))
+        if surfaces.retro[material]:
+            seen *= np.float32(RETRO_GAIN)
+        elif roughness > 0 and ROUGH[material]:
+            seen *= rough_cosine(cosine, roughness)
+        else:
+            seen *= cosine
+        for _ in range(panes[ray]):
+            seen *= np.float32(PANE_TRANSMISSION)
+        out[ray] = seen
+    return out
+
+
+@compiled
+def rough_cosine(cosine, roughness):
+    """Return what takes the place of the cosine of incidence on a surface of facets, seen from where it is lit.
+
+    `roughness` is the standard deviation of the facets' slopes [rad]: Oren and Nayar, "Generalization of Lambert's
+    reflectance model", SIGGRAPH 1994, eq. 30, for equal directions in and out. A street is hardly darker far off.
+    """
+    square = roughness * roughness
+    flat = 1 - 0.5 * square / (square + 0.33)
+    return np.float32(flat * cosine + 0.45 * square / (square + 0.09) * (1 - cosine * cosine))
+
+
+@compiled
+def under_water(cosine, reflectivity):
+    """Return how bright a diffuse surface is under a film of water, relative to dry.
+
+    Light enters and leaves through the film, whose Fresnel reflectance F grows towards grazing incidence, spreads by
+    1 / n^2 on the way out, and what is turned back inside (p) meets the surface again: Lekner and Dorf, "Why some
+    things are darker when wet", Applied Optics 27:1278 (1988).
+    """
+    inside = np.sqrt(1 - (1 - cosine**2) / WATER_INDEX**2)
+    across = (cosine - WATER_INDEX * inside) / (cosine + WATER_INDEX * inside)
+    along = (inside - WATER_INDEX * cosine) / (inside + WATER_INDEX * cosine)
+    fresnel = (across**2 + along**2) / 2
+    return (1 - fresnel) ** 2 / WATER_INDEX**2 / (1 - TURNED_BACK * reflectivity)
+
+
+@compiled
+def detect(
+    directions,
+    distance,
+    brightness,
+    source,
+    inverse_threshold,
+    keep,
+    chance,
+    noise,
+    noise_m,
+    noise_share,
+    points,
+    actor,
+):
+    """Write the detected echoes' `points` (N, 4) and `actor` (N,) and return their number.
+
+    An echo of power P = `brightness` / `distance`^2 is detected with a probability that rises from 0 at 0.7 P_min to
+    `keep` at 1.3 P_min; `chance` (N,) in [0, 1) decides. `inverse_threshold` is 1 / P_min. `source` (N,) is the actor
+    that each echo comes from. `noise` (N,) picks a quantile of the range error, whose standard deviation is `noise_m`
+    and, independently, `noise_share` of the range.
+    """
+    count = 0
+    for ray in range(len(directions)):
+        if brightness[ray] <= 0:
+            continue
+        power = brightness[ray] / (distance[ray] * distance[ray])
+        margin = (power * inverse_threshold - np.float32(0.7)) / np.float32(0.6)
+        if chance[ray] >= keep * min(margin, np.float32(1.0)):
+            continue
+        deviation = noise_m
+        if noise_share > 0:
+            deviation = np.float32(np.hypot(noise_m, noise_share * distance[ray]))
+        measured = distance[ray] + deviation * QUANTILES[noise[ray]]
+        points[count, 0] = directions[ray, 0] * measured
+        points[count, 1] = directions[ray, 1] * measured
+        points[count, 2] = directions[ray, 2] * measured
+        points[count, 3] = min(brightness[ray], np.float32(1.0))
+        actor[count] = source[ray]
+        count += 1
+    return count

@@ -1,0 +1,131 @@
+"""How much more of each actor a sensor would see if nothing stood in the way: rays stopped before it, traced on."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.compiled import compiled
+from flcav.sensors.lidar.lidar import Lidar, ray_pattern
+from flcav.sensors.lidar.returns import cast_through_glass
+from flcav.world.rays.raycaster import Hits
+from flcav.world.scene import Scene
+
+BOX_MARGIN_M = 0.01
+
+
+def occluded_rays(
+    scene: Scene,
+    world_from_sensor: NDArray[np.float64],
+    lidar: Lidar,
+    passes: NDArray[np.bool_],
+    distance: NDArray[np.float32],
+    instance: NDArray[np.int32],
+    actors: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Return, for each of `actors` (K,), how many more rays of the sweep would come back from it in an empty world.
+
+    `distance` (N,) is where the rays ended, `instance` (N,) at what: a + 1 at actor a.
+    """
+    pattern, surfaces = ray_pattern(lidar), scene.surfaces
+    body_from_sensor = _bodies_from(scene.poses()[actors], world_from_sensor)
+    rays, counts = _stopped_rays(
+        pattern, lidar.azimuth_steps, body_from_sensor, scene.trace.size[actors], BOX_MARGIN_M, distance
+    )
+    group = np.repeat(np.arange(len(actors)), counts)
+    if lidar.rolling:  # an actor may have been met before, or on its way to, where it is at the scene's instant
+        others = instance[rays] != actors[group] + 1
+        rays, group = rays[others], group[others]
+    directions = pattern[rays]
+
+    def trace(rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
+        ends = np.searchsorted(group[rays], np.arange(len(actors)), side="right")
+        return scene.cast_each(actors, body_from_sensor, ends, directions[rays], near_m=near_m, far_m=lidar.range_m)
+
+    echoes = cast_through_glass(trace, passes[rays], surfaces.first[actors + 1], surfaces.material)
+    return np.bincount(group[echoes.instance >= 0], minlength=len(actors))
+
+
+def _bodies_from(poses: NDArray[np.float64], world_from_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (K, 4, 4) `body_from_sensor` of actors at `poses` (K, 4) x, y, z, yaw."""
+    cos, sin, zero, one = np.cos(poses[:, 3]), np.sin(poses[:, 3]), 0 * poses[:, 3], 0 * poses[:, 3] + 1
+    turn = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
+    found = np.tile(np.eye(4), (len(poses), 1, 1))
+    found[:, :3, :3] = turn @ world_from_sensor[:3, :3]
+    found[:, :3, 3] = np.einsum("kij,kj->ki", turn, world_from_sensor[:3, 3] - poses[:, :3])
+    return found
+
+
+@compiled
+def _stopped_rays(directions, steps, body_from_sensor, size, margin, distance):
+    """Return the rays of `rays_into_box` for each of K boxes, one after another, and (K,) how many they are."""
+    counts = np.zeros(len(size), np.int64)
+    found = np.empty(1024, np.int64)
+    total = 0
+    for box in range(len(size)):
+        rays = rays_into_box(directions, steps, body_from_sensor[box], size[box], margin, distance)
+        counts[box] = len(rays)
+        if total + len(rays) > len(found):
+            larger = np.empty(2 * (total + len(rays)), np.int64)
+            larger[:total] = found[:total]
+            found = larger
+        found[total : total + len(rays)] = rays
+        total += len(rays)
+    return found[:total], counts
+
+
+@compiled
+def rays_into_box(directions, steps, body_from_sensor, size, margin, distance):
+    """Return the numbers of the rays of a spinning pattern (channels * steps, 3) that end before a box on their way.
+
+    They end at `distance` (N,) [m]. The box of `size` (3,), grown by `margin` [m], stands on the body's origin. Only
+    the columns between its corners' azimuths are tried.
+    """
+    low = np.array([-size[0] / 2, -size[1] / 2, 0.0]) - margin
+    high = np.array([size[0] / 2, size[1] / 2, size[2]]) + margin
+    first, columns = _columns(low, high, body_from_sensor, steps)
+    channels = len(directions) // steps
+    found = np.empty(channels * columns, np.int64)
+    count = 0
+    for channel in range(channels):
+        for column in range(first, first + columns):
+            ray = channel * steps + column % steps
+            enter, leave = 0.0, np.inf
+            for axis in range(3):
+                along = (
+                    body_from_sensor[axis, 0] * directions[ray, 0]
+                    + body_from_sensor[axis, 1] * directions[ray, 1]
+                    + body_from_sensor[axis, 2] * directions[ray, 2]
+                )
+                if abs(along) < 1e-9:
+                    along = 1e-9
+                one = (low[axis] - body_from_sensor[axis, 3]) / along
+                other = (high[axis] - body_from_sensor[axis, 3]) / along
+                enter = max(enter, min(one, other))
+                leave = min(leave, max(one, other))
+            if enter <= leave and distance[ray] <= enter:
+                found[count] = ray
+                count += 1
+    return found[:count]
+
+
+@compiled
+def _columns(low, high, body_from_sensor, steps):
+    """Return the first column and the number of columns of the pattern that can meet the box; the first is >= 0."""
+    origin = body_from_sensor[:3, 3]
+    ahead, left = body_from_sensor[:3, 0].copy(), body_from_sensor[:3, 1].copy()  # the sensor's axes
+    middle = (low + high) / 2 - origin
+    x, y = np.dot(ahead, middle), np.dot(left, middle)
+    if np.hypot(x, y) <= np.linalg.norm(high - low) / 2:  # the spin axis may pass through the box
+        return 0, steps
+    azimuth = np.arctan2(y, x)
+    least, most = 0.0, 0.0
+    for corner in range(8):
+        offset = -origin
+        for axis in range(3):
+            offset[axis] += high[axis] if corner >> axis & 1 else low[axis]
+        x, y = np.dot(ahead, offset), np.dot(left, offset)
+        aside = (np.arctan2(y, x) - azimuth + np.pi) % (2 * np.pi) - np.pi
+        least, most = min(least, aside), max(most, aside)
+    step = 2 * np.pi / steps
+    first = int(np.floor((azimuth + least) / step))
+    last = int(np.ceil((azimuth + most) / step))
+    return first % steps, min(last - first + 1, steps)

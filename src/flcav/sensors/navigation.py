@@ -1,0 +1,165 @@
+"""Satellite navigation and inertial measurement, with drifting errors."""
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.config import Config
+from flcav.world.map.parameters import GeoReference
+from flcav.world.scene import Scene
+
+Array = NDArray[np.float64]
+
+STEP_S = 0.1
+
+
+def wander(rng: np.random.Generator, time_s: float, deviation: Array, correlation_s: float) -> Array:
+    """Return (K,) a first-order Gauss-Markov process at `time_s` >= 0.
+
+    It has the standard deviations `deviation` (K,) at all times and forgets over `correlation_s`.
+    """
+    from scipy.signal import lfilter  # takes a second to import, which who records neither GNSS nor IMU is spared
+
+    kept = np.exp(-STEP_S / correlation_s)
+    normal = _grid(rng, time_s, len(deviation))
+    normal[1:] *= np.sqrt(1 - kept**2)
+    return deviation * _read(np.asarray(lfilter([1.0], [1.0, -kept], normal, axis=0)), time_s)
+
+
+def walk(rng: np.random.Generator, time_s: float, start: Array, per_root_s: Array) -> Array:
+    """Return (K,) a random walk at `time_s` >= 0.
+
+    It begins with the standard deviations `start` (K,); its increments over t seconds have `per_root_s` * sqrt(t).
+    """
+    normal = _grid(rng, time_s, len(start))
+    normal[0] *= start
+    normal[1:] *= per_root_s * np.sqrt(STEP_S)
+    return _read(np.cumsum(normal, axis=0), time_s)
+
+
+def _grid(rng: np.random.Generator, time_s: float, axes: int) -> Array:
+    return rng.standard_normal((int(time_s / STEP_S) + 2, axes))
+
+
+def _read(values: Array, time_s: float) -> Array:
+    step, share = divmod(time_s / STEP_S, 1.0)
+    return (1 - share) * values[int(step)] + share * values[int(step) + 1]
+
+
+EQUATOR_M = 6_378_137.0
+FLATTENING = 1 / 298.257223563
+POLE_M = EQUATOR_M * (1 - FLATTENING)
+ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
+ITERATIONS = 4
+
+
+def geodetic(origin: GeoReference, enu: Array) -> Array:
+    """Return (..., 3) latitude [deg], longitude [deg], altitude [m] of points (..., 3) east, north, up [m]."""
+    return _from_earth(_to_earth(origin) + enu @ _earth_from_enu(origin).T)
+
+
+def _to_earth(at: GeoReference) -> Array:
+    lat, lon = np.radians((at.latitude_deg, at.longitude_deg))
+    normal = EQUATOR_M / np.sqrt(1 - ECCENTRICITY2 * np.sin(lat) ** 2)
+    level = (normal + at.altitude_m) * np.cos(lat)
+    return np.array(
+        [level * np.cos(lon), level * np.sin(lon), (normal * (1 - ECCENTRICITY2) + at.altitude_m) * np.sin(lat)]
+    )
+
+
+def _earth_from_enu(at: GeoReference) -> Array:
+    lat, lon = np.radians((at.latitude_deg, at.longitude_deg))
+    east = (-np.sin(lon), np.cos(lon), 0.0)
+    north = (-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat))
+    up = (np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat))
+    return np.array((east, north, up)).T
+
+
+def _from_earth(earth: Array) -> Array:
+    x, y, z = np.moveaxis(earth, -1, 0)
+    level = np.hypot(x, y)
+    beyond = ECCENTRICITY2 / (1 - ECCENTRICITY2)
+    reduced = np.arctan2(z * EQUATOR_M, level * POLE_M)
+    lat = reduced
+    for _ in range(ITERATIONS):
+        lat = np.arctan2(
+            z + beyond * POLE_M * np.sin(reduced) ** 3, level - ECCENTRICITY2 * EQUATOR_M * np.cos(reduced) ** 3
+        )
+        reduced = np.arctan2((1 - FLATTENING) * np.sin(lat), np.cos(lat))
+    altitude = level * np.cos(lat) + z * np.sin(lat) - EQUATOR_M * np.sqrt(1 - ECCENTRICITY2 * np.sin(lat) ** 2)
+    return np.stack((np.degrees(lat), np.degrees(np.arctan2(y, x)), altitude), axis=-1)
+
+
+class Gnss(Config):
+    """How good a receiver is; the defaults are those of a single-frequency receiver under open sky."""
+
+    noise_m: float = Field(default=0.3, ge=0, le=1000)  # standard deviation of the white noise, east and north
+    noise_up_m: float = Field(default=0.6, ge=0, le=1000)  # the same of the altitude
+    bias_m: float = Field(
+        default=1.2, ge=0, le=1000
+    )  # standard deviation of what wanders (satellites, ionosphere), east, north
+    bias_up_m: float = Field(default=2.4, ge=0, le=1000)  # the same of the altitude
+    bias_s: float = Field(default=60.0, ge=0.001, le=1e6)  # time in which the bias is forgotten
+
+
+def fix(
+    scene: Scene, world_from_gnss: Array, gnss: Gnss, rng: np.random.Generator, bias_rng: np.random.Generator
+) -> Array:
+    """Return (3,) latitude [deg], longitude [deg], altitude [m] (WGS 84) of an antenna at the scene's time.
+
+    `world_from_gnss` (4, 4) is the antenna's pose. `rng` is the frame's stream; `bias_rng` is at the start of the one
+    stream of this receiver in this scene, so that the bias is the same whatever frames were rendered before.
+    """
+    time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
+    noise = rng.standard_normal(3) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
+    bias = wander(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
+    return geodetic(scene.town.geo, world_from_gnss[:3, 3] + noise + bias)
+
+
+GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
+
+
+class Imu(Config):
+    """How good a unit is; the defaults are those of an automotive MEMS unit."""
+
+    rate_hz: float = Field(default=100.0, ge=0.1, le=10_000)  # samples a second: how much of the noise passes
+    force_noise: float = Field(default=1.5e-3, ge=0, le=1000)  # white noise of the specific force [m/s^2 / sqrt(Hz)]
+    rate_noise: float = Field(default=1.0e-4, ge=0, le=1000)  # the same of the angular rate [rad/s / sqrt(Hz)]
+    force_bias: float = Field(default=0.05, ge=0, le=1000)  # standard deviation when switched on [m/s^2]
+    rate_bias: float = Field(default=2.0e-3, ge=0, le=1000)  # the same of the angular rate [rad/s]
+    force_walk: float = Field(default=1.0e-4, ge=0, le=1000)  # growth of this bias [m/s^2 / sqrt(s)]
+    rate_walk: float = Field(default=5.0e-6, ge=0, le=1000)  # the same of the angular rate [rad/s / sqrt(s)]
+
+
+def reading(
+    scene: Scene,
+    world_from_imu: Array,
+    carrier: int | None,
+    imu: Imu,
+    rng: np.random.Generator,
+    bias_rng: np.random.Generator,
+) -> Array:
+    """Return (6,) specific force [m/s^2] and angular rate [rad/s] in the unit's own frame, at the scene's time.
+
+    `world_from_imu` (4, 4) is its pose, `carrier` the actor it is on (None: it stands still). `rng` is the frame's
+    stream; `bias_rng` is at the start of the one stream of this unit in this scene, so that the bias is the same
+    whatever frames were rendered before.
+    """
+    time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
+    turn = world_from_imu[:3, :3]
+    acceleration, rate = _motion(scene, world_from_imu[:3, 3], carrier)
+    true = np.concatenate((turn.T @ (acceleration - GRAVITY), turn.T @ rate))
+    noise = np.repeat((imu.force_noise, imu.rate_noise), 3) * np.sqrt(imu.rate_hz / 2)
+    start = np.repeat((imu.force_bias, imu.rate_bias), 3)
+    growth = np.repeat((imu.force_walk, imu.rate_walk), 3)
+    return true + noise * rng.standard_normal(6) + walk(bias_rng, time_s, start, growth)
+
+
+def _motion(scene: Scene, at: Array, carrier: int | None) -> tuple[Array, Array]:
+    """Return (3,) acceleration of the carrier's point `at` (3,) and (3,) its angular rate, world frame."""
+    if carrier is None:
+        return np.zeros(3), np.zeros(3)
+    trace, index = scene.trace, scene.index
+    rate = np.array((0.0, 0.0, trace.yaw_rate[index, carrier]))
+    arm = at - scene.world_from_actor(carrier)[:3, 3]
+    return trace.acceleration[index, carrier] + np.cross(rate, np.cross(rate, arm)), rate

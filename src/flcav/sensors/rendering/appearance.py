@@ -1,0 +1,177 @@
+"""What the surfaces of a scene look like, as tables that shading looks up by surface row and instance."""
+
+import zlib
+from functools import lru_cache
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.sensors.rendering.facade import Facades, facades_of
+from flcav.sensors.rendering.ground import Markings, markings_of
+from flcav.sensors.rendering.noise import clouds
+from flcav.sensors.rendering.signs import SIGN_KINDS, pictures
+from flcav.world.map.lanes import map_layers
+from flcav.world.map.layers import MapLayers
+from flcav.world.map.town import Town
+from flcav.world.materials import (
+    CLOTH_COLOURS,
+    COLOUR,
+    GLOSS,
+    MIRROR,
+    PAINT_COLOURS,
+    PAINT_REFLECTIVITY,
+    SKIN_TONES,
+    TROUSER_COLOURS,
+    Material,
+)
+from flcav.world.meshes import actor_mesh
+from flcav.world.scene import Scene
+from flcav.world.static import Part, static_world
+
+# Numbers and names of CARLA's semantic tags (0.9.15)
+SEMANTICS: dict[str, int] = {
+    "unlabeled": 0,
+    "road": 1,
+    "sidewalk": 2,
+    "building": 3,
+    "pole": 6,
+    "traffic_light": 7,
+    "traffic_sign": 8,
+    "vegetation": 9,
+    "terrain": 10,
+    "sky": 11,
+    "pedestrian": 12,
+    "rider": 13,
+    "car": 14,
+    "truck": 15,
+    "bus": 16,
+    "motorcycle": 18,
+    "bicycle": 19,
+    "static": 20,
+    "road_line": 24,
+}
+_OF_PART = {
+    Part.GROUND: "terrain",
+    Part.ROAD: "road",
+    Part.SIDEWALK: "sidewalk",
+    Part.BUILDING: "building",
+    Part.TREE: "vegetation",
+    Part.CLUTTER: "static",
+    Part.LAMP: "pole",
+    Part.POST: "pole",
+    Part.MAST: "pole",
+    Part.SIGN: "traffic_sign",
+    Part.SIGNAL: "traffic_light",
+}
+_RIDER = (Material.SKIN, Material.CLOTH, Material.TROUSERS)
+
+
+class Plates(NamedTuple):
+    """The signs of a town."""
+
+    place: NDArray[np.float32]  # (S, 5) centre x, y, z, cosine and sin of the direction to the reader's right
+    kind: NDArray[np.uint8]  # (S,) row of SIGN_KINDS
+    drawn: NDArray[np.float32]  # see `signs.pictures`
+
+
+class Appearance(NamedTuple):
+    """Tables of one scene."""
+
+    material: NDArray[np.uint8]  # (S,) by surface row
+    semantic: NDArray[np.uint8]  # (S,)
+    thing: NDArray[np.int32]  # (S,) -(t + 1) for thing t of the town, else 0
+    part: NDArray[np.uint8]  # (S,) a Part; meaningless for actors
+    part_row: NDArray[np.int32]  # (S,) see `StaticWorld.row`
+    first_actor: int  # surface row from which on faces are actors'
+    corner: NDArray[np.float32]  # (S - first_actor, 3, 3) corners of actors' faces, body frame
+    corner_normal: NDArray[np.float32]  # (S - first_actor, 3, 3) see `Mesh.corner_normals`
+    colour: NDArray[np.float32]  # (I, M, 3) by instance and material: actors differ in paint and clothes
+    mirror: NDArray[np.float32]  # (M,)
+    gloss: NDArray[np.float32]  # (M,)
+    markings: Markings
+    facades: Facades
+    plates: Plates
+    noise: NDArray[np.float32]
+
+
+_KNOWN: WeakKeyDictionary[Scene, Appearance] = WeakKeyDictionary()
+
+
+def appearance_of(scene: Scene) -> Appearance:
+    """Return the tables of `scene`, made once; they hold for all its instants."""
+    if scene not in _KNOWN:
+        _KNOWN[scene] = _appearance(scene)
+    return _KNOWN[scene]
+
+
+def _appearance(scene: Scene) -> Appearance:
+    surfaces, trace, town = scene.surfaces, scene.trace, scene.town
+    world = static_world(town)
+    rows, actors = len(surfaces.material), len(world.part)
+    semantic = np.zeros(rows, np.uint8)
+    part, part_row, thing = np.zeros(rows, np.uint8), np.zeros(rows, np.int32), np.zeros(rows, np.int32)
+    numbers = np.array([SEMANTICS[_OF_PART[Part(value)]] for value in range(len(Part))], np.uint8)
+    leafy = (world.part == Part.CLUTTER) & (world.mesh.material == Material.LEAF)
+    semantic[:actors] = np.where(leafy, SEMANTICS["vegetation"], numbers[world.part])
+    part[:actors], part_row[:actors] = world.part, world.row
+    thing[:actors] = -(scene.things.face + 1)
+    corner = np.zeros((rows - actors, 3, 3), np.float32)
+    corner_normal = np.zeros((rows - actors, 3, 3), np.float32)
+    for instance, (category, shape) in enumerate(zip(trace.category, trace.shape), start=1):
+        corners, normals = _corners(str(category), int(shape))
+        first = int(surfaces.first[instance])
+        faces = slice(first, first + len(corners))
+        corner[first - actors : first - actors + len(corners)] = corners
+        corner_normal[first - actors : first - actors + len(corners)] = normals
+        semantic[faces] = SEMANTICS["car" if category == "van" else str(category)]
+        if category in ("bicycle", "motorcycle"):
+            semantic[faces][np.isin(surfaces.material[faces], _RIDER)] = SEMANTICS["rider"]
+    signs = town.signs
+    place = np.c_[signs.position, -np.sin(signs.yaw), np.cos(signs.yaw)]
+    return Appearance(
+        material=surfaces.material,
+        semantic=semantic,
+        thing=thing,
+        part=part,
+        part_row=part_row,
+        first_actor=actors,
+        corner=corner,
+        corner_normal=corner_normal,
+        colour=_colours([str(name) for name in trace.actor]),
+        mirror=MIRROR,
+        gloss=GLOSS,
+        markings=_markings(town),
+        facades=facades_of(town.name, town.buildings),
+        plates=Plates(
+            place.astype(np.float32), np.array([SIGN_KINDS.index(kind) for kind in signs.kind], np.uint8), pictures()
+        ),
+        noise=clouds(),
+    )
+
+
+def _markings(town: Town) -> Markings:
+    """Return the paint on a town's roads; a town whose net file is gone has none."""
+    if not town.net.exists():
+        return markings_of(MapLayers((), (), (), (), (), ()))
+    return markings_of(map_layers(town))
+
+
+@lru_cache(maxsize=64)
+def _corners(category: str, shape: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    mesh = actor_mesh(category, shape)
+    return mesh.vertices[mesh.faces], mesh.corner_normals()
+
+
+def _colours(names: list[str]) -> NDArray[np.float32]:
+    """Return each instance's colours by material; the same actor always wears the same."""
+    out = np.tile(COLOUR, (len(names) + 1, 1, 1))
+    for instance, name in enumerate(names, start=1):
+        number = zlib.crc32(name.encode())
+        paints = PAINT_COLOURS[number % len(PAINT_REFLECTIVITY)]
+        out[instance, Material.PAINT] = paints[number // len(PAINT_REFLECTIVITY) % len(paints)]
+        out[instance, Material.CLOTH] = CLOTH_COLOURS[number // 64 % len(CLOTH_COLOURS)]
+        out[instance, Material.TROUSERS] = TROUSER_COLOURS[number // 1024 % len(TROUSER_COLOURS)]
+        out[instance, Material.SKIN] *= SKIN_TONES[number // 8192 % len(SKIN_TONES)]
+    return out

@@ -1,0 +1,194 @@
+"""Light of the sun, the sky and lamps, and the shadows they cast."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.compiled import compiled
+from flcav.sensors.rendering.gbuffer import Survey
+from flcav.sensors.rendering.state import Lamps, light_up
+from flcav.world.scene import Scene
+from flcav.world.weather import Weather
+
+Colour = tuple[np.float32, np.float32, np.float32]  # scalars: compiled code passes arrays less cheaply
+
+RAIN_EXTINCTION = 0.00022  # 1/m at 1 mm/h, growing with the rain's power of 0.63 (Atlas 1953, visible light)
+
+# Sun elevation [deg] -> colours of the sun's light on a surface face on, and of the sky overhead and at the horizon
+_ELEVATION = (-18.0, -9.0, -4.0, 0.0, 4.0, 10.0, 25.0, 60.0)
+_SUN = (
+    (0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0),
+    (0.32, 0.10, 0.02),
+    (1.05, 0.47, 0.16),
+    (1.62, 1.06, 0.62),
+    (2.00, 1.74, 1.38),
+    (2.20, 2.08, 1.86),
+)
+_ZENITH = (
+    (0.0007, 0.0009, 0.0016),
+    (0.004, 0.006, 0.013),
+    (0.030, 0.044, 0.090),
+    (0.085, 0.115, 0.210),
+    (0.130, 0.180, 0.310),
+    (0.150, 0.240, 0.430),
+    (0.150, 0.290, 0.570),
+    (0.145, 0.300, 0.620),
+)
+_HORIZON = (
+    (0.0028, 0.0024, 0.0026),
+    (0.014, 0.011, 0.014),
+    (0.130, 0.085, 0.090),
+    (0.420, 0.210, 0.120),
+    (0.700, 0.400, 0.230),
+    (0.720, 0.600, 0.490),
+    (0.640, 0.720, 0.800),
+    (0.600, 0.730, 0.860),
+)
+
+
+class Light(NamedTuple):
+    """What shines at one instant."""
+
+    to_sun: Colour  # unit, world
+    sun: Colour  # on a surface face on, through the clouds
+    zenith: Colour  # radiance of the clear sky overhead
+    horizon: Colour  # and above the horizon
+    ambient: Colour  # what the whole sky sends to a level surface
+    bounce: Colour  # and what the ground sends back up
+    cloud: Colour  # of a cloud
+    cover: np.float32  # share of the sky that is clouds
+    air: Colour  # what the air between adds where it hides everything
+    extinction: np.float32  # [1/m] by fog, haze and rain
+    exposure: np.float32  # factor before tone mapping
+    wetness: np.float32
+    lamps: np.float32  # 0 off, 1 on
+
+
+def light_of(weather: Weather) -> Light:
+    """Return the light of `weather`."""
+    elevation, azimuth = np.radians(weather.sun_elevation_deg), np.radians(weather.sun_azimuth_deg)
+    level = np.cos(elevation)
+    to_sun = np.array([level * np.sin(azimuth), level * np.cos(azimuth), np.sin(elevation)])
+    clear_sun, zenith, horizon = (_at(weather.sun_elevation_deg, table) for table in (_SUN, _ZENITH, _HORIZON))
+    through = 1 - np.clip((weather.cloud_cover - 0.3) / 0.6, 0, 1)  # gaps close from a third of the sky on
+    fog = weather.fog_per_m
+    sun = clear_sun * through * np.exp(-120.0 * fog)
+    whole = 0.35 * clear_sun * max(np.sin(elevation), 0.06) + 0.5 * (zenith + horizon)
+    grey = whole.mean() * np.array([0.97, 1.0, 1.04])
+    deck = np.clip((weather.cloud_cover - 0.4) / 0.6, 0, 1)
+    cloud = grey * (1.25 - 0.55 * deck)
+    hazy = np.clip(fog * 400, 0, 1) * (1 - 0.3 * deck)
+    over = deck * 0.92
+    zenith = zenith * (1 - over) + cloud * over
+    horizon = horizon * (1 - over) + cloud * over
+    zenith = zenith * (1 - 0.6 * hazy) + 0.6 * hazy * horizon
+    air = 0.9 * horizon if fog else 0.95 * horizon
+    haze = 0.00012
+    rain = RAIN_EXTINCTION * weather.rain_mm_h**0.63 * 3.0
+    lamps = float(np.clip((2.0 - weather.sun_elevation_deg) / 6.0, 0, 1))
+    sky = 0.45 * zenith + 0.55 * horizon
+    sky = 0.55 * sky + 0.45 * sky.mean()  # light from many sides: houses and ground take the blue out of it
+    bounce = 0.16 * (sun * max(to_sun[2], 0.0) + sky)
+    ambient = float((0.5 * sun * max(to_sun[2], 0.15) + 0.6 * zenith + 0.4 * horizon).mean())
+    return Light(
+        to_sun=_three(to_sun),
+        sun=_three(sun),
+        zenith=_three(zenith),
+        horizon=_three(horizon),
+        ambient=_three(sky),
+        bounce=_three(bounce),
+        cloud=_three(cloud),
+        cover=np.float32(weather.cloud_cover),
+        air=_three(air),
+        extinction=np.float32(fog + haze + rain),
+        exposure=np.float32(_exposure(ambient)),
+        wetness=np.float32(weather.wetness),
+        lamps=np.float32(lamps),
+    )
+
+
+def _three(values: NDArray[np.float64]) -> Colour:
+    return np.float32(values[0]), np.float32(values[1]), np.float32(values[2])
+
+
+def _at(elevation_deg: float, table: tuple[tuple[float, float, float], ...]) -> NDArray[np.float64]:
+    return np.array([np.interp(elevation_deg, _ELEVATION, column) for column in zip(*table)])
+
+
+def _exposure(ambient: float) -> float:
+    """Return how much longer a camera exposes in less light: not enough to make night day."""
+    return float(0.92 * max(ambient, 2e-3) ** -0.55 if ambient < 1.0 else 0.92)
+
+
+SUN_REACH_M = 300.0
+DARK = 1e-3  # a sun dimmer than this casts no shadow
+SAME = 0.04  # pixels that differ by less of their distance lie on one surface
+
+
+def lamp_light_on(scene: Scene, seen: Survey, lamps: Lamps, hidden: int | None) -> NDArray[np.float32]:
+    """Return (N, 3) what lamps throw on each ray's end; the strongest one there casts shadows, the others none."""
+    light, most, towards = (np.zeros((len(seen), 3), np.float32) for _ in range(3))
+    far = np.empty(len(seen), np.float32)
+    light_up(seen, lamps, light, most, towards, far)
+    _add_where_free(light, most, scene.blocked(seen.position, towards, far, hidden=hidden))
+    return light
+
+
+def sunlit(scene: Scene, seen: Survey, light: Light, hidden: int | None) -> NDArray[np.float32]:
+    """Return for each ray's end whether the sun reaches it: 1, or 0 behind something; 1 too where it faces away."""
+    far = np.empty(len(seen), np.float32)
+    _facing(seen, light.to_sun, max(light.sun) > DARK, far)
+    return (
+        (~scene.blocked(seen.position, np.array([light.to_sun]), far, hidden=hidden)).view(np.uint8).astype(np.float32)
+    )
+
+
+def soften(lit: NDArray[np.float32], seen: Survey, width: int) -> NDArray[np.float32]:
+    """Return `lit` (N,), a picture's row after row, with edges of shadows as soft as a sun that is no point makes them.
+
+    Means over three by three pixels (weights 1, 2, 1 each way) of what lies as far away.
+    """
+    out = np.empty_like(lit)
+    _soften(lit, seen.distance, width, out)
+    return out
+
+
+@compiled
+def _facing(seen, to_sun, shines, far):
+    for ray in range(len(far)):
+        normal = seen.normal[ray]
+        turned = normal[0] * to_sun[0] + normal[1] * to_sun[1] + normal[2] * to_sun[2]
+        far[ray] = SUN_REACH_M if shines and seen.row[ray] >= 0 and turned > 0 else -1.0
+
+
+@compiled
+def _add_where_free(light, most, blocked):
+    for ray in range(len(blocked)):
+        if not blocked[ray]:
+            for band in range(3):
+                light[ray, band] += most[ray, band]
+
+
+@compiled
+def _soften(lit, distance, width, out):
+    count = len(lit)
+    for pixel in range(count):
+        own, column = lit[pixel], pixel % width
+        out[pixel] = own
+        if column == 0 or column == width - 1 or pixel < width or pixel >= count - width:
+            continue
+        if lit[pixel - 1] == own and lit[pixel + 1] == own and lit[pixel - width] == own and lit[pixel + width] == own:
+            continue
+        total, weight, near = np.float32(0), np.float32(0), np.float32(SAME) * distance[pixel]
+        for down in range(-1, 2):
+            for right in range(-1, 2):
+                other = pixel + down * width + right
+                if abs(distance[other] - distance[pixel]) <= near:
+                    share = np.float32((2 - abs(down)) * (2 - abs(right)))
+                    total += share * lit[other]
+                    weight += share
+        if weight > 0:
+            out[pixel] = total / weight

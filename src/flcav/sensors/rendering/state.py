@@ -1,0 +1,186 @@
+"""What shines by itself at one instant: signal lenses, head and tail lamps, street lamps."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.compiled import compiled, inlined
+from flcav.geometry import transform_points
+from flcav.world.materials import Material
+from flcav.world.meshes import actor_mesh
+from flcav.world.scene import Scene
+
+RED, AMBER, GREEN = 1, 2, 4
+LENSES = {"r": RED, "R": RED, "y": AMBER, "Y": AMBER, "u": RED | AMBER, "g": GREEN, "G": GREEN, "o": AMBER}
+BRAKING_MS2 = -0.6  # harder than this, brake lamps are on
+
+STREET_LAMP = (4.6, 3.3, 1.75)  # intensity straight down
+HEADLAMP = (17.0, 16.2, 14.5)  # intensity on the axis of a low beam
+STREET_REACH_M, BEAM_REACH_M = 20.0, 45.0
+CELL_M = 8.0
+
+
+class State(NamedTuple):
+    """By thing and by instance."""
+
+    lens: NDArray[np.uint8]  # (K,) of each of the town's things: RED, AMBER and GREEN that are lit
+    head: NDArray[np.float32]  # (I,) how bright the head lamps are, 0 to 1
+    tail: NDArray[np.float32]  # (I,) and the tail lamps; braking is brighter
+
+
+class Lamps(NamedTuple):
+    """K lamps that light up what is around them, and which reach each cell of a grid."""
+
+    position: NDArray[np.float32]  # (K, 3) world [m]
+    ahead: NDArray[np.float32]  # (K, 3) unit direction of a beam; zero for a street lamp
+    colour: NDArray[np.float32]  # (K, 3) intensity straight down, or on the beam's axis
+    corner: NDArray[np.float64]  # (2,) lowest x, y of the grid
+    first: NDArray[np.int32]  # (cells along x, cells along y + 1)
+    listed: NDArray[np.int32]
+
+
+def state_of(scene: Scene, lamps_on: float, low_sight: bool) -> State:
+    """Return what is lit; `low_sight`: rain or fog that vehicles have their lamps on in by day."""
+    trace, index = scene.trace, scene.index
+    letters = dict(zip(trace.light.tolist(), trace.light_state[index].tolist()))
+    lens = [LENSES.get(letters.get(link, ""), 0) for link in scene.things.link]
+    parked = np.char.startswith(trace.actor, "parked")
+    on = np.where(parked | ~trace.present[index], 0.0, max(lamps_on, 0.8 if low_sight else 0.0))
+    forward = np.stack((np.cos(trace.yaw[index]), np.sin(trace.yaw[index])), axis=1)
+    along = np.nan_to_num((trace.acceleration[index, :, :2] * forward).sum(axis=1))
+    stopped = np.nan_to_num(np.linalg.norm(trace.velocity[index], axis=1), nan=9.0) < 0.1
+    braking = ((along < BRAKING_MS2) | stopped) & ~parked
+    tail = np.where(braking, 1.0, 0.25 * on)
+    return State(np.array(lens, np.uint8), *(np.append(0.0, row).astype(np.float32) for row in (on, tail)))
+
+
+def lamps_of(scene: Scene, state: State) -> Lamps:
+    """Return the lamps that are on, the street's first."""
+    street = scene.town.lamps - (0.0, 0.0, 0.08)
+    places, beams = [street], [np.zeros_like(street)]
+    for actor in np.flatnonzero(state.head[1:] > 0.5):
+        body = scene.world_from_actor(int(actor))
+        heads, _ = lamp_places(str(scene.trace.category[actor]), int(scene.trace.shape[actor]))
+        if len(heads):
+            places.append(transform_points(body, heads))
+            beams.append(np.tile(body[:3, 0] - (0, 0, 0.012), (len(heads), 1)))
+    position, ahead = np.concatenate(places), np.concatenate(beams)
+    reach = np.where(np.abs(ahead).sum(axis=1) > 0, BEAM_REACH_M, STREET_REACH_M)
+    beam = np.abs(ahead).sum(axis=1, keepdims=True) > 0
+    colour = np.where(beam, HEADLAMP, STREET_LAMP).astype(np.float32)
+    return Lamps(position.astype(np.float32), ahead.astype(np.float32), colour, *_grid(position, ahead, reach))
+
+
+def no_lamps() -> Lamps:
+    """Return no lamps at all: those of a day."""
+    none = np.zeros((0, 3))
+    position, ahead, colour = (none.astype(np.float32) for _ in range(3))
+    return Lamps(position, ahead, colour, *_grid(none, none, np.zeros(0)))
+
+
+@lru_cache(maxsize=64)
+def lamp_places(category: str, shape: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centres of an actor's head lamps and of its tail lamps, (K, 3) each, body frame."""
+    mesh = actor_mesh(category, shape)
+    centres = mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64)
+
+    def centre(material: Material) -> NDArray[np.float64]:
+        own = centres[mesh.material == material]
+        sides = [own[own[:, 1] > 0.15], own[own[:, 1] < -0.15], own[np.abs(own[:, 1]) <= 0.15]]
+        return np.array([side.mean(axis=0) for side in sides if len(side)]).reshape(-1, 3)
+
+    return centre(Material.HEADLAMP), centre(Material.TAILLAMP)
+
+
+@inlined
+def lamp_light(lamp, x, y, z, nx, ny, nz, lamps):
+    """Return how much light, over its intensity, a lamp throws on a surface at x, y, z that faces nx, ny, nz."""
+    px, py, pz = lamps.position[lamp, 0] - x, lamps.position[lamp, 1] - y, lamps.position[lamp, 2] - z
+    square = px * px + py * py + pz * pz
+    faced = px * nx + py * ny + pz * nz
+    if faced <= 0 or square > np.float32(BEAM_REACH_M * BEAM_REACH_M):
+        return np.float32(0)
+    distance = np.sqrt(square)
+    incidence = faced / distance
+    ax, ay, az = lamps.ahead[lamp, 0], lamps.ahead[lamp, 1], lamps.ahead[lamp, 2]
+    if ax == 0 and ay == 0:
+        down = pz / distance
+        if down <= np.float32(0.05) or distance > STREET_REACH_M:
+            return np.float32(0)
+        end = 1 - square / np.float32(STREET_REACH_M * STREET_REACH_M)
+        return incidence * down * (np.float32(0.55) + np.float32(0.45) / max(down, np.float32(0.25))) * end / square
+    forward = -(px * ax + py * ay) / distance
+    if forward <= np.float32(0.2) or distance > BEAM_REACH_M:
+        return np.float32(0)
+    aside = (px * ay - py * ax) / distance
+    above = -pz / distance - az
+    level = above * 14
+    if above > 0:
+        spread = max(np.float32(0.02), 1 - above * 60)
+    else:
+        spread = np.float32(0.85) / (1 + level * level * level * level) + np.float32(0.04)
+    beam = max(np.float32(0), 1 - aside * aside * np.float32(2.6))
+    end = 1 - square / np.float32(BEAM_REACH_M * BEAM_REACH_M)
+    return incidence * spread * beam * beam * end / max(square, np.float32(9))
+
+
+@compiled
+def light_up(survey, lamps, light, most, towards, distance):
+    """Write what lamps throw on each ray's end: `light` (N, 3) of all but the strongest one, `most` (N, 3) of that.
+
+    `towards` (N, 3) and `distance` (N,) lead to the strongest; the distance is -1 where there is none.
+    """
+    for ray in range(len(distance)):
+        distance[ray] = -1
+        if survey.row[ray] < 0:
+            continue
+        x, y, z = survey.position[ray, 0], survey.position[ray, 1], survey.position[ray, 2]
+        i, j = int((x - lamps.corner[0]) / CELL_M), int((y - lamps.corner[1]) / CELL_M)
+        if i < 0 or j < 0 or i >= lamps.first.shape[0] or j >= lamps.first.shape[1] - 1:
+            continue
+        nx, ny, nz = survey.normal[ray, 0], survey.normal[ray, 1], survey.normal[ray, 2]
+        best, which = np.float32(1e-5), -1
+        for place in range(lamps.first[i, j], lamps.first[i, j + 1]):
+            lamp = lamps.listed[place]
+            own = lamp_light(lamp, x, y, z, nx, ny, nz, lamps)
+            if own <= 0:
+                continue
+            red, green, blue = lamps.colour[lamp, 0] * own, lamps.colour[lamp, 1] * own, lamps.colour[lamp, 2] * own
+            if red > best:
+                light[ray, 0] += most[ray, 0]
+                light[ray, 1] += most[ray, 1]
+                light[ray, 2] += most[ray, 2]
+                most[ray, 0], most[ray, 1], most[ray, 2] = red, green, blue
+                best, which = red, lamp
+            else:
+                light[ray, 0] += red
+                light[ray, 1] += green
+                light[ray, 2] += blue
+        if which >= 0:
+            px, py, pz = lamps.position[which, 0] - x, lamps.position[which, 1] - y, lamps.position[which, 2] - z
+            length = np.sqrt(px * px + py * py + pz * pz)
+            towards[ray, 0], towards[ray, 1], towards[ray, 2] = px / length, py / length, pz / length
+            distance[ray] = length - np.float32(0.6)
+
+
+def _grid(
+    position: NDArray[np.float64], ahead: NDArray[np.float64], reach: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:
+    if not len(position):
+        return np.zeros(2), np.zeros((1, 2), np.int32), np.zeros(0, np.int32)
+    corner = (position[:, :2] - reach[:, None]).min(axis=0)
+    cells = np.ceil(((position[:, :2] + reach[:, None]).max(axis=0) - corner) / CELL_M).astype(int) + 1
+    x, y = (corner[axis] + (np.arange(cells[axis]) + 0.5) * CELL_M for axis in (0, 1))
+    dx = x[:, None, None] - position[:, 0]  # (X, 1, K)
+    dy = y[None, :, None] - position[:, 1]
+    within = dx**2 + dy**2 < (reach + 0.71 * CELL_M) ** 2
+    beam = ahead.any(axis=1)
+    within &= ~beam | (dx * ahead[:, 0] + dy * ahead[:, 1] > -CELL_M)
+    count = within.sum(axis=2).ravel()
+    starts = np.append(0, np.cumsum(count)).astype(np.int32)
+    first = np.empty((cells[0], cells[1] + 1), np.int32)
+    first[:, :-1] = starts[:-1].reshape(cells)
+    first[:, -1] = starts[cells[1] :: cells[1]]
+    return corner, first, np.nonzero(within)[2].astype(np.int32)

@@ -1,0 +1,191 @@
+"""Supersampling of pixels at edges and thin distant objects."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.compiled import compiled
+from flcav.geometry import inverse, transform_points
+from flcav.sensors.camera.lens import Lens, project
+from flcav.sensors.rendering.appearance import Appearance
+from flcav.sensors.rendering.gbuffer import Survey
+from flcav.world.map.town import Town
+from flcav.world.materials import Material
+
+LEAF = int(Material.LEAF)
+EDGE, THIN = 1, 2  # what a pixel is
+BEND = 0.93  # cosine between normals from which on a surface has no edge
+STEP = 0.02  # out of the neighbour's plane, over the distance
+CONTRAST = 0.03  # difference over sum of what two pixels show, below which nobody sees an edge
+DARK = 0.02  # light after exposure that is added to that sum: no edges in the dark
+THIN_PX = 4.0  # things narrower than this are thin
+REACH_PX = 0.8  # beyond their edges, that they may touch a pixel
+FARTHEST_M = 220.0
+POST_M, SIGN_M, SIGNAL_M = 0.1, 0.42, 0.6  # half widths
+
+
+def rough_pixels(
+    seen: Survey, radiance: NDArray[np.float32], exposure: np.float32, appearance: Appearance, lens: Lens
+) -> NDArray[np.uint8]:
+    """Return (N,) which pixels are an EDGE, given the `radiance` (N, 3) of each."""
+    out = np.zeros(len(seen), np.uint8)
+    _edges(seen, radiance, np.float32(DARK / exposure), appearance.material, lens.width, out)
+    return out
+
+
+def mark_thin(
+    kind: NDArray[np.uint8], town: Town, world_from_camera: NDArray[np.float64], lens: Lens, seen: Survey
+) -> None:
+    """Mark the pixels that the town's lamps, masts, signs and signal heads may cross and that show nothing nearer."""
+    bars = thin_bars(town)
+    camera_from_world = inverse(world_from_camera)
+    ends = [transform_points(camera_from_world, bars[:, part]) for part in (slice(0, 3), slice(3, 6))]
+    near = np.minimum(ends[0][:, 2], ends[1][:, 2])
+    kept = (near > 2.0) & (near < FARTHEST_M)
+    pixels = [project(lens, end[kept]) for end in ends]
+    focal = lens.intrinsics()[0, 0]
+    half_px = bars[kept, 6] * focal / near[kept]
+    small = (half_px * 2 < THIN_PX) | (bars[kept, 6] > POST_M) & (half_px * 2 < 6 * THIN_PX)
+    small &= np.isfinite(pixels[0]).all(axis=1) & np.isfinite(pixels[1]).all(axis=1)
+    _draw_bars(
+        pixels[0][small],
+        pixels[1][small],
+        half_px[small],
+        near[kept][small],
+        seen.distance,
+        lens.width,
+        lens.height,
+        kind,
+    )
+
+
+def thin_bars(town: Town) -> NDArray[np.float64]:
+    """Return (K, 7) both ends of everything thin in a town, world [m], and its half width."""
+    rows = [(x, y, 0, x, y, height, POST_M) for x, y, height in town.lamps]
+    rows += [(x, y, 0, x, y, z, POST_M) for x, y, z in town.poles.position]
+    for x, y, z in town.signs.position:
+        rows += [(x, y, 0, x, y, z, POST_M), (x, y, z - 0.36, x, y, z + 0.36, SIGN_M)]
+    for (x, y, z), foot in zip(town.signals.position, town.signals.foot):
+        rows += [(*foot, 0, *foot, z + 0.25, POST_M), (*foot, z, x, y, z, POST_M)]
+        rows.append((x, y, z - 0.6, x, y, z + 0.6, SIGNAL_M))
+    return np.array(rows, np.float64).reshape(-1, 7)
+
+
+@compiled
+def _edges(seen, radiance, dark, material, width, out):
+    row = seen.row
+    for pixel in range(len(out)):
+        for side in range(2):
+            if side == 0 and pixel % width + 1 == width:
+                continue
+            other = pixel + (width if side else 1)
+            if other >= len(out) or row[pixel] == row[other]:
+                continue
+            edge = row[pixel] < 0 or row[other] < 0 or seen.instance[pixel] != seen.instance[other]
+            if not edge and not (material[row[pixel]] == LEAF and material[row[other]] == LEAF):
+                bend, off = np.float32(0), np.float32(0)
+                for axis in range(3):
+                    bend += seen.normal[pixel, axis] * seen.normal[other, axis]
+                    off += seen.normal[pixel, axis] * (seen.position[other, axis] - seen.position[pixel, axis])
+                edge = bend < BEND or abs(off) > STEP * min(seen.distance[pixel], seen.distance[other])
+            if edge:
+                for band in range(3):
+                    one, two = radiance[pixel, band], radiance[other, band]
+                    if abs(one - two) > np.float32(CONTRAST) * (one + two + dark):
+                        out[pixel], out[other] = EDGE, EDGE
+
+
+@compiled
+def _draw_bars(start, end, half, near, distance, width, height, kind):
+    for bar in range(len(half)):
+        along_x, along_y = end[bar, 0] - start[bar, 0], end[bar, 1] - start[bar, 1]
+        steps = int(max(abs(along_x), abs(along_y))) + 1
+        if steps > 4 * (width + height):
+            continue
+        reach = half[bar] + REACH_PX
+        for step in range(steps + 1):
+            x = start[bar, 0] + along_x * step / steps
+            y = start[bar, 1] + along_y * step / steps
+            flat = abs(along_y) < abs(along_x)
+            middle = y if flat else x
+            for aside in range(int(np.ceil(middle - reach)), int(np.floor(middle + reach)) + 1):
+                column, row = (round(x), aside) if flat else (aside, round(y))
+                if column < 0 or row < 0 or column >= width or row >= height:
+                    continue
+                pixel = row * width + column
+                if distance[pixel] > near[bar] - 1.0:
+                    kind[pixel] |= THIN
+
+
+SIGN = int(Material.SIGN)
+ROOKS = np.float32(3)  # a further ray stands for so much narrower a part of its pixel
+_THREE = np.array([(-1, 1), (1, -1)], np.float32) / 3
+_NINE = np.array([(-4, -1), (-3, 2), (-2, -3), (-1, 4), (1, -4), (2, 3), (3, -2), (4, 1)], np.float32) / 9
+BRIGHTEST = 3.0  # what outshines this after exposure counts no more: edges of lamps would stay jagged
+
+
+def further_rays(
+    rays: NDArray[np.float32], kind: NDArray[np.uint8], lens: Lens
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Return the further unit rays (S, 3) of the pixels that need some, and the pixel (S,) each belongs to."""
+    total = int(np.bincount(kind, minlength=4) @ (0, len(_THREE), len(_NINE), len(_NINE)))
+    directions, pixel = np.empty((total, 3), np.float32), np.empty(total, np.int32)
+    _spread(rays, kind, lens.width, lens.height, _THREE, _NINE, directions, pixel)
+    return directions, pixel
+
+
+@compiled
+def donors(hits, pixel, seen, first, material, width, out):
+    """Write for each further ray the pixel `out` (S,) that shows the same face: its own or one beside it; else -1.
+
+    What is drawn on faces is smooth over pixels, so that such a ray would see the same. Signs have none: their
+    letters are finer. `first` and `material` are those of `Scene.surfaces`.
+    """
+    for sample in range(len(pixel)):
+        out[sample] = -1
+        own, instance, row = pixel[sample], hits.instance[sample], -1
+        if instance >= 0:
+            row = first[instance] + hits.face[sample]
+            if material[row] == SIGN:
+                continue
+        for step in (0, -1, 1, -width, width, -width - 1, -width + 1, width - 1, width + 1):
+            other = own + step
+            if other >= 0 and other < len(seen.row) and seen.row[other] == row and seen.instance[other] == instance:
+                out[sample] = other
+                break
+
+
+@compiled
+def average(radiance, further, pixel, ceiling):
+    """Replace the `radiance` of pixels by the mean with that of their `further` rays (S, 3), all below `ceiling`."""
+    start = 0
+    while start < len(pixel):
+        own, end = pixel[start], start
+        while end < len(pixel) and pixel[end] == own:
+            end += 1
+        for band in range(3):
+            total = min(radiance[own, band], ceiling)
+            for sample in range(start, end):
+                total += min(further[sample, band], ceiling)
+            radiance[own, band] = total / (end - start + 1)
+        start = end
+
+
+@compiled
+def _spread(rays, kind, width, height, three, nine, directions, pixel):
+    sample = 0
+    for own in range(len(kind)):
+        if kind[own] == 0:
+            continue
+        offsets = nine if kind[own] & THIN else three
+        right = own + 1 if own % width + 1 < width else own - 1
+        below = own + width if own + width < len(kind) else own - width
+        sign_x, sign_y = np.float32(right - own), np.float32(1 if below > own else -1)
+        a, b = rays[own, 0] / rays[own, 2], rays[own, 1] / rays[own, 2]
+        a_x, b_x = (rays[right, 0] / rays[right, 2] - a) * sign_x, (rays[right, 1] / rays[right, 2] - b) * sign_x
+        a_y, b_y = (rays[below, 0] / rays[below, 2] - a) * sign_y, (rays[below, 1] / rays[below, 2] - b) * sign_y
+        for offset in offsets:
+            x, y = a + offset[0] * a_x + offset[1] * a_y, b + offset[0] * b_x + offset[1] * b_y
+            length = np.sqrt(x * x + y * y + 1)
+            directions[sample, 0], directions[sample, 1], directions[sample, 2] = x / length, y / length, 1 / length
+            pixel[sample] = own
+            sample += 1

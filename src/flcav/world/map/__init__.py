@@ -1,0 +1,1 @@
+"""The map of a town: roads, lanes, markings, surfaces, street furniture."""

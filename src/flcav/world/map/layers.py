@@ -1,0 +1,115 @@
+"""What a lane-level map of a town is made of: vector records in the world frame, metres and radians.
+
+Lines are in two dimensions; the road surface is at z = 0.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.files import Json
+from flcav.world.map.roads import LaneKind
+
+Array = NDArray[np.float64]
+Record = Mapping[str, Json]  # of one lane, line, crossing, arrow or polygon
+
+MarkingKind = Literal["solid", "dashed", "stop_line", "yield_line", "edge"]
+ArrowKind = Literal["straight", "left", "right", "straight_left", "straight_right", "left_right", "straight_left_right"]
+
+
+@dataclass(frozen=True)
+class MapLane:
+    """One lane, on a street or inside a junction."""
+
+    id: str
+    kind: LaneKind
+    centre_line: Array  # (K, 2) in driving direction; the outline of a walkingarea
+    width_m: float
+    speed: float  # limit [m/s]
+    junction: str  # the junction it lies in; empty on a street
+    turn: str  # s straight, l left, r right, t about, of a lane inside a junction; else empty
+    light: str  # "junction:link" that rules the entry to this lane inside a junction; else empty
+    successors: tuple[str, ...]  # ids of lanes
+
+
+@dataclass(frozen=True)
+class Marking:
+    """A painted line."""
+
+    kind: MarkingKind
+    line: Array  # (K, 2) its middle
+    width_m: float
+    dash_m: float  # painted stretch; 0 for a continuous line
+    gap_m: float  # between two of them
+    colour: str = "white"
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A pedestrian crossing."""
+
+    id: str
+    outline: Array  # (K, 2) counter-clockwise, on the road
+    centre_line: Array  # (K, 2) from kerb to kerb
+    width_m: float
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """A painted arrow: its middle, and the driving direction it is read in."""
+
+    kind: ArrowKind
+    x: float
+    y: float
+    yaw: float
+    lane: str  # id of the lane it lies on
+
+
+@dataclass(frozen=True)
+class MapLayers:
+    """A town's map."""
+
+    roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, counter-clockwise, without holes
+    sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2)
+    lanes: tuple[MapLane, ...]
+    markings: tuple[Marking, ...]
+    crossings: tuple[Crossing, ...]
+    arrows: tuple[Arrow, ...]
+
+    def to_records(self) -> dict[str, list[Record]]:
+        """Return each layer as a list of plain JSON values, polygons as `{"outline": [[x, y], ...]}`."""
+        out: dict[str, list[Record]] = {}
+        for layer in fields(self):
+            rows = getattr(self, layer.name)
+            out[layer.name] = [
+                {"outline": row.tolist()} if isinstance(row, np.ndarray) else _plain(row) for row in rows
+            ]
+        return out
+
+    @classmethod
+    def from_records(cls, records: Mapping[str, Sequence[Record]]) -> "MapLayers":
+        """Return the map that `to_records` gave."""
+        kinds = {"lanes": MapLane, "markings": Marking, "crossings": Crossing, "arrows": Arrow}
+        layers: dict[str, Any] = {}
+        for layer in fields(cls):
+            rows = [{name: _value(value) for name, value in row.items()} for row in records[layer.name]]
+            kind = kinds.get(layer.name)
+            layers[layer.name] = tuple(kind(**row) if kind else row["outline"] for row in rows)
+        return cls(**layers)
+
+
+def _plain(row: Any) -> Record:
+    values = ((field.name, getattr(row, field.name)) for field in fields(row))
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
+        for name, value in values
+    }
+
+
+def _value(value: Any) -> Any:
+    if not isinstance(value, list):
+        return value
+    return np.array(value, dtype=np.float64) if value and isinstance(value[0], list) else tuple(value)

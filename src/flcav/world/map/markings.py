@@ -1,0 +1,183 @@
+"""Which lines are painted on a town's streets.
+
+The rules are those of European towns: broken lines between lanes that turn solid before a controlled junction, a
+double line between directions of several lanes, solid lines beside bicycle and parking lanes, edge lines where there is
+no kerb or the street is fast, a stop line where one stops and a broken one where one gives way.
+"""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString, Point
+from shapely.geometry.base import BaseGeometry
+from shapely.ops import substring
+
+from flcav.world.map.layers import Marking, MarkingKind
+from flcav.world.map.roads import CARRIAGEWAY, Edge, Lane, RoadNet
+
+Array = NDArray[np.float64]
+
+LINE_M = 0.12  # width of a line
+BICYCLE_LINE_M = 0.25
+DASH_M, GAP_M = 3.0, 6.0  # between lanes
+YIELD_DASH_M, YIELD_GAP_M, YIELD_LINE_M = 0.5, 0.25, 0.5
+STOP_LINE_M = 0.5
+TO_STOP_M = 0.35  # from the middle of a stop line to the end of its lane
+APPROACH_M = 18.0  # before a controlled junction nobody changes lanes
+DOUBLE_M = 0.12  # from the middle of the road to each of a double line
+INSET_M = 0.2  # of an edge line from the edge
+FAST = 13.0  # [m/s] streets as fast as this have edge lines even along a kerb
+SHORTEST_M = 0.3  # painted line
+SAME_LINE_M = 0.7  # two edges this close are the two directions of one street
+
+
+def markings(net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry) -> Iterator[Marking]:
+    """Iterate over the painted lines of a net, kept on `roads` and off `crossings`."""
+    paper = roads.buffer(-0.01).difference(crossings)
+    shapely.prepare(paper)
+    for marking in _drawn(net):
+        width = marking.width_m / 2
+        inside = paper.buffer(-width) if width > LINE_M else paper  # stop lines are wide: keep all of them on the road
+        for part in _lines(LineString(marking.line).intersection(inside)):
+            if part.length >= SHORTEST_M:
+                line = np.asarray(part.coords)
+                yield Marking(marking.kind, line, marking.width_m, marking.dash_m, marking.gap_m, marking.colour)
+
+
+def _drawn(net: RoadNet) -> Iterator[Marking]:
+    bends = _bends(net)
+    facing: dict[tuple[str, str], list[Edge]] = {}
+    for edge in net.edges.values():
+        if edge.function == "normal":
+            facing.setdefault((edge.start, edge.end), []).append(edge)
+        elif edge.id in bends:
+            facing.setdefault(("", bends[edge.id]), []).append(edge)
+    for edge in net.edges.values():
+        inside = edge.id in bends
+        if edge.function != "normal" and not inside:
+            continue
+        lanes = [lane for lane in edge.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
+        if not lanes:
+            continue
+        approach = APPROACH_M if not inside and _controlled(net, edge) else 0.0
+        yield from _between_lanes(lanes, approach)
+        across = facing.get(("", bends[edge.id]) if inside else (edge.end, edge.start), [])
+        yield from _left_side(edge, lanes, across, approach)
+        kerb = any(lane.kind == "sidewalk" for lane in edge.lanes) and lanes[0].speed < FAST
+        if not kerb and not inside and lanes[0].kind == "driving":
+            yield Marking("edge", _beside(lanes[0], INSET_M - lanes[0].width / 2), LINE_M, 0.0, 0.0)
+        if not inside:
+            yield from _entry(net, edge)
+
+
+def _between_lanes(lanes: list[Lane], approach: float) -> Iterator[Marking]:
+    for right, left in pairwise(lanes):
+        line = _beside(right, right.width / 2)
+        if right.kind == left.kind == "driving":
+            yield from _broken(line, approach)
+        else:
+            wide = {right.kind, left.kind} == {"bicycle", "driving"}
+            yield Marking("solid", line, BICYCLE_LINE_M if wide else LINE_M, 0.0, 0.0)
+
+
+def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: float) -> Iterator[Marking]:
+    line = _beside(lanes[-1], lanes[-1].width / 2)
+    for other in across:
+        theirs = [lane for lane in other.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
+        if other is edge or not theirs or not _same(line, _beside(theirs[-1], theirs[-1].width / 2)):
+            continue
+        if edge.id > other.id:
+            return  # drawn with the other direction
+        if len([lane for lane in (*lanes, *theirs) if lane.kind == "driving"]) > 2:
+            for side in (-DOUBLE_M, DOUBLE_M):
+                yield Marking("solid", _beside(lanes[-1], lanes[-1].width / 2 + side), LINE_M, 0.0, 0.0)
+        else:
+            yield from _broken(line, approach, both_ends=True)
+        return
+    if edge.function == "normal":
+        yield Marking("edge", _beside(lanes[-1], lanes[-1].width / 2 - INSET_M), LINE_M, 0.0, 0.0)
+
+
+def _broken(line: Array, approach: float, *, both_ends: bool = False) -> Iterator[Marking]:
+    """Yield a dashed line that is solid over the last `approach` metres, or over those at both ends."""
+    whole = LineString(line)
+    approach = min(approach, whole.length / 3)
+    start = approach if both_ends else 0.0
+    pieces: list[tuple[MarkingKind, float, float]] = [("dashed", start, whole.length - approach)]
+    pieces.append(("solid", 0.0, start))
+    pieces.append(("solid", whole.length - approach, whole.length))
+    for kind, low, high in pieces:
+        if high - low > SHORTEST_M:
+            dash, gap = (DASH_M, GAP_M) if kind == "dashed" else (0.0, 0.0)
+            yield Marking(kind, np.asarray(substring(whole, low, high).coords), LINE_M, dash, gap)
+
+
+def _entry(net: RoadNet, edge: Edge) -> Iterator[Marking]:
+    """Yield the stop or give-way line across the driving and bicycle lanes of an edge, before its junction."""
+    states = set(net.right_of_way.get(edge.id, ""))
+    lanes = [lane for lane in edge.lanes if lane.kind in ("driving", "bicycle") and len(lane.shape) > 1]
+    if not lanes or not states:
+        return
+    stops = net.junctions[edge.end].kind.startswith("traffic_light") or "s" in states
+    if not stops and states != {"m"}:
+        return
+    ends = []
+    for lane, side in ((lanes[0], -0.5), (lanes[-1], 0.5)):
+        a, b = lane.shape[-2], lane.shape[-1]
+        forward = (b - a) / np.hypot(*(b - a))
+        inset = 0.1 if len(lanes) == 1 or side < 0 else 0.15
+        left = np.array([-forward[1], forward[0]])
+        ends.append(b - TO_STOP_M * forward + (side * lane.width - np.sign(side) * inset) * left)
+    line = np.array(ends)
+    if stops:
+        yield Marking("stop_line", line, STOP_LINE_M, 0.0, 0.0)
+    else:
+        yield Marking("yield_line", line, YIELD_LINE_M, YIELD_DASH_M, YIELD_GAP_M)
+
+
+def _controlled(net: RoadNet, edge: Edge) -> bool:
+    junction = net.junctions.get(edge.end)
+    return junction is not None and (
+        junction.kind.startswith("traffic_light") or bool(set(net.right_of_way.get(edge.id, "")) & {"s", "m"})
+    )
+
+
+def _bends(net: RoadNet) -> dict[str, str]:
+    """Return the edges inside junctions that are but a bend or a seam of one street, with their junction."""
+    neighbours: dict[str, set[str]] = {}
+    for edge in net.streets:
+        neighbours.setdefault(edge.end, set()).add(edge.start)
+        neighbours.setdefault(edge.start, set()).add(edge.end)
+    through = {name for name, others in neighbours.items() if len(others) == 2}
+    straight = {
+        connection.via.rpartition("_")[0] for connection in net.connections if connection.turn in ("s", "L", "R")
+    }
+    return {
+        edge.id: name
+        for edge in net.edges.values()
+        if edge.function == "internal" and edge.id in straight
+        for name in [edge.id[1:].rpartition("_")[0]]
+        if name in through and not net.junctions[name].kind.startswith("traffic_light")
+    }
+
+
+def _beside(lane: Lane, left_m: float) -> Array:
+    """Return the line `left_m` to the left of a lane's middle, in driving direction."""
+    line = LineString(lane.shape).offset_curve(left_m, join_style="mitre")
+    parts = _lines(line)
+    return np.asarray(max(parts, key=lambda part: part.length).coords) if parts else lane.shape
+
+
+def _same(one: Array, other: Array) -> bool:
+    line = LineString(one)
+    whole = LineString(other)
+    inner = [whole.interpolate(share, normalized=True) for share in (0.25, 0.5, 0.75)]
+    return max(line.distance(Point(at)) for at in inner) < SAME_LINE_M
+
+
+def _lines(shape: BaseGeometry) -> list[LineString]:
+    parts = getattr(shape, "geoms", [shape])
+    return [part for part in parts if isinstance(part, LineString) and not part.is_empty]

@@ -1,0 +1,89 @@
+"""Painted shapes: the dashes, stripes and arrows of a map as polygons."""
+
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString, Polygon
+from shapely.geometry.base import BaseGeometry
+from shapely.geometry.polygon import orient
+from shapely.ops import substring
+
+from flcav.world.map.layers import Arrow, ArrowKind, Crossing, MapLayers, Marking
+
+Array = NDArray[np.float64]
+
+STRIPE_M = 0.5  # of a zebra crossing, and between two of its stripes
+ARROW_M = 5.0  # length of an arrow
+SHAFT_M = 0.15  # its width
+
+
+class Paint(NamedTuple):
+    """One painted shape."""
+
+    layer: str  # marking | crossing | arrow
+    outline: Array  # (K, 2) counter-clockwise, without holes [m]
+    colour: str
+
+
+def painted(layers: MapLayers) -> tuple[Paint, ...]:
+    """Return everything that is painted on the roads of a map, in the world frame."""
+    return (
+        *(Paint("marking", piece, marking.colour) for marking in layers.markings for piece in strokes(marking)),
+        *(Paint("crossing", piece, "white") for crossing in layers.crossings for piece in stripes(crossing)),
+        *(Paint("arrow", piece, "white") for arrow in layers.arrows for piece in [glyph(arrow)]),
+    )
+
+
+def strokes(marking: Marking) -> Iterator[Array]:
+    """Yield the polygons (K, 2) of a line: one, or one per dash."""
+    line = LineString(marking.line)
+    period = marking.dash_m + marking.gap_m if marking.dash_m else line.length
+    starts = np.arange(0.0, line.length - 1e-6, period)
+    for start in starts:
+        piece = substring(line, start, min(start + (marking.dash_m or line.length), line.length))
+        yield from outlines(piece.buffer(marking.width_m / 2, cap_style="flat", join_style="mitre"))
+
+
+def stripes(crossing: Crossing) -> Iterator[Array]:
+    """Yield the polygons (K, 2) of a zebra crossing's stripes, which run in driving direction."""
+    line, outline = LineString(crossing.centre_line), Polygon(crossing.outline)
+    count = max(int((line.length + STRIPE_M) / (2 * STRIPE_M)), 1)
+    first = (line.length - (2 * count - 1) * STRIPE_M) / 2
+    for start in first + 2 * STRIPE_M * np.arange(count):
+        piece = substring(line, start, start + STRIPE_M)
+        if isinstance(piece, LineString):
+            yield from outlines(piece.buffer(crossing.width_m / 2, cap_style="flat").intersection(outline))
+
+
+def glyph(arrow: Arrow) -> Array:
+    """Return the outline (K, 2) of a painted arrow."""
+    cos, sin = np.cos(arrow.yaw), np.sin(arrow.yaw)
+    return _glyph(arrow.kind) @ np.array([[cos, sin], [-sin, cos]]) + (arrow.x, arrow.y)
+
+
+@lru_cache(maxsize=16)
+def _glyph(kind: ArrowKind) -> Array:
+    """Return an arrow about the origin, read along x."""
+    back, heads = -ARROW_M / 2, kind.split("_")
+    shaft = LineString([(back, 0.0), (0.9 if "straight" in heads else -0.2, 0.0)])
+    pieces: list[BaseGeometry] = [shaft.buffer(SHAFT_M / 2, cap_style="flat")]
+    if "straight" in heads:
+        pieces.append(Polygon([(0.6, -0.35), (ARROW_M / 2, 0.0), (0.6, 0.35)]))
+    for side, name in ((1.0, "left"), (-1.0, "right")):
+        if name in heads:
+            bow = LineString([(back / 2, 0.0), (-0.5, side * 0.05), (0.0, side * 0.25), (0.3, side * 0.55)])
+            pieces.append(bow.buffer(SHAFT_M / 2, cap_style="flat"))
+            pieces.append(Polygon([(-0.35, side * 0.62), (0.85, side * 0.42), (0.75, side * 1.25)]))
+    return next(iter(outlines(shapely.union_all(pieces).buffer(0.001))))
+
+
+def outlines(shape: BaseGeometry | Iterable[BaseGeometry]) -> Iterator[Array]:
+    """Yield the polygons of a shape as vertices (K, 2), counter-clockwise, the first not repeated."""
+    parts = shape if not isinstance(shape, BaseGeometry) else getattr(shape, "geoms", [shape])
+    for part in parts:
+        if isinstance(part, Polygon) and part.area > 1e-4:
+            yield np.asarray(orient(part).exterior.coords)[:-1]

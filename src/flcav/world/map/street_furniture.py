@@ -1,0 +1,201 @@
+"""What stands along the streets of a town: buildings, clutter, trees, lamps, poles, signs."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString, Point, Polygon
+from shapely.geometry.base import BaseGeometry
+
+from flcav.world.map.parameters import CLUTTER, Interval, PoleParameters, StreetParameters, TownParameters
+from flcav.world.map.roads import Edge, RoadNet
+from flcav.world.map.surfaces import Surfaces, footprint
+
+Array = NDArray[np.float64]
+
+CORNER_M = 9.0  # how far beyond an edge's ends its frontage may go on
+STEP_M = 1.0  # how far on to try where something did not fit
+CLEARANCE_M = 0.25  # kept between solid things
+SENSOR_CLEAR_M = 2.5  # no street lamp stands nearer to a roadside sensor: it hides the view
+SIGN_HEIGHT_M = 2.2  # of the plate's centre
+SPEED_SIGNS = {30: "speed_30", 60: "speed_60", 90: "speed_90"}  # [km/h]
+
+
+class Plot:
+    """The land of a town, and what has been built on it: asks where there is room."""
+
+    def __init__(self, closed: BaseGeometry) -> None:
+        self._closed = closed
+        shapely.prepare(self._closed)
+        self._taken: list[Polygon] = []
+
+    def build(self, shape: Polygon) -> bool:
+        """Take `shape` where it is free of the closed area and of all that was built before; say whether it was."""
+        if self._closed.intersects(shape):
+            return False
+        if self._taken and shapely.dwithin(np.array(self._taken), shape, CLEARANCE_M).any():
+            return False
+        self._taken.append(shape)
+        return True
+
+
+@dataclass(frozen=True)
+class Verge:
+    """The middle of a street's sidewalk, walked in driving direction: its right is away from the road."""
+
+    line: LineString
+    half_width: float  # of the sidewalk lane [m]
+    street: StreetParameters
+
+    def at(self, along_m: float, right_m: float) -> tuple[float, float, float]:
+        """Return x, y and the driving direction at `along_m` (beyond the ends: straight on), `right_m` off the line."""
+        inside = float(np.clip(along_m, 0.0, self.line.length))
+        before, after = max(inside - 0.5, 0.0), min(inside + 0.5, self.line.length)
+        a, b = self.line.interpolate(before), self.line.interpolate(after)
+        yaw = float(np.arctan2(b.y - a.y, b.x - a.x))
+        here = self.line.interpolate(inside)
+        on = along_m - inside
+        x = here.x + on * np.cos(yaw) + right_m * np.sin(yaw)
+        y = here.y + on * np.sin(yaw) - right_m * np.cos(yaw)
+        return float(x), float(y), yaw
+
+
+def verges(net: RoadNet, parameters: TownParameters) -> Iterator[Verge]:
+    """Iterate over the sidewalks of all streets, in the net's order."""
+    for edge in net.streets:
+        for lane in edge.lanes_of("sidewalk"):
+            yield Verge(LineString(lane.shape), lane.width / 2, parameters.streets[edge.type])
+
+
+def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) -> Array:
+    """Return buildings (B, 6) x, y, yaw, length, width, height, shoulder to shoulder along every frontage."""
+    out = []
+    for verge in rows:
+        street = verge.street
+        along = -CORNER_M
+        while along < verge.line.length + CORNER_M:
+            length, width = _draw(random, street.building_length_m), _draw(random, street.building_depth_m)
+            height = _draw(random, street.building_height_m)
+            right = verge.half_width + street.frontage_m + _draw(random, street.setback_m) + width / 2
+            for candidate in (length, street.building_length_m[0]):
+                x, y, yaw = verge.at(along + candidate / 2, right)
+                if plot.build(footprint(x, y, yaw, candidate, width)):
+                    out.append((x, y, yaw, candidate, width, height))
+                    along += candidate + max(CLEARANCE_M, _draw(random, street.building_gap_m))
+                    break
+            else:
+                along += STEP_M
+    return _rows(out, 6)
+
+
+def place_clutter(rows: list[Verge], plot: Plot, random: np.random.Generator) -> tuple[tuple[str, Array], ...]:
+    """Return, per kind, rows (K, 6) x, y, yaw, length, width, height, just behind the walked part of the sidewalk."""
+    out: dict[str, list[tuple[float, ...]]] = {}
+    for verge in rows:
+        kinds, weights = list(verge.street.clutter), np.array(list(verge.street.clutter.values()))
+        for along in _stations(verge, verge.street.clutter_spacing_m, random):
+            kind = kinds[int(random.choice(len(kinds), p=weights / weights.sum()))]
+            length, width, height = np.array(CLUTTER[kind]) * random.uniform(0.85, 1.15, size=3)
+            x, y, yaw = verge.at(along, verge.half_width + 0.15 + width / 2)
+            if plot.build(footprint(x, y, yaw, length, width)):
+                out.setdefault(kind, []).append((x, y, yaw, float(length), float(width), float(height)))
+    return tuple((kind, _rows(out[kind], 6)) for kind in sorted(out))
+
+
+def place_trees(rows: list[Verge], ground: Surfaces, plot: Plot, random: np.random.Generator) -> Array:
+    """Return trees (T, 4) x, y, height, crown radius: along the streets and on the traffic islands."""
+    out = []
+
+    def plant(x: float, y: float, room: Callable[[Polygon], bool]) -> None:
+        height = float(random.uniform(4.5, 9.0))
+        if room(Point(x, y).buffer(0.45)):
+            out.append((x, y, height, float(height * random.uniform(0.22, 0.32))))
+
+    for verge in rows:
+        for along in _stations(verge, verge.street.tree_spacing_m, random):
+            x, y, _ = verge.at(along, verge.half_width + random.uniform(0.6, 2.4))
+            plant(x, y, plot.build)
+    for island in ground.islands.geoms:
+        inner = island.buffer(-1.5)
+        low_x, low_y, high_x, high_y = island.bounds
+        for _ in range(int(island.area / 45.0)):
+            x, y = float(random.uniform(low_x, high_x)), float(random.uniform(low_y, high_y))
+            plant(x, y, inner.contains)
+    return _rows(out, 4)
+
+
+def place_lamps(rows: list[Verge], sensors: Array, random: np.random.Generator) -> Array:
+    """Return street lamps (L, 3): foot x, y at the kerb, and height.
+
+    A lamp that would stand within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) stands further along.
+    """
+    out = []
+    for verge in rows:
+        for along in _stations(verge, verge.street.lamp_spacing_m, random):
+            x, y, _ = verge.at(along, 0.3 - verge.half_width)
+            while len(sensors) and np.hypot(*(sensors[:, :2] - (x, y)).T).min() < SENSOR_CLEAR_M:
+                along += STEP_M
+                x, y, _ = verge.at(along, 0.3 - verge.half_width)
+            out.append((x, y, 7.0))
+    return _rows(out, 3)
+
+
+def place_poles(
+    net: RoadNet, parameters: tuple[PoleParameters, ...]
+) -> list[tuple[int, tuple[float, float, float], float, str]]:
+    """Return id, position, yaw and kind of each candidate site; raises `KeyError` for an edge the net lacks."""
+    out = []
+    for pole in sorted(parameters, key=lambda pole: pole.id):
+        x, y, heading = _kerb_side(net.edges[pole.edge], pole.before_end_m)
+        yaw = heading + np.pi / 2
+        if pole.kind != "straight":
+            target = net.junctions[net.edges[pole.edge].end].centre
+            if net.edges[pole.edge].end in net.roundabouts:
+                circle = [net.junctions[name].centre for name in sorted(net.roundabouts)]
+                target = np.mean(circle, axis=0)
+            yaw = np.arctan2(target[1] - y, target[0] - x)
+        out.append((pole.id, (x, y, pole.height_m), float(yaw), pole.kind))
+    return out
+
+
+def place_signs(net: RoadNet) -> list[tuple[tuple[float, float, float], float, str]]:
+    """Return position, yaw and kind of each sign: give way and stop before junctions, the speed limit after them."""
+    out = []
+    for edge in net.streets:
+        if not edge.lanes_of("sidewalk") or not edge.lanes_of("driving"):
+            continue
+        length = LineString(edge.lanes_of("sidewalk")[-1].shape).length
+        states = set(net.right_of_way.get(edge.id, ""))
+        kind = "stop" if "s" in states else "yield" if states == {"m"} else None
+        wanted = [(kind, 1.5)] if kind else []
+        if length > 45.0:
+            limit = 3.6 * edge.lanes_of("driving")[0].speed
+            wanted.append((SPEED_SIGNS[min(SPEED_SIGNS, key=lambda known: abs(known - limit))], length - 12.0))
+        for name, before_end in wanted:
+            x, y, heading = _kerb_side(edge, before_end)
+            out.append(((x, y, SIGN_HEIGHT_M), float(heading + np.pi), name))
+    return out
+
+
+def _kerb_side(edge: Edge, before_end_m: float) -> tuple[float, float, float]:
+    """Return x, y on the sidewalk 0.35 m from the kerb, and the driving direction there."""
+    lane = edge.lanes_of("sidewalk")[-1]
+    verge = Verge(LineString(lane.shape), lane.width / 2, StreetParameters())
+    return verge.at(verge.line.length - before_end_m, 0.35 - verge.half_width)
+
+
+def _stations(verge: Verge, spacing_m: float, random: np.random.Generator) -> Iterator[float]:
+    along = spacing_m * random.uniform(0.2, 0.8)
+    while along < verge.line.length - 2.0:
+        yield float(along)
+        along += spacing_m * random.uniform(0.7, 1.3)
+
+
+def _draw(random: np.random.Generator, interval: Interval) -> float:
+    return float(random.uniform(*interval))
+
+
+def _rows(rows: list[tuple[float, ...]], columns: int) -> Array:
+    return np.array(rows, dtype=np.float64).reshape(-1, columns)

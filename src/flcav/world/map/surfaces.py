@@ -1,0 +1,104 @@
+"""The ground of a town as clean polygons: what is driven on, what is walked on, and the kerb between them."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString, MultiPolygon, Polygon, box
+from shapely.geometry.base import BaseGeometry
+from shapely.ops import linemerge, split
+
+from flcav.world.map.roads import CARRIAGEWAY, RoadNet
+
+Array = NDArray[np.float64]
+
+SLIVER_M = 0.25  # pieces and notches narrower than twice this are drawing artefacts of the net
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The ground, as shapely geometry in the world frame [m]."""
+
+    roads: MultiPolygon
+    sidewalks: MultiPolygon  # with the traffic islands
+    islands: MultiPolygon
+
+
+def surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Surfaces:
+    """Return the surfaces of a net; `frontage_m` maps a street type to the width of paving behind its sidewalk."""
+    driven = [
+        LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
+        for edge in net.edges.values()
+        for lane in edge.lanes
+        if lane.kind in CARRIAGEWAY and LineString(lane.shape).length > SLIVER_M
+    ]
+    walked, paved = [], []
+    narrowest = min(frontage_m.values(), default=0.0)
+    for edge in net.edges.values():
+        for lane in edge.lanes:
+            if lane.kind == "sidewalk" and len(lane.shape) > 1:
+                area = LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
+                frontage = frontage_m.get(edge.type, narrowest)
+            elif lane.kind == "walkingarea" and len(lane.shape) > 2:
+                area, frontage = shapely.make_valid(Polygon(lane.shape)), narrowest
+            else:
+                continue
+            walked.append(area)
+            paved.append(area.buffer(frontage, join_style="mitre"))
+    inside = [Polygon(junction.shape).buffer(0) for junction in net.junctions.values() if len(junction.shape) > 2]
+    driven_area, walked_area = shapely.union_all(driven), shapely.union_all(walked)
+    roads = driven_area.union(shapely.union_all(inside).difference(walked_area))
+    roads = MultiPolygon([part for part in _clean(roads).geoms if part.intersects(driven_area)])
+    sidewalks = shapely.union_all(paved).difference(roads)
+    islands = MultiPolygon(
+        [
+            hole
+            for hole in (Polygon(ring) for part in roads.geoms for ring in part.interiors)
+            if not hole.intersects(walked_area.buffer(-SLIVER_M))
+        ]
+    )
+    return Surfaces(roads, _clean(sidewalks.union(islands)), islands)
+
+
+def simple_polygons(area: BaseGeometry) -> tuple[Array, ...]:
+    """Return `area` as disjoint polygons (K, 2) without holes, counter-clockwise, first vertex not repeated."""
+    pieces: list[Array] = []
+    for part in _polygons(area):
+        if part.interiors:
+            x = Polygon(part.interiors[0]).representative_point().x
+            _, low, _, high = part.bounds
+            cut = LineString([(x, low - 1), (x, high + 1)])
+            pieces.extend(simple_polygons(split(part, cut)))
+        else:
+            pieces.append(np.asarray(shapely.geometry.polygon.orient(part).exterior.coords)[:-1])
+    return tuple(pieces)
+
+
+def kerb_lines(ground: Surfaces) -> tuple[Array, ...]:
+    """Return the polylines (K, 2) along which road meets sidewalk."""
+    shared = ground.roads.boundary.intersection(ground.sidewalks.buffer(0.02))
+    lines = [line for line in getattr(shared, "geoms", [shared]) if isinstance(line, LineString) and line.length > 0]
+    merged = linemerge(lines)
+    return tuple(np.asarray(line.coords) for line in getattr(merged, "geoms", [merged]) if line.length > 0.5)
+
+
+def _clean(area: BaseGeometry) -> MultiPolygon:
+    """Drop slivers, close hairline gaps, thin vertices."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # a mitre divides by the sine of its turn, zero or not
+        opened = area.buffer(-SLIVER_M / 2, join_style="mitre").buffer(SLIVER_M, join_style="mitre")
+        closed = opened.buffer(-SLIVER_M / 2, join_style="mitre").simplify(0.02)
+    return MultiPolygon([part for part in _polygons(closed) if part.area > 1.0])
+
+
+def _polygons(area: BaseGeometry) -> Iterable[Polygon]:
+    parts = getattr(area, "geoms", [area])
+    return [part for part in parts if isinstance(part, Polygon) and not part.is_empty]
+
+
+def footprint(x: float, y: float, yaw: float, length: float, width: float) -> Polygon:
+    """Return the rectangle (centre, heading, extents [m]) as a polygon."""
+    rectangle = box(-length / 2, -width / 2, length / 2, width / 2)
+    cos, sin = float(np.cos(yaw)), float(np.sin(yaw))
+    return shapely.affinity.affine_transform(rectangle, [cos, -sin, sin, cos, x, y])

@@ -1,0 +1,1 @@
+"""Traffic: demand, SUMO, and the trace of everybody that it gives."""

@@ -1,0 +1,183 @@
+"""Traffic demand: who drives and walks where, and who is parked."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+import numpy as np
+from numpy.typing import NDArray
+from shapely.geometry import LineString
+
+from flcav.geometry import wrap_angle
+from flcav.seeds import stream
+from flcav.world.map.parameters import TownParameters
+from flcav.world.map.roads import Edge, RoadNet
+from flcav.world.map.street_furniture import Verge
+from flcav.world.shapes import SHAPES
+
+FROM_JUNCTION_M = 6.0  # kept free at both ends of a parking lane
+KERB_GAP_M = (0.1, 0.3)  # between wheels and kerb
+BUMPER_GAP_M = (0.6, 1.8)  # between neighbours
+CROOKED = 0.12  # share of drivers who do not care
+BACKWARDS = 0.06  # share parked against the traffic
+OVERHANG_M = 0.1  # how far a wide vehicle may stand out of its lane
+
+
+@dataclass(frozen=True)
+class Parked:
+    """One parked vehicle."""
+
+    category: str
+    shape: int  # index within the category
+    x: float
+    y: float
+    yaw: float
+
+
+def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) -> list[Parked]:
+    """Return the vehicles on the parking lanes of all streets: inside their lane, apart from each other."""
+    out = []
+    for edge in net.streets:
+        street = parameters.streets[edge.type]
+        categories = list(street.parked_mix)
+        shares = np.array([street.parked_mix[category] for category in categories])
+        for lane in edge.lanes_of("parking"):
+            verge = Verge(LineString(lane.shape), lane.width / 2, street)
+            along = FROM_JUNCTION_M + random.uniform(0.0, 3.0)
+            while True:
+                category = categories[int(random.choice(len(categories), p=shares / shares.sum()))]
+                shape = int(random.choice(len(SHAPES[category]), p=parameters.shape_weights(category)))
+                length, width = SHAPES[category][shape].length, SHAPES[category][shape].width
+                taken, backwards = random.random() < street.parked, random.random() < BACKWARDS
+                crooked = random.normal(0.0, 0.07 if random.random() < CROOKED else 0.012)
+                kerb_gap, bumper_gap = random.uniform(*KERB_GAP_M), random.uniform(*BUMPER_GAP_M)
+                if along + length > verge.line.length - FROM_JUNCTION_M:
+                    break
+                if taken and width < lane.width + OVERHANG_M:
+                    room = lane.width + OVERHANG_M - width
+                    crooked = float(np.clip(crooked, -0.8 * room / length, 0.8 * room / length))
+                    needed = width + length * abs(np.sin(crooked))
+                    right = lane.width / 2 - min(kerb_gap, lane.width + OVERHANG_M - needed) - needed / 2
+                    x, y, heading = verge.at(along + length / 2, right)
+                    yaw = float(wrap_angle(heading + crooked + np.pi * backwards))
+                    out.append(Parked(category, shape, x, y, yaw))
+                along += length + bumper_gap
+    return out
+
+
+Array = NDArray[np.float64]
+
+DRIVER = {  # SUMO's vehicle class and what departs from its defaults
+    "car": {"vClass": "passenger", "speedFactor": "normc(1,0.1,0.75,1.2)", "minGap": "2.0"},
+    "van": {"vClass": "delivery", "speedFactor": "normc(0.95,0.1,0.7,1.1)", "minGap": "2.0"},
+    "truck": {"vClass": "truck", "speedFactor": "normc(0.9,0.1,0.7,1.0)", "minGap": "2.5"},
+    "bus": {"vClass": "bus", "speedFactor": "normc(0.85,0.1,0.7,1.0)", "minGap": "2.5"},
+    "motorcycle": {"vClass": "motorcycle", "speedFactor": "normc(1.05,0.1,0.8,1.3)", "minGap": "1.5"},
+    "bicycle": {"vClass": "bicycle", "maxSpeed": "5.0", "minGap": "1.0"},
+    "pedestrian": {"vClass": "pedestrian", "maxSpeed": "1.6", "speedFactor": "normc(0.8,0.15,0.4,1.0)"},
+}
+CAV_TYPE = "car.sedan"
+FASTEST = 20.0  # no vehicle is faster [m/s]
+FASTEST_WALK = 1.7  # no pedestrian is [m/s]
+
+
+def write_demand(
+    net: RoadNet, parameters: TownParameters, *, seed: int, cavs: int, until_s: float, fill_s: float
+) -> str:
+    """Return the text of the route file: CAVs from the start, all others from some instant before `fill_s` [s].
+
+    Everybody has a tour of random destinations too long to be finished by `until_s`. Vehicles draw destinations by
+    the street type's `traffic`, pedestrians by `footfall`; CAVs draw the approaches of the candidate poles, if any.
+    """
+    root = Element("routes")
+    for category, shapes in SHAPES.items():
+        for shape in shapes:
+            size = {"length": shape.length, "width": shape.width, "height": shape.height}
+            attributes = {name: str(value) for name, value in size.items()}
+            SubElement(root, "vType", {"id": f"{category}.{shape.name}"} | DRIVER[category] | attributes)
+    driven = [edge for edge in net.streets if edge.lanes_of("driving")]
+    walked = [edge for edge in net.streets if edge.lanes_of("sidewalk")]
+    traffic = np.array([parameters.streets[edge.type].traffic for edge in driven])
+    footfall = np.array([parameters.streets[edge.type].footfall for edge in walked])
+    watched = pole_approaches(net, parameters)
+    watching = np.array([watched.get(edge.id, 0.0) for edge in driven])
+    reach = FASTEST * until_s
+    trips: list[tuple[float, Element]] = []
+    for i in range(cavs):
+        random = stream(seed, "cav", i)
+        edges = tour(driven, watching if watching.any() else traffic, reach, random)
+        trips.append((0.0, _vehicle(f"cav{i}", CAV_TYPE, 0.0, edges)))
+    categories = list(parameters.mix)
+    shares = np.array([parameters.mix[category] for category in categories])
+    for i in range(parameters.vehicles):
+        random = stream(seed, "vehicle", i)
+        kind = draw_type(categories[int(random.choice(len(categories), p=shares / shares.sum()))], parameters, random)
+        depart = round(float(random.uniform(0.0, fill_s)), 1)
+        trips.append((depart, _vehicle(f"veh{i}", kind, depart, tour(driven, traffic, reach, random))))
+    for i in range(parameters.pedestrians):
+        random = stream(seed, "pedestrian", i)
+        kind = draw_type("pedestrian", parameters, random)
+        depart = round(float(random.uniform(0.0, fill_s)), 1)
+        trips.append((depart, _person(f"ped{i}", kind, depart, tour(walked, footfall, FASTEST_WALK * until_s, random))))
+    for _, trip in sorted(trips, key=lambda item: item[0]):
+        root.append(trip)
+    return tostring(root, encoding="unicode")
+
+
+def pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str, float]:
+    """Return the edges that lead past the candidate poles, weighted so that all poles weigh the same.
+
+    They are both directions of the street a straight pole stands on, and all edges into the junction another watches.
+    """
+    out: dict[str, float] = {}
+    for pole in parameters.poles:
+        own = net.edges[pole.edge]
+        if pole.kind == "straight":
+            past = [edge.id for edge in net.streets if {edge.start, edge.end} == {own.start, own.end}]
+        else:
+            past = [edge.id for edge in net.streets if edge.end == own.end]
+        for edge in past:
+            out[edge] = out.get(edge, 0.0) + 1.0 / len(past)
+    return out
+
+
+def tour(edges: list[Edge], weight: Array, length_m: float, random: np.random.Generator) -> list[str]:
+    """Return edges to visit in order, drawn by `weight` (N,), whose beeline adds up to at least `length_m`."""
+    middle = np.array([edge.lanes[0].shape.mean(axis=0) for edge in edges])
+    share = weight / weight.sum()
+    at = int(random.choice(len(edges), p=share))
+    out, done = [edges[at].id], 0.0
+    while done < length_m:
+        to = int(random.choice(len(edges), p=share))
+        step = float(np.hypot(*(middle[to] - middle[at])))
+        if step < 5.0:
+            continue
+        out.append(edges[to].id)
+        done, at = done + step, to
+    return out
+
+
+def draw_type(category: str, parameters: TownParameters, random: np.random.Generator) -> str:
+    """Return the SUMO vehicle type of a random shape of the category, "category.shape"."""
+    weights = parameters.shape_weights(category)
+    return f"{category}.{SHAPES[category][int(random.choice(len(weights), p=weights))].name}"
+
+
+def _vehicle(name: str, kind: str, depart: float, edges: list[str]) -> Element:
+    row = {"id": name, "type": kind, "depart": f"{depart:.1f}", "departPos": "random_free", "departLane": "best"}
+    return Element("trip", row | {"from": edges[0], "to": edges[-1], "via": " ".join(edges[1:-1])})
+
+
+def _person(name: str, kind: str, depart: float, edges: list[str]) -> Element:
+    person = Element("person", {"id": name, "type": kind, "depart": f"{depart:.1f}", "departPos": "random"})
+    SubElement(person, "walk", {"from": edges[0], "to": edges[1]})
+    for edge in edges[2:]:
+        SubElement(person, "walk", {"to": edge})
+    return person
+
+
+def types() -> Iterator[tuple[str, str, int]]:
+    """Iterate over SUMO vehicle type, category, shape index."""
+    for category, shapes in SHAPES.items():
+        for i, shape in enumerate(shapes):
+            yield f"{category}.{shape.name}", category, i

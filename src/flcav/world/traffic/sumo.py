@@ -1,0 +1,56 @@
+"""SUMO in a process beside this one, started with the first simulation and kept for the next."""
+
+import atexit
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+SERVE = "flcav.world.traffic.sumo_process:serve"
+
+_lock = threading.Lock()
+_process: tuple[int, subprocess.Popen[str]] | None = None  # and the process that started it: a fork starts its own
+
+
+def simulate_in(folder: Path) -> None:
+    """Do the job in `folder`, see `sumo_process`; raises `RuntimeError` with what SUMO said if it fails."""
+    with _lock:
+        try:
+            process = _running()
+            assert process.stdin is not None
+            assert process.stdout is not None
+            process.stdin.write(f"{folder}\n")
+            process.stdin.flush()
+            code = process.stdout.readline().strip()
+        except BrokenPipeError:
+            code = ""
+        except BaseException:
+            _stop()  # its answer would be taken for that to the next job
+            raise
+    if code != "0":
+        if not code:
+            _stop()
+        said = folder / "said.txt"
+        raise RuntimeError(said.read_text()[-500:].strip() if said.exists() else f"exit code {code}")
+
+
+def _running() -> subprocess.Popen[str]:
+    """Return the process, started where there is none."""
+    global _process
+    if _process is None or _process[0] != os.getpid() or _process[1].poll() is not None:
+        module, name = SERVE.split(":")
+        command = [sys.executable, "-c", f"from {module} import {name}; {name}()"]
+        started = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        _process = os.getpid(), started
+    return _process[1]
+
+
+@atexit.register
+def _stop() -> None:
+    """End the process, if this one started it."""
+    global _process
+    if _process is not None and _process[0] == os.getpid():
+        _process[1].kill()
+        _process[1].communicate()
+        _process = None

@@ -1,0 +1,227 @@
+"""Traffic of a town by SUMO: everything that moves, and what is parked beside it, as a `Trace`."""
+
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+from shapely.geometry.base import BaseGeometry
+
+from flcav.config import InputError
+from flcav.geometry import wrap_angle
+from flcav.seeds import child_seed, stream
+from flcav.world.map.roads import read_net
+from flcav.world.map.surfaces import footprint
+from flcav.world.map.town import KERB_M, Town
+from flcav.world.scenarios.scenario import Scenario
+from flcav.world.shapes import SHAPES
+from flcav.world.trace import Event, Trace
+from flcav.world.traffic.demand import Parked, park, types, write_demand
+from flcav.world.traffic.sumo import simulate_in
+from flcav.world.traffic.sumo_process import STEP_S
+
+Array = NDArray[np.float64]
+
+FILL_S = 30.0  # everybody is under way by then
+SMOOTHING_STEPS = 4  # half width of the window over which a pose is averaged: SUMO turns and changes lanes in jerks
+
+
+def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: Sequence[Scenario] = ()) -> Trace:
+    """Return the traffic of `town` at `times_s` (T,): ascending multiples of 0.1 s after an empty town's time 0.
+
+    Actors are "cav<i>" (sedans, under way from the start), "veh<i>", "ped<i>" and "parked<i>"; those absent at all of
+    `times_s` are left out. Before `FILL_S` the town is still filling. The same arguments give the same trace. Whoever
+    takes part in one of the `scenarios` and was made for it is called "scripted<i>"; `events` of the trace says which
+    of them happened, and when: each waits from its `at_s` on until the traffic lends itself to it.
+    Raises `InputError` for other times, for more CAVs than are on the road by the first of them, and for somebody who
+    is to run a red light in a town without lights.
+    """
+    times_s = np.asarray(times_s, dtype=np.float64)
+    steps = np.rint(times_s / STEP_S).astype(np.int64)
+    if not len(steps) or not np.allclose(steps * STEP_S, times_s, atol=1e-6) or (np.diff(steps, prepend=0) <= 0).any():
+        raise InputError(f"times_s = {times_s}: must be ascending multiples of {STEP_S} s above 0")
+    if cavs < 0:
+        raise InputError(f"cavs = {cavs}: must be 0 or more")
+    if any(scenario.kind == "red_light_runner" for scenario in scenarios) and not town.signals.link:
+        raise InputError(f"scenario 'red_light_runner': {town.name} has no traffic lights")
+    net = read_net(town.net)
+    demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, until_s=float(times_s[-1]), fill_s=FILL_S)
+    before, now, after = (_windows(steps + offset) for offset in (-1, 0, 1))
+    read = np.unique((before, now, after))
+    raw = _run(town.net, demand, child_seed(seed, "sumo"), read, scenarios)
+    parked = _beside(raw, park(net, town.parameters, stream(seed, "parked")))
+    rows = tuple(np.searchsorted(read, window) for window in (before, now, after))
+    trace = _trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
+    under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
+    if under_way.sum() < cavs * len(times_s):
+        raise InputError(f"not all of {cavs} CAVs are under way at {times_s[0]} s: begin later, or take fewer")
+    return trace
+
+
+def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (T, W) the steps over which the state at each of `steps` (T,) is averaged."""
+    return np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
+
+
+def _run(
+    net: Path, demand: str, seed: int, steps: NDArray[np.int64], scenarios: Sequence[Scenario]
+) -> dict[str, NDArray]:
+    with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
+        folder = Path(name)
+        (folder / "routes.rou.xml").write_text(demand, encoding="utf-8")
+        asked = [scenario.model_dump() for scenario in scenarios]
+        values = {"net": str(net), "routes": str(folder / "routes.rou.xml"), "seed": seed, "steps": steps.tolist()}
+        (folder / "job.json").write_text(json.dumps(values | {"scenarios": asked}))
+        try:
+            simulate_in(folder)
+        except RuntimeError as error:
+            raise RuntimeError(f"SUMO failed on {net}: {error}") from None
+        with np.load(folder / "out.npz") as arrays:
+            return dict(arrays)
+
+
+def _trace(
+    town: Town,
+    time_s: Array,
+    raw: dict[str, NDArray],
+    windows: tuple[NDArray[np.int64], ...],
+    parked: list[Parked],
+) -> Trace:
+    before, now, after = windows
+    earlier, state, later = (_smooth(raw, window) for window in (before, now, after))
+    rates = _rates(earlier, state, later)
+    seen = np.flatnonzero(~np.isnan(state[..., 0]).all(axis=0))
+    order = np.array(sorted(seen, key=lambda i: _natural(str(raw["id"][i]))), dtype=np.int64)
+    known = {name: (category, shape) for name, category, shape in types()}
+    kinds = [known[str(raw["type"][i])] for i in order] + [(car.category, car.shape) for car in parked]
+    size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], dtype=np.float64).reshape(-1, 3)
+    half_length = size[: len(order), 0] / 2  # from an actor's front, which SUMO moves, to its centre
+    walk = _walk(*(_centre(step[:, order], half_length) for step in (earlier, state, later)))
+    still = np.array([(car.x, car.y, car.yaw, 0.0) for car in parked], dtype=np.float64).reshape(-1, 4)
+    state = np.concatenate((state[:, order], np.broadcast_to(still, (len(time_s), *still.shape))), axis=1)
+    rates = np.concatenate((rates[:, order], np.zeros((len(time_s), *still.shape))), axis=1)
+
+    x, y, yaw, speed = np.moveaxis(state, 2, 0)
+    forward = np.stack((np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)), axis=2)
+    pedestrian = np.array([category == "pedestrian" for category, _ in kinds])
+    velocity, acceleration = speed[..., None] * forward, rates[..., :3]
+    walking = np.flatnonzero(pedestrian)  # SUMO moves people aside without turning them
+    velocity[:, walking], acceleration[:, walking] = (motion[:, walking] for motion in walk)
+    z = np.where(np.isnan(x), np.nan, KERB_M * (shapely.contains_xy(_pavement(town), x, y) & pedestrian))
+    lights = [(light, len(letters)) for light, letters in zip(raw["light"], raw["light_state"][0])]
+    letters = [list("".join(row)) for row in raw["light_state"][now[:, SMOOTHING_STEPS]]]
+    return Trace(
+        town=town.name,
+        time_s=time_s,
+        actor=np.array([*(str(raw["id"][i]) for i in order), *(f"parked{i}" for i in range(len(parked)))]),
+        category=np.array([category for category, _ in kinds], dtype=np.str_),
+        shape=np.array([shape for _, shape in kinds], dtype=np.int64),
+        size=size,
+        present=~np.isnan(yaw),
+        position=np.concatenate((_centre(state, np.append(half_length, np.zeros(len(still)))), z[..., None]), axis=2),
+        yaw=yaw,
+        velocity=velocity,
+        acceleration=acceleration,
+        yaw_rate=rates[..., 3],
+        light=np.array([f"{light}:{i}" for light, links in lights for i in range(links)], dtype=np.str_),
+        light_state=np.array(letters, dtype="<U1").reshape(len(time_s), -1),
+        events=tuple(
+            Event(row["kind"], row["begins_s"], tuple(row["actors"])) for row in json.loads(str(raw["events"]))
+        ),
+    )
+
+
+def _smooth(raw: dict[str, NDArray], windows: NDArray[np.int64]) -> Array:
+    """Return (T, A, 4) front x, y, yaw, speed averaged over the rows of each window (T, W); NaN where absent midway."""
+    rows = np.unique(windows)
+    dense, windows = _dense(raw, rows), np.searchsorted(rows, windows)
+    total, count = np.zeros((len(windows), *dense.shape[1:])), np.zeros((len(windows), dense.shape[1], 1))
+    for column in windows.T:
+        there = ~np.isnan(dense[column, :, :1])
+        total += np.where(there, dense[column], 0.0)
+        count += there
+    absent = np.isnan(dense[windows[:, windows.shape[1] // 2], :, :1])
+    out = np.where(absent, np.nan, total / np.maximum(count, 1))
+    out[..., 2] = wrap_angle(out[..., 2])
+    return out
+
+
+def _dense(raw: dict[str, NDArray], rows: NDArray[np.int64]) -> Array:
+    """Return (R, A, 4) front x, y, unwrapped yaw, speed at `rows` (R,) of the steps read; NaN where absent."""
+    out = np.full((len(raw["light_state"]), len(raw["id"]), 4), np.nan)
+    out[raw["row"][:, 0], raw["row"][:, 1]] = raw["state"]
+    out = out[rows]
+    yaw = np.pi / 2 - np.radians(out[..., 2])
+    out[..., 2] = np.where(np.isnan(yaw), np.nan, np.unwrap(np.nan_to_num(yaw), axis=0))
+    return out
+
+
+def _rates(before: Array, now: Array, after: Array) -> Array:
+    """Return (T, A, 4) acceleration [m/s^2] and yaw rate [rad/s] from the states a step before, now, a step after.
+
+    One-sided where an actor has just come or is about to leave; NaN where it is absent now.
+    """
+
+    def motion(state: Array) -> Array:
+        _, _, yaw, speed = np.moveaxis(state, 2, 0)
+        return np.stack((speed * np.cos(yaw), speed * np.sin(yaw), 0 * speed, yaw), axis=2)
+
+    changes = np.stack((motion(now) - motion(before), motion(after) - motion(now)))
+    changes[..., 3] = wrap_angle(changes[..., 3])
+    known = ~np.isnan(changes)
+    mean = np.where(known, changes, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(np.isnan(now), np.nan, mean / STEP_S)
+
+
+def _centre(state: Array, half_length: Array) -> Array:
+    """Return (T, A, 2) the centres of actors whose front, yaw and speed are `state` (T, A, 4)."""
+    yaw = state[..., 2]
+    return state[..., :2] - half_length[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), axis=2)
+
+
+def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
+    """Return velocities [m/s] and accelerations [m/s^2] (T, A, 3) of positions (T, A, 2) a step before, now, and after.
+
+    One-sided, without an acceleration, where an actor has just come or is about to leave; NaN where it is absent now.
+    """
+    steps = np.stack((now - before, after - now)) / STEP_S
+    known = ~np.isnan(steps)
+    velocity = np.where(known, steps, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    acceleration = np.where(known.all(axis=0), steps[1] - steps[0], 0.0) / STEP_S
+    absent = np.isnan(now[..., :1])
+    level = np.zeros_like(absent, dtype=np.float64)
+    motions = (np.where(absent, np.nan, np.concatenate((flat, level), axis=2)) for flat in (velocity, acceleration))
+    return next(motions), next(motions)
+
+
+def _beside(raw: dict[str, NDArray], parked: list[Parked]) -> list[Parked]:
+    """Return the parked vehicles that are in nobody's way who was made for a scenario."""
+    scripted = np.flatnonzero(np.char.startswith(raw["id"], "scripted"))
+    ways = []
+    for actor in scripted:
+        at = raw["state"][raw["row"][:, 1] == actor]
+        category, _, shape = str(raw["type"][actor]).partition(".")
+        length, width = next(row[1:3] for row in SHAPES[category] if row.name == shape)
+        yaw = np.pi / 2 - np.radians(at[:, 2])
+        middle = at[:, :2] - length / 2 * np.stack((np.cos(yaw), np.sin(yaw)), axis=1)
+        ways += [footprint(x, y, turn, length, width).buffer(0.3) for (x, y), turn in zip(middle, yaw)]
+    taken = shapely.union_all(ways)
+    room = [(car, SHAPES[car.category][car.shape]) for car in parked]
+    return [
+        car for car, size in room if not footprint(car.x, car.y, car.yaw, size.length, size.width).intersects(taken)
+    ]
+
+
+def _pavement(town: Town) -> BaseGeometry:
+    pavement = shapely.union_all([Polygon(outline) for outline in town.sidewalks])
+    shapely.prepare(pavement)
+    return pavement
+
+
+def _natural(name: str) -> tuple[str, int]:
+    kind = name.rstrip("0123456789")
+    return kind, int(name[len(kind) :])
