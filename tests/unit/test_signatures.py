@@ -18,7 +18,6 @@ UNCHECKED = "whatever a user's file holds, a date of YAML too, before it is chec
 EXTRA = "types of an extra (view, ray) that is not installed where types are checked"
 STEPS = "a step's function, arguments and JSON value: whatever the step is"
 OWN = "what a user's module holds, of the protocol that was asked for"
-PAGE = "what the template of a page names; a record of each page is wanted"
 ALLOWED: Mapping[str, str] = {
     "flcav.config:parse_config": UNCHECKED,
     "flcav.config:read_yaml": UNCHECKED,
@@ -30,7 +29,6 @@ ALLOWED: Mapping[str, str] = {
     "flcav.pipeline.steps.step:Step.run": STEPS,
     "flcav.pipeline.steps.step:Work.result": STEPS,
     "flcav.plugins:load_own": OWN,
-    "flcav.report.pages.html:render": PAGE,
     "flcav.report.pictures.rerun_log:blueprint": EXTRA,
     "flcav.report.pictures.rerun_log:log_scene": EXTRA,
 }

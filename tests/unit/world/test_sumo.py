@@ -19,7 +19,7 @@ from flcav.world.traffic.demand import write_demand
 ASK = """
 import sys
 from pathlib import Path
-from flcav.world import sumo
+from flcav.world.traffic import sumo
 print(sumo._running().pid, flush=True)
 sumo.simulate_in(Path(sys.argv[1]))
 print("done", flush=True)

@@ -1,10 +1,10 @@
-"""The studies of the tasks: every module here holds one, called `STUDY`, and gives it its name.
+"""The studies of the tasks by name: `STUDIES`, the one list of those of the package, and those of users' own tasks.
 
 What is recorded, trained and tested is the task's own (`flcav.perception.study`); here is how its results are drawn.
 """
 
+from collections.abc import Mapping
 from importlib import import_module
-from pkgutil import iter_modules
 from typing import TYPE_CHECKING
 
 from flcav.config import InputError
@@ -13,7 +13,13 @@ from flcav.plugins import load_own
 if TYPE_CHECKING:
     from flcav.experiments.studies.run import Study, StudyResult
 
-STUDIES: tuple[str, ...] = tuple(sorted(found.name.replace("_", "-") for found in iter_modules(__path__)))
+STUDIES: Mapping[str, str] = {  # name -> module:NAME, so that listing them loads none
+    "objects": "flcav.experiments.studies.objects:STUDY",
+    "signs": "flcav.experiments.studies.signs:STUDY",
+    "trajectory": "flcav.experiments.studies.trajectory:STUDY",
+    "trajectory-cameras": "flcav.experiments.studies.trajectory:CAMERAS",
+    "weather": "flcav.experiments.studies.weather:STUDY",
+}
 
 
 def study_named(name: str) -> "Study":
@@ -22,7 +28,8 @@ def study_named(name: str) -> "Study":
     Raises `InputError` where there is none.
     """
     if name in STUDIES:
-        return import_module(f"{__name__}.{name.replace('-', '_')}").STUDY
+        module, _, attribute = STUDIES[name].partition(":")
+        return getattr(import_module(module), attribute)
     from flcav.experiments.studies.run import Study
     from flcav.perception.study import Studied
     from flcav.perception.task import Task

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.compiled import compiled
-from flcav.perception.ops import rulebook as pairs
 
 Int32s = NDArray[np.int32]
 Int64s = NDArray[np.int64]
@@ -177,7 +176,7 @@ def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
     _, height, width = (extent + 2 for extent in shape)
     if _compiled(keys):
         steps = [(z * height + y) * width + x for z, y, x in product((-1, 0, 1), repeat=3)]
-        source, target, counts = pairs.submanifold_pairs(keys.numpy(), np.array(steps[14:]))
+        source, target, counts = submanifold_pairs(keys.numpy(), np.array(steps[14:]))
         return Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(keys))
     return _submanifold_rules(keys, height, width)
 
@@ -223,7 +222,7 @@ def strided_rules(
     out_shape = (depth, height, width)
     if _compiled(keys):
         triples = (np.array(triple) for triple in (shape, kernel, stride, padding, out_shape))
-        source, target, counts, out_keys = pairs.strided_pairs(keys.numpy(), samples, *triples)
+        source, target, counts, out_keys = strided_pairs(keys.numpy(), samples, *triples)
         rules = Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(out_keys))
         return rules, torch.from_numpy(out_keys), out_shape
     rules, out_keys = _strided_rules(keys, shape, kernel, stride, padding, out_shape, samples)
