@@ -121,7 +121,7 @@ def _fig3a(out: Path) -> None:
 
 @when_interrupted()
 def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.terminal import live_steps
+    from flcav.cli.steps import live_steps
     from flcav.experiments.arms.run import draw_arms, run_arms, study_recipe
     from flcav.files import write_bytes, write_json
 
@@ -136,7 +136,7 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
 
 @when_interrupted()
 def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.terminal import live_steps
+    from flcav.cli.steps import live_steps
     from flcav.experiments.arms.run import study_recipe
     from flcav.experiments.fig6a.run import draw_allocation, run_allocation
     from flcav.files import write_bytes, write_json
@@ -152,7 +152,7 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
 
 @when_interrupted()
 def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.terminal import live_steps
+    from flcav.cli.steps import live_steps
     from flcav.config import InputError
     from flcav.experiments.sim_to_real.run import draw_frame, run_sim_to_real
     from flcav.files import write_bytes, write_json
@@ -178,7 +178,7 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int,
 
 @when_interrupted()
 def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.terminal import live_steps
+    from flcav.cli.steps import live_steps
     from flcav.experiments.studies import study_named
     from flcav.experiments.studies.run import results_as_json, run_study
     from flcav.files import write_bytes, write_json

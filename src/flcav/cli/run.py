@@ -1,14 +1,13 @@
 """`flcav run`, `flcav demo`, `flcav compare`: the three stages of a recipe, and two runs side by side."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
-from flcav.cli.terminal import when_interrupted
+from flcav.cli.terminal import print_json, when_interrupted
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
@@ -67,7 +66,7 @@ def _run(
     title: str,
 ) -> None:
     use_threads(1)
-    from flcav.cli.terminal import live_steps
+    from flcav.cli.steps import live_steps
     from flcav.files import check_writable
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import run as run_one
@@ -91,7 +90,7 @@ def _run(
     reports = [write_report(result, folder) for folder, result in results.items()]
     if as_json:
         first = next(iter(results.values()))
-        typer.echo(json.dumps((summary or first).as_json()))
+        print_json((summary or first).as_json())
         return
     _tell(list(results.values()), summary)
     for report, result in zip(reports, results.values(), strict=True):
@@ -119,7 +118,7 @@ def compare(
 
     rows = compare_runs(first, second)
     if as_json:
-        typer.echo(json.dumps({"compared": [dataclasses.asdict(row) for row in rows]}))
+        print_json({"compared": [dataclasses.asdict(row) for row in rows]})
         return
     for row in rows:
         change = row.difference

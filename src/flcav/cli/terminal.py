@@ -1,20 +1,39 @@
-"""The terminal: width, live progress of steps, and what Ctrl-C leaves."""
+"""What commands print, and what Ctrl-C leaves."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+import typer
 
-from flcav.pipeline.steps import FINISHED, Notify
+from flcav.files import Json
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+GOES_ON = "the same command goes on where it stopped"
 
 
-def plain_console() -> Console:
+def plain_console() -> "Console":
     """Return stdout's console; brackets and colons in what is printed are neither markup nor emoji."""
+    from rich.console import Console
+
     return Console(highlight=False, markup=False, emoji=False)
 
 
-GOES_ON = "the same command goes on where it stopped"
+def print_json(value: Json) -> None:
+    """Print one JSON object on stdout; numbers that JSON does not have, inf and nan, are null."""
+    typer.echo(json.dumps(_finite(value), allow_nan=False))
+
+
+def _finite(value: Json) -> Json:
+    if isinstance(value, Mapping):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Interrupted(Exception):
@@ -28,33 +47,3 @@ def when_interrupted(kept: Callable[[], str] = lambda: GOES_ON) -> Iterator[None
         yield
     except KeyboardInterrupt:
         raise Interrupted(kept()) from None
-
-
-@contextlib.contextmanager
-def live_steps(title: str) -> Iterator[Notify]:
-    """Yield a `Notify` that draws one bar per running step; without a terminal, one line per finished step."""
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=24),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-        whole = bars.add_task(title, total=None, note="")
-        rows: dict[str, TaskID] = {}
-        finished = 0
-
-        def notify(step: str, done: int, total: int, note: str) -> None:
-            nonlocal finished
-            if step not in rows:
-                rows[step] = bars.add_task(f"  {step}", total=None, note="")
-            bars.update(rows[step], completed=done, total=max(total, 1), note=note)
-            if note in FINISHED:
-                finished += 1
-                bars.update(rows[step], visible=False)
-                bars.update(whole, note=f"{finished} steps done, {step} {note}")
-                if not console.is_terminal:
-                    console.print(f"{title}: {step} {note}", highlight=False)
-
-        yield notify

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from flcav.cli.terminal import print_json
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
@@ -21,8 +23,6 @@ def register(app: typer.Typer) -> None:
 @towns.command("list")
 def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead.")) -> None:
     """List the towns that come with flcav, and what they have."""
-    import json
-
     from flcav.world.map.census import census
     from flcav.world.map.town import TOWNS, load_town
 
@@ -30,7 +30,7 @@ def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSO
     counts = {name: census(town) for name, town in found.items()}
     if as_json:
         rows = [{"name": name, "description": found[name].parameters.description, **counts[name]} for name in TOWNS]
-        typer.echo(json.dumps({"towns": rows}))
+        print_json({"towns": rows})
         return
     for name, town in found.items():
         typer.echo(f"{name}: {town.parameters.description}")

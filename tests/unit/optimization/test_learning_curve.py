@@ -178,3 +178,13 @@ def test_a_curve_too_small_to_compute_with_is_refused_in_a_sentence():
         fit_effective(*rows, group_samples=5e-324)
     with pytest.raises(InputError, match=r"the fitted curve: field 'beta' = 1e-300"):
         fit_effective(*rows, group_samples=700, beta=1e-300)
+
+
+@pytest.mark.filterwarnings("error")
+def test_bands_are_infinite_where_the_error_is():
+    found = fit_additive([10, 20, 40, 80, 160], [0] * 5, [0] * 5, [0.3, 0.42, 0.5, 0.61, 0.66])
+    band = bands(found, repeats=20)
+    assert band is not None
+    low, high = band.between(np.array([[0.0, 0, 0], [100.0, 0, 0]]))
+    assert (low[0], high[0]) == (np.inf, np.inf)
+    assert 0 < low[1] <= high[1] < 1

@@ -1,11 +1,11 @@
 """flcav evaluate: how good a network is on a dataset."""
 
-import json
 from pathlib import Path
 
 import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device
+from flcav.cli.terminal import print_json
 from flcav.threads import use_threads
 
 
@@ -49,6 +49,6 @@ def evaluate(
         )
     origin = networks.origin_of(learned, weights)
     if as_json:
-        typer.echo(json.dumps(vars(origin) | found.chosen.summary() | dict(found.numbers), allow_nan=False))
+        print_json(vars(origin) | found.chosen.summary() | dict(found.numbers))
         return
     typer.echo("\n".join([found.chosen.sentence, str(origin), *found.lines]))

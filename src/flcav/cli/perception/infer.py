@@ -1,12 +1,12 @@
 """flcav infer: a network on what sensors saw."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device, finite, refuse_unused
+from flcav.cli.terminal import print_json
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def infer(
     if as_json:
         datasets = [{"path": str(path), **choice.summary()} for path, choice in found.chosen.items()]
         results = [{"path": path, **result.as_json()} for path, result in findings]
-        typer.echo(json.dumps({"datasets": datasets, "inputs": results}, allow_nan=False))
+        print_json({"datasets": datasets, "inputs": results})
         return
     for path, choice in found.chosen.items():
         typer.echo(f"{path}: {choice.sentence}")

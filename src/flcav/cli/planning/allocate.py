@@ -1,7 +1,6 @@
 """`flcav allocate`: samples, edge rounds and cloud rounds per task under both uplink budgets (MLGRA)."""
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from flcav.cli.options import listed
+from flcav.cli.terminal import print_json
 
 if TYPE_CHECKING:
     from flcav.optimization.allocation.allocate import Allocation
@@ -66,7 +66,7 @@ def allocate(
         plan, shares = allocate_fleet(asked)
     except Infeasible as error:
         if as_json:
-            typer.echo(json.dumps({"status": "infeasible", "message": str(error)}))
+            print_json({"status": "infeasible", "message": str(error)})
         raise
     more = savings(asked, plan)
     if out is not None:
@@ -77,7 +77,7 @@ def allocate(
     beside = None if baseline is None else compared(asked, baseline.value)
     if as_json:
         beside_it = {} if beside is None else {"baseline": _plain(beside)}
-        typer.echo(json.dumps(_as_json(plan, shares, more) | beside_it))
+        print_json(_as_json(plan, shares, more) | beside_it)
         return
     _show(asked, plan, more)
     _show_vehicles(shares)

@@ -1,6 +1,5 @@
 """`flcav fit`: learning curves from a history of training runs."""
 
-import json
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from flcav.cli.options import finite, refuse_unused
+from flcav.cli.terminal import print_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -90,7 +90,7 @@ def fit(
     if problem is not None:
         _write(problem, held, found_of, k, history.name)
     if as_json:
-        typer.echo(json.dumps({"curves": answers}))
+        print_json({"curves": answers})
         return
     _show(answers, shown)
     if problem is not None:

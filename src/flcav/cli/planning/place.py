@@ -1,11 +1,11 @@
 """`flcav place`: where a roadside sensor covers most of the registered errors (VRCSP)."""
 
-import json
 from pathlib import Path
 
 import typer
 
 from flcav.cli.options import Method
+from flcav.cli.terminal import print_json
 
 
 def register(app: typer.Typer) -> None:
@@ -57,16 +57,14 @@ def place(
         scene = ErrorMap(here, where, np.array(kind, dtype=np.str_), candidates, placed, range_m=range_m)
         write_bytes(map_, style.png(town_map(scene)))
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    "chosen": [{"pole": pole} for pole in chosen],
-                    "covered": result.covered,
-                    "covered_weight": result.covered_weight,
-                    "upper_bound": result.upper_bound,
-                    "optimal": result.optimal,
-                }
-            )
+        print_json(
+            {
+                "chosen": [{"pole": pole} for pole in chosen],
+                "covered": result.covered,
+                "covered_weight": result.covered_weight,
+                "upper_bound": result.upper_bound,
+                "optimal": result.optimal,
+            }
         )
         return
     proof = "optimal" if result.optimal else f"at most {result.upper_bound:.6g} can be covered"

@@ -31,10 +31,11 @@ class Bands:
     k: int
 
     def between(self, resources: Array) -> tuple[Array, Array]:
-        """Return the lower and upper band of the error (n,) at `resources` (n, 3)."""
+        """Return the lower and upper band of the error (n,) at `resources` (n, 3); inf where curves have no end."""
         errors = np.array([curve.error(*resources.T, k=self.k) for curve in self.curves])
-        low, high = np.quantile(errors, (0.5 - self.level / 2, 0.5 + self.level / 2), axis=0)
-        return low, high
+        with np.errstate(invalid="ignore"):  # between infinite errors
+            low, high = np.quantile(errors, (0.5 - self.level / 2, 0.5 + self.level / 2), axis=0)
+        return np.where(np.isnan(low), np.inf, low), np.where(np.isnan(high), np.inf, high)
 
 
 def bands(fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 0, k: int = 1) -> Bands | None:
