@@ -244,7 +244,7 @@ def _scaled(parameter: str, value: float) -> float:
 
 
 def _anywhere(rng: np.random.Generator) -> Region:
-    """Return drawn limits of plausible weathers: rain with clouds and wet roads in 40 %, fog in 25 % of them."""
+    """Return drawn limits of plausible weathers: 40 % with rain (from clouds, on wet roads), 25 % with fog."""
     rains, foggy, dries = rng.random(3) < (0.4, 0.25, 0.7)
     return {
         "sun_elevation_deg": (-60.0, 75.0),

@@ -91,7 +91,7 @@ class Imported:
 def import_town(xodr: Path, out: Path) -> Imported:
     """Write the town of an OpenDRIVE map as the folder `out` and return it; the same map gives the same town.
 
-    Raises `InputError`, without leaving a folder behind, where `out` exists, where the file is no OpenDRIVE map that
+    Raises `InputError`, and does not make `out`, where it exists already, where the file is no OpenDRIVE map that
     netconvert can read, and where the map has no driving lane.
     """
     if out.exists():

@@ -25,7 +25,7 @@ NEAR_M = 50.0  # from `Scenario.position` to the vehicle under test, at most
 
 
 class Scenario(Config):
-    """One corner case of a recipe: as soon after `at_s` as the traffic around `near` lends itself to it."""
+    """One corner case of a recipe: it begins as soon after `at_s` as the traffic around `near` allows."""
 
     kind: Kind  # what happens
     at_s: Annotated[float, Field(gt=0, le=LONGEST_S)]  # of the traffic's clock, as `warmup_s`; not before

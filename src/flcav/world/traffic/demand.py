@@ -83,7 +83,7 @@ DRIVER = {  # attributes of SUMO's vehicle types by category, where they differ 
     "pedestrian": {"vClass": "pedestrian", "maxSpeed": "1.6", "speedFactor": "normc(0.8,0.15,0.4,1.0)"},
 }
 CAV_TYPE = "car.sedan"
-FASTEST = 20.0  # upper bound of the mean speed of vehicles [m/s]
+FASTEST = 20.0  # speed for which tours are long enough, of vehicles [m/s]
 FASTEST_WALK = 1.7  # and of pedestrians [m/s]
 
 
@@ -93,8 +93,8 @@ def write_demand(
     """Return the text of SUMO's route file (XML): vehicle types, and a trip for every vehicle and pedestrian.
 
     CAVs depart at 0 s, all others at a uniform time before `fill_s` [s]. Each has a tour of random destinations too
-    long to be finished by `until_s` [s]. Vehicles draw destinations by the street type's `traffic`, pedestrians by its
-    `footfall`; CAVs draw the approaches of the candidate poles, if there are any.
+    long to be finished by `until_s` [s] at `FASTEST` or `FASTEST_WALK`. Vehicles draw destinations by the street type's
+    `traffic`, pedestrians by its `footfall`; CAVs draw the approaches of the candidate poles, if there are any.
     """
     root = Element("routes")
     for category, shapes in SHAPES.items():

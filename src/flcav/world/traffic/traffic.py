@@ -36,9 +36,9 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
     Actors are "cav<i>" (sedans, under way from the start), "veh<i>", "ped<i>", "parked<i>", and "scripted<i>" for those
     created for a scenario; actors absent at all of `times_s` are left out. Until `FILL_S` the town is still filling.
     Each of the `scenarios` waits from its `at_s` on until the traffic allows it; `events` of the trace are those that
-    took place. The same arguments give the same trace. Raises `InputError` for other times, where not all `cavs` CAVs
-    are on the road at all of them, and for a red-light scenario in a town without traffic lights; `RuntimeError` where
-    SUMO fails.
+    took place. The same arguments give the same trace. Raises `InputError` for other times, for a negative `cavs`,
+    where not all CAVs are on the road at all times, and for a red-light scenario in a town without traffic lights;
+    `RuntimeError` where SUMO fails.
     """
     times_s = np.asarray(times_s, dtype=np.float64)
     steps = np.rint(times_s / STEP_S).astype(np.int64)
