@@ -1,4 +1,4 @@
-"""Towns, their traffic, and the rays that see them."""
+"""The simulated world: town maps, traffic, scripted scenarios, weather, meshes, materials and ray casting."""
 
 from typing import TYPE_CHECKING
 

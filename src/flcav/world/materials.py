@@ -1,4 +1,4 @@
-"""What surfaces are made of: what they send back of a 905 nm pulse, what they look like, how warm they get."""
+"""Materials of surfaces: reflectivity at 905 nm for LiDAR, and appearance in visible light for cameras."""
 
 from enum import IntEnum
 from typing import NamedTuple
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Material(IntEnum):
-    """Material of one face."""
+    """The material of a face."""
 
     GROUND = 0
     ROAD = 1
@@ -37,10 +37,10 @@ class Material(IntEnum):
 
 
 class Optics(NamedTuple):
-    """How a material answers a pulse."""
+    """Reflection of a 905 nm laser pulse by a material."""
 
-    reflectivity: float  # share of the light sent back, diffusely
-    retro: bool = False  # sends light back where it came from, whatever the incidence
+    reflectivity: float  # diffuse reflectance, 0 to 1
+    retro: bool = False  # retroreflector: reflects towards the source at any angle of incidence
 
 
 OPTICS: dict[Material, Optics] = {
@@ -53,7 +53,7 @@ OPTICS: dict[Material, Optics] = {
     Material.LEAF: Optics(0.45),
     Material.METAL: Optics(0.40),
     Material.SIGN: Optics(0.95, retro=True),
-    Material.PAINT: Optics(0.30),  # each actor has its own, of PAINT_REFLECTIVITY
+    Material.PAINT: Optics(0.30),  # replaced per actor by one of PAINT_REFLECTIVITY
     Material.GLASS: Optics(0.03),
     Material.TYRE: Optics(0.05),
     Material.RIM: Optics(0.45),
@@ -71,17 +71,18 @@ OPTICS: dict[Material, Optics] = {
     Material.LENS_GREEN: Optics(0.12),
 }
 
+# Columns of OPTICS, by material.
 REFLECTIVITY = np.array([OPTICS[material].reflectivity for material in Material], np.float32)
 RETRO = np.array([OPTICS[material].retro for material in Material], np.bool_)
-PAINT_REFLECTIVITY = np.array([0.08, 0.14, 0.22, 0.30, 0.45, 0.60, 0.70], np.float32)  # black ... white
+PAINT_REFLECTIVITY = np.array([0.08, 0.14, 0.22, 0.30, 0.45, 0.60, 0.70], np.float32)  # (P,) car paints, black to white
 
 
 class Look(NamedTuple):
-    """What a material looks like by daylight."""
+    """Appearance of a material in visible light: diffuse albedo, specular reflectance and gloss."""
 
     colour: tuple[float, float, float]  # diffuse albedo, linear red, green, blue
-    mirror: float = 0.0  # reflectance face on of its clear or polished surface; grows towards grazing (Schlick)
-    gloss: float = 0.0  # exponent of the highlight; 0 for none
+    mirror: float = 0.0  # specular reflectance at normal incidence (Schlick at others)
+    gloss: float = 0.0  # exponent of the specular highlight; 0 for none
 
 
 LOOKS: dict[Material, Look] = {
@@ -112,11 +113,12 @@ LOOKS: dict[Material, Look] = {
     Material.LENS_GREEN: Look((0.008, 0.070, 0.038), mirror=0.05, gloss=80.0),
 }
 
+# Columns of LOOKS, by material.
 COLOUR = np.array([LOOKS[material].colour for material in Material], np.float32)
 MIRROR = np.array([LOOKS[material].mirror for material in Material], np.float32)
 GLOSS = np.array([LOOKS[material].gloss for material in Material], np.float32)
 
-# The colours a paint of each PAINT_REFLECTIVITY comes in; what is dark at 905 nm is dark to the eye, by and large.
+# Albedos, linear red, green, blue, that go with each of PAINT_REFLECTIVITY: dark at 905 nm is roughly dark to the eye.
 PAINT_COLOURS: tuple[tuple[tuple[float, float, float], ...], ...] = (
     ((0.010, 0.010, 0.012), (0.012, 0.014, 0.022), (0.020, 0.012, 0.012)),
     ((0.045, 0.047, 0.052), (0.012, 0.030, 0.110), (0.015, 0.055, 0.040)),
@@ -126,7 +128,7 @@ PAINT_COLOURS: tuple[tuple[tuple[float, float, float], ...], ...] = (
     ((0.520, 0.525, 0.530), (0.700, 0.420, 0.030), (0.450, 0.520, 0.560)),
     ((0.780, 0.780, 0.770), (0.700, 0.690, 0.640)),
 )
-CLOTH_COLOURS = (
+CLOTH_COLOURS = (  # albedos, linear red, green, blue
     (0.030, 0.032, 0.040),
     (0.18, 0.18, 0.19),
     (0.55, 0.54, 0.50),
@@ -138,11 +140,11 @@ CLOTH_COLOURS = (
     (0.10, 0.20, 0.30),
     (0.62, 0.35, 0.02),
 )
-TROUSER_COLOURS = (
+TROUSER_COLOURS = (  # albedos, linear red, green, blue
     (0.016, 0.017, 0.022),
     (0.030, 0.048, 0.105),
     (0.055, 0.085, 0.16),
     (0.16, 0.13, 0.09),
     (0.09, 0.09, 0.09),
 )
-SKIN_TONES = (1.0, 1.15, 0.75, 0.45, 0.25)
+SKIN_TONES = (1.0, 1.15, 0.75, 0.45, 0.25)  # factors of the albedo of SKIN

@@ -1,4 +1,4 @@
-"""Everything rays can hit at one instant of a traffic run."""
+"""Scenes: the static mesh of a town and the meshes of its actors at one instant of a trace, for ray casting."""
 
 import pickle
 import zlib
@@ -18,24 +18,30 @@ from flcav.world.rays.raycaster import Hits
 from flcav.world.static import Things, town_mesh, town_things
 from flcav.world.trace import Trace
 
-OFFSET_S = 0.1  # how far from an instant actors are moved on: one step of the traffic
+OFFSET_S = 0.1  # largest extrapolation from an instant of the trace: one step of the traffic
 
 
 class Surfaces(NamedTuple):
-    """What the faces of a scene's instances are like; row `first[instance] + face`."""
+    """Normals and materials of the S faces of a scene's meshes; a hit's row is `first[instance] + face`.
 
-    normal: NDArray[np.float32]  # (S, 3) unit, of either sign, body frame
-    material: NDArray[np.uint8]  # (S,)
+    There are I instances and M materials; instances of the same shape share their rows.
+    """
+
+    normal: NDArray[np.float32]  # (S, 3) unit normals, of either sign, body frame
+    material: NDArray[np.uint8]  # (S,) a Material
     first: NDArray[np.int64]  # (I,) first row of each instance's mesh
-    reflectivity: NDArray[np.float32]  # (I, M) of each instance by material: actors differ in their paint
-    retro: NDArray[np.bool_] = RETRO  # (M,) by material
+    reflectivity: NDArray[np.float32]  # (I, M) at 905 nm, by material: actors differ in their paint
+    retro: NDArray[np.bool_] = RETRO  # (M,) retroreflectors
 
 
 class Scene:
     """A town and its traffic at one instant; instance 0 is the town, instance a + 1 the trace's actor a."""
 
     def __init__(self, town: Town, trace: Trace) -> None:
-        """Stand at the first instant of `trace`. Meshes are built once per process, whatever the number of scenes."""
+        """Start at the first instant of `trace`. Meshes are cached for all scenes of the process.
+
+        Raises `OSError` where the ray casting engine is missing.
+        """
         self.town = town
         self.trace = trace
         self.index = 0
@@ -47,19 +53,20 @@ class Scene:
         self._engine = Embree()
         self._assembly = self._engine.assembly(self._solids)
         self._assembly.place(0, np.eye(4))
-        self._placed = np.full((len(trace.actor), 4), np.nan)  # x, y, z, yaw; NaN where an actor is nowhere
+        self._placed = np.full((len(trace.actor), 4), np.nan)  # x, y, z, yaw; NaN where an actor is not placed
         self._hidden: int | None = None
         self._place()
 
     @cached_property
     def things(self) -> Things:
-        """Return the town's signs and signal heads."""
+        """The town's signs and signal heads."""
         return town_things(self.town)
 
     def move_to(self, index: int, offset_s: float = 0.0) -> None:
-        """Put every actor where it is at instant `index` of the trace, or `offset_s` (-0.1 to 0.1) later.
+        """Move every actor to its pose at instant `index` of the trace, or `offset_s` later.
 
-        Between instants it goes on from its velocity, acceleration and yaw rate. Raises `ValueError` beyond that.
+        Poses off an instant are extrapolated with constant acceleration and yaw rate. Raises `ValueError` where
+        `offset_s` is not within -`OFFSET_S` and `OFFSET_S`.
         """
         if abs(offset_s) > OFFSET_S:
             raise ValueError(f"offset_s = {offset_s}: must lie within -{OFFSET_S} and {OFFSET_S}")
@@ -68,7 +75,7 @@ class Scene:
             self._place()
 
     def poses(self) -> NDArray[np.float64]:
-        """Return (A, 4) x, y, z, yaw of every actor at the scene's time; NaN where absent."""
+        """Return x, y, z [m] and yaw [rad] of every actor at the scene's time (A, 4), world frame; NaN where absent."""
         trace, i, dt = self.trace, self.index, self.offset_s
         position, yaw = trace.position[i], trace.yaw[i]
         if dt:
@@ -77,11 +84,11 @@ class Scene:
         return np.concatenate((position, yaw[:, None]), axis=1)
 
     def world_from_actor(self, actor: int) -> NDArray[np.float64]:
-        """Return the (4, 4) pose of an actor that is present; its origin is the ground centre."""
+        """Return the pose (4, 4) of an actor that is present; the origin of its body frame is its ground centre."""
         return pose(*self.poses()[actor])
 
     def world_from_instance(self) -> NDArray[np.float64]:
-        """Return the instances' (I, 3, 3) rotations; the identity for the town and for absent actors."""
+        """Return the rotations of the instances (I, 3, 3); the identity for the town and for absent actors."""
         return _turned(np.concatenate(([0.0], np.nan_to_num(self.poses()[:, 3]))))
 
     def cast(
@@ -94,7 +101,7 @@ class Scene:
         hidden: int | None = None,
         threads: int = 1,
     ) -> Hits:
-        """Return what each ray (N, 3) meets first, as if the actor `hidden` were not there: see `Target.trace`."""
+        """Return the first hit of each ray (N, 3), without the actor `hidden`: see `raycaster.Target.trace`."""
         self._hide(hidden)
         return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m, threads=threads)
 
@@ -106,9 +113,10 @@ class Scene:
         *,
         hidden: int | None = None,
     ) -> NDArray[np.bool_]:
-        """Return for each ray, world frame, whether anything but the actor `hidden` lies before its end `far_m` (N,).
+        """Return (N,) whether anything but the actor `hidden` occludes each ray before its end `far_m` (N,) [m].
 
-        `directions` are unit vectors (N, 3), or (1, 3) for all. Never blocked where `far_m` is not positive.
+        `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the world frame. A ray whose
+        `far_m` is not positive is never occluded.
         """
         self._hide(hidden)
         return self._assembly.blocked(origins, directions, far_m)
@@ -123,10 +131,10 @@ class Scene:
         near_m: NDArray[np.float32] | None = None,
         far_m: float = np.inf,
     ) -> Hits:
-        """Return what groups of rays meet, each of its own one of `actors` (K,) in an empty world.
+        """Return the first hits of K groups of rays, group k with the mesh of `actors[k]` alone.
 
-        `instance` is the group's number. Group k is `directions[ends[k - 1] : ends[k]]`; `body_from_rays` (K, 4, 4)
-        places it in its actor's body frame.
+        `instance` is the group's number. Group k is `directions[ends[k - 1] : ends[k]]`: unit vectors in a frame whose
+        pose in the actor's body frame is `body_from_rays[k]` (4, 4).
         """
         solids = [self._solids[actor + 1] for actor in actors.tolist()]
         return self._engine.trace_each(solids, body_from_rays, ends, directions, near_m=near_m, far_m=far_m)
@@ -153,7 +161,7 @@ class Scene:
 
 
 def _turned(yaw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (K, 3, 3) rotations by `yaw` (K,) [rad] about the vertical."""
+    """Return the rotations (K, 3, 3) by `yaw` (K,) [rad] about z."""
     cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
     return np.array([[cos, -sin, zero], [sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
 
@@ -188,7 +196,7 @@ def _actor_model(category: str, shape: int) -> _Model:
     return _model(actor_mesh(category, shape))
 
 
-_TOWNS: dict[str, _Model] = {}  # the last few, by content
+_TOWNS: dict[str, _Model] = {}  # by hash of the town: the last TOWNS_KEPT
 TOWNS_KEPT = 4
 
 

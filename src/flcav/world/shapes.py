@@ -1,10 +1,10 @@
-"""The shapes actors come in: what the traffic spaces them by and what the meshes are built to."""
+"""Shapes of actors by category: outer dimensions, which both the traffic simulation and the meshes use."""
 
 from typing import NamedTuple
 
 
 class Shape(NamedTuple):
-    """Outer dimensions of one mesh variant [m]."""
+    """Name and outer dimensions of one shape [m]."""
 
     name: str
     length: float

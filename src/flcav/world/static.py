@@ -1,4 +1,4 @@
-"""A town's static content as one mesh, and which of its faces belong to what."""
+"""The static mesh of a town, with the object that each face belongs to."""
 
 import pickle
 from collections.abc import Iterator
@@ -27,13 +27,13 @@ from flcav.world.meshes.furniture import (
 )
 from flcav.world.meshes.mesh import Mesh, join, moved, sheet
 
-GROUND_M = -0.03  # open ground lies a little below the road
-LAND_M = 150.0  # ground beyond the town's bounds
-TOWNS_KEPT = 4
+GROUND_M = -0.03  # height of open ground, a little below the road
+LAND_M = 150.0  # width of open ground beyond the town's bounds
+TOWNS_KEPT = 4  # size of the cache of meshes
 
 
 class Part(IntEnum):
-    """What a face of the town is a part of."""
+    """The kind of object that a face of the town belongs to."""
 
     GROUND = 0
     ROAD = 1
@@ -49,33 +49,33 @@ class Part(IntEnum):
 
 
 class StaticWorld(NamedTuple):
-    """A town's mesh and the owners of its faces."""
+    """The static mesh of a town, and the object of each of its F faces."""
 
     mesh: Mesh  # world frame
     part: NDArray[np.uint8]  # (F,) a Part
-    row: NDArray[np.int32]  # (F,) of the town's field that the part comes from; clutter counts through all kinds
+    row: NDArray[np.int32]  # (F,) the object's row in its field of `Town`; clutter is numbered through all kinds
 
 
 class Things(NamedTuple):
-    """The K signs and signal heads of a town: the signs first, in the town's order."""
+    """The K traffic signs and signal heads of a town: first the signs, then the heads, in the town's order."""
 
     kind: tuple[str, ...]  # (K,) stop | yield | speed_30 | speed_60 | speed_90 | signal
     position: NDArray[np.float64]  # (K, 3) centre of the plate or head, world [m]
-    yaw: NDArray[np.float64]  # (K,) where it faces [rad]
-    link: tuple[str, ...]  # (K,) the entry of `Trace.light` that a signal shows; empty for signs
-    face: NDArray[np.int32]  # (F,) the thing each face of the town's mesh belongs to, -1 for none
+    yaw: NDArray[np.float64]  # (K,) direction it faces, world [rad]
+    link: tuple[str, ...]  # (K,) the entry of `Trace.light` that a head shows; empty for signs
+    face: NDArray[np.int32]  # (F,) row here of the sign or head that each face of the town's mesh belongs to; -1: none
 
     def __len__(self) -> int:
         return len(self.kind)
 
 
 def town_mesh(town: Town) -> Mesh:
-    """Return everything of `town` that stands still, world frame. The same town gives the same mesh."""
+    """Return the static mesh of a town, world frame. The same town gives the same mesh."""
     return static_world(town).mesh
 
 
 def town_things(town: Town) -> Things:
-    """Return the signs and signal heads of `town`, and which faces of `town_mesh` are theirs; posts are not."""
+    """Return the signs and signal heads of a town, with their faces in `town_mesh`; posts and masts do not count."""
     world, signs, signals = static_world(town), town.signs, town.signals
     face = np.full(len(world.part), -1, np.int32)
     for part, first in ((Part.SIGN, 0), (Part.SIGNAL, len(signs.kind))):
@@ -89,11 +89,11 @@ def town_things(town: Town) -> Things:
     )
 
 
-_WORLDS: dict[str, StaticWorld] = {}  # the last few, by content
+_WORLDS: dict[str, StaticWorld] = {}  # by hash of the town: the last TOWNS_KEPT
 
 
 def static_world(town: Town) -> StaticWorld:
-    """Return the mesh of `town` with its faces' owners; made once per process."""
+    """Return the static mesh of a town with the object of each face; the last `TOWNS_KEPT` are cached."""
     key = sha256(pickle.dumps(town)).hexdigest()
     if key not in _WORLDS:
         while len(_WORLDS) >= TOWNS_KEPT:
@@ -108,7 +108,7 @@ def static_world(town: Town) -> StaticWorld:
     return _WORLDS[key]
 
 
-Owned = tuple[Part, int, Mesh]
+Owned = tuple[Part, int, Mesh]  # kind of object, its row, its mesh in the world frame
 
 
 def _parts(town: Town) -> Iterator[Owned]:
@@ -138,7 +138,7 @@ def _sidewalks(town: Town) -> Iterator[Owned]:
 
 
 def _plate(polygon: NDArray[np.float64], z: float, material: Material) -> Mesh:
-    """Return a polygon (K, 2) as a level surface."""
+    """Return a polygon (K, 2) as a horizontal surface at height `z` [m], by constrained Delaunay triangulation."""
     triangles = shapely.constrained_delaunay_triangles(shapely.Polygon(polygon))
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3].reshape(-1, 2)
     vertices = np.c_[corners, np.full(len(corners), z)].astype(np.float32)

@@ -1,4 +1,4 @@
-"""A traffic run as one immutable table: who was where, when."""
+"""Traffic traces: the motion of all actors, the signals and the scripted events of one traffic run."""
 
 import json
 from dataclasses import dataclass
@@ -28,16 +28,18 @@ STATE = (
 
 
 class Event(NamedTuple):
-    """A scripted corner case that happened."""
+    """A scripted corner case that took place."""
 
-    kind: str
-    begins_s: float  # when those who take part begin to act
-    actors: tuple[str, ...]  # track ids; may name somebody absent at all of the trace's instants
+    kind: str  # as `Scenario.kind`
+    begins_s: float  # start of the action, on the clock of `Trace.time_s`
+    actors: tuple[str, ...]  # track ids of those who take part; one of them may be absent at all instants of the trace
 
 
 @dataclass(frozen=True)
 class Trace:
-    """A traffic run: T instants of A actors; an actor's pose is its ground centre, world frame.
+    """A traffic run: the motion of A actors at T instants, in the world frame.
+
+    An actor's position is that of its ground centre, the middle of the underside of its box.
 
     >>> from flcav import Dataset, Trace
     >>> trace: Trace = Dataset.open("data").trace("grid-0-000")
@@ -45,19 +47,19 @@ class Trace:
     True
     """
 
-    town: str
-    time_s: Array  # (T,)
+    town: str  # name of the town
+    time_s: Array  # (T,) ascending, from the start of the traffic
     actor: NDArray[np.str_]  # (A,) track ids, e.g. "cav0", "veh17", "parked3", "ped8"
     category: NDArray[np.str_]  # (A,) one of CATEGORIES
-    shape: NDArray[np.int64]  # (A,) index of the mesh variant within the category
+    shape: NDArray[np.int64]  # (A,) row of SHAPES[category]
     size: Array  # (A, 3) length, width, height [m]
-    present: NDArray[np.bool_]  # (T, A)
+    present: NDArray[np.bool_]  # (T, A) whether the actor is in the town
     position: Array  # (T, A, 3) ground centre [m]; NaN where absent
     yaw: Array  # (T, A) [rad]; NaN where absent
     velocity: Array  # (T, A, 3) [m/s]; NaN where absent
     acceleration: Array  # (T, A, 3) [m/s^2]; NaN where absent
     yaw_rate: Array  # (T, A) [rad/s]; NaN where absent
-    light: NDArray[np.str_]  # (L,) traffic light ids (junction:link index)
+    light: NDArray[np.str_]  # (L,) ids of signals, "junction:link index"
     light_state: NDArray[np.str_]  # (T, L) one SUMO state letter: G g y r ...
     events: tuple[Event, ...] = ()
 
@@ -87,7 +89,7 @@ class Trace:
 
     @classmethod
     def load(cls, path: Path) -> "Trace":
-        """Read a trace that `save` wrote; raises `InputError` where `path` is none."""
+        """Return the trace that `save` wrote; raises `InputError` where `path` is missing or no trace."""
         table = read_parquet(path)
         metadata = table.schema.metadata or {}
         if METADATA not in metadata:
@@ -101,7 +103,7 @@ class Trace:
 
     @classmethod
     def _decode(cls, rest: dict[str, Any], table: pa.Table) -> "Trace":
-        """Return the trace of a file's metadata and rows; raises `ValueError` and others where they are of none."""
+        """Return the trace of a file's metadata and rows; raises `ValueError` and others where they do not fit."""
         instants, actors, lights = len(rest["time_s"]), len(rest["actor"]), len(rest["light"])
         at = (table["instant"].to_numpy(), table["actor"].to_numpy())
         if min(column.min(initial=0) for column in at) < 0:
@@ -134,7 +136,7 @@ class Trace:
         return trace
 
     def _check(self) -> None:
-        """Raise `ValueError` where the fields cannot be those of a trace."""
+        """Raise `ValueError` where the fields are not consistent, a number is not finite or time does not ascend."""
         if {len(each) for each in (self.actor, self.category, self.shape, self.size)} != {
             len(set(self.actor.tolist()))
         }:

@@ -1,4 +1,7 @@
-"""Weather as continuous parameters; presets and the classes of the weather task are a point and a region of them."""
+"""Weather parameters, presets, the classes of the weather task, and schedules of the weather over a scene.
+
+A preset is a point of the parameter space, a class a region of it (a box).
+"""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -9,12 +12,12 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config
 
-NO_FOG_M = 20_000.0  # from this visibility on the air is taken as clear
-NIGHT_DEG = -6.0  # end of civil twilight: street lamps and headlamps are on
+NO_FOG_M = 20_000.0  # from this visibility on, the air is clear
+NIGHT_DEG = -6.0  # sun elevation at the end of civil twilight: below it, street lamps and headlamps are on
 
 
 class Weather(Config):
-    """The weather of one instant."""
+    """The weather at one instant, as continuous parameters."""
 
     sun_elevation_deg: float = Field(default=45.0, ge=-90, le=90)  # above the horizon; night below -6
     sun_azimuth_deg: float = 160.0  # clockwise from north
@@ -25,12 +28,12 @@ class Weather(Config):
 
     @property
     def night(self) -> bool:
-        """Return whether it is too dark to see without lamps."""
+        """Whether the sun is below civil twilight, so that lamps are on."""
         return self.sun_elevation_deg < NIGHT_DEG
 
     @property
     def fog_per_m(self) -> float:
-        """Return the extinction coefficient of fog [1/m], ln 20 / visibility (ICAO's 5 % contrast); 0 in clear air."""
+        """The extinction coefficient of fog [1/m]: ln 20 / visibility (5 % contrast, ICAO); 0 in clear air."""
         return np.log(20.0) / self.visibility_m if self.visibility_m < NO_FOG_M else 0.0
 
 
@@ -49,9 +52,9 @@ WEATHERS: dict[str, Weather] = {
     "wet_sun": Weather(cloud_cover=0.3, wetness=0.8),
 }
 
-ANY = "any"  # no class: a weather from the whole space
+ANY = "any"  # instead of a class: the whole parameter space
 
-Region = Mapping[str, tuple[float, float]]  # parameter -> lowest and highest value; what is not named is free
+Region = Mapping[str, tuple[float, float]]  # parameter -> lowest and highest value; others are free
 
 _DAY = {"sun_elevation_deg": (20.0, 75.0)}
 _DRY = {"rain_mm_h": (0.0, 0.0), "wetness": (0.0, 0.2)}
@@ -68,20 +71,20 @@ WEATHER_CLASSES: dict[str, Region] = {
     "sunset": {**_DRY, **_FAR, "sun_elevation_deg": (1.0, 7.0), "cloud_cover": (0.0, 0.5)},
     "night": {**_DRY, **_FAR, "sun_elevation_deg": (-60.0, -10.0), "cloud_cover": (0.0, 1.0)},
 }
-# Any two classes are at least so far apart in one of these parameters.
+# Least gap between the regions of any two classes, in at least one of these parameters.
 MARGINS: dict[str, float] = {
     "sun_elevation_deg": 10.0,
     "cloud_cover": 0.2,
     "rain_mm_h": 1.0,
     "visibility_m": 5000.0,
 }
-# The same, as a distance is measured: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H) and visibility.
+# The same gaps as units of `nearest_class`: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H) and visibility.
 SEPARATION: dict[str, float] = {"sun_elevation_deg": 10.0, "cloud_cover": 0.2, "rain_mm_h": 0.59, "visibility_m": 0.85}
-DRIZZLE_MM_H = 0.1  # less rain than that is no rain
+DRIZZLE_MM_H = 0.1  # added to the rain rate before its logarithm
 
 
 def weather_class(weather: Weather) -> str | None:
-    """Return the class of WEATHER_CLASSES whose region holds `weather`; None between and beyond them."""
+    """Return the class of `WEATHER_CLASSES` whose region contains `weather`; None outside all regions."""
     for name, region in WEATHER_CLASSES.items():
         if all(low <= getattr(weather, parameter) <= high for parameter, (low, high) in region.items()):
             return name
@@ -89,19 +92,20 @@ def weather_class(weather: Weather) -> str | None:
 
 
 def nearest_class(weather: Weather) -> str:
-    """Return the class whose region is nearest: the class itself within a region, a stated rule between and beyond.
+    """Return the class whose region is nearest to `weather`; inside a region, its class.
 
-    Distances are Euclidean over what is in the air: each parameter's gap to the region in units of the gap that at the
-    least separates two classes, those of rain and visibility on logarithmic scales. Wetness is left out, since roads
-    stay wet after rain.
+    The distance is Euclidean over the gaps between each parameter of `SEPARATION` and the region, in units of the
+    least gap between two classes; rain and visibility are on logarithmic scales. Wetness is left out, since roads stay
+    wet after rain.
     """
     return min(WEATHER_CLASSES, key=lambda name: _distance(weather, WEATHER_CLASSES[name]))
 
 
 def draw_weather(name: str, rng: np.random.Generator) -> Weather:
-    """Return a weather drawn from the region of the class `name`, from the whole space for "any".
+    """Return a weather drawn from the region of the class `name`, or from the whole space for "any".
 
-    Rain and visibility are drawn evenly over their logarithm, everything else evenly; the sun's azimuth is free.
+    Rain and visibility are log-uniform, everything else is uniform; the sun's azimuth is uniform over the full circle.
+    Raises `KeyError` for an unknown class.
     """
     region = _anywhere(rng) if name == ANY else WEATHER_CLASSES[name]
     drawn = {parameter: _draw(parameter, *limits, rng) for parameter, limits in region.items()}
@@ -109,10 +113,10 @@ def draw_weather(name: str, rng: np.random.Generator) -> Weather:
 
 
 def interpolate(one: Weather, other: Weather, share: float) -> Weather:
-    """Return the weather `share` (0..1) of the way from `one` to `other`.
+    """Return the weather at the share `share` (0 to 1) of the way from `one` to `other`.
 
-    Each parameter changes linearly, the visibility by its reciprocal (which is what fog does to light), the sun's
-    azimuth the short way round.
+    Parameters are interpolated linearly, the visibility by its reciprocal (linear in the extinction coefficient of
+    fog), the sun's azimuth along the shorter arc.
     """
     parts = {name: (getattr(one, name), getattr(other, name)) for name in Weather.model_fields}
     mixed = {name: (1 - share) * a + share * b for name, (a, b) in parts.items()}
@@ -124,7 +128,7 @@ def interpolate(one: Weather, other: Weather, share: float) -> Weather:
 
 
 def _named(value: Any) -> Any:
-    """Return the fields of a weather that is named, or whose `preset` is; anything else as it is."""
+    """Return the fields of a weather given by its preset's name or by `preset` and fields; other values as they are."""
     if isinstance(value, dict) and "preset" in value:
         return _preset(value["preset"]) | {field: given for field, given in value.items() if field != "preset"}
     return _preset(value) if isinstance(value, str) else value
@@ -137,18 +141,19 @@ def _preset(name: Any) -> dict[str, Any]:
 
 
 class Keyframe(Config):
-    """The weather at one time."""
+    """The weather at one time of a scene."""
 
     at_s: float = Field(ge=0)  # after the scene's first spin
     weather: Annotated[Weather, BeforeValidator(_named)]  # the name of a preset, or values
 
 
 class WeatherSchedule(Config):
-    """The weather over a scene: keyframes, or classes one of which is drawn for each scene.
+    """The weather over a scene: keyframes, or classes from which each scene draws.
 
-    With `turn_s`, a scene goes through all its classes in an order drawn for it, from one to the next in that time; a
-    class may be named several times. In a recipe it may also be written as the name of a preset, as one weather, or as
-    the list of keyframes alone. A weather is its fields, the name of a preset, or a `preset` with fields given anew.
+    Without `turn_s` a scene draws one class; with it, a scene goes through all classes in an order drawn for it, and
+    takes `turn_s` from one to the next. A class may be named several times. In a recipe a schedule may also be written
+    as the name of a preset, as one weather, or as the list of keyframes alone. A weather is written as its fields, as
+    the name of a preset, or as a `preset` with the fields that differ from it.
     """
 
     keyframes: tuple[Keyframe, ...] = ()  # between them everything changes evenly
@@ -190,7 +195,7 @@ class WeatherSchedule(Config):
         return self
 
     def draw(self, rng: np.random.Generator) -> "WeatherSchedule":
-        """Return the schedule of one scene: itself, a weather of one of its classes, or one of each in turn."""
+        """Return the schedule of one scene, of keyframes alone: those given, or weathers drawn from its classes."""
         if not self.classes:
             return self
         if self.turn_s is None:
@@ -203,9 +208,10 @@ class WeatherSchedule(Config):
         return WeatherSchedule(keyframes=tuple(turns))
 
     def at(self, time_s: float) -> Weather:
-        """Return the weather `time_s` after the scene's first spin; before and after all keyframes it stands still.
+        """Return the weather `time_s` after the scene's first spin, interpolated between keyframes.
 
-        Raises `ValueError` where classes were given and none was drawn.
+        Before the first and after the last keyframe it is constant. Raises `ValueError` for a schedule of classes that
+        has not been drawn.
         """
         if not self.keyframes:
             raise ValueError("no weather was drawn from the classes: see WeatherSchedule.draw")
@@ -238,7 +244,7 @@ def _scaled(parameter: str, value: float) -> float:
 
 
 def _anywhere(rng: np.random.Generator) -> Region:
-    """Return limits around weathers that occur: rain comes from clouds and wets the road, fog is the exception."""
+    """Return drawn limits of plausible weathers: 40 % with rain (from clouds, on wet roads), 25 % with fog."""
     rains, foggy, dries = rng.random(3) < (0.4, 0.25, 0.7)
     return {
         "sun_elevation_deg": (-60.0, 75.0),

@@ -1,1 +1,1 @@
-"""The map of a town: roads, lanes, markings, surfaces, street furniture."""
+"""Town maps: SUMO road networks, lanes, markings, ground surfaces and street furniture."""

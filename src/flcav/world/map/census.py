@@ -1,4 +1,8 @@
-"""Counts of a town: its streets, buildings and furniture, and the road users around each pole."""
+"""Town statistics and traffic density.
+
+`census` counts a town's streets, buildings and furniture. `mean_actors` is the traffic density around candidate sites,
+the criterion of conventional sensor placement.
+"""
 
 from collections.abc import Sequence
 
@@ -14,22 +18,28 @@ Array = NDArray[np.float64]
 
 
 def mean_actors(sites: Array, traces: Trace | Sequence[Trace], range_m: float) -> Array:
-    """Return (P,) the mean number of actors within `range_m` of each site (P, 3), over all instants of `traces` [m].
+    """Return the traffic density (P,): the mean number of actors within `range_m` of each site, over all instants.
 
-    Counts every present actor, moving or parked, vehicle or pedestrian, by the 3D distance of its box's centre.
+    `sites` (P, 3) are in the world frame [m]. Every present actor counts, moving or parked, vehicle or pedestrian; its
+    distance is the 3D distance from the site to the centre of its box. All zeros without traces.
     """
     traces = [traces] if isinstance(traces, Trace) else traces
     total, instants = np.zeros(len(sites)), 0
     for trace in traces:
         centre = trace.position + np.array([0.0, 0.0, 0.5]) * trace.size[:, 2:]
         for i, site in enumerate(sites):
-            total[i] += (np.linalg.norm(centre - site, axis=2) <= range_m).sum()  # absent is NaN: never within
+            total[i] += (np.linalg.norm(centre - site, axis=2) <= range_m).sum()  # an absent actor is NaN: not within
         instants += len(trace.time_s)
     return total / max(instants, 1)
 
 
 def census(town: Town) -> dict[str, float]:
-    """Return how much there is of what in a town: lengths in km, extents in m, all else in numbers."""
+    """Return the statistics of a town by name.
+
+    `width_m` and `height_m` are the extents of its bounds; `driving_km` and `sidewalk_km` the total length of these
+    lanes; `junctions` the number of nodes with three or more neighbours, `lights` of junctions with traffic lights;
+    `vehicles` and `pedestrians` the number moving at once; all others are plain counts.
+    """
     net = read_net(town.net)
     x_low, y_low, x_high, y_high = town.bounds
     arms: dict[str, set[str]] = {}

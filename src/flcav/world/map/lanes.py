@@ -1,4 +1,4 @@
-"""Lanes, crossings and markings of a town as polylines, and as a raster."""
+"""The lane-level map of a town: vector layers (`map_layers`) and their bird's-eye raster (`rasterise`)."""
 
 from collections.abc import Iterator, Sequence
 from typing import get_args
@@ -22,9 +22,9 @@ RASTER_LAYERS: tuple[str, ...] = (
     "sidewalk",
     "lane",  # driving lanes on streets and inside junctions
     "marking",  # lines along the road
-    "stop_line",  # and give-way lines
-    "crossing",  # the whole crossing
-    "stripe",  # its paint
+    "stop_line",  # stop lines and give-way lines
+    "crossing",  # the whole area of a crossing
+    "stripe",  # the painted stripes of a crossing
     "arrow",
 )
 
@@ -32,9 +32,10 @@ RASTER_LAYERS: tuple[str, ...] = (
 def rasterise(
     layers: MapLayers, world_from_patch: Array, size_m: tuple[float, float], resolution_m: float
 ) -> NDArray[np.bool_]:
-    """Return a (len(RASTER_LAYERS), H, W) raster of the patch: whether a pixel's centre lies in the layer.
+    """Return the bird's-eye raster (len(RASTER_LAYERS), H, W) of a patch: which pixel centres lie in each layer.
 
-    `world_from_patch` (4, 4) is the pose of the patch's middle, x forward and y left; `size_m` its extents along x, y.
+    `world_from_patch` (4, 4) is the pose of the patch's middle, x forward and y left; `size_m` its extents along x, y
+    [m]; H = size_m[0] / resolution_m and W = size_m[1] / resolution_m, rounded.
     Row 0 is farthest ahead, column 0 farthest left: pixel (i, j) has its centre at x = size_m[0] / 2 - (i + 0.5)
     resolution_m, y = size_m[1] / 2 - (j + 0.5) resolution_m.
     """
@@ -53,10 +54,11 @@ def rasterise(
 
 
 def fill(points: Array, counts: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return (H, W) which pixel centres (i + 0.5, j + 0.5) lie in any of the polygons.
+    """Return the mask (H, W) of pixels whose centres (i + 0.5, j + 0.5) lie in any of the polygons.
 
-    `points` (N, 2) are the polygons' vertices as row and column, polygon after polygon of `counts` vertices, all wound
-    the same way: scan lines add up each edge's winding number, vectorised over all edges.
+    Scan-line fill by the nonzero winding rule, vectorised over all edges. `points` (N, 2) are the polygons' vertices as
+    row and column [px], polygon after polygon; `counts` are their numbers of vertices. All polygons are wound the same
+    way. `shape` is (H, W).
     """
     height, width = shape
     starts = np.repeat(np.cumsum(counts) - counts, counts)
@@ -102,11 +104,11 @@ __all__ = ["RASTER_LAYERS", "map_layers", "rasterise"]
 
 
 WAYS: dict[str, ArrowKind] = {kind: kind for kind in get_args(ArrowKind)}
-ARROWS_BEFORE_M = (8.0, 28.0)  # from the stop line to an arrow's middle
+ARROWS_BEFORE_M = (8.0, 28.0)  # from the end of the lane back to an arrow's middle
 
 
 def map_layers(town: Town) -> MapLayers:
-    """Return the map of a town. The same town gives the same map."""
+    """Return the lane-level map of a town, in the world frame. The same town gives the same map."""
     net = read_net(town.net)
     roads = shapely.union_all([Polygon(outline) for outline in town.roads])
     crossings = tuple(_crossings(net, roads))
@@ -154,7 +156,7 @@ def _crossings(net: RoadNet, roads: BaseGeometry) -> Iterator[Crossing]:
 
 
 def _arrows(net: RoadNet) -> Iterator[Arrow]:
-    """Yield arrows on the lanes into junctions with lights, and wherever the lanes of a street go different ways."""
+    """Yield lane arrows before traffic lights, and on streets whose lanes lead in different directions."""
     turns: dict[str, set[str]] = {}
     for connection in net.connections:
         turns.setdefault(connection.start, set()).add(connection.turn.lower())

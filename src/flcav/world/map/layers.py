@@ -1,6 +1,6 @@
-"""What a lane-level map of a town is made of: vector records in the world frame, metres and radians.
+"""Records of a lane-level map: lanes, road markings, crossings and lane arrows as vectors.
 
-Lines are in two dimensions; the road surface is at z = 0.
+Lines and outlines are two-dimensional, in the world frame [m]; angles are in radians. The road surface is at z = 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from flcav.files import Json
 from flcav.world.map.roads import LaneKind
 
 Array = NDArray[np.float64]
-Record = Mapping[str, Json]  # of one lane, line, crossing, arrow or polygon
+Record = Mapping[str, Json]  # one lane, marking, crossing, arrow or polygon as plain JSON values
 
 MarkingKind = Literal["solid", "dashed", "stop_line", "yield_line", "edge"]
 ArrowKind = Literal["straight", "left", "right", "straight_left", "straight_right", "left_right", "straight_left_right"]
@@ -30,20 +30,20 @@ class MapLane:
     width_m: float
     speed: float  # limit [m/s]
     junction: str  # the junction it lies in; empty on a street
-    turn: str  # s straight, l left, r right, t about, of a lane inside a junction; else empty
-    light: str  # "junction:link" that rules the entry to this lane inside a junction; else empty
-    successors: tuple[str, ...]  # ids of lanes
+    turn: str  # of a lane inside a junction: s straight, l left, r right, t U-turn; else empty
+    light: str  # of a lane inside a junction: "junction:link" of the signal that controls its entry; else empty
+    successors: tuple[str, ...]  # ids of the lanes that it leads to
 
 
 @dataclass(frozen=True)
 class Marking:
-    """A painted line."""
+    """A road marking: one painted line."""
 
     kind: MarkingKind
-    line: Array  # (K, 2) its middle
+    line: Array  # (K, 2) centre line of the paint
     width_m: float
-    dash_m: float  # painted stretch; 0 for a continuous line
-    gap_m: float  # between two of them
+    dash_m: float  # length of a dash; 0 for a continuous line
+    gap_m: float  # between two dashes
     colour: str = "white"
 
 
@@ -52,14 +52,14 @@ class Crossing:
     """A pedestrian crossing."""
 
     id: str
-    outline: Array  # (K, 2) counter-clockwise, on the road
+    outline: Array  # (K, 2) counter-clockwise, clipped to the road
     centre_line: Array  # (K, 2) from kerb to kerb
     width_m: float
 
 
 @dataclass(frozen=True)
 class Arrow:
-    """A painted arrow: its middle, and the driving direction it is read in."""
+    """A lane arrow on the road: position of its middle [m] and the driving direction in which it is read [rad]."""
 
     kind: ArrowKind
     x: float
@@ -70,7 +70,7 @@ class Arrow:
 
 @dataclass(frozen=True)
 class MapLayers:
-    """A town's map."""
+    """The lane-level map of a town, as vector layers."""
 
     roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, counter-clockwise, without holes
     sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2)
@@ -91,7 +91,7 @@ class MapLayers:
 
     @classmethod
     def from_records(cls, records: Mapping[str, Sequence[Record]]) -> "MapLayers":
-        """Return the map that `to_records` gave."""
+        """Return the map of records: the inverse of `to_records`. Raises `KeyError` for a missing layer."""
         kinds = {"lanes": MapLane, "markings": Marking, "crossings": Crossing, "arrows": Arrow}
         layers: dict[str, Any] = {}
         for layer in fields(cls):

@@ -1,8 +1,8 @@
-"""Which lines are painted on a town's streets.
+"""Road markings of a SUMO net, after the practice of European towns.
 
-The rules are those of European towns: broken lines between lanes that turn solid before a controlled junction, a
-double line between directions of several lanes, solid lines beside bicycle and parking lanes, edge lines where there is
-no kerb or the street is fast, a stop line where one stops and a broken one where one gives way.
+Lane lines are dashed, and solid before a controlled junction. The directions of a street are separated by a dashed
+line, and by a double solid line where they have more than two driving lanes together. Solid lines separate bicycle and
+parking lanes; edge lines mark streets without a kerb and fast ones. Approaches end in a stop line or a give-way line.
 """
 
 from collections.abc import Iterator
@@ -22,25 +22,28 @@ Array = NDArray[np.float64]
 
 LINE_M = 0.12  # width of a line
 BICYCLE_LINE_M = 0.25
-DASH_M, GAP_M = 3.0, 6.0  # between lanes
+DASH_M, GAP_M = 3.0, 6.0  # of a dashed lane line
 YIELD_DASH_M, YIELD_GAP_M, YIELD_LINE_M = 0.5, 0.25, 0.5
 STOP_LINE_M = 0.5
 TO_STOP_M = 0.35  # from the middle of a stop line to the end of its lane
-APPROACH_M = 18.0  # before a controlled junction nobody changes lanes
-DOUBLE_M = 0.12  # from the middle of the road to each of a double line
-INSET_M = 0.2  # of an edge line from the edge
-FAST = 13.0  # [m/s] streets as fast as this have edge lines even along a kerb
-SHORTEST_M = 0.3  # painted line
-SAME_LINE_M = 0.7  # two edges this close are the two directions of one street
+APPROACH_M = 18.0  # lane lines are solid over this length before a controlled junction
+DOUBLE_M = 0.12  # from the middle of the road to each line of a double line
+INSET_M = 0.2  # from the edge of the lane to an edge line
+FAST = 13.0  # [m/s] from this speed limit on, streets have edge lines even along a kerb
+SHORTEST_M = 0.3  # shorter pieces of a line are left out
+SAME_LINE_M = 0.7  # left sides of two edges nearer than this are one line: the directions of one street
 
 
 def markings(net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry) -> Iterator[Marking]:
-    """Iterate over the painted lines of a net, kept on `roads` and off `crossings`."""
+    """Yield the road markings of a net, clipped to `roads` and left out on `crossings`.
+
+    Both areas are shapely geometry in the world frame [m].
+    """
     paper = roads.buffer(-0.01).difference(crossings)
     shapely.prepare(paper)
     for marking in _drawn(net):
         width = marking.width_m / 2
-        inside = paper.buffer(-width) if width > LINE_M else paper  # stop lines are wide: keep all of them on the road
+        inside = paper.buffer(-width) if width > LINE_M else paper  # wide ones lie wholly on the road
         for part in _lines(LineString(marking.line).intersection(inside)):
             if part.length >= SHORTEST_M:
                 line = np.asarray(part.coords)
@@ -90,7 +93,7 @@ def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: floa
         if other is edge or not theirs or not _same(line, _beside(theirs[-1], theirs[-1].width / 2)):
             continue
         if edge.id > other.id:
-            return  # drawn with the other direction
+            return  # the other direction has it
         if len([lane for lane in (*lanes, *theirs) if lane.kind == "driving"]) > 2:
             for side in (-DOUBLE_M, DOUBLE_M):
                 yield Marking("solid", _beside(lanes[-1], lanes[-1].width / 2 + side), LINE_M, 0.0, 0.0)
@@ -102,7 +105,7 @@ def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: floa
 
 
 def _broken(line: Array, approach: float, *, both_ends: bool = False) -> Iterator[Marking]:
-    """Yield a dashed line that is solid over the last `approach` metres, or over those at both ends."""
+    """Yield a dashed line that is solid over its last `approach` metres, or over both ends; a third of it at most."""
     whole = LineString(line)
     approach = min(approach, whole.length / 3)
     start = approach if both_ends else 0.0
@@ -116,7 +119,7 @@ def _broken(line: Array, approach: float, *, both_ends: bool = False) -> Iterato
 
 
 def _entry(net: RoadNet, edge: Edge) -> Iterator[Marking]:
-    """Yield the stop or give-way line across the driving and bicycle lanes of an edge, before its junction."""
+    """Yield the stop line or give-way line across the driving and bicycle lanes at the end of an edge."""
     states = set(net.right_of_way.get(edge.id, ""))
     lanes = [lane for lane in edge.lanes if lane.kind in ("driving", "bicycle") and len(lane.shape) > 1]
     if not lanes or not states:
@@ -146,7 +149,7 @@ def _controlled(net: RoadNet, edge: Edge) -> bool:
 
 
 def _bends(net: RoadNet) -> dict[str, str]:
-    """Return the edges inside junctions that are but a bend or a seam of one street, with their junction."""
+    """Return the internal edges that continue one street through a node with two neighbours: edge -> junction."""
     neighbours: dict[str, set[str]] = {}
     for edge in net.streets:
         neighbours.setdefault(edge.end, set()).add(edge.start)

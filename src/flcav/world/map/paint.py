@@ -1,4 +1,4 @@
-"""Painted shapes: the dashes, stripes and arrows of a map as polygons."""
+"""Polygons of road paint: the dashes of lines, the stripes of crossings and lane arrows."""
 
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
@@ -16,13 +16,13 @@ from flcav.world.map.layers import Arrow, ArrowKind, Crossing, MapLayers, Markin
 
 Array = NDArray[np.float64]
 
-STRIPE_M = 0.5  # of a zebra crossing, and between two of its stripes
+STRIPE_M = 0.5  # width of a zebra crossing's stripes, and of the gaps between them
 ARROW_M = 5.0  # length of an arrow
-SHAFT_M = 0.15  # its width
+SHAFT_M = 0.15  # width of its shaft
 
 
 class Paint(NamedTuple):
-    """One painted shape."""
+    """One polygon of road paint."""
 
     layer: str  # marking | crossing | arrow
     outline: Array  # (K, 2) counter-clockwise, without holes [m]
@@ -30,7 +30,7 @@ class Paint(NamedTuple):
 
 
 def painted(layers: MapLayers) -> tuple[Paint, ...]:
-    """Return everything that is painted on the roads of a map, in the world frame."""
+    """Return the road paint of a map as polygons in the world frame: markings, then crossings, then arrows."""
     return (
         *(Paint("marking", piece, marking.colour) for marking in layers.markings for piece in strokes(marking)),
         *(Paint("crossing", piece, "white") for crossing in layers.crossings for piece in stripes(crossing)),
@@ -39,7 +39,7 @@ def painted(layers: MapLayers) -> tuple[Paint, ...]:
 
 
 def strokes(marking: Marking) -> Iterator[Array]:
-    """Yield the polygons (K, 2) of a line: one, or one per dash."""
+    """Yield the polygons (K, 2) of a marking: one per dash, or one of a continuous line."""
     line = LineString(marking.line)
     period = marking.dash_m + marking.gap_m if marking.dash_m else line.length
     starts = np.arange(0.0, line.length - 1e-6, period)
@@ -49,7 +49,7 @@ def strokes(marking: Marking) -> Iterator[Array]:
 
 
 def stripes(crossing: Crossing) -> Iterator[Array]:
-    """Yield the polygons (K, 2) of a zebra crossing's stripes, which run in driving direction."""
+    """Yield the polygons (K, 2) of a zebra crossing's stripes, whose long sides lie in driving direction."""
     line, outline = LineString(crossing.centre_line), Polygon(crossing.outline)
     count = max(int((line.length + STRIPE_M) / (2 * STRIPE_M)), 1)
     first = (line.length - (2 * count - 1) * STRIPE_M) / 2
@@ -60,14 +60,14 @@ def stripes(crossing: Crossing) -> Iterator[Array]:
 
 
 def glyph(arrow: Arrow) -> Array:
-    """Return the outline (K, 2) of a painted arrow."""
+    """Return the outline (K, 2) of a lane arrow, world frame [m]."""
     cos, sin = np.cos(arrow.yaw), np.sin(arrow.yaw)
     return _glyph(arrow.kind) @ np.array([[cos, sin], [-sin, cos]]) + (arrow.x, arrow.y)
 
 
 @lru_cache(maxsize=16)
 def _glyph(kind: ArrowKind) -> Array:
-    """Return an arrow about the origin, read along x."""
+    """Return the outline (K, 2) of an arrow centred on the origin, pointing along +x [m]."""
     back, heads = -ARROW_M / 2, kind.split("_")
     shaft = LineString([(back, 0.0), (0.9 if "straight" in heads else -0.2, 0.0)])
     pieces: list[BaseGeometry] = [shaft.buffer(SHAFT_M / 2, cap_style="flat")]
@@ -82,7 +82,7 @@ def _glyph(kind: ArrowKind) -> Array:
 
 
 def outlines(shape: BaseGeometry | Iterable[BaseGeometry]) -> Iterator[Array]:
-    """Yield the polygons of a shape as vertices (K, 2), counter-clockwise, the first not repeated."""
+    """Yield the outer rings of a shape's polygons: (K, 2) vertices, counter-clockwise, the first not repeated."""
     parts = shape if not isinstance(shape, BaseGeometry) else getattr(shape, "geoms", [shape])
     for part in parts:
         if isinstance(part, Polygon) and part.area > 1e-4:

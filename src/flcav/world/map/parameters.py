@@ -1,4 +1,4 @@
-"""What makes a town this town and no other, beside its road net: the file `town.yaml`."""
+"""Parameters of a town: the schema of `town.yaml`, from which buildings, furniture and traffic are drawn."""
 
 from typing import Annotated, Literal
 
@@ -61,10 +61,10 @@ ClutterMix = Annotated[dict[str, float], AfterValidator(_clutter_mix)]
 
 
 class StreetParameters(Config):
-    """One street type: what lines it, who parks on it, how much it draws."""
+    """Parameters of one street type: buildings, street furniture, parked vehicles and weight as a destination."""
 
     frontage_m: NotNegative = 0.0  # paving behind the sidewalk
-    setback_m: Interval = (2.0, 4.0)  # from the paving to the facades
+    setback_m: Interval = (2.0, 4.0)  # from the paving to the facades; intervals are drawn from uniformly
     building_length_m: Extent = (9.0, 14.0)
     building_depth_m: Extent = (8.0, 11.0)
     building_height_m: Extent = (5.0, 8.0)
@@ -76,21 +76,21 @@ class StreetParameters(Config):
     parked: Share = 0.0  # share of the parking lane's places that are taken
     parked_mix: VehicleMix = Field(default={"car": 1.0})
     traffic: NotNegative = 1.0  # relative weight of its edges as a destination of vehicles
-    footfall: NotNegative = 1.0  # and of pedestrians
+    footfall: NotNegative = 1.0  # relative weight of its edges as a destination of pedestrians
 
 
 class PoleParameters(Config):
-    """A candidate site at the kerb of an edge."""
+    """A candidate site of a roadside sensor, at the kerb of an edge."""
 
     id: Annotated[int, Field(ge=1, le=10**6)]
     kind: Literal["straight", "cross", "tee", "roundabout"]
     edge: str  # stands on the right of this edge
-    before_end_m: NotNegative  # distance to the edge's end; other than straight: watches the junction there
+    before_end_m: NotNegative  # distance to the edge's end; unless straight, the site faces the junction there
     height_m: Height = 6.0
 
 
 class GeoReference(Config):
-    """Where on Earth a town's local origin is, on the WGS 84 ellipsoid; x points east there and y north."""
+    """Geodetic position of a town's local origin on the WGS 84 ellipsoid; x points east there and y north."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] = 49.0
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 8.4
@@ -105,16 +105,16 @@ class MapSource(Config):
 
 
 class TownParameters(Config):
-    """A town's parameter file."""
+    """The parameters of a town, as in its file `town.yaml`."""
 
     description: str
     geo: GeoReference = GeoReference()
-    source: MapSource | None = None  # None: drawn here
-    seed: Annotated[int, Field(ge=0, lt=2**63)]  # of everything that stands still
-    vehicles: Many  # moving at once, CAVs apart
+    source: MapSource | None = None  # None: not imported
+    seed: Annotated[int, Field(ge=0, lt=2**63)]  # of buildings, trees, lamps and clutter
+    vehicles: Many  # moving at once, without the CAVs
     pedestrians: Many
     mix: VehicleMix  # category -> weight among moving vehicles
-    shapes: dict[str, dict[str, float]] = Field(default={})  # category -> shape -> weight; all alike where left out
+    shapes: dict[str, dict[str, float]] = Field(default={})  # category -> shape -> weight; equal weights where left out
     streets: dict[str, StreetParameters]  # by the net's edge type
     poles: tuple[PoleParameters, ...] = ()
 
@@ -129,7 +129,7 @@ class TownParameters(Config):
         return self
 
     def shape_weights(self, category: str) -> list[float]:
-        """Return the weight of each of a category's shapes, in the order of `SHAPES`, summing to one."""
+        """Return the probabilities of a category's shapes, in the order of `SHAPES`."""
         weights = self.shapes.get(category) or {shape.name: 1.0 for shape in SHAPES[category]}
         total = sum(weights.values())
         return [weights.get(shape.name, 0.0) / total for shape in SHAPES[category]]

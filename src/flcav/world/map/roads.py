@@ -1,4 +1,4 @@
-"""A SUMO road net as records: edges with their lanes, junctions, and who gives way where.
+"""SUMO road networks: edges with their lanes, junctions, connections and right of way.
 
 Format: https://sumo.dlr.de/docs/Networks/SUMO_Road_Networks.html
 """
@@ -17,9 +17,9 @@ from flcav.config import InputError, shorten
 Array = NDArray[np.float64]
 
 LaneKind = Literal["driving", "bicycle", "parking", "shoulder", "sidewalk", "crossing", "walkingarea"]
-CARRIAGEWAY: tuple[LaneKind, ...] = ("driving", "bicycle", "parking", "shoulder")  # the last two are closed to traffic
+CARRIAGEWAY: tuple[LaneKind, ...] = ("driving", "bicycle", "parking", "shoulder")  # the last two without traffic
 
-FARTHEST_M = 1e8  # maps may lie as far from their origin as the Earth is round
+FARTHEST_M = 1e8  # largest number in a net, coordinates included: more than the Earth's circumference
 ONLY_FOR: dict[str, LaneKind] = {"pedestrian": "sidewalk", "bicycle": "bicycle"}
 
 
@@ -36,12 +36,12 @@ class Lane:
 
 @dataclass(frozen=True)
 class Edge:
-    """One direction of a street, or a piece of a junction's inside."""
+    """One direction of a street, or an edge inside a junction."""
 
     id: str
     function: str  # normal | internal | crossing | walkingarea
-    start: str  # junction ids; empty for the inside of a junction
-    end: str
+    start: str  # id of the junction it comes from; empty inside a junction
+    end: str  # id of the junction it leads to; empty inside a junction
     type: str  # street type of the town's parameters
     lanes: tuple[Lane, ...]  # from the kerb to the middle of the road
 
@@ -52,7 +52,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class Junction:
-    """Where edges meet."""
+    """A node of the net, where edges meet."""
 
     id: str
     kind: str  # SUMO's type: priority, priority_stop, traffic_light, ...
@@ -62,36 +62,34 @@ class Junction:
 
 @dataclass(frozen=True)
 class Connection:
-    """A way on from the end of one lane to the start of another."""
+    """A link from the end of one lane to the start of another."""
 
-    start: str  # lane ids
-    end: str
+    start: str  # id of the lane it leaves
+    end: str  # id of the lane it enters
     via: str  # first lane inside the junction; empty where there is none
-    turn: str  # s straight, l left, r right, L and R slightly so, t about
-    state: str  # who gives way: M has priority, m gives way, s stops, o is ruled by a light, ...
+    turn: str  # s straight, l left, r right, L and R half left and half right, t U-turn
+    state: str  # right of way in SUMO's letters: M has priority, m gives way, s stops, o at a traffic light, ...
     light: str  # "junction:link" as in `Trace.light`; empty without a light
 
 
 @dataclass(frozen=True)
 class RoadNet:
-    """All of a net that the static world and the traffic are made from."""
+    """The parts of a SUMO net from which the town and its traffic are made."""
 
     edges: dict[str, Edge]
     junctions: dict[str, Junction]
-    roundabouts: frozenset[str]  # junctions on a roundabout
-    right_of_way: dict[
-        str, str
-    ]  # edge -> link states of its driving lanes, e.g. "MMm"; s stops, m gives way, M has priority
+    roundabouts: frozenset[str]  # ids of the junctions on a roundabout
+    right_of_way: dict[str, str]  # edge -> `Connection.state` of all links of its driving lanes, e.g. "MMm"
     connections: tuple[Connection, ...]
 
     @property
     def streets(self) -> Iterator[Edge]:
-        """Iterate over the edges outside junctions."""
+        """Iterate over the edges outside junctions, in the net's order."""
         return (edge for edge in self.edges.values() if edge.function == "normal")
 
 
 def read_net(path: Path) -> RoadNet:
-    """Return the net file at `path`; raises `InputError` where it is no SUMO net."""
+    """Return the road network of a net file; raises `InputError` where it is missing or no SUMO net."""
     try:
         root = ElementTree.parse(path).getroot()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Traffic light heads: one on a mast at the kerb of every approach a light rules, one more above wide ones."""
+"""Placement of signal heads: a mast at the kerb of each approach to a traffic light, an arm over wide approaches."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,33 +13,33 @@ from flcav.world.map.street_furniture import Verge
 
 Array = NDArray[np.float64]
 
-KERB_HEAD_M = 2.9  # height of a head's centre beside the road
-ARM_HEAD_M = 5.6  # and above it
-ARM_LANES = 2  # approaches from so many driving lanes on have a head above them
-BEFORE_END_M = 0.6  # a mast stands so far before its lane's end
-FROM_KERB_M = 0.45
-SENSOR_CLEAR_M = 8.0
+KERB_HEAD_M = 2.9  # height of the centre of a head beside the road
+ARM_HEAD_M = 5.6  # height of the centre of a head above the road
+ARM_LANES = 2  # approaches with at least so many driving lanes also have a head above them
+BEFORE_END_M = 0.6  # from a mast to the end of its lane
+FROM_KERB_M = 0.45  # from a mast to the kerb
+SENSOR_CLEAR_M = 8.0  # no arm where a roadside sensor is nearer than this to the mast
 
 
 @dataclass(frozen=True)
 class Signals:
-    """The signal heads of a town."""
+    """The K signal heads of a town."""
 
     position: Array  # (K, 3) centre of the head, world [m]
-    yaw: Array  # (K,) where it faces: against the traffic it rules [rad]
-    foot: Array  # (K, 2) of its mast [m]; heads on one mast share it
+    yaw: Array  # (K,) direction it faces, towards the traffic it controls, world [rad]
+    foot: Array  # (K, 2) foot of its mast, world [m]; heads on one mast share it
     link: tuple[str, ...]  # (K,) the entry of `Trace.light` it shows
 
     @classmethod
     def none(cls) -> "Signals":
-        """Return the signals of a town without any."""
+        """Return an empty record, of a town without traffic lights."""
         return cls(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)), ())
 
 
 def place_signals(net: RoadNet, sensors: Array) -> Signals:
-    """Return the heads of all approaches of `net` that a light rules, in the net's order.
+    """Return the signal heads of all approaches to traffic lights, in the net's order.
 
-    No arm reaches over the road where one of the `sensors` (P, 3) at the roadside stands close by: it hides the view.
+    There is no arm within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) [m], since it would block the view.
     """
     heads = [head for edge in net.streets for head in _approach(edge, net.connections, sensors)]
     if not heads:
@@ -57,7 +57,7 @@ def _approach(edge: Edge, connections: tuple[Connection, ...], sensors: Array) -
     ruled = [way for way in connections if way.light and way.start in names]
     if not ruled:
         return
-    link = min(ruled, key=lambda way: way.turn != "s").light  # the light of those who go straight on
+    link = min(ruled, key=lambda way: way.turn != "s").light  # the signal of the way straight on, where there is one
     outer = edge.lanes[0]
     verge = Verge(LineString(outer.shape), outer.width / 2, StreetParameters())
     inwards = FROM_KERB_M - verge.half_width if outer.kind == "sidewalk" else verge.half_width + FROM_KERB_M

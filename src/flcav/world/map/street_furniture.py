@@ -1,4 +1,7 @@
-"""What stands along the streets of a town: buildings, clutter, trees, lamps, poles, signs."""
+"""Procedural placement along the streets of a town: buildings, trees, clutter, lamps, signs and candidate poles.
+
+Positions and yaws are in the world frame [m, rad]. The same random generator gives the same placement.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,16 +18,16 @@ from flcav.world.map.surfaces import Surfaces, footprint
 
 Array = NDArray[np.float64]
 
-CORNER_M = 9.0  # how far beyond an edge's ends its frontage may go on
-STEP_M = 1.0  # how far on to try where something did not fit
-CLEARANCE_M = 0.25  # kept between solid things
-SENSOR_CLEAR_M = 2.5  # no street lamp stands nearer to a roadside sensor: it hides the view
+CORNER_M = 9.0  # a row of buildings may begin and end this far beyond its edge's ends
+STEP_M = 1.0  # shift along the street to the next try where something did not fit
+CLEARANCE_M = 0.25  # least distance between solid objects
+SENSOR_CLEAR_M = 2.5  # no street lamp is nearer to a roadside sensor, since it would block the view
 SIGN_HEIGHT_M = 2.2  # of the plate's centre
-SPEED_SIGNS = {30: "speed_30", 60: "speed_60", 90: "speed_90"}  # [km/h]
+SPEED_SIGNS = {30: "speed_30", 60: "speed_60", 90: "speed_90"}  # limit [km/h] -> kind of sign
 
 
 class Plot:
-    """The land of a town, and what has been built on it: asks where there is room."""
+    """Occupancy of a town's land: the area closed to building, and the footprints of what has been built."""
 
     def __init__(self, closed: BaseGeometry) -> None:
         self._closed = closed
@@ -32,7 +35,10 @@ class Plot:
         self._taken: list[Polygon] = []
 
     def build(self, shape: Polygon) -> bool:
-        """Take `shape` where it is free of the closed area and of all that was built before; say whether it was."""
+        """Reserve the footprint `shape` and return True; return False where it is not free.
+
+        It is free where it does not touch the closed area and is `CLEARANCE_M` from all that was built before.
+        """
         if self._closed.intersects(shape):
             return False
         if self._taken and shapely.dwithin(np.array(self._taken), shape, CLEARANCE_M).any():
@@ -43,14 +49,17 @@ class Plot:
 
 @dataclass(frozen=True)
 class Verge:
-    """The middle of a street's sidewalk, walked in driving direction: its right is away from the road."""
+    """The centre line of an outer lane, mostly a sidewalk, in driving direction: its right is away from the road."""
 
-    line: LineString
-    half_width: float  # of the sidewalk lane [m]
+    line: LineString  # world frame [m]
+    half_width: float  # of the lane [m]
     street: StreetParameters
 
     def at(self, along_m: float, right_m: float) -> tuple[float, float, float]:
-        """Return x, y and the driving direction at `along_m` (beyond the ends: straight on), `right_m` off the line."""
+        """Return x, y [m] and the driving direction [rad] at `along_m` on the line, shifted `right_m` to its right.
+
+        Beyond its ends the line goes straight on.
+        """
         inside = float(np.clip(along_m, 0.0, self.line.length))
         before, after = max(inside - 0.5, 0.0), min(inside + 0.5, self.line.length)
         a, b = self.line.interpolate(before), self.line.interpolate(after)
@@ -63,14 +72,14 @@ class Verge:
 
 
 def verges(net: RoadNet, parameters: TownParameters) -> Iterator[Verge]:
-    """Iterate over the sidewalks of all streets, in the net's order."""
+    """Yield the verge of each sidewalk of all streets, in the net's order."""
     for edge in net.streets:
         for lane in edge.lanes_of("sidewalk"):
             yield Verge(LineString(lane.shape), lane.width / 2, parameters.streets[edge.type])
 
 
 def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) -> Array:
-    """Return buildings (B, 6) x, y, yaw, length, width, height, shoulder to shoulder along every frontage."""
+    """Return the buildings (B, 6) x, y, yaw, length, width, height: rows along every verge, with drawn gaps."""
     out = []
     for verge in rows:
         street = verge.street
@@ -91,7 +100,7 @@ def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) 
 
 
 def place_clutter(rows: list[Verge], plot: Plot, random: np.random.Generator) -> tuple[tuple[str, Array], ...]:
-    """Return, per kind, rows (K, 6) x, y, yaw, length, width, height, just behind the walked part of the sidewalk."""
+    """Return the clutter just behind the sidewalks by kind: rows (K, 6) x, y, yaw, length, width, height [m, rad]."""
     out: dict[str, list[tuple[float, ...]]] = {}
     for verge in rows:
         kinds, weights = list(verge.street.clutter), np.array(list(verge.street.clutter.values()))
@@ -105,7 +114,7 @@ def place_clutter(rows: list[Verge], plot: Plot, random: np.random.Generator) ->
 
 
 def place_trees(rows: list[Verge], ground: Surfaces, plot: Plot, random: np.random.Generator) -> Array:
-    """Return trees (T, 4) x, y, height, crown radius: along the streets and on the traffic islands."""
+    """Return the trees (T, 4) x, y, height, crown radius [m]: along the streets and on the traffic islands."""
     out = []
 
     def plant(x: float, y: float, room: Callable[[Polygon], bool]) -> None:
@@ -127,9 +136,9 @@ def place_trees(rows: list[Verge], ground: Surfaces, plot: Plot, random: np.rand
 
 
 def place_lamps(rows: list[Verge], sensors: Array, random: np.random.Generator) -> Array:
-    """Return street lamps (L, 3): foot x, y at the kerb, and height.
+    """Return the street lamps (L, 3): x, y of the foot at the kerb, and height [m].
 
-    A lamp that would stand within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) stands further along.
+    A lamp within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) is shifted along the street.
     """
     out = []
     for verge in rows:
@@ -145,7 +154,10 @@ def place_lamps(rows: list[Verge], sensors: Array, random: np.random.Generator) 
 def place_poles(
     net: RoadNet, parameters: tuple[PoleParameters, ...]
 ) -> list[tuple[int, tuple[float, float, float], float, str]]:
-    """Return id, position, yaw and kind of each candidate site; raises `KeyError` for an edge the net lacks."""
+    """Return id, position, yaw and kind of each candidate site, by id; raises `KeyError` for an edge the net lacks.
+
+    A straight site faces across the road, another one its junction or the middle of its roundabout.
+    """
     out = []
     for pole in sorted(parameters, key=lambda pole: pole.id):
         x, y, heading = _kerb_side(net.edges[pole.edge], pole.before_end_m)
@@ -161,7 +173,7 @@ def place_poles(
 
 
 def place_signs(net: RoadNet) -> list[tuple[tuple[float, float, float], float, str]]:
-    """Return position, yaw and kind of each sign: give way and stop before junctions, the speed limit after them."""
+    """Return position, yaw and kind of each traffic sign: give way and stop before junctions, the limit after them."""
     out = []
     for edge in net.streets:
         if not edge.lanes_of("sidewalk") or not edge.lanes_of("driving"):
@@ -180,7 +192,7 @@ def place_signs(net: RoadNet) -> list[tuple[tuple[float, float, float], float, s
 
 
 def _kerb_side(edge: Edge, before_end_m: float) -> tuple[float, float, float]:
-    """Return x, y on the sidewalk 0.35 m from the kerb, and the driving direction there."""
+    """Return x, y [m] of a point on the sidewalk 0.35 m from the kerb, and the driving direction [rad] there."""
     lane = edge.lanes_of("sidewalk")[-1]
     verge = Verge(LineString(lane.shape), lane.width / 2, StreetParameters())
     return verge.at(verge.line.length - before_end_m, 0.35 - verge.half_width)

@@ -1,4 +1,4 @@
-"""The ground of a town as clean polygons: what is driven on, what is walked on, and the kerb between them."""
+"""Ground surfaces of a town as polygons: roads, sidewalks and traffic islands, and the kerbs between them."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -14,20 +14,20 @@ from flcav.world.map.roads import CARRIAGEWAY, RoadNet
 
 Array = NDArray[np.float64]
 
-SLIVER_M = 0.25  # pieces and notches narrower than twice this are drawing artefacts of the net
+SLIVER_M = 0.25  # narrower pieces are dropped, narrower gaps closed, shorter lanes left out: artefacts of the net
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """The ground, as shapely geometry in the world frame [m]."""
+    """The ground surfaces of a town, as shapely geometry in the world frame [m]."""
 
-    roads: MultiPolygon
-    sidewalks: MultiPolygon  # with the traffic islands
-    islands: MultiPolygon
+    roads: MultiPolygon  # carriageways and junctions
+    sidewalks: MultiPolygon  # with the paving behind them and the traffic islands
+    islands: MultiPolygon  # traffic islands: holes of the roads without a sidewalk in them
 
 
 def surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Surfaces:
-    """Return the surfaces of a net; `frontage_m` maps a street type to the width of paving behind its sidewalk."""
+    """Return the ground surfaces of a net; `frontage_m` is the width of paving behind the sidewalk, by street type."""
     driven = [
         LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
         for edge in net.edges.values()
@@ -63,7 +63,7 @@ def surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Surfaces:
 
 
 def simple_polygons(area: BaseGeometry) -> tuple[Array, ...]:
-    """Return `area` as disjoint polygons (K, 2) without holes, counter-clockwise, first vertex not repeated."""
+    """Return a partition of `area` into polygons (K, 2) without holes, counter-clockwise, first vertex not repeated."""
     pieces: list[Array] = []
     for part in _polygons(area):
         if part.interiors:
@@ -77,7 +77,7 @@ def simple_polygons(area: BaseGeometry) -> tuple[Array, ...]:
 
 
 def kerb_lines(ground: Surfaces) -> tuple[Array, ...]:
-    """Return the polylines (K, 2) along which road meets sidewalk."""
+    """Return the kerbs: polylines (K, 2) along which road meets sidewalk, world frame [m]."""
     shared = ground.roads.boundary.intersection(ground.sidewalks.buffer(0.02))
     lines = [line for line in getattr(shared, "geoms", [shared]) if isinstance(line, LineString) and line.length > 0]
     merged = linemerge(lines)
@@ -85,8 +85,8 @@ def kerb_lines(ground: Surfaces) -> tuple[Array, ...]:
 
 
 def _clean(area: BaseGeometry) -> MultiPolygon:
-    """Drop slivers, close hairline gaps, thin vertices."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # a mitre divides by the sine of its turn, zero or not
+    """Return the area after opening and closing by `SLIVER_M`, simplified, without parts below 1 m²."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # a mitre divides by the sine of its angle, even by 0
         opened = area.buffer(-SLIVER_M / 2, join_style="mitre").buffer(SLIVER_M, join_style="mitre")
         closed = opened.buffer(-SLIVER_M / 2, join_style="mitre").simplify(0.02)
     return MultiPolygon([part for part in _polygons(closed) if part.area > 1.0])
@@ -98,7 +98,7 @@ def _polygons(area: BaseGeometry) -> Iterable[Polygon]:
 
 
 def footprint(x: float, y: float, yaw: float, length: float, width: float) -> Polygon:
-    """Return the rectangle (centre, heading, extents [m]) as a polygon."""
+    """Return the rectangle with centre x, y [m], heading `yaw` [rad] and these extents [m] as a polygon."""
     rectangle = box(-length / 2, -width / 2, length / 2, width / 2)
     cos, sin = float(np.cos(yaw)), float(np.sin(yaw))
     return shapely.affinity.affine_transform(rectangle, [cos, -sin, sin, cos, x, y])

@@ -1,4 +1,4 @@
-"""A town: what stands still. Roads come from a SUMO net, the rest from the town's parameter file."""
+"""Towns: static content from a SUMO net (roads) and a parameter file (buildings, furniture, candidate sites)."""
 
 import os
 from dataclasses import dataclass, field
@@ -19,32 +19,32 @@ from flcav.world.map.surfaces import kerb_lines, simple_polygons, surfaces
 Array = NDArray[np.float64]
 
 TOWNS: tuple[str, ...] = ("suburb", "grid", "ring", "arterial")
-KERB_M = 0.12  # how far a sidewalk is above the road
-MARGIN_M = 5.0  # of open land around the outermost thing
+KERB_M = 0.12  # height of a sidewalk above the road
+MARGIN_M = 5.0  # from the outermost surface or building to the bounds
 
 
 @dataclass(frozen=True)
 class Poles:
-    """Candidate sites of a roadside sensor."""
+    """The P candidate sites of a roadside sensor."""
 
-    id: NDArray[np.int64]  # (P,) the numbers people call them by, 1-based
-    position: Array  # (P, 3) the sensor's mount, world [m]; z is its height above ground
-    yaw: Array  # (P,) where the mount faces: towards the road or junction it watches, world [rad]
+    id: NDArray[np.int64]  # (P,) site numbers, from 1
+    position: Array  # (P, 3) mount of the sensor, world [m]; z is its height above ground
+    yaw: Array  # (P,) direction the mount faces: the road or the junction, world [rad]
     kind: tuple[str, ...]  # (P,) straight | cross | tee | roundabout
 
 
 @dataclass(frozen=True)
 class Signs:
-    """Traffic signs."""
+    """The S traffic signs of a town."""
 
     position: Array  # (S, 3) plate centre, world [m]
-    yaw: Array  # (S,) the plate's outward normal [rad]
+    yaw: Array  # (S,) direction of the plate's front normal, world [rad]
     kind: tuple[str, ...]  # (S,) stop | yield | speed_30 | speed_60 | speed_90
 
 
 @dataclass(frozen=True)
 class Town:
-    """A town's static content. World frame: ENU, metres, z = 0 is the road surface.
+    """The static content of a town. World frame: ENU, metres, z = 0 at the road surface.
 
     >>> from flcav import Town, load_town
     >>> town: Town = load_town("suburb")
@@ -54,26 +54,27 @@ class Town:
 
     name: str
     net: Path  # the SUMO net file (.net.xml)
-    parameters: TownParameters  # what the town was furnished by, and its traffic
+    parameters: TownParameters  # of its furnishing and of its traffic
     bounds: tuple[float, float, float, float]  # x_min, y_min, x_max, y_max [m]
     roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, without holes
     sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2), raised by the kerb; traffic islands too
     kerbs: tuple[Array, ...]  # polylines (K, 2) where road meets sidewalk
-    buildings: Array  # (B, 6) centre x, y, yaw, length, width, height
-    trees: Array  # (T, 4) x, y, height, crown radius
+    buildings: Array  # (B, 6) centre x, y, yaw, length, width, height [m, rad]
+    trees: Array  # (T, 4) x, y, height, crown radius [m]
     clutter: tuple[tuple[str, Array], ...]  # (kind of `parameters.CLUTTER`, (K, 6) x, y, yaw, length, width, height)
     poles: Poles
     signs: Signs
-    lamps: Array  # (L, 3) street lamp foot x, y and height
-    geo: GeoReference = field(default_factory=GeoReference)  # of the world frame's origin
+    lamps: Array  # (L, 3) street lamps: x, y of the foot, height [m]
+    geo: GeoReference = field(default_factory=GeoReference)  # geodetic position of the world frame's origin
     signals: Signals = field(default_factory=Signals.none)
 
 
 def load_town(name: str | Path, beside: Path | None = None) -> Town:
-    """Return the town of that name, or of the folder `name` with `town.net.xml` and `town.yaml`.
+    """Return a town of `TOWNS`, or the town of a folder that holds `town.net.xml` and `town.yaml`.
 
-    A folder is looked for in the folder `beside`, where one is given, and then in the working directory. The same files
-    give the same town. Raises `InputError` for an unknown name and for files that do not fit together.
+    A `Path` is that folder; any other name is a folder in `beside`, where given, or else in the working directory. The
+    same files give the same town. Raises `InputError` for an unknown name, and for files that are missing, not of their
+    format or not consistent with each other.
 
     >>> from flcav import load_town
     >>> load_town("grid").poles.id
@@ -94,7 +95,7 @@ def _folder(name: str, beside: Path | None) -> Path:
         return Path(__file__).parents[1] / "towns" / name
     sought = [place / name for place in (beside, Path.cwd()) if place is not None]
     for folder in sought:
-        if os.path.isdir(folder):  # noqa: PTH112 - which takes a name that can be none
+        if os.path.isdir(folder):  # noqa: PTH112 - accepts names that no path may have
             return folder
     places = " nor ".join(map(str, dict.fromkeys(folder.absolute() for folder in sought)))
     raise InputError(

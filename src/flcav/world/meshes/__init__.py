@@ -1,4 +1,4 @@
-"""Parametric meshes of actors: no third-party assets; every shape has exactly its outer dimensions."""
+"""Parametric triangle meshes of actors and of a town's objects, without third-party assets."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -23,6 +23,9 @@ MAKERS: dict[str, Callable[[Shape], Mesh]] = {
 
 @lru_cache(maxsize=64)
 def actor_mesh(category: str, shape: int) -> Mesh:
-    """Return the mesh of `SHAPES[category][shape]` in its body frame: ground centre at the origin, x forward."""
+    """Return the mesh of `SHAPES[category][shape]` in its body frame: ground centre at the origin, x forward.
+
+    It has exactly the outer dimensions of the shape. Raises `KeyError` and `IndexError` for an unknown shape.
+    """
     wanted = SHAPES[category][shape]
     return fitted(MAKERS[category](wanted), wanted.length, wanted.width, wanted.height)

@@ -1,4 +1,4 @@
-"""Road vehicle bodies: a side view and a plan view, lofted, with arches, wheels, glass and an interior."""
+"""Lofted bodies of road vehicles from side-view profiles, with wheel arches, wheels, glass and an interior."""
 
 from dataclasses import dataclass
 
@@ -11,31 +11,31 @@ from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join, mirrored, moved,
 Array = NDArray[np.float64]
 Outline = tuple[tuple[float, float], ...]
 
-MIRROR_M = 0.05  # how far a mirror stands out of the body
-FRONT_SEAT_M = 1.05  # behind the foot of the windscreen
-REAR_SEAT_M = 1.95
-ARCH = 1.16  # wheel arch radius over wheel radius
+MIRROR_M = 0.05  # width of a mirror beside the body
+FRONT_SEAT_M = 1.05  # from the foot of the windscreen back to the front seats
+REAR_SEAT_M = 1.95  # and to the rear seats
+ARCH = 1.16  # radius of a wheel arch over that of its wheel
 
 
 @dataclass(frozen=True)
 class Profile:
-    """What a body looks like from the side; x from -0.5 (rear) to 0.5 of its length, z to 1 of its height."""
+    """Side-view profile of a body: x from -0.5 (rear) to 0.5 of its length, z from 0 to 1 of its height."""
 
-    belt: Outline  # top of the lower body: boot, waist, bonnet
-    roof: Outline  # the cabin above it, from its rear foot to the foot of the windscreen
-    axles: tuple[float, float] = (-0.295, 0.305)  # x, rear and front
+    belt: Outline  # x, z of the upper edge of the lower body: boot, waist, bonnet
+    roof: Outline  # x, z of the cabin above it, from its rear foot to the foot of the windscreen
+    axles: tuple[float, float] = (-0.295, 0.305)  # x of the rear and the front axle
     wheel_radius: float = 0.31  # [m]
-    clearance: float = 0.17  # [m]
-    windows: tuple[float, float] = (0.08, 0.93)  # the part of the cabin's length with side windows
-    pillars: tuple[float, ...] = (0.36, 0.66)  # in the same measure
+    clearance: float = 0.17  # of the floor above the ground [m]
+    windows: tuple[float, float] = (0.08, 0.93)  # start and end of the side windows, shares of the cabin's length
+    pillars: tuple[float, ...] = (0.36, 0.66)  # between windows, shares of the cabin's length
     roof_width: float = 0.80  # over the cabin's width at the waist
-    rounding: float = 0.16  # how much narrower the ends are
-    bed: tuple[float, float, float] | None = None  # a pickup's: from x, to x, floor z
-    stations: int = 23
+    rounding: float = 0.16  # share by which the ends are narrower
+    bed: tuple[float, float, float] | None = None  # of a pickup: rear x, front x, z of the floor
+    stations: int = 23  # evenly spaced cross sections along x
 
 
 def vehicle_body(profile: Profile, length: float, width: float, height: float) -> Mesh:
-    """Return a whole vehicle about those dimensions [m], mirrors within the width."""
+    """Return the mesh of a vehicle of about these outer dimensions [m], mirrors included, in its body frame."""
     half_width = width / 2 - MIRROR_M
     lower = _Lower.of(profile, length, half_width, height)
     parts = [mirrored(_flank(lower)), _floor(lower), _end(lower, front=False), _end(lower, front=True)]
@@ -54,7 +54,7 @@ def vehicle_body(profile: Profile, length: float, width: float, height: float) -
 
 
 def wheel(radius: float, width: float, sides: int = 12) -> Mesh:
-    """Return a wheel standing on z = 0, its outer side towards +y."""
+    """Return a wheel of `radius` and `width` [m] that stands on z = 0, its outer side towards +y."""
     hub, face = np.array((0.0, 0.0, radius)), width / 2
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     circle = np.stack((np.cos(angle), 0 * angle, np.sin(angle)), axis=1) * radius
@@ -66,14 +66,14 @@ def wheel(radius: float, width: float, sides: int = 12) -> Mesh:
 
 @dataclass(frozen=True)
 class _Lower:
-    """The lower body along its stations."""
+    """The lower body: its cross sections at S stations along x."""
 
     x: Array  # (S,) [m]
     half: Array  # (S,) half width [m]
-    sill: Array  # (S,) lowest z, up and over the wheels [m]
-    belt: Array  # (S,) highest z [m]
-    deck: Array  # (S,) z of what lies between the flanks [m]
-    clearance: float
+    sill: Array  # (S,) z of the lower edge of the flank, around the wheel arches [m]
+    belt: Array  # (S,) z of the upper edge of the flank [m]
+    deck: Array  # (S,) z of the bonnet, boot or bed between the flanks [m]
+    clearance: float  # [m]
 
     @classmethod
     def of(cls, profile: Profile, length: float, half_width: float, height: float) -> "_Lower":
@@ -134,7 +134,7 @@ def _end(lower: _Lower, *, front: bool) -> Mesh:
 
 
 def _arch(x: float, profile: Profile, half_width: float) -> Mesh:
-    """Return the liner that keeps rays from passing behind a wheel, down to the floor."""
+    """Return the liner of the left wheel arch at `x`, which keeps rays from passing behind the wheel."""
     radius, hub = profile.wheel_radius * ARCH, profile.wheel_radius
     angle = np.linspace(0, np.pi, 7)
     circle = np.stack((np.cos(angle), 0 * angle, np.sin(angle)), axis=1) * radius
@@ -180,7 +180,7 @@ def _cabin_side(profile: Profile, lower: _Lower, length: float, height: float) -
 
 
 def _cabin_frame(profile: Profile, lower: _Lower, length: float) -> tuple[float, float, float]:
-    """Return where the cabin starts and ends along x, and the height of its waist [m]."""
+    """Return x of the rear and the front end of the cabin, and z of its waist [m]."""
     start, end = profile.roof[0][0] * length, profile.roof[-1][0] * length
     return start, end, float(np.interp((start + end) / 2, lower.x, lower.belt))
 
@@ -191,7 +191,7 @@ def _headroom(profile: Profile, length: float, height: float, x: float, waist: f
 
 
 def _interior(profile: Profile, lower: _Lower, length: float, height: float) -> Mesh:
-    """Return the left half of seats and dashboard."""
+    """Return the left half of the dashboard and of the seats; rows without headroom are left out."""
     start, end, waist = _cabin_frame(profile, lower, length)
     side = float(lower.half.max()) * 0.45
     parts = [box((end - 0.45, side, waist - 0.05), (0.30, 2 * side * 0.85, 0.12), Material.INTERIOR)]
@@ -214,7 +214,7 @@ def _driver(profile: Profile, lower: _Lower, length: float, height: float) -> Me
 
 
 def roof_sign(x: float, z: float) -> Mesh:
-    """Return a taxi's sign with its foot at height `z` [m]."""
+    """Return the roof sign of a taxi, at `x` and with its foot at height `z` [m]."""
     return join(
         (
             box((x, 0, z + 0.02), (0.10, 0.30, 0.06), Material.TRIM),

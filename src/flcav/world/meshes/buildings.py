@@ -1,17 +1,17 @@
-"""Buildings: walls with balconies under a flat or a gabled roof."""
+"""Meshes of buildings: walls with balconies, sills and porches under a flat or a gabled roof."""
 
 import numpy as np
 
 from flcav.world.materials import Material
 from flcav.world.meshes.mesh import Mesh, box, join, moved, sheet
 
-STOREY_M = 3.0
-BAY_M = 4.5
-GABLED_BELOW_M = 9.0  # lower buildings are houses
+STOREY_M = 3.0  # height of a storey
+BAY_M = 4.5  # width of a bay of the facade
+GABLED_BELOW_M = 9.0  # buildings lower than this have a gabled roof
 
 
 def building(length: float, width: float, height: float, rng: np.random.Generator) -> Mesh:
-    """Return a building about its ground centre, `length` along x; `rng` chooses its facade."""
+    """Return a building of these dimensions [m] about its ground centre, `length` along x; `rng` draws its facades."""
     walls = height * 0.68 if height < GABLED_BELOW_M else height - 0.5
     parts = [box((0, 0, walls / 2), (length, width, walls), Material.WALL)]
     parts.append(_gable(length, width, walls, height) if height < GABLED_BELOW_M else _parapet(length, width, walls))
@@ -24,7 +24,7 @@ def building(length: float, width: float, height: float, rng: np.random.Generato
 
 
 def _facade(along: float, depth: float, walls: float, rng: np.random.Generator) -> Mesh | None:
-    """Return the balconies, window sills and porches of the side at y = depth / 2."""
+    """Return the balconies, sills and porches of the side at y = `depth` / 2, or None where it has no bay."""
     bays = int(along // BAY_M)
     storeys = int(walls // STOREY_M)
     parts = []
@@ -49,7 +49,7 @@ def _parapet(length: float, width: float, walls: float) -> Mesh:
 
 
 def _gable(length: float, width: float, walls: float, height: float) -> Mesh:
-    """Return a saddle roof with its ridge along the longer side."""
+    """Return a gabled roof with its ridge along the longer side, from the height `walls` to `height` [m]."""
     turned = width > length
     along, across = (width, length) if turned else (length, width)
     x = np.array((-1.0, 1.0)) * (along / 2 + 0.3)

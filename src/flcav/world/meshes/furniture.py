@@ -1,4 +1,7 @@
-"""Meshes of street furniture: trees, traffic lights, signs, lamps, benches."""
+"""Meshes of trees and street furniture: signal heads, masts, lamps, signs and clutter, each about its foot.
+
+Crowns of trees are loose leaves, so that some rays pass between them.
+"""
 
 from collections.abc import Callable
 
@@ -8,12 +11,12 @@ from numpy.typing import ArrayLike
 from flcav.world.materials import Material
 from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join, sheet, tube
 
-LEAVES = 360  # of a tree; each stands for a cluster
-LEAF = 0.38  # size of a cluster over the crown's radius: about two rays in three are caught
+LEAVES = 360  # triangles of a crown; each stands for a cluster of leaves
+LEAF = 0.38  # size of a cluster over the crown's radius: the crown stops about two rays in three
 
 
 def tree(height: float, crown_radius: float, rng: np.random.Generator) -> Mesh:
-    """Return a tree about the foot of its trunk."""
+    """Return a tree of these dimensions [m] about the foot of its trunk; `rng` draws its leaves."""
     crown_foot = 0.32 * height
     middle = np.array((0.0, 0.0, (height + crown_foot) / 2))
     radii = np.array((crown_radius, crown_radius, (height - crown_foot) / 2))
@@ -22,7 +25,10 @@ def tree(height: float, crown_radius: float, rng: np.random.Generator) -> Mesh:
 
 
 def leaves(center: ArrayLike, radii: ArrayLike, count: int, size_m: float, rng: np.random.Generator) -> Mesh:
-    """Return `count` loose triangles of about `size_m`, densest towards the outside of an ellipsoid."""
+    """Return `count` loose triangles of about `size_m` in an ellipsoid, densest towards its surface.
+
+    `center` (3,) and half axes `radii` (3,) are in metres; the triangles have random orientations.
+    """
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     inside = 1 - size_m / 2 / np.min(radii)
@@ -33,16 +39,16 @@ def leaves(center: ArrayLike, radii: ArrayLike, count: int, size_m: float, rng: 
     return Mesh(vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3), np.full(count, Material.LEAF, np.uint8))
 
 
-HEAD_M = (0.20, 0.36, 1.04)  # depth, width, height of the housing
+HEAD_M = (0.20, 0.36, 1.04)  # depth, width, height of a signal head's housing
 LENS_RADIUS_M = 0.125
-LENS_PITCH_M = 0.32
-VISOR_M = 0.20
-LIGHT_MAST_BEHIND_M = 0.22  # the mast stands behind the head's centre
-LENSES = (Material.LENS_RED, Material.LENS_AMBER, Material.LENS_GREEN)  # from above
+LENS_PITCH_M = 0.32  # between the centres of neighbouring lenses
+VISOR_M = 0.20  # length of a visor
+LIGHT_MAST_BEHIND_M = 0.22  # from the head's centre back to its mast
+LENSES = (Material.LENS_RED, Material.LENS_AMBER, Material.LENS_GREEN)  # from top to bottom
 
 
 def signal_head(height: float) -> Mesh:
-    """Return a head of three lenses under visors, its centre `height` above the origin, facing +x."""
+    """Return a signal head of three lenses with visors, its centre `height` [m] above the origin, facing +x."""
     front = HEAD_M[0] / 2
     parts = [box((0, 0, height), HEAD_M, Material.TRIM)]
     for place, material in zip((1, 0, -1), LENSES):
@@ -52,7 +58,7 @@ def signal_head(height: float) -> Mesh:
 
 
 def signal_mast(height: float, reach: float = 0.0) -> Mesh:
-    """Return the mast of a head `height` above the origin; with a `reach` to its left, it hangs from an arm there."""
+    """Return the mast of a signal head `height` [m] above the origin; with a `reach` [m], on an arm to its left."""
     foot = np.array((-LIGHT_MAST_BEHIND_M, 0.0, 0.0))
     top = np.array((-LIGHT_MAST_BEHIND_M, 0.0, height + 0.25))
     mast = tube(foot, top, 0.075, Material.METAL, sides=8)
@@ -82,17 +88,17 @@ def _visor(middle: np.ndarray) -> Mesh:
     return sheet(np.stack((rim, rim + np.array((VISOR_M, 0, 0)))), Material.TRIM)
 
 
-SIGN_RADIUS_M = 0.36
-MAST_BEHIND_M = 0.40  # a roadside sensor stands this far in front of its mast
+SIGN_RADIUS_M = 0.36  # circumscribed radius of a sign's plate
+MAST_BEHIND_M = 0.40  # from a roadside sensor back to its mast
 
 
 def clutter(kind: str, length: float, width: float, height: float) -> Mesh:
-    """Return a piece of street clutter of that size, `length` along x; of an unknown kind, a box."""
+    """Return a piece of street clutter of these dimensions [m], `length` along x; a box for an unknown kind."""
     return CLUTTER.get(kind, _box)(length, width, height)
 
 
 def lamp(height: float) -> Mesh:
-    """Return a street lamp; the underside of its head is what shines."""
+    """Return a street lamp of this height [m]; the underside of its head is luminous."""
     post = tube((0, 0, 0), (0, 0, height), 0.08, Material.METAL, end_radius=0.05, sides=6)
     head = box((0, 0, height), (0.9, 0.9, 0.12), Material.METAL)
     head.material[head.vertices[head.faces, 2].max(axis=1) < height] = Material.LAMP
@@ -100,19 +106,22 @@ def lamp(height: float) -> Mesh:
 
 
 def sensor_mast(height: float) -> Mesh:
-    """Return the mast of a sensor that is `height` above the origin and looks along +x."""
+    """Return the mast of a roadside sensor that is `height` [m] above the origin and faces +x."""
     mast = tube((-MAST_BEHIND_M, 0, 0), (-MAST_BEHIND_M, 0, height + 0.1), 0.09, Material.METAL, sides=8)
     arm = box((-MAST_BEHIND_M / 2 - 0.06, 0, height - 0.12), (MAST_BEHIND_M - 0.12, 0.06, 0.06), Material.METAL)
     return join((mast, arm))
 
 
 def sign(kind: str, height: float) -> Mesh:
-    """Return a sign and its post; the plate, `height` above the origin, faces +x."""
+    """Return a traffic sign with its post; the centre of its plate is `height` [m] above the origin and faces +x."""
     return join((sign_plate(kind, height), sign_post(height)))
 
 
 def sign_plate(kind: str, height: float) -> Mesh:
-    """Return the plate of a sign, front and back: stop 8 corners, yield 3, others round."""
+    """Return the plate of a traffic sign, front and back: an octagon for stop, a triangle for yield, else a disc.
+
+    Its centre is `height` [m] above the origin; it faces +x.
+    """
     corners, start = {"stop": (8, np.pi / 8), "yield": (3, -np.pi / 2)}.get(kind, (16, 0.0))
     angle = start + np.arange(corners + 1) * 2 * np.pi / corners
     rim = np.stack((0 * angle, np.cos(angle), np.sin(angle)), axis=1) * SIGN_RADIUS_M
@@ -126,7 +135,7 @@ def sign_plate(kind: str, height: float) -> Mesh:
 
 
 def sign_post(height: float) -> Mesh:
-    """Return the post behind the plate of a sign."""
+    """Return the post behind the plate of a traffic sign that is `height` [m] above the origin."""
     return tube((-0.05, 0, 0), (-0.05, 0, height + 0.2), 0.035, Material.METAL, sides=6)
 
 

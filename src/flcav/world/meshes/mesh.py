@@ -1,4 +1,4 @@
-"""The mesh record and the pieces meshes are put together from. Body frame: x forward, y left, z up, metres."""
+"""Triangle meshes, their primitives and operations. Body frame: x forward, y left, z up, metres."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,24 +14,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles, each of one material."""
+    """A triangle mesh with one material per face."""
 
     vertices: NDArray[np.float32]  # (V, 3) [m]
-    faces: NDArray[np.int32]  # (F, 3) rows of vertices
+    faces: NDArray[np.int32]  # (F, 3) rows of `vertices`
     material: NDArray[np.uint8]  # (F,) a Material
 
     def normals(self) -> NDArray[np.float32]:
-        """Return (F, 3) unit normals, of either sign; zero where a face has no area."""
+        """Return the unit normals of the faces (F, 3), of either sign; zero where a face has no area."""
         a, b, c = (self.vertices[self.faces[:, i]].astype(np.float64) for i in range(3))
         normal = np.cross(b - a, c - a)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         return (normal / np.maximum(length, 1e-12)).astype(np.float32)
 
     def corner_normals(self, crease_deg: float = 40.0) -> NDArray[np.float32]:
-        """Return (F, 3, 3) unit normals at each face's corners, as of the smooth surface the faces stand for.
+        """Return the area-weighted unit normals at each face's corners (F, 3, 3), for smooth shading.
 
-        Faces that share a corner are one surface where they bend by less than `crease_deg`; signs are those of
-        `normals`.
+        The normal at a corner averages the faces that share it and differ from this face by less than `crease_deg`.
+        Signs are those of `normals`.
         """
         corners = self.vertices[self.faces]
         flat = self.normals().astype(np.float64)
@@ -51,7 +51,7 @@ class Mesh:
         return np.where(length > 1e-12, out / np.maximum(length, 1e-12), flat[:, None]).astype(np.float32)
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return the lowest and the highest x, y, z, (3,) each."""
+        """Return the axis-aligned bounding box: lowest and highest x, y, z, (3,) each [m]."""
         return self.vertices.min(axis=0).astype(np.float64), self.vertices.max(axis=0).astype(np.float64)
 
 
@@ -66,20 +66,20 @@ def join(parts: Sequence[Mesh]) -> Mesh:
 
 
 def moved(mesh: Mesh, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Mesh:
-    """Return `mesh` turned by `yaw` [rad] and then shifted."""
+    """Return `mesh` rotated by `yaw` [rad] about z and then translated by x, y, z [m]."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
     return Mesh((mesh.vertices @ turn + (x, y, z)).astype(np.float32), mesh.faces, mesh.material)
 
 
 def mirrored(mesh: Mesh) -> Mesh:
-    """Return `mesh` and its mirror image across the x-z plane, as one mesh."""
+    """Return `mesh` together with its mirror image in the x-z plane, as one mesh."""
     other = Mesh(mesh.vertices * np.array([1, -1, 1], np.float32), mesh.faces[:, ::-1], mesh.material)
     return join((mesh, other))
 
 
 def fitted(mesh: Mesh, length: float, width: float, height: float) -> Mesh:
-    """Return `mesh` stretched to those outer dimensions exactly, standing on z = 0 around the origin."""
+    """Return `mesh` scaled to exactly these outer dimensions [m], standing on z = 0, centred on the origin."""
     low, high = mesh.bounds()
     unit = (mesh.vertices - low) / (high - low)
     vertices = (unit - (0.5, 0.5, 0.0)) * (length, width, height)
@@ -87,7 +87,10 @@ def fitted(mesh: Mesh, length: float, width: float, height: float) -> Mesh:
 
 
 def sheet(points: ArrayLike, material: Material | NDArray[np.uint8]) -> Mesh:
-    """Return the surface through a grid of points (A, B, 3); `material` is one, or one per cell (A-1, B-1)."""
+    """Return the surface through a grid of points (A, B, 3) [m], two triangles per cell.
+
+    `material` is one for all, or one per cell (A - 1, B - 1).
+    """
     grid = np.asarray(points, np.float64)
     rows, columns = grid.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
@@ -103,7 +106,7 @@ _BOX_FACES = _BOX_QUADS[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def box(center: ArrayLike, size: ArrayLike, material: Material) -> Mesh:
-    """Return a closed box about `center` (3,), `size` (3,) along x, y, z."""
+    """Return a closed box about `center` (3,) with extents `size` (3,) along x, y, z [m]."""
     vertices = _BOX_CORNERS * np.asarray(size) + np.asarray(center)
     return Mesh(vertices.astype(np.float32), _BOX_FACES, np.full(12, material, np.uint8))
 
@@ -118,7 +121,10 @@ def tube(
     sides: int = 8,
     capped: bool = True,
 ) -> Mesh:
-    """Return a round bar from `start` (3,) to `end` (3,), as thick as `radius` to `end_radius`."""
+    """Return a prism of `sides` sides from `start` (3,) to `end` (3,): a cylinder or truncated cone [m].
+
+    Its radius goes from `radius` to `end_radius`, by default the same; `capped` closes its ends.
+    """
     first, last = np.asarray(start, np.float64), np.asarray(end, np.float64)
     along = (last - first) / np.linalg.norm(last - first)
     aside = np.cross(along, (1.0, 0.0, 0.0) if abs(along[2]) > 0.9 else (0.0, 0.0, 1.0))
@@ -132,7 +138,7 @@ def tube(
 
 
 def ellipsoid(center: ArrayLike, radii: ArrayLike, material: Material, sides: int = 8) -> Mesh:
-    """Return an ellipsoid about `center` (3,) with half axes `radii` (3,)."""
+    """Return an ellipsoid about `center` (3,) with half axes `radii` (3,) [m], of `sides` meridians."""
     polar = np.linspace(0, np.pi, sides // 2 + 2)[:, None]
     around = np.linspace(0, 2 * np.pi, sides + 1)[None]
     unit = np.stack(

@@ -1,4 +1,4 @@
-"""People, on foot and on two wheels: figures from the positions of their joints."""
+"""Meshes of pedestrians, cyclists and motorcyclists: figures posed by the positions of their joints."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ Point = tuple[float, float, float]
 
 
 class Side(NamedTuple):
-    """The joints of one leg and one arm [m]."""
+    """The joints of one leg and one arm of a figure: x, y, z [m]."""
 
     hip: Point
     knee: Point
@@ -23,7 +23,7 @@ class Side(NamedTuple):
 
 
 def figure(waist: Point, neck: Point, sides: tuple[Side, Side], *, helmet: bool = False) -> Mesh:
-    """Return a person, facing +x."""
+    """Return a person facing +x with these joints [m]; a `helmet` for riders."""
     low, high = np.array(waist), np.array(neck)
     head = high + np.array((0.05, 0.0, 0.19))
     parts = [
@@ -45,7 +45,7 @@ def figure(waist: Point, neck: Point, sides: tuple[Side, Side], *, helmet: bool 
 
 
 def pedestrian(shape: Shape) -> Mesh:
-    """Return the pedestrian `shape` in mid-stride."""
+    """Return a pedestrian in mid-stride, of one size for every `shape`: `actor_mesh` scales it."""
     sides = tuple(
         Side(
             hip=(0.0, 0.09 * left, 0.92),
@@ -61,7 +61,7 @@ def pedestrian(shape: Shape) -> Mesh:
 
 
 def bicycle(shape: Shape) -> Mesh:
-    """Return the bicycle `shape` and its rider; a sport bike's leans further forward."""
+    """Return the bicycle `shape` with its rider; that of a sport bike leans further forward."""
     lean = 0.42 if shape.name == "sport_bike" else 0.22
     wheel_x, hub = 0.53, 0.34
     parts = [_spoked_wheel(x, hub, 0.022) for x in (-wheel_x, wheel_x)]
@@ -84,7 +84,7 @@ def bicycle(shape: Shape) -> Mesh:
 
 
 def motorcycle(shape: Shape) -> Mesh:
-    """Return the motorcycle `shape` and its rider; a scooter has a leg shield and a flat floor."""
+    """Return the motorcycle `shape` with its rider; a scooter has a leg shield and a flat floor."""
     scooter = shape.name == "scooter"
     radius, wheel_x = (0.26, 0.62) if scooter else (0.31, 0.72)
     parts = []
@@ -112,7 +112,7 @@ def motorcycle(shape: Shape) -> Mesh:
 def _rider(
     saddle: Point, neck: Point, *, knee_x: float, feet: tuple[tuple[float, float], tuple[float, float]], hand: Point
 ) -> Mesh:
-    """Return a seated figure; `feet` are x, z of the left and the right foot, `hand` is the left one."""
+    """Return a seated figure with a helmet; `feet` are x, z of the left and right foot, `hand` is the left hand [m]."""
     sides = []
     for left, (x, z) in zip((1, -1), feet):
         shoulder = (neck[0] + 0.01, 0.20 * left, neck[2] - 0.09)
@@ -132,7 +132,7 @@ def _rider(
 
 
 def _ring(x: float, radius: float, thickness: float) -> Mesh:
-    """Return a tyre in the x-z plane, standing on z = 0."""
+    """Return a torus-shaped tyre in the x-z plane that stands on z = 0 [m]."""
     around = np.linspace(0, 2 * np.pi, 15)
     rows = []
     for angle in np.linspace(0, 2 * np.pi, 5):

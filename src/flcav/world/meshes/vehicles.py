@@ -1,11 +1,11 @@
-"""Meshes of vehicles: cars, vans, trucks, buses."""
+"""Meshes of cars, vans, trucks and buses: their profiles, and what is built onto the body."""
 
 from flcav.world.materials import Material
 from flcav.world.meshes.bodywork import Profile, roof_sign, vehicle_body, wheel
 from flcav.world.meshes.mesh import Mesh, box, join, mirrored, moved
 from flcav.world.shapes import Shape
 
-TAXI_SIGN_M = 0.18
+TAXI_SIGN_M = 0.18  # height of a taxi's roof sign
 
 _SEDAN = Profile(
     belt=((-0.5, 0.50), (-0.475, 0.63), (-0.32, 0.66), (0.18, 0.63), (0.23, 0.61), (0.46, 0.49), (0.5, 0.36)),
@@ -107,15 +107,15 @@ PROFILES: dict[str, Profile] = {
 
 
 def car(shape: Shape) -> Mesh:
-    """Return the car or van `shape`."""
+    """Return the car or van `shape`, in its body frame; a taxi has a roof sign."""
     if shape.name == "taxi":
         top = shape.height - TAXI_SIGN_M
         return join((vehicle_body(PROFILES["taxi"], shape.length, shape.width, top), roof_sign(-0.2, top)))
     return vehicle_body(PROFILES[shape.name], shape.length, shape.width, shape.height)
 
 
-CAB_M = 2.2
-WHEEL_M = 0.48
+CAB_M = 2.2  # length of a truck's cab
+WHEEL_M = 0.48  # radius of the wheels of trucks and buses
 
 _CAB = Profile(
     belt=((-0.5, 0.44), (0.40, 0.44), (0.48, 0.40), (0.5, 0.30)),
@@ -144,7 +144,7 @@ _BUS = Profile(
 
 
 def truck(shape: Shape) -> Mesh:
-    """Return the truck `shape`: a cab, and a closed box or an open tipper behind it."""
+    """Return the truck `shape`, in its body frame: a cab, and a closed box or an open tipper behind it."""
     length, width, height = shape[1:]
     cab_height = min(2.75, height - 0.15)
     parts = [moved(vehicle_body(_CAB, CAB_M, width, cab_height), length / 2 - CAB_M / 2, 0)]
@@ -164,7 +164,7 @@ def truck(shape: Shape) -> Mesh:
 
 
 def bus(shape: Shape) -> Mesh:
-    """Return the bus `shape`, with rows of seats behind its windows."""
+    """Return the bus `shape`, in its body frame, with rows of seats behind its windows."""
     length, width, height = shape[1:]
     parts = [vehicle_body(_BUS, length, width, height)]
     row = -length / 2 + 1.2

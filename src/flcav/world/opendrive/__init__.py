@@ -1,6 +1,6 @@
-"""Towns from OpenDRIVE maps (https://www.asam.net/standards/detail/opendrive/, versions 1.x).
+"""Import of OpenDRIVE maps as towns (https://www.asam.net/standards/detail/opendrive/, versions 1.x).
 
-`importing` is where to start: it reads what SUMO's importer leaves out (`document`), has netconvert take the map
-apart, writes its streets anew with sidewalks (`streets`), has netconvert join them to a net, and furnishes that
-(`furnishing`).
+Start reading at `importing`. It reads from the map what SUMO's importer leaves out (`document`), lets netconvert split
+the map into nodes, edges and connections, rewrites these as streets with sidewalks (`streets`), lets netconvert join
+them to a net, and derives the town's parameters from it (`furnishing`, `georeference`).
 """

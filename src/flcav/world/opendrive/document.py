@@ -1,4 +1,4 @@
-"""What an OpenDRIVE file says beside its geometry: where on Earth it is, how fast its roads are, where one stops."""
+"""Attributes of an OpenDRIVE file beside its geometry: geo-reference, types and speed limits of roads, stop signs."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
@@ -6,30 +6,30 @@ from pathlib import Path
 
 from flcav.config import InputError
 
-STOP_SIGN = "206"  # types of <signal>, after the German catalogue of signs, which CARLA's maps go by
+STOP_SIGN = "206"  # type of <signal>: number in the German catalogue of signs, as in CARLA's maps
 TO_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
-OPEN_ROADS = ("rural", "motorway", "highway")
+OPEN_ROADS = ("rural", "motorway", "highway")  # types of roads outside towns
 
 
 @dataclass(frozen=True)
 class Road:
-    """A road of the map."""
+    """Type and speed limit of one road of the map."""
 
     kind: str  # of the first <type>: town, rural, motorway, ...; "unknown" where there is none
-    speed: float | None  # limit [m/s]
+    speed: float | None  # limit of the first <type> [m/s]; None where there is none
 
 
 @dataclass(frozen=True)
 class Document:
-    """The parts of an OpenDRIVE file that are read here."""
+    """The attributes read from an OpenDRIVE file."""
 
     geo_reference: str  # a PROJ string; empty where there is none
-    roads: dict[str, Road]
-    stops: frozenset[str]  # junctions with a stop sign
+    roads: dict[str, Road]  # by the road's id
+    stops: frozenset[str]  # ids of the junctions with a stop sign
 
 
 def read_document(path: Path) -> Document:
-    """Return what is in the file; raises `InputError` where it is no OpenDRIVE map of version 1."""
+    """Return the attributes of an OpenDRIVE file; raises `InputError` where it is missing or no map of version 1."""
     try:
         root = ElementTree.parse(path).getroot()
     except FileNotFoundError:
@@ -70,7 +70,7 @@ def _road(row: ElementTree.Element) -> Road:
 
 
 def _stops(row: ElementTree.Element) -> list[str]:
-    """Return the junctions that the stop signs of a road stand at."""
+    """Return the ids of the junctions at the stop signs of a road: the road's own, or the one ahead of the sign."""
     out = []
     for signal in row.iterfind("signals/signal"):
         if signal.get("type") != STOP_SIGN:

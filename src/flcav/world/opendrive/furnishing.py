@@ -1,4 +1,4 @@
-"""Parameters of an imported town: what lines its streets, how busy it is, where a roadside sensor could stand."""
+"""Parameters of an imported town: defaults by street type, traffic by lane length, and candidate sites of sensors."""
 
 from typing import Any, Literal
 
@@ -11,10 +11,10 @@ from flcav.world.map.roads import Edge, RoadNet
 
 VEHICLES_PER_KM = 9.0  # of driving lane
 PEDESTRIANS_PER_KM = 10.0  # of sidewalk
-MOST = 150  # of either
-CORNER_M = 4.0  # from a pole to the end of its edge
-STRAIGHT_M = 60.0  # a stretch as long as this gets a pole midway
-BENT_M = 2.0  # and may be this far off the straight line
+MOST = 150  # vehicles, and pedestrians, at most
+CORNER_M = 4.0  # from a pole at a junction to the end of its edge
+STRAIGHT_M = 60.0  # straight edges of at least this length get a pole midway
+BENT_M = 2.0  # largest deviation of a straight edge from its chord
 STREETS: dict[str, dict[str, Any]] = {
     "arterial": {
         "frontage_m": 1.0,
@@ -47,7 +47,7 @@ MIX = {"car": 0.66, "van": 0.12, "truck": 0.05, "bus": 0.03, "motorcycle": 0.05,
 
 
 def furnish(net: RoadNet, *, description: str, seed: int, geo: GeoReference, source: MapSource) -> TownParameters:
-    """Return the parameters of a town on `net`, whose street types are those of `STREETS`."""
+    """Return the parameters of a town on `net`; raises `KeyError` for a street type that is not in `STREETS`."""
     kinds = sorted({edge.type for edge in net.streets})
     return TownParameters(
         description=description,
@@ -63,10 +63,10 @@ def furnish(net: RoadNet, *, description: str, seed: int, geo: GeoReference, sou
 
 
 def candidate_poles(net: RoadNet) -> list[PoleParameters]:
-    """Return candidate sites, numbered from north to south and west to east.
+    """Return the candidate sites of roadside sensors, numbered from north to south, then from west to east.
 
-    One stands at the corner of each junction of three streets or more, on the widest street that leads there, and one
-    midway of each straight stretch of at least `STRAIGHT_M`; only where there is a sidewalk to stand on.
+    There is one at each junction of three or more streets, on the widest street that leads there, and one midway along
+    each straight edge of at least `STRAIGHT_M`. Edges without a sidewalk have none.
     """
     into: dict[str, list[Edge]] = {}
     for edge in net.streets:

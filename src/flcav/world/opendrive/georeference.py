@@ -1,7 +1,7 @@
-"""Where on Earth a map's origin is, from the PROJ string of its header: transverse Mercator and UTM on WGS 84.
+"""Inverse transverse Mercator and UTM projection on WGS 84, from the PROJ string of an OpenDRIVE header.
 
-The inverse projection is Krüger's series in the third flattening n, to n^4 (C. F. F. Karney, "Transverse Mercator with
-an accuracy of a few nanometers", J. Geodesy 85, 2011, eqs. 11, 15, 36).
+Krüger's series in the third flattening n, to n^4 (C. F. F. Karney, "Transverse Mercator with an accuracy of a few
+nanometers", J. Geodesy 85, 2011, eqs. 11, 15, 36).
 """
 
 import math
@@ -13,9 +13,10 @@ UTM_SCALE, UTM_FALSE_EASTING_M, UTM_FALSE_NORTHING_M = 0.9996, 500_000.0, 10_000
 
 
 def geo_reference(projection: str, x: float, y: float) -> GeoReference | None:
-    """Return where the point (x, y) [m] of a map is whose projection is the PROJ string; None where that is not known.
+    """Return the geodetic position of the point (x, y) [m] in a map with the PROJ string `projection`.
 
-    The town's axes stay those of the projection's grid: north of the grid is y.
+    None for a projection other than +proj=tmerc and +proj=utm, and for values that are no numbers or out of range. The
+    town keeps the axes of the projection's grid: y is grid north. The altitude is 0.
     """
     parts = (word.lstrip("+").partition("=") for word in projection.split())
     words = {name: value for name, _, value in parts}
@@ -42,7 +43,10 @@ def geo_reference(projection: str, x: float, y: float) -> GeoReference | None:
 def inverse_mercator(
     east_m: float, north_m: float, latitude_0: float, longitude_0: float, scale: float
 ) -> tuple[float, float]:
-    """Return latitude and longitude [deg] of a point (east_m, north_m) from the projection's origin [deg]."""
+    """Return latitude and longitude [deg] of a point east and north of the projection's origin (Karney, section 3).
+
+    `latitude_0` and `longitude_0` are the origin [deg], `scale` is the scale factor on the central meridian.
+    """
     n = FLATTENING / (2 - FLATTENING)
     radius = EQUATOR_M / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
     alpha = (

@@ -1,4 +1,7 @@
-"""The import of an OpenDRIVE map as a town, through SUMO's netconvert."""
+"""Import of an OpenDRIVE map as the folder of a town, by SUMO's netconvert in two passes.
+
+The first pass splits the map into nodes, edges and connections; the second joins these, rewritten, to a net.
+"""
 
 import importlib.util
 import re
@@ -21,13 +24,13 @@ from flcav.world.opendrive.furnishing import furnish
 from flcav.world.opendrive.georeference import geo_reference
 from flcav.world.opendrive.streets import rewrite
 
-PARTS = ("nod", "edg", "con")
+PARTS = ("nod", "edg", "con")  # netconvert's plain XML files: nodes, edges, connections
 OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
 JOINING = {
     "offset.disable-normalization": "true",
     "no-turnarounds.except-deadend": "true",
-    "geometry.remove": "true",  # a node between two stretches of one street becomes a bend of it,
-    "geometry.remove.min-length": "40",  # even where a short one differs a little from the other
+    "geometry.remove": "true",  # merge the edges at a node of one street,
+    "geometry.remove.min-length": "40",  # and a short edge even where it differs a little
     "geometry.remove.width-tolerance": "1",
     "keep-edges.components": "1",
     "crossings.guess": "true",
@@ -42,9 +45,9 @@ JOINING = {
 
 
 def take_apart(xodr: Path, prefix: Path) -> None:
-    """Write the nodes, edges and connections of an OpenDRIVE map beside `prefix`, e.g. `prefix.nod.xml`, and a net.
+    """Split an OpenDRIVE map: write its `PARTS` as `prefix.nod.xml` and so on, and its net as `prefix.net.xml`.
 
-    Heights are dropped: towns are flat. Raises `InputError` where netconvert refuses the map.
+    Heights are dropped, since towns are flat. Raises `InputError` where netconvert is missing or refuses the map.
     """
     options = {
         "opendrive-files": str(xodr),
@@ -58,11 +61,11 @@ def take_apart(xodr: Path, prefix: Path) -> None:
 
 
 def join(prefix: Path, net: Path, origin: Path) -> None:
-    """Join the parts beside `prefix` to the net file `net`; raises `InputError` naming `origin` where they cannot."""
+    """Join the `PARTS` beside `prefix` to the net file `net`; raises `InputError` naming `origin` where that fails."""
     options = {OPTIONS[part]: f"{prefix}.{part}.xml" for part in PARTS}
     _run(options | JOINING | {"output-file": str(net)}, origin)
     text = net.read_text(encoding="utf-8")
-    net.write_text(re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL), encoding="utf-8")  # dates and paths
+    net.write_text(re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL), encoding="utf-8")  # no dates and paths
 
 
 def _run(options: dict[str, str], origin: Path) -> None:
@@ -79,17 +82,17 @@ def _run(options: dict[str, str], origin: Path) -> None:
 
 @dataclass(frozen=True)
 class Imported:
-    """A town made from a map, and what one should know about it."""
+    """An imported town, and notes on what differs from the map."""
 
     town: Town
     notes: tuple[str, ...]  # sentences
 
 
 def import_town(xodr: Path, out: Path) -> Imported:
-    """Make the folder `out` of a town from an OpenDRIVE map; the same map gives the same town.
+    """Write the town of an OpenDRIVE map as the folder `out` and return it; the same map gives the same town.
 
-    Raises `InputError`, and leaves nothing behind, where the file is no OpenDRIVE map that netconvert can read, where
-    no car can drive on it, and where `out` is there already.
+    Raises `InputError`, and does not make `out`, where it exists already, where the file is no OpenDRIVE map that
+    netconvert can read, and where the map has no driving lane.
     """
     if out.exists():
         raise InputError(f"{out}: is there already; give a new folder")

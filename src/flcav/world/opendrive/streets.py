@@ -1,7 +1,7 @@
-"""A map's nodes, edges and connections, as netconvert wrote them, written anew as the streets of a town.
+"""Rewriting of netconvert's plain nodes, edges and connections as the streets of a town.
 
-Who may use which lane is said anew: cars drive on lanes for driving, people walk on the outermost sidewalk (which is
-added where a map has none at all), and everything else that is paved stays in its place, closed to traffic.
+Access to lanes is assigned anew: vehicles use the driving lanes, pedestrians the sidewalk nearest to them (added to
+town streets where a map has no sidewalk at all), and other lanes keep their place but are closed to traffic.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -15,15 +15,15 @@ from flcav.config import InputError
 from flcav.world.map.roads import read_net
 from flcav.world.opendrive.document import OPEN_ROADS, Document, Road
 
-FAR_M = 5000.0  # a map farther from its origin than this is moved there
+FAR_M = 5000.0  # a map that reaches farther than this from its origin is moved there
 SIDEWALK_M = 2.0  # width of an added sidewalk
-PARKING_M = 1.9  # a shoulder as wide as this beside a town's street is parked on
-SHORT_M = 60.0  # an edge shorter than this has no room to change lanes
-ARTERIAL = 16.0  # [m/s] a street as fast as this, or of several lanes a direction, is one
-WALKED = ("sidewalk", "walking")
-SHARED = ("allow", "disallow", "width", "speed")
-PRIORITY = {"arterial": "3", "open": "3", "street": "2"}
-ALLOWED = {
+PARKING_M = 1.9  # least width of a shoulder beside a town street that becomes a parking lane
+SHORT_M = 60.0  # edges shorter than this are too short to change lanes
+ARTERIAL = 16.0  # [m/s] from this limit on, or with several driving lanes a direction, a street is an arterial
+WALKED = ("sidewalk", "walking")  # types of lanes for pedestrians in OpenDRIVE
+SHARED = ("allow", "disallow", "width", "speed")  # attributes that netconvert writes at the edge for all its lanes
+PRIORITY = {"arterial": "3", "open": "3", "street": "2"}  # SUMO's, by street type
+ALLOWED = {  # attributes of a SUMO lane, by kind
     "driving": {"disallow": "pedestrian"},
     "bicycle": {"allow": "bicycle"},
     "sidewalk": {"allow": "pedestrian"},
@@ -34,7 +34,7 @@ ALLOWED = {
 
 @dataclass(frozen=True)
 class Rewritten:
-    """What became of a map's streets."""
+    """The changes made to a map."""
 
     offset_m: tuple[float, float]  # town = map + offset
     sidewalks_added: bool
@@ -42,18 +42,18 @@ class Rewritten:
 
 @dataclass(frozen=True)
 class _Lane:
-    kind: str
-    width: float
-    before: int | None  # index in the map; None for an added one
+    kind: str  # a key of ALLOWED
+    width: float  # [m]
+    before: int | None  # its index in the map; None for an added lane
 
 
 def rewrite(prefix: Path, document: Document, origin: Path) -> Rewritten:
-    """Rewrite the parts beside `prefix` in place; raises `InputError` naming `origin` where no car can drive."""
+    """Rewrite the plain files beside `prefix` in place; raises `InputError` naming `origin` without a driving lane."""
     nodes, edges, connections = (ElementTree.parse(f"{prefix}.{part}.xml") for part in ("nod", "edg", "con"))
     rows = edges.getroot().findall("edge")
     _write_widths(rows, Path(f"{prefix}.net.xml"))
     add = not any(lane.get("type") in WALKED for row in rows for lane in _plain_lanes(row))
-    kept: dict[str, dict[int, int]] = {}  # edge -> lane index in the map -> in the town, of lanes with traffic
+    kept: dict[str, dict[int, int]] = {}  # edge -> index of a lane with traffic in the map -> in the town
     for row in rows:
         road = _road(row.attrib["id"], document)
         lanes = _lanes(row, road, add)
@@ -80,7 +80,7 @@ def rewrite(prefix: Path, document: Document, origin: Path) -> Rewritten:
 
 
 def _write_widths(rows: list[ElementTree.Element], net: Path) -> None:
-    """Give every lane its width from the net: among the parts netconvert leaves out what the lanes of an edge share."""
+    """Write each lane's width, read from the net, to its row: netconvert's plain edges leave out shared widths."""
     width = {lane.id: lane.width for edge in read_net(net).edges.values() for lane in edge.lanes}
     for row in rows:
         lanes = _plain_lanes(row)
@@ -92,7 +92,7 @@ def _write_widths(rows: list[ElementTree.Element], net: Path) -> None:
 
 
 def _road(edge: str, document: Document) -> Road:
-    """Return the road an edge was made of: netconvert calls it by the road's id, a sign before, a section behind."""
+    """Return the road of an edge, which netconvert names by the road's id with a sign before and a section behind."""
     name = edge.removeprefix("-")
     while name not in document.roads and "." in name:
         name = name.rpartition(".")[0]
@@ -100,7 +100,7 @@ def _road(edge: str, document: Document) -> Road:
 
 
 def _lanes(row: ElementTree.Element, road: Road, add_sidewalk: bool) -> list[_Lane]:
-    """Return an edge's lanes from the kerb to the middle."""
+    """Return the lanes of an edge in the town, from the kerb to the middle; those beyond the sidewalk are left out."""
     found = _plain_lanes(row)
     kinds = [_kind(lane) for lane in found]
     town = road.kind not in OPEN_ROADS
@@ -118,7 +118,7 @@ def _lanes(row: ElementTree.Element, road: Road, add_sidewalk: bool) -> list[_La
 
 
 def _plain_lanes(row: ElementTree.Element) -> list[dict[str, str]]:
-    """Return the attributes of an edge's lanes by index; netconvert writes what they share at the edge."""
+    """Return the attributes of an edge's lanes by index, those that netconvert writes at the edge included."""
     own = {int(lane.attrib["index"]): lane.attrib for lane in row.iterfind("lane")}
     shared = {name: row.attrib[name] for name in SHARED if name in row.attrib}
     count = int(row.get("numLanes", len(own) or 1))
@@ -171,9 +171,10 @@ def _connect(root: ElementTree.Element, kept: dict[str, dict[int, int]]) -> None
 
 
 def _open_short_lanes(root: ElementTree.Element, length: dict[str, float]) -> None:
-    """Let every lane of a short edge lead wherever any of its lanes does.
+    """Connect every lane of a short edge to every edge that any of its lanes leads to.
 
-    Where there is no room to change lanes, two vehicles that each need the other's would wait for each other for ever.
+    Without room to change lanes, two vehicles that each need the other's lane would block each other for ever.
+    `length` is that of each edge [m].
     """
     ways: dict[str, dict[str, dict[int, int]]] = {}  # edge -> next edge -> lane -> its lane
     for row in root.findall("connection"):
@@ -197,7 +198,7 @@ def _length(row: ElementTree.Element) -> float:
 
 
 def _rule(root: ElementTree.Element, edges: Iterable[ElementTree.Element], document: Document) -> None:
-    """Say who goes first at each node: lights only where three streets or more meet, stop signs as the map has them."""
+    """Set the type of each node: traffic lights only where three or more streets meet, stop signs as in the map."""
     neighbours: dict[str, set[str]] = {}
     for edge in edges:
         neighbours.setdefault(edge.attrib["from"], set()).add(edge.attrib["to"])
@@ -211,7 +212,7 @@ def _rule(root: ElementTree.Element, edges: Iterable[ElementTree.Element], docum
 
 
 def _move(nodes: ElementTree.Element, edges: ElementTree.Element) -> tuple[float, float]:
-    """Move a far map to the origin; return by how much [m]."""
+    """Move a map that reaches beyond `FAR_M` to the origin, in place; return the offset x, y [m]."""
     rows = nodes.findall("node")
     at = np.array([(float(row.attrib["x"]), float(row.attrib["y"])) for row in rows])
     if np.abs(at).max() <= FAR_M:

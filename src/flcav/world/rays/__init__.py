@@ -1,1 +1,1 @@
-"""Ray casting engines."""
+"""Ray casting: the interface of an engine (`raycaster`), and Embree 4 behind it."""

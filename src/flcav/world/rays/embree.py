@@ -1,6 +1,7 @@
-"""Embree 4 as a `Raycaster`: two levels, so that a moving solid costs one transform and no rebuild of its mesh.
+"""Embree 4 as a `Raycaster`, with a two-level hierarchy: moving an instance sets its transform and rebuilds no mesh.
 
-All handles live on one device per process, whose trees are built by one thread, the same from run to run.
+There is one Embree device per process. It builds the bounding volume hierarchies on one thread, so that they are the
+same from run to run.
 """
 
 import ctypes
@@ -23,14 +24,17 @@ _BLOCK_ARGUMENTS = c.OccludedArguments(flags=c.QUERY_COHERENT, feature_mask=0xFF
 
 
 class Solid:
-    """A mesh with its search tree, in the mesh's own frame."""
+    """A triangle mesh with its bounding volume hierarchy, in the mesh's own frame."""
 
     def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
-        """Build the tree of (V, 3) vertices [m] and (F, 3) faces; raises `ValueError` for an empty mesh."""
+        """Build the hierarchy of vertices (V, 3) [m] and faces (F, 3).
+
+        Raises `ValueError` for an empty mesh, `OSError` where Embree is missing or fails.
+        """
         if not len(faces):
             raise ValueError("a solid needs at least one face")
         api, device = c.embree_library(), _device()
-        # Embree reads 16 bytes of the last 12-byte vertex: one more keeps that inside the buffer.
+        # Embree reads 16 bytes at the last 12-byte vertex: one more vertex keeps that inside the buffer.
         self._vertices = np.concatenate((vertices, vertices[-1:])).astype(np.float32)
         self._faces = np.ascontiguousarray(faces, np.uint32)
         self.handle: int = api.rtcNewScene(device)
@@ -57,17 +61,17 @@ class Solid:
         far_m: float = np.inf,
         threads: int = 1,
     ) -> Hits:
-        """Trace rays against the mesh alone: see `Target.trace`."""
+        """Return the first hit of each ray with the mesh alone: see `raycaster.Target.trace`."""
         return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
 
 
 class Assembly:
-    """Solids placed by rigid transforms."""
+    """Instances of solids, placed by rigid transforms: the upper level of the hierarchy."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
-        """Hold one instance of each of `solids`, none placed yet."""
+        """Make one instance of each of `solids`, none placed yet."""
         api, device = c.embree_library(), _device()
-        self._solids = tuple(solids)  # alive as long as their instances
+        self._solids = tuple(solids)  # kept alive as long as their instances
         self.handle: int = api.rtcNewScene(device)
         api.rtcSetSceneFlags(self.handle, c.SCENE_DYNAMIC)
         self._instances: list[int] = []
@@ -83,7 +87,7 @@ class Assembly:
         weakref.finalize(self, api.rtcReleaseScene, self.handle)
 
     def place(self, instance: int, target_from_body: NDArray[np.float64] | None) -> None:
-        """Put a solid at a (4, 4) transform, or nowhere (None); takes effect with `commit`."""
+        """Place an instance by a (4, 4) rigid transform, or remove it (None); takes effect with `commit`."""
         api, geometry = c.embree_library(), self._instances[instance]
         if target_from_body is None:
             api.rtcDisableGeometry(geometry)
@@ -94,7 +98,7 @@ class Assembly:
         api.rtcCommitGeometry(geometry)
 
     def commit(self) -> None:
-        """Make what was placed visible to the next trace."""
+        """Rebuild the upper level from the placed instances; raises `OSError` where Embree fails."""
         c.embree_library().rtcCommitScene(self.handle)
         _check("placing meshes")
 
@@ -107,13 +111,13 @@ class Assembly:
         far_m: float = np.inf,
         threads: int = 1,
     ) -> Hits:
-        """Trace rays against everything placed: see `Target.trace`."""
+        """Return the first hit of each ray with the placed instances: see `raycaster.Target.trace`."""
         return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
 
     def blocked(
         self, origins: NDArray[np.float32], directions: NDArray[np.float32], far_m: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
-        """Return for each ray whether anything lies before its end: see `Assembly.blocked`."""
+        """Return whether each ray is occluded before its end: see `raycaster.Assembly.blocked`."""
         out = np.empty(len(far_m), np.bool_)
         block_packets(
             _address("rtcOccluded16"),
@@ -128,17 +132,17 @@ class Assembly:
 
 
 class Embree:
-    """The engine; making one tests the library: raises `OSError` where it is missing or does not trace rightly."""
+    """The Embree engine."""
 
     def __init__(self) -> None:
         _self_test()
 
     def solid(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> Solid:
-        """Return a mesh with its search tree."""
+        """Return a mesh with its bounding volume hierarchy: see `Solid`."""
         return Solid(vertices, faces)
 
     def assembly(self, solids: Sequence[Solid]) -> Assembly:
-        """Return an assembly of `solids`, none placed yet."""
+        """Return an assembly of `solids`, none placed yet: see `Assembly`."""
         return Assembly(solids)
 
     def trace_each(
@@ -151,7 +155,7 @@ class Embree:
         near_m: NDArray[np.float32] | None = None,
         far_m: float = np.inf,
     ) -> Hits:
-        """Trace groups of rays, each against its own solid: see `Raycaster.trace_each`."""
+        """Return the first hits of groups of rays, each with its own solid: see `raycaster.Raycaster.trace_each`."""
         rays, near, hits = _buffers(directions, near_m)
         trace_groups(
             _address("rtcIntersect16"),
@@ -171,7 +175,10 @@ class Embree:
 def _buffers(
     directions: NDArray[np.float32], near_m: NDArray[np.float32] | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], Hits]:
-    """Return rays (N, 3), where they begin (N,) or (1,), and room for what they meet."""
+    """Return directions (N, 3) and near distances (N,) or (1,) as Embree takes them, and unset hits.
+
+    Raises `ValueError` where `near_m` is not of the rays' number.
+    """
     rays = np.ascontiguousarray(directions, np.float32)
     near = np.zeros(1, np.float32) if near_m is None else np.ascontiguousarray(near_m, np.float32)
     if near_m is not None and len(near) != len(rays):
@@ -239,7 +246,7 @@ def _check(doing: str) -> None:
 
 @lru_cache(maxsize=1)
 def _self_test() -> None:
-    """Raise `OSError` unless a known ray meets a known mesh, alone and as a turned and moved instance."""
+    """Raise `OSError` unless known rays hit a known mesh, alone and as a rotated and translated instance."""
     vertices = np.array([[2, -1, -1], [2, 1, -1], [2, 0, 1]], np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
     forward = np.array([[1, 0, 0]], np.float32)

@@ -1,4 +1,4 @@
-"""The Embree 4 C library that the embreex wheel carries, with typed entry points.
+"""Loader of the Embree 4 C library in the embreex wheel, with typed entry points through ctypes.
 
 API: https://github.com/RenderKit/embree/blob/v4.4.0/README.md (chapter "Embree API").
 """
@@ -74,7 +74,7 @@ class OccludedArguments(ctypes.Structure):
 
 @lru_cache(maxsize=1)
 def embree_library() -> ctypes.CDLL:
-    """Return the loaded library; raises `OSError`, with a sentence for the user, where the machine has none."""
+    """Return the Embree library, loaded once per process; raises `OSError` where it is not installed."""
     spec = importlib.util.find_spec("embreex")
     if spec is None or spec.origin is None:
         raise OSError(
@@ -83,7 +83,7 @@ def embree_library() -> ctypes.CDLL:
         )
     package = Path(spec.origin).parent
     folders = (package.parent / "embreex.libs", package / ".dylibs", package)
-    for thread_library in _matching(folders, "tbb"):  # Embree finds its thread library already in memory
+    for thread_library in _matching(folders, "tbb"):  # TBB must be in memory before Embree is loaded
         ctypes.CDLL(str(thread_library), mode=getattr(ctypes, "RTLD_GLOBAL", 0))
     candidates = _matching(folders, "embree4")
     if not candidates:

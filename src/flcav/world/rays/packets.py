@@ -1,7 +1,7 @@
-"""Rays through Embree in packets of 16, compiled.
+"""Compiled loops over ray packets of 16 for Embree's `rtcIntersect16` and `rtcOccluded16`.
 
-The function is called by its address, an ordinary integer argument, so that the compiled code can be cached on disk
-(a kernel that closes over a ctypes function cannot be).
+Embree's function is called by its address, an integer argument, so that Numba can cache the compiled code on disk; a
+kernel that closes over a ctypes function cannot be cached.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from numba.extending import intrinsic
 
 from flcav.compiled import compiled
 
-# RTCRayHit16: rows of 16 float32 (or int32)
+# Rows of an RTCRayHit16, seen as a (32, 16) array of float32 or int32.
 ORIGIN, NEAR, DIRECTION, TIME, FAR, MASK, RAY_ID, FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
 FACE, GEOMETRY, INSTANCE, INSTANCE_PRIMITIVE = 17, 18, 19, 20
 ROWS, LANES = 32, 16
@@ -19,7 +19,7 @@ ROWS, LANES = 32, 16
 
 @intrinsic
 def call_c(typing_context, address, first, second, third, fourth):
-    """Call the C function `void f(void*, void*, void*, void*)` at `address`; all five are integers."""
+    """Call the C function `void f(void*, void*, void*, void*)` at `address`; all five arguments are int64."""
 
     def generate(context, builder, signature, arguments):
         word = ir.IntType(64)
@@ -34,13 +34,15 @@ def call_c(typing_context, address, first, second, third, fourth):
 def trace_packets(
     intersect, scene, arguments, origin, rotation, directions, near, far, first_ray, last_ray, distance, instance, face
 ):
-    """Trace rays `first_ray` to `last_ray`, and write `distance`, `instance` and `face` of each.
+    """Write the first hit of each ray to `distance`, `instance` and `face`, (N,) each.
 
-    `intersect`, `scene` and `arguments` are addresses; `origin` (3,) and `rotation` (3, 3) place the rays' frame;
-    `near` is (N,) or (1,) for all.
+    The rays are those from `first_ray` up to, not including, `last_ray`.
+    `intersect`, `scene` and `arguments` are addresses. `origin` (3,) and `rotation` (3, 3) are the pose of the rays'
+    frame in the scene, `directions` (N, 3) unit vectors in it. `near` is (N,), or (1,) for all; `far` is a scalar [m].
+    Distance is inf, and instance and face are -1, where nothing is hit.
     """
     spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
-    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4  # Embree wants 64-byte alignment
+    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4  # Embree requires 64-byte alignment
     packet = spare_floats[skipped : skipped + ROWS * LANES].reshape(ROWS, LANES)
     packet_words = packet.view(np.int32)
     spare_words = np.empty(2 * LANES, np.int32)
@@ -87,9 +89,10 @@ def trace_packets(
 def trace_groups(
     intersect, scenes, arguments, origins, rotations, directions, near, far, ends, distance, instance, face
 ):
-    """Trace group k of the rays, from `ends[k - 1]` to `ends[k]`, against `scenes[k]`, whose number is then `instance`.
+    """Write the first hit of each ray of K groups, group k with `scenes[k]` alone; `instance` is the group's number.
 
-    `origins` (K, 3) and `rotations` (K, 3, 3) place the groups' frames; all else is as `trace_packets` has it.
+    Group k is the rays from `ends[k - 1]` to `ends[k]`; `origins` (K, 3) and `rotations` (K, 3, 3) are the poses of the
+    groups' frames. All else is as in `trace_packets`.
     """
     first = 0
     for group in range(len(scenes)):
@@ -106,9 +109,10 @@ def trace_groups(
 
 @compiled
 def block_packets(occluded, scene, arguments, origins, directions, far, blocked):
-    """Write for each ray whether anything lies before its end `far` (N,); where that is not positive: nothing does.
+    """Write to `blocked` (N,) whether each ray is occluded before its end `far` (N,) [m]; never where `far` <= 0.
 
-    `occluded`, `scene` and `arguments` are addresses; `origins` is (N, 3) and `directions` (N, 3), or (1, 3) for all.
+    `occluded`, `scene` and `arguments` are addresses. `origins` (N, 3) and unit `directions` (N, 3), or (1, 3) for all,
+    are in the scene's frame.
     """
     spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
     skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4

@@ -1,4 +1,4 @@
-"""Vehicles that stop for good: one that breaks down, and two that crash."""
+"""Scripts of breakdowns: a vehicle that stalls, and a rear-end crash of two."""
 
 import math
 from collections.abc import Generator
@@ -7,23 +7,23 @@ from typing import NamedTuple
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Stage
 
-AHEAD_M = (6.0, 60.0)  # a vehicle that breaks down is so far ahead
-STREETS = 3  # on one of so many streets of the way
-STANDS_BEFORE_M = 15.0  # a junction, at least
-MOVES = 3.0  # [m/s] at least
-ROLLS_OUT_S = 2.5  # and takes so long to stop
-SEEN_M = 70.0  # a crash is as near as this
-APART_M = (4.0, 25.0)  # before it, the two are so far apart
-ROOM_M = 50.0  # and have so much of their lane left
-FAST = 5.0  # at least [m/s]
-BRAKES_MPS2 = 6.5  # the first one, sharply
-OVERLAP_M = 0.05  # how far metal gives way
-TWIST = (math.radians(5.0), math.radians(-3.0))  # how far they are turned by it: who ran into it, and whom
-TWIST_S = 0.4
+AHEAD_M = (6.0, 60.0)  # gap from the vehicle under test to one that stalls
+STREETS = 3  # which is on one of the next so many edges of its route, the present one included
+STANDS_BEFORE_M = 15.0  # least distance from a stalling vehicle to the end of its lane
+MOVES = 3.0  # [m/s] least speed of a vehicle that stalls
+ROLLS_OUT_S = 2.5  # time in which it comes to a stop
+SEEN_M = 70.0  # largest distance of a crash from the vehicle under test
+APART_M = (4.0, 25.0)  # gap between the two vehicles before a crash
+ROOM_M = 50.0  # least length of lane ahead of the rear vehicle of a crash; half of it for the front one
+FAST = 5.0  # [m/s] least speed of both
+BRAKES_MPS2 = 6.5  # deceleration of the front vehicle
+OVERLAP_M = 0.05  # by which the two overlap after the crash
+TWIST = (math.radians(5.0), math.radians(-3.0))  # yaw by which the crash turns the rear and the front vehicle
+TWIST_S = 0.4  # time in which it turns them
 
 
 def cast_stalled(stage: Stage, scenario: Scenario) -> str | None:
-    """Return the nearest moving vehicle ahead of one under test, in its lane or on the next streets of its way."""
+    """Return the nearest moving vehicle ahead of a vehicle under test, in its lane or on its next edges."""
     found: list[tuple[float, str]] = []
     for ego in stage.egos(scenario):
         spot, way = stage.spot(ego), stage.onward(ego)[1:STREETS]
@@ -41,7 +41,7 @@ def cast_stalled(stage: Stage, scenario: Scenario) -> str | None:
 
 
 def stall(stage: Stage, scenario: Scenario, victim: str) -> Generator[None, None, None]:
-    """Roll out and stand; drive on after `lasts_s`."""
+    """Slow the victim to a stop; let it drive on after `scenario.lasts_s`, if given."""
     stage.take(victim)
     stage.sumo.vehicle.slowDown(victim, 0.0, ROLLS_OUT_S)
     for _ in range(round(ROLLS_OUT_S / STEP_S)):
@@ -54,14 +54,14 @@ def stall(stage: Stage, scenario: Scenario, victim: str) -> Generator[None, None
 
 
 class Pair(NamedTuple):
-    """Who runs into whom."""
+    """The two vehicles of a rear-end crash."""
 
     behind: str
     ahead: str
 
 
 def cast_crash(stage: Stage, scenario: Scenario) -> Pair | None:
-    """Return two vehicles that follow each other near one under test."""
+    """Return two moving motor vehicles in one lane, one behind the other, near a vehicle under test."""
     egos = stage.egos(scenario)
     for behind in stage.sumo.vehicle.getIDList():
         near = any(math.dist(stage.state(behind)[:2], stage.state(ego)[:2]) <= SEEN_M for ego in egos)
@@ -78,7 +78,7 @@ def cast_crash(stage: Stage, scenario: Scenario) -> Pair | None:
 
 
 def crash(stage: Stage, scenario: Scenario, pair: Pair) -> Generator[None, None, None]:
-    """Have the first brake sharply and the second notice nothing; then both stand, turned a little."""
+    """Let the front vehicle brake sharply and the rear one not react; after the impact both stand, slightly turned."""
     vehicle = stage.sumo.vehicle
     for name in pair:
         stage.take(name)

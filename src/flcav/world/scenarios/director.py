@@ -1,4 +1,4 @@
-"""The director of scenarios: which are staged, when, and how they go on."""
+"""The director of scripted scenarios: casts and advances the script of each along with SUMO."""
 
 from collections.abc import Callable, Generator
 from pathlib import Path
@@ -9,8 +9,8 @@ from flcav.world.scenarios import breakdowns, manoeuvres, overtaking, pedestrian
 from flcav.world.scenarios.scenario import Kind, Scenario
 from flcav.world.scenarios.stage import STEP_S, Stage, State
 
-Cast = Callable[[Stage, Scenario], Any]  # the roles, or None while nobody fits
-Act = Callable[[Stage, Scenario, Any], Generator[None, None, None]]
+Cast = Callable[[Stage, Scenario], Any]  # returns the roles, or None while nobody fits
+Act = Callable[[Stage, Scenario, Any], Generator[None, None, None]]  # the script: one step per `yield`
 
 SCRIPTS: dict[Kind, tuple[Cast, Act]] = {
     "cut_in": (manoeuvres.cast_cut_in, manoeuvres.cut_in),
@@ -22,26 +22,26 @@ SCRIPTS: dict[Kind, tuple[Cast, Act]] = {
 }
 
 
-ALONE_S = 15.0  # so long nothing else begins before a vehicle under test
-LOOKS_AGAIN = 3  # steps after which a scenario tries again to find its place
+ALONE_S = 15.0  # for so long after a scenario begins, its vehicle under test is not free: see `Stage.free_egos`
+LOOKS_AGAIN = 3  # steps between two attempts to cast a scenario
 
 
 class Director:
-    """The scenarios of one run."""
+    """The director of the scenarios of one SUMO run."""
 
     def __init__(self, sumo: Any, net: Path, scenarios: list[Scenario]) -> None:
-        """Stand at the start of a run; `sumo` is the libsumo module."""
+        """Start at the beginning of a run; `sumo` is the libsumo module, `net` the net file."""
         self.stage = Stage(sumo, read_net(net))
-        self.events: list[dict[str, Any]] = []  # as `Event`, of those that happened, in order of time
-        self._busy: set[str] = set()  # who plays in one scenario plays in no other
+        self.events: list[dict[str, Any]] = []  # of scenarios that have begun, in that order; fields of `Event`
+        self._busy: set[str] = set()  # actors of a scenario, which take part in no other
         self._scenarios = scenarios
         self._scripts: list[Generator[None, None, None] | None] = [
             self._play(number, scenario) for number, scenario in enumerate(scenarios)
         ]
-        self._needed: dict[int, set[str]] = {}  # scenario under way -> without whom it cannot go on
+        self._needed: dict[int, set[str]] = {}  # number of a scenario under way -> vehicles that it needs
 
     def direct(self) -> None:
-        """Advance every script by the step that SUMO just made; end those of somebody who has left the town."""
+        """Advance every script by the step that SUMO just made; end those that need a vehicle which has left."""
         self.stage.look()
         there = set(self.stage.sumo.vehicle.getIDList())
         for i, (scenario, script) in enumerate(zip(self._scenarios, self._scripts)):
@@ -74,10 +74,10 @@ class Director:
         yield from playing
 
     def props(self, step: int) -> list[tuple[str, str, State]]:
-        """Return name, vehicle type and state of every prop at a step."""
+        """Return name, vehicle type and state of every prop that is present at a step."""
         return [(name, kind, states[step]) for name, (kind, states) in self.stage.props.items() if step in states]
 
 
 def named(roles: Any) -> list[str]:
-    """Return the names among the roles of a scenario."""
+    """Return the names of vehicles among the roles of a scenario: a name, or a tuple with some."""
     return [roles] if isinstance(roles, str) else [role for role in roles if isinstance(role, str)]

@@ -1,4 +1,4 @@
-"""What drivers do to each other: pushing in, and running a red light."""
+"""Scripts of drivers' manoeuvres: cutting in, and running a red light."""
 
 import math
 from collections.abc import Generator
@@ -9,37 +9,37 @@ from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Spot, Stage
 from flcav.world.shapes import SHAPES
 
-CLOSE_M = 7.0  # bumper to bumper, when somebody pushes in
-NARROW_M = 1.5  # and at least
-NEXT_M = (-6.0, 16.0)  # when a car of the next lane begins to pass or to fall back for it
-FALLS_BACK_S = 5.0
-MOVES_OVER_S = 2.2
-FAST = 4.0  # [m/s] slower egos are not worth pushing in before
-TOO_FAST = 15.0  # [m/s] and faster ones could not brake for a car from the kerb
-ROOM_M = 45.0  # of lane ahead, for a car from the kerb
+CLOSE_M = 7.0  # largest gap between the bumpers at a cut-in
+NARROW_M = 1.5  # and least gap
+NEXT_M = (-6.0, 16.0)  # gap ahead of the ego to a vehicle of the next lane that may cut in
+FALLS_BACK_S = 5.0  # longest time in which that vehicle adjusts its gap
+MOVES_OVER_S = 2.2  # duration of the lane change
+FAST = 4.0  # [m/s] least speed of the ego, of the vehicle of the next lane and of a moving runner
+TOO_FAST = 15.0  # [m/s] above this, the ego could not brake for a car from the kerb
+ROOM_M = 45.0  # least length of lane ahead for a car from the kerb
 NEXT_ROOM_M = 30.0  # and for one from the next lane
-KERB_GAP_M = 0.25  # between a standing car and the lane
-CLEAR_M = 2.0  # nobody has ever been so close to where a car from the kerb stands
+KERB_GAP_M = 0.25  # between a standing vehicle and the lane
+CLEAR_M = 2.0  # no vehicle has been nearer than this to where the car from the kerb stands
 DEFAULT_CAR = "car.hatchback"
-LIGHT_M = (6.0, 45.0)  # a runner is so far from the stop line
-SEEN_M = 70.0  # and so far from the vehicle under test
-IMPATIENT_S = 8.0  # or has stood there for so long
-RUNS_AT = 9.0  # [m/s]
-TURN = 6  # where SUMO's links have the direction: who turns right on red surprises nobody
-IGNORES_LIGHTS = 7  # SUMO's speed mode: keeps its distance and its physics, goes by no light and no right of way
-NORMAL = 31
+LIGHT_M = (6.0, 45.0)  # distance of a moving runner from the stop line
+SEEN_M = 70.0  # largest distance of a runner from the vehicle under test
+IMPATIENT_S = 8.0  # a waiting runner has stood for so long
+RUNS_AT = 9.0  # [m/s] least speed over the stop line
+TURN = 6  # index of the direction in SUMO's links; vehicles that turn right are no runners
+IGNORES_LIGHTS = 7  # SUMO's speed mode: safe gap and physical limits, no traffic light, no right of way
+NORMAL = 31  # SUMO's default speed mode
 
 
 class CutIn(NamedTuple):
-    """Who pushes in before whom: a car of the next lane, or one from the kerb."""
+    """The roles of a cut-in."""
 
-    ego: str
-    spot: Spot
-    neighbour: str | None
+    ego: str  # the vehicle under test
+    spot: Spot  # of the ego at the casting
+    neighbour: str | None  # vehicle of the next lane that cuts in; None: a new car pulls out from the kerb
 
 
 def cast_cut_in(stage: Stage, scenario: Scenario) -> CutIn | None:
-    """Return a vehicle under test with room ahead, and who is beside that room."""
+    """Return a vehicle under test with a free lane ahead, and a vehicle on the next lane or free space at the kerb."""
     for ego in stage.free_egos(scenario):
         spot = stage.spot(ego)
         if not spot or stage.state(ego)[3] < FAST or spot.left < NEXT_ROOM_M or stage.leader(ego, 15.0):
@@ -57,7 +57,7 @@ def cast_cut_in(stage: Stage, scenario: Scenario) -> CutIn | None:
 
 
 def cut_in(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, None, None]:
-    """Move over into the lane of the vehicle under test, right before it, a little slower than it."""
+    """Change into the lane of the vehicle under test, close ahead of it and a little slower than it."""
     if roles.neighbour is None:
         yield from _pull_out(stage, scenario, roles)
         return
@@ -80,7 +80,7 @@ def cut_in(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, No
 
 
 def _beside(stage: Stage, ego: Spot) -> str | None:
-    """Return a vehicle on a neighbouring lane that is beside the ego or a little ahead."""
+    """Return a moving vehicle on a neighbouring lane with a gap ahead of the ego within `NEXT_M`, if any."""
     driving = list(ego.edge.lanes_of("driving"))
     here = driving.index(ego.lane) if ego.lane in driving else -9
     for name in stage.sumo.vehicle.getIDList():
@@ -98,7 +98,7 @@ def _stands_at(ego: Spot, kind: str) -> float:
 
 
 def _kerb(lane: Lane, kind: str) -> float:
-    """Return how far left of a lane's middle a vehicle stands that is parked at its right."""
+    """Return the lateral offset from a lane's middle of a vehicle parked at its right side, left positive [m]."""
     return -(lane.width / 2 + KERB_GAP_M + width_of(kind) / 2)
 
 
@@ -122,14 +122,14 @@ def _pull_out(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None,
 
 
 class Runner(NamedTuple):
-    """Who runs which light."""
+    """A vehicle that runs a red light, and the id of that light."""
 
     name: str
     light: str
 
 
 def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
-    """Return a vehicle near one under test, first before a red light: still moving, or tired of waiting."""
+    """Return a vehicle near a vehicle under test, first at a red light: still moving, or waiting for `IMPATIENT_S`."""
     egos = stage.egos(scenario)
     for name in stage.sumo.vehicle.getIDList():
         lights, ways = stage.sumo.vehicle.getNextTLS(name), stage.sumo.vehicle.getNextLinks(name)
@@ -146,7 +146,7 @@ def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
 
 
 def run_the_light(stage: Stage, scenario: Scenario, runner: Runner) -> Generator[None, None, None]:
-    """Drive over the stop line without a look at the light, then by the rules again."""
+    """Cross the stop line on red; one second after, obey lights and right of way again."""
     vehicle, name = stage.sumo.vehicle, runner.name
     stage.take(name)
     vehicle.setSpeedMode(name, IGNORES_LIGHTS)
@@ -176,5 +176,5 @@ def _shape(kind: str) -> tuple[float, float]:
 
 
 def ease(share: float) -> tuple[float, float]:
-    """Return how much of a smooth move is done after `share` of its time, and the rate then."""
+    """Return the smoothstep 3 s² - 2 s³ of the share s of a move's time, and its derivative."""
     return share**2 * (3 - 2 * share), 6 * share * (1 - share)

@@ -1,4 +1,4 @@
-"""An oncoming car overtakes and comes towards one in one's own lane."""
+"""Script of oncoming overtaking: a car overtakes a slow one in the lane of the vehicle under test."""
 
 import math
 from collections.abc import Generator
@@ -9,35 +9,35 @@ from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Spot, Stage, State, braking_m
 
 KIND = "car.sedan"
-BEHIND_M = 4.0  # bumper to bumper, before it pulls out
+BEHIND_M = 4.0  # gap between the bumpers before the car pulls out
 AHEAD_M = 3.0  # and before it moves back
-TAKES_S = 5.5  # until it is back; whoever comes towards them can stop before that
-WITHIN_M = 70.0  # and the vehicle under test is at most so much further away
-STREETS = 4  # on one of so many next edges of its route
-ROOM_M = 42.0  # of lane for the manoeuvre
-SLOW = 3.0  # [m/s] what is overtaken becomes slow
-FAST = 17.0  # [m/s] and was no faster than this
-ROLLS = 1.0  # [m/s] at least, whoever they meet
-FASTER = 8.0  # [m/s] by so much it is overtaken
-GAINS_MPS2, SLOWS_MPS2 = 4.5, 2.5
-SHARPEST = math.radians(25.0)  # turn, however slow it is
-STANDS_M = 2.0  # behind a queue that it finds
-SWINGS_S = 1.8  # from one lane to the other
-WAY_M = (4.0, 12.0, 20.0, 28.0)  # ahead of it, where others see that they must give way
-OUT = 0.6  # of it before it accelerates
-NEIGHBOUR_M = 4.8  # from the front of whoever follows to another's
-SEEN_STEPS = 60  # how far back it matters where somebody was
+TAKES_S = 5.5  # estimated duration of the manoeuvre, after which oncoming vehicles can still stop
+WITHIN_M = 70.0  # largest distance of the vehicle under test beyond that
+STREETS = 4  # the overtaken vehicle comes along one of the next so many edges of the ego's route
+ROOM_M = 42.0  # least length of lane ahead of the overtaken vehicle
+SLOW = 3.0  # [m/s] speed to which the overtaken vehicle slows down
+FAST = 17.0  # [m/s] largest speed of it before
+ROLLS = 1.0  # [m/s] least speed of the vehicle under test
+FASTER = 8.0  # [m/s] speed of the car over that of the slowed vehicle
+GAINS_MPS2, SLOWS_MPS2 = 4.5, 2.5  # acceleration of the car; deceleration of both
+SHARPEST = math.radians(25.0)  # largest angle of the car to its lane
+STANDS_M = 2.0  # gap at which the car stops behind a queue
+SWINGS_S = 1.8  # duration of a lane change
+WAY_M = (4.0, 12.0, 20.0, 28.0)  # ahead of the car, places for which oncoming traffic brakes
+OUT = 0.6  # share of the lane change after which the car accelerates
+NEIGHBOUR_M = 4.8  # least distance between the front of the car and those of other vehicles before it acts
+SEEN_STEPS = 60  # steps before the present over which this distance is checked
 
 
 class Overtaking(NamedTuple):
-    """Who is overtaken where."""
+    """The roles of an overtaking."""
 
-    slow: str
-    spot: Spot
+    slow: str  # the vehicle that is overtaken
+    spot: Spot  # its place at the casting
 
 
 def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
-    """Return somebody oncoming to a vehicle under test, with nobody behind and room ahead."""
+    """Return a vehicle oncoming to a vehicle under test, with nobody close behind and room to be overtaken."""
     for ego in stage.egos(scenario):
         if stage.state(ego)[3] < ROLLS:
             continue
@@ -62,7 +62,7 @@ def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
 
 
 def _meets(one: State, other: State) -> bool:
-    """Say whether two drive towards each other, still far enough apart."""
+    """Return whether two vehicles drive towards each other, with road enough to overtake `one` in between."""
     dx, dy = other[0] - one[0], other[1] - one[1]
     (x, y), (other_x, other_y) = (
         (math.sin(math.radians(state[2])), math.cos(math.radians(state[2]))) for state in (one, other)
@@ -73,12 +73,12 @@ def _meets(one: State, other: State) -> bool:
 
 
 def _takes_m(speed: float) -> float:
-    """Return how far it is until somebody is back who overtakes one at `speed` [m/s]."""
+    """Return the length of road [m] for overtaking a vehicle at `speed` [m/s]."""
     return TAKES_S * max(SLOW + FASTER, speed)
 
 
 def _way_is_free(stage: Stage, name: str) -> bool:
-    """Say whether nobody comes towards a vehicle on the other lane, nearer than the vehicle under test may be."""
+    """Return whether the lane to the left of a vehicle is free as far as overtaking it takes, braking included."""
     x, y, angle, own_speed = stage.state(name)
     heading = math.radians(90.0 - angle)
     for other in stage.sumo.vehicle.getIDList():
@@ -92,7 +92,7 @@ def _way_is_free(stage: Stage, name: str) -> bool:
 
 
 def _alone(stage: Stage, name: str) -> bool:
-    """Say whether nobody follows close behind, so that somebody could have all along."""
+    """Return whether a follower `BEHIND_M` behind a vehicle would lately have kept `NEIGHBOUR_M` from all others."""
     behind = BEHIND_M + stage.sumo.vehicle.getLength(name)
     trail = dict(stage.trail(name, behind))
     if stage.step not in trail:
@@ -107,11 +107,11 @@ def _alone(stage: Stage, name: str) -> bool:
 
 
 def overtake(stage: Stage, scenario: Scenario, roles: Overtaking) -> Generator[None, None, None]:
-    """Follow the slow one, pull out, pass, move back, and drive on as anybody; oncoming traffic brakes."""
+    """Let a new car follow the slow vehicle, pull out, pass and move back into the traffic; oncoming traffic brakes."""
     vehicle, slow, lane = stage.sumo.vehicle, roles.slow, roles.spot.lane
     kind = scenario.actors.get("car", KIND)
     name, length = stage.cast(kind), length_of(kind)
-    way = stage.onward(slow)  # from this lane on; the slow one may leave it first
+    way = stage.onward(slow)  # from this lane on; the slow vehicle may leave it first
     slow_length = vehicle.getLength(slow)
     for step, (x, y, angle, speed) in stage.trail(slow, BEHIND_M + slow_length):
         stage.place(name, x, y, math.radians(90.0 - angle), speed, step)

@@ -1,4 +1,4 @@
-"""Somebody runs out into the road from behind a parked van."""
+"""Script of an occluded pedestrian: somebody runs into the road from behind a parked van."""
 
 import math
 from collections.abc import Generator
@@ -10,26 +10,26 @@ from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import CAREFUL_MPS2, STEP_S, Spot, Stage
 
 VAN, PEDESTRIAN = "van.high_van", "pedestrian.child"
-FAST = 4.0  # [m/s] slower vehicles are no danger
-AHEAD_M = (22.0, 45.0)  # of the vehicle under test, where the pedestrian crosses
-BEFORE_VAN_M = 0.9  # the pedestrian comes so close before the van's bumper
+FAST = 4.0  # [m/s] least speed of the vehicle under test
+AHEAD_M = (22.0, 45.0)  # limits of the distance from the vehicle under test to the crossing
+BEFORE_VAN_M = 0.9  # from the van's front bumper to the pedestrian's path
 RUNS_AT = 2.6  # [m/s]
-NOTICED_S = 0.9  # the run begins so many seconds before the last moment to brake
-WALK_ON_M = 1.5  # beyond the far kerb
-CLEAR_M = 2.2  # nobody has ever been so close to where the van stands
+NOTICED_S = 0.9  # the run begins so long, less the time to the lane, before the last moment to brake
+WALK_ON_M = 1.5  # by which the pedestrian goes on beyond the far kerb
+CLEAR_M = 2.2  # no vehicle has been nearer than this to where the van stands
 
 
 class BehindVan(NamedTuple):
-    """Before whom somebody runs out, and where."""
+    """The roles of a pedestrian who runs out from behind a van."""
 
-    ego: str
-    spot: Spot
-    along: float  # of the crossing, on the ego's lane [m]
-    kinds: tuple[str, str]  # van, pedestrian
+    ego: str  # the vehicle under test
+    spot: Spot  # of the ego at the casting
+    along: float  # place of the crossing along the ego's lane [m]
+    kinds: tuple[str, str]  # vehicle types of the van and the pedestrian
 
 
 def cast_behind_van(stage: Stage, scenario: Scenario) -> BehindVan | None:
-    """Return a vehicle under test that drives freely on the right lane, with room for a van at the kerb ahead."""
+    """Return a vehicle under test in free flow on the rightmost lane, with room for a van at the kerb ahead."""
     kinds = scenario.actors.get("van", VAN), scenario.actors.get("pedestrian", PEDESTRIAN)
     for ego in stage.free_egos(scenario):
         spot, speed = stage.spot(ego), stage.state(ego)[3]
@@ -45,12 +45,15 @@ def cast_behind_van(stage: Stage, scenario: Scenario) -> BehindVan | None:
 
 
 def _beside(spot: Spot, van: str) -> float:
-    """Return how far left of the lane's middle the van stands: it is to the right."""
+    """Return the lateral offset of the van from the lane's middle, left positive: it stands to the right [m]."""
     return -(spot.lane.width / 2 + KERB_GAP_M + width_of(van) / 2)
 
 
 def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[None, None, None]:
-    """Wait behind the van until the vehicle is near, run across its lane and on to the other side; traffic brakes."""
+    """Let a pedestrian wait behind the van until the ego is near, then run across the street; traffic brakes.
+
+    The run begins so that the ego can just stop. Van and pedestrian stand there from the start of the run on.
+    """
     lane, vehicle = roles.spot.lane, stage.sumo.vehicle
     van, pedestrian = (stage.cast(kind) for kind in roles.kinds)
     hidden = _beside(roles.spot, roles.kinds[0])
@@ -83,7 +86,7 @@ def _walker(stage: Stage, roles: BehindVan, left: float) -> tuple[float, float, 
 
 
 def _far_kerb(stage: Stage, edge: Edge, width: float) -> float:
-    """Return how far the other side of the street is to the left of the middle of an edge's right lane [m]."""
+    """Return the lateral offset of the far kerb from the middle of an edge's rightmost lane, left positive [m]."""
     ours = sum(lane.width for lane in edge.lanes_of("driving"))
     back = [other for other in stage.net.streets if (other.start, other.end) == (edge.end, edge.start)]
     theirs = sum(lane.width for other in back[:1] for lane in other.lanes if lane.kind != "sidewalk")

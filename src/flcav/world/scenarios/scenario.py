@@ -1,4 +1,4 @@
-"""What a user asks to happen."""
+"""The configuration of a scripted corner case in a recipe."""
 
 from typing import Annotated, Literal
 
@@ -15,17 +15,17 @@ Kind = Literal[
     "stalled_vehicle",  # the vehicle ahead breaks down and stays
     "crash",  # a vehicle runs into the one before it, and both stay
 ]
-ROLES: dict[str, tuple[str, ...]] = {  # what takes part and is made for it -> categories it may be of
+ROLES: dict[str, tuple[str, ...]] = {  # role of an actor created for a scenario -> categories it may be of
     "car": ("car", "van", "motorcycle"),
     "van": ("van", "truck", "bus"),
     "pedestrian": ("pedestrian",),
 }
 LONGEST_S = 36_000.0
-NEAR_M = 50.0  # of a position
+NEAR_M = 50.0  # from `Scenario.position` to the vehicle under test, at most
 
 
 class Scenario(Config):
-    """One corner case of a recipe: as soon after `at_s` as the traffic around `near` lends itself to it."""
+    """One corner case of a recipe: it begins as soon after `at_s` as the traffic around `near` allows."""
 
     kind: Kind  # what happens
     at_s: Annotated[float, Field(gt=0, le=LONGEST_S)]  # of the traffic's clock, as `warmup_s`; not before

@@ -1,8 +1,7 @@
-"""What a script sees of a SUMO run and can do to it, one step of 0.1 s at a time.
+"""The stage of scripted scenarios: queries and actions on a SUMO run, one step of 0.1 s at a time.
 
-Some actors are SUMO's, and the traffic reacts to them; some are props that only scripts move, and the traffic brakes
-for them where a script says so (`brake_for`). A state is SUMO's: front x, y [m], angle [deg clockwise from north],
-speed [m/s].
+Vehicles of SUMO are simulated by it, and the traffic reacts to them. Props are moved by scripts alone, and the traffic
+brakes for them where a script asks for it (`brake_for`). Vehicles under test are SUMO's "cav0", "cav1", ...
 """
 
 import math
@@ -14,10 +13,10 @@ import numpy as np
 from flcav.world.map.roads import Edge, Lane, RoadNet
 from flcav.world.scenarios.scenario import NEAR_M, Scenario
 
-State = tuple[float, float, float, float]
+State = tuple[float, float, float, float]  # SUMO's: front x, y [m], angle [deg clockwise from north], speed [m/s]
 STEP_S = 0.1
-ALERT = 0.1  # [s] a vehicle on stage decides at every step
-CAREFUL_MPS2 = 4.5  # how hard drivers brake for a prop
+ALERT = 0.1  # [s] action step of vehicles in a scenario: they decide at every step
+CAREFUL_MPS2 = 4.5  # deceleration with which drivers brake for a prop
 
 
 class Spot(NamedTuple):
@@ -25,29 +24,29 @@ class Spot(NamedTuple):
 
     lane: Lane
     edge: Edge
-    along: float  # of its front [m]
-    left: float  # to the end of the lane [m]
+    along: float  # from the start of the lane to its front [m]
+    left: float  # from its front to the end of the lane [m]
 
 
 class Stage:
-    """A SUMO run with scripts in it."""
+    """A SUMO run that scripts observe and change."""
 
     def __init__(self, sumo: Any, net: RoadNet) -> None:
-        """Stand at the start of a run; `sumo` is the libsumo module."""
+        """Start at the beginning of a run; `sumo` is the libsumo module."""
         self.sumo = sumo
         self.net = net
         self.step = 0
         self.props: dict[str, tuple[str, dict[int, State]]] = {}  # name -> vehicle type, state by step
-        self.shifted: dict[str, tuple[float, float]] = {}  # SUMO's vehicle -> metres to the left, radians to the left
-        self.past: dict[str, list[tuple[int, State]]] = {}
-        self.engaged: dict[str, int] = {}  # vehicle under test -> step up to which a scenario has it to itself
+        self.shifted: dict[str, tuple[float, float]] = {}  # SUMO's vehicle -> shift and turn to the left [m, rad]
+        self.past: dict[str, list[tuple[int, State]]] = {}  # SUMO's vehicle -> step and state since it came
+        self.engaged: dict[str, int] = {}  # vehicle under test -> step until which it is not free
         self._edge_of = {lane.id: (edge, lane) for edge in net.edges.values() for lane in edge.lanes}
         self._braking: set[str] = set()
         self._dangers: list[tuple[float, float, float]] = []  # x, y, half width [m] of this step
         self._cast = 0
 
     def look(self) -> None:
-        """Take note of where everybody is after a step."""
+        """Record the states of all vehicles of SUMO after a step."""
         self.step += 1
         for name in self.sumo.vehicle.getIDList():
             self.past.setdefault(name, []).append((self.step, self.state(name)))
@@ -58,7 +57,7 @@ class Stage:
         return (*vehicle.getPosition(name), vehicle.getAngle(name), vehicle.getSpeed(name))
 
     def egos(self, scenario: Scenario) -> list[str]:
-        """Return the vehicles under test near which the scenario may happen now."""
+        """Return the vehicles under test at which the scenario may happen now, by its `near` and `position`."""
         there = set(self.sumo.vehicle.getIDList())
         names = [scenario.near] if scenario.near else sorted(name for name in there if name.startswith("cav"))
         at = scenario.position
@@ -69,11 +68,11 @@ class Stage:
         ]
 
     def free_egos(self, scenario: Scenario) -> list[str]:
-        """Return those of `egos` before whom nothing else happens now."""
+        """Return those of `egos` at which no scenario has begun lately: see `engaged`."""
         return [name for name in self.egos(scenario) if self.engaged.get(name, 0) <= self.step]
 
     def spot(self, name: str) -> Spot | None:
-        """Return a vehicle's place on a street; None inside a junction."""
+        """Return the place of a vehicle of SUMO on a street; None inside a junction."""
         found = self._edge_of.get(self.sumo.vehicle.getLaneID(name))
         if found is None or found[0].function != "normal":
             return None
@@ -81,7 +80,10 @@ class Stage:
         return Spot(found[1], found[0], along, self.sumo.lane.getLength(found[1].id) - along)
 
     def point(self, lane: Lane, along: float, left: float) -> tuple[float, float, float]:
-        """Return x, y and heading [rad] at a place of a lane, `left` metres to the left of its middle."""
+        """Return x, y [m] and heading [rad] at `along` metres of a lane, `left` metres to the left of its middle.
+
+        Beyond its ends the lane goes straight on.
+        """
         edge, index = lane.id.rpartition("_")[::2]
         length = self.sumo.lane.getLength(lane.id)
         inside = min(max(along, 0.0), length)
@@ -97,30 +99,33 @@ class Stage:
         )
 
     def cast(self, kind: str) -> str:
-        """Return the name of a new actor of a vehicle type, "category.shape"."""
+        """Create a prop of a vehicle type, "category.shape", placed nowhere yet; return its name."""
         name = f"scripted{self._cast}"
         self._cast += 1
         self.props[name] = (kind, {})
         return name
 
     def place(self, name: str, x: float, y: float, heading: float, speed: float, step: int | None = None) -> None:
-        """Put a prop somewhere now, or at an earlier step."""
+        """Set the state of a prop now, or at an earlier `step`: x, y [m], heading [rad], speed [m/s]."""
         angle = 90.0 - math.degrees(heading)
         self.props[name][1][self.step if step is None else step] = (x, y, angle, speed)
 
     def stood(self, name: str, x: float, y: float, heading: float) -> None:
-        """Have a prop stand somewhere from the start of the run up to now."""
+        """Let a prop stand at x, y [m] with this heading [rad] from the start of the run up to now."""
         for step in range(self.step + 1):
             self.place(name, x, y, heading, 0.0, step)
 
     def untouched(self, x: float, y: float, radius_m: float) -> bool:
-        """Say whether no vehicle has ever been within `radius_m` of a place."""
+        """Return whether no vehicle of SUMO has ever been within `radius_m` of x, y [m]."""
         return not any(
             math.hypot(state[0] - x, state[1] - y) < radius_m for states in self.past.values() for _, state in states
         )
 
     def enter(self, name: str, kind: str, spot: tuple[Lane, float], route: list[str], speed: float) -> None:
-        """Put a new vehicle into the traffic, its front at a place of a lane, whoever is there."""
+        """Insert a new vehicle of SUMO with its front at a place of a lane, even where another one is.
+
+        `route` are the edges it follows, `speed` is in m/s.
+        """
         vehicle = self.sumo.vehicle
         self.sumo.route.add(f"route of {name}", route)
         vehicle.add(name, f"route of {name}", typeID=kind)
@@ -129,15 +134,15 @@ class Stage:
         self.take(name)
 
     def take(self, name: str) -> None:
-        """Have a vehicle of SUMO's obey at every step."""
+        """Let a vehicle of SUMO act at every step, so that it obeys a script at once."""
         self.sumo.vehicle.setActionStepLength(name, ALERT)
 
     def onward(self, name: str) -> list[str]:
-        """Return the rest of a vehicle's route, from the edge it is on."""
+        """Return the edges of the rest of a vehicle's route, from the one it is on."""
         return list(self.sumo.vehicle.getRoute(name)[max(self.sumo.vehicle.getRouteIndex(name), 0) :])
 
     def leader(self, name: str, within_m: float) -> tuple[str, float] | None:
-        """Return who drives ahead in one's lane, and the gap between the bumpers [m]; None further away than asked."""
+        """Return the vehicle ahead of a vehicle and the gap between their bumpers [m]; None beyond `within_m`."""
         found = self.sumo.vehicle.getLeader(name, within_m)
         if not found or not found[0]:
             return None
@@ -145,13 +150,14 @@ class Stage:
         return (found[0], gap) if gap <= within_m else None
 
     def brake_for(self, places: Sequence[tuple[float, float]], half_width_m: float) -> None:
-        """Have everybody brake in this step who drives towards one of the places and could not stop before it later."""
+        """Mark places x, y [m] for which vehicles brake in this step: see `react`."""
         self._dangers += [(x, y, half_width_m) for x, y in places]
 
     def react(self, careless: Set[str]) -> None:
-        """Have everybody brake for what this step's scripts asked for, and drive on who needs not any more.
+        """Let vehicles brake for the places marked in this step, and let those go that need not brake any more.
 
-        Those who are `careless` do neither: scripts move them.
+        A vehicle brakes for a place within its braking distance ahead and the place's half width of its path. Those
+        that are `careless` are left to their scripts.
         """
         x, y, half_width_m = np.array(self._dangers, np.float64).reshape(-1, 3).T
         self._dangers.clear()
@@ -170,7 +176,7 @@ class Stage:
                 self._braking.discard(name)
 
     def gap_ahead(self, lane: Lane, along: float) -> float:
-        """Return how far it is from a place of a lane to the next vehicle's tail on it; inf where there is none [m]."""
+        """Return the gap from a place of a lane to the rear of the next vehicle on it [m]; inf where there is none."""
         vehicle = self.sumo.vehicle
         places = [
             (vehicle.getLanePosition(name), vehicle.getLength(name))
@@ -179,7 +185,7 @@ class Stage:
         return min((front - length - along for front, length in places if front > along), default=math.inf)
 
     def seen(self, name: str, state: State) -> State:
-        """Return a vehicle's state as it is to be recorded: with what a script shifts it by."""
+        """Return the state of a vehicle of SUMO as it is recorded: with the shift and turn of its script."""
         if name not in self.shifted:
             return state
         left, turn = self.shifted[name]
@@ -188,7 +194,10 @@ class Stage:
         return x - left * math.sin(heading), y + left * math.cos(heading), angle - math.degrees(turn), speed
 
     def trail(self, name: str, behind_m: float) -> Iterator[tuple[int, State]]:
-        """Iterate over the states of somebody who has always followed a vehicle at a distance along its path."""
+        """Yield steps and states of a follower on a vehicle's path, `behind_m` behind it from front to front.
+
+        Steps before the vehicle has gone that far are left out.
+        """
         states = self.past[name]
         at = np.array([state[:2] for _, state in states])
         done = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(at, axis=0).T))))
@@ -200,5 +209,5 @@ class Stage:
 
 
 def braking_m(speed: float) -> float:
-    """Return how far before a prop somebody at `speed` [m/s] begins to brake."""
+    """Return the distance [m] before a prop at which a vehicle at `speed` [m/s] begins to brake."""
     return 4.0 + 0.7 * speed + speed**2 / (2 * CAREFUL_MPS2)

@@ -1,1 +1,1 @@
-"""Traffic: demand, SUMO, and the trace of everybody that it gives."""
+"""Microscopic traffic simulation by SUMO: demand, the simulation process, and the trace of the run."""

@@ -1,4 +1,7 @@
-"""Traffic demand: who drives and walks where, and who is parked."""
+"""Traffic demand: SUMO's route file of random tours, and parked vehicles along the streets.
+
+Vehicles and pedestrians are under way to the end of the run. Both parts are drawn anew for every traffic seed.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,26 +19,29 @@ from flcav.world.map.street_furniture import Verge
 from flcav.world.shapes import SHAPES
 
 FROM_JUNCTION_M = 6.0  # kept free at both ends of a parking lane
-KERB_GAP_M = (0.1, 0.3)  # between wheels and kerb
-BUMPER_GAP_M = (0.6, 1.8)  # between neighbours
-CROOKED = 0.12  # share of drivers who do not care
-BACKWARDS = 0.06  # share parked against the traffic
-OVERHANG_M = 0.1  # how far a wide vehicle may stand out of its lane
+KERB_GAP_M = (0.1, 0.3)  # limits of the gap between wheels and kerb
+BUMPER_GAP_M = (0.6, 1.8)  # limits of the gap between neighbours
+CROOKED = 0.12  # share of vehicles parked at a larger angle
+BACKWARDS = 0.06  # share of vehicles parked against the driving direction
+OVERHANG_M = 0.1  # by which a vehicle may stand out of its lane, at most
 
 
 @dataclass(frozen=True)
 class Parked:
-    """One parked vehicle."""
+    """One parked vehicle: its shape, ground centre [m] and yaw [rad], world frame."""
 
     category: str
-    shape: int  # index within the category
+    shape: int  # row of SHAPES[category]
     x: float
     y: float
     yaw: float
 
 
 def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) -> list[Parked]:
-    """Return the vehicles on the parking lanes of all streets: inside their lane, apart from each other."""
+    """Return the parked vehicles on the parking lanes of all streets, drawn by the parameters of the street types.
+
+    They do not overlap and stand out of their lane by `OVERHANG_M` at most.
+    """
     out = []
     for edge in net.streets:
         street = parameters.streets[edge.type]
@@ -67,7 +73,7 @@ def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) 
 
 Array = NDArray[np.float64]
 
-DRIVER = {  # SUMO's vehicle class and what departs from its defaults
+DRIVER = {  # attributes of SUMO's vehicle types by category, where they differ from the defaults
     "car": {"vClass": "passenger", "speedFactor": "normc(1,0.1,0.75,1.2)", "minGap": "2.0"},
     "van": {"vClass": "delivery", "speedFactor": "normc(0.95,0.1,0.7,1.1)", "minGap": "2.0"},
     "truck": {"vClass": "truck", "speedFactor": "normc(0.9,0.1,0.7,1.0)", "minGap": "2.5"},
@@ -77,17 +83,18 @@ DRIVER = {  # SUMO's vehicle class and what departs from its defaults
     "pedestrian": {"vClass": "pedestrian", "maxSpeed": "1.6", "speedFactor": "normc(0.8,0.15,0.4,1.0)"},
 }
 CAV_TYPE = "car.sedan"
-FASTEST = 20.0  # no vehicle is faster [m/s]
-FASTEST_WALK = 1.7  # no pedestrian is [m/s]
+FASTEST = 20.0  # speed for which tours are long enough, of vehicles [m/s]
+FASTEST_WALK = 1.7  # and of pedestrians [m/s]
 
 
 def write_demand(
     net: RoadNet, parameters: TownParameters, *, seed: int, cavs: int, until_s: float, fill_s: float
 ) -> str:
-    """Return the text of the route file: CAVs from the start, all others from some instant before `fill_s` [s].
+    """Return the text of SUMO's route file (XML): vehicle types, and a trip for every vehicle and pedestrian.
 
-    Everybody has a tour of random destinations too long to be finished by `until_s`. Vehicles draw destinations by
-    the street type's `traffic`, pedestrians by `footfall`; CAVs draw the approaches of the candidate poles, if any.
+    CAVs depart at 0 s, all others at a uniform time before `fill_s` [s]. Each has a tour of random destinations too
+    long to be finished by `until_s` [s] at `FASTEST` or `FASTEST_WALK`. Vehicles draw destinations by the street type's
+    `traffic`, pedestrians by its `footfall`; CAVs draw the approaches of the candidate poles, if there are any.
     """
     root = Element("routes")
     for category, shapes in SHAPES.items():
@@ -125,9 +132,9 @@ def write_demand(
 
 
 def pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str, float]:
-    """Return the edges that lead past the candidate poles, weighted so that all poles weigh the same.
+    """Return the weights, by edge, of the edges that lead past the candidate poles; each pole adds 1 in total.
 
-    They are both directions of the street a straight pole stands on, and all edges into the junction another watches.
+    The edges of a straight pole are both directions of its street; those of another lead into the junction it faces.
     """
     out: dict[str, float] = {}
     for pole in parameters.poles:
@@ -142,7 +149,7 @@ def pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str, float
 
 
 def tour(edges: list[Edge], weight: Array, length_m: float, random: np.random.Generator) -> list[str]:
-    """Return edges to visit in order, drawn by `weight` (N,), whose beeline adds up to at least `length_m`."""
+    """Return the ids of edges to visit in order, drawn by `weight` (N,), at least `length_m` long as the crow flies."""
     middle = np.array([edge.lanes[0].shape.mean(axis=0) for edge in edges])
     share = weight / weight.sum()
     at = int(random.choice(len(edges), p=share))
@@ -158,7 +165,7 @@ def tour(edges: list[Edge], weight: Array, length_m: float, random: np.random.Ge
 
 
 def draw_type(category: str, parameters: TownParameters, random: np.random.Generator) -> str:
-    """Return the SUMO vehicle type of a random shape of the category, "category.shape"."""
+    """Return SUMO's vehicle type of a random shape of the category, "category.shape"."""
     weights = parameters.shape_weights(category)
     return f"{category}.{SHAPES[category][int(random.choice(len(weights), p=weights))].name}"
 
@@ -177,7 +184,7 @@ def _person(name: str, kind: str, depart: float, edges: list[str]) -> Element:
 
 
 def types() -> Iterator[tuple[str, str, int]]:
-    """Iterate over SUMO vehicle type, category, shape index."""
+    """Yield each of SUMO's vehicle types with its category and its row of `SHAPES[category]`."""
     for category, shapes in SHAPES.items():
         for i, shape in enumerate(shapes):
             yield f"{category}.{shape.name}", category, i

@@ -1,4 +1,4 @@
-"""SUMO in a process beside this one, started with the first simulation and kept for the next."""
+"""Client of the SUMO process, which is started with the first simulation and kept for the next."""
 
 import atexit
 import os
@@ -7,14 +7,14 @@ import sys
 import threading
 from pathlib import Path
 
-SERVE = "flcav.world.traffic.sumo_process:serve"
+SERVE = "flcav.world.traffic.sumo_process:serve"  # what that process runs
 
 _lock = threading.Lock()
-_process: tuple[int, subprocess.Popen[str]] | None = None  # and the process that started it: a fork starts its own
+_process: tuple[int, subprocess.Popen[str]] | None = None  # with the id of its parent: a fork starts its own
 
 
 def simulate_in(folder: Path) -> None:
-    """Do the job in `folder`, see `sumo_process`; raises `RuntimeError` with what SUMO said if it fails."""
+    """Simulate the job in `folder`, see `sumo_process`; raises `RuntimeError` with SUMO's output where it fails."""
     with _lock:
         try:
             process = _running()
@@ -26,7 +26,7 @@ def simulate_in(folder: Path) -> None:
         except BrokenPipeError:
             code = ""
         except BaseException:
-            _stop()  # its answer would be taken for that to the next job
+            _stop()  # or its answer would be taken for that to the next job
             raise
     if code != "0":
         if not code:
@@ -36,7 +36,7 @@ def simulate_in(folder: Path) -> None:
 
 
 def _running() -> subprocess.Popen[str]:
-    """Return the process, started where there is none."""
+    """Return the SUMO process of this process; start it where there is none."""
     global _process
     if _process is None or _process[0] != os.getpid() or _process[1].poll() is not None:
         module, name = SERVE.split(":")
@@ -48,7 +48,7 @@ def _running() -> subprocess.Popen[str]:
 
 @atexit.register
 def _stop() -> None:
-    """End the process, if this one started it."""
+    """Kill the SUMO process, if this process started it."""
     global _process
     if _process is not None and _process[0] == os.getpid():
         _process[1].kill()

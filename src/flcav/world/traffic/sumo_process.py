@@ -1,4 +1,15 @@
-"""The process that SUMO runs in: steps, pedestrians' motion, and the state after each."""
+"""The SUMO process: simulation of jobs, and pedestrians of limited speed.
+
+`serve` reads a folder with `job.json` from each line of its input, and answers with an exit code when `out.npz` and
+`said.txt` are there. libsumo holds one simulation per process, and a second start silently replaces the first.
+Therefore only this process imports it, and each simulation is a fork of this process: loading libsumo takes longer than
+a minute of traffic.
+
+`Walkers` limits the speed of pedestrians. In SUMO's "striping" model they jump: up to three stripes aside in one step,
+and from one end of a junction's corner to the other where they wait for one crossing and another turns green. Here a
+pedestrian who falls behind follows the path of SUMO's pedestrian at no more than `HURRY_MPS` until caught up. Nothing
+of later steps is used.
+"""
 
 import json
 import math
@@ -17,25 +28,25 @@ from flcav.world.scenarios.director import Director
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import State
 
-HURRY_MPS = 2.5  # a jog; SUMO's pedestrians walk at no more than 1.7 m/s
+HURRY_MPS = 2.5  # jogging speed; the pedestrians of the demand walk at no more than 1.7 m/s
 
 
 class Walkers:
-    """All pedestrians of a run, followed step by step."""
+    """The pedestrians of a run, with limited speed: they follow SUMO's pedestrians step by step."""
 
     def __init__(self, step_s: float) -> None:
-        """Begin with nobody; steps last `step_s`."""
-        self.states: dict[str, State] = {}  # of those there now, in SUMO's order
+        """Start without pedestrians; `step_s` is the duration of a step [s]."""
+        self.states: dict[str, State] = {}  # of those present now, in SUMO's order
         self._step_s = step_s
-        self._behind: dict[str, deque[tuple[float, float]]] = {}  # path that SUMO's pedestrian has walked alone
+        self._behind: dict[str, deque[tuple[float, float]]] = {}  # path between a pedestrian and SUMO's
 
     def follow(self, targets: Mapping[str, State]) -> None:
-        """Take a step in which SUMO's pedestrians come to `targets`, and those who are not in it leave."""
+        """Advance by one step, in which SUMO's pedestrians reach `targets`; those not among them leave."""
         self.states = {name: self._follow(name, target) for name, target in targets.items()}
         self._behind = {name: path for name, path in self._behind.items() if path and name in targets}
 
     def _follow(self, name: str, target: State) -> State:
-        """Return `target`, or, if it is out of reach, a state on the way with angle and speed of the motion."""
+        """Return `target`, or where it is out of reach the state on the path to it, with its own angle and speed."""
         if name not in self.states:
             return target
         path = self._behind.setdefault(name, deque())
@@ -58,11 +69,11 @@ STEP_S = 0.1
 
 
 def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenarios: list[Scenario]) -> None:
-    """Simulate up to the last of `steps` (ascending, of 0.1 s) and write what was read at each to `out` (.npz).
+    """Simulate up to the last of `steps` (T,), ascending, of 0.1 s each, and write the states at these to `out` (.npz).
 
-    Arrays: `id`, `type` (A,); `row` (N, 2) instant and actor index; `state` (N, 4) SUMO's x, y [m], angle [deg
-    clockwise from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of each light's links; `events`
-    the scenarios that happened, as JSON.
+    Arrays: `id` and `type` (A,) of each actor; `row` (N, 2) instant and actor of each state; `state` (N, 4) SUMO's
+    front x, y [m], angle [deg clockwise from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of
+    each light's links; `events`, the scenarios that took place, as JSON.
     """
     import libsumo
 
@@ -71,9 +82,9 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
         "route-files": routes,
         "seed": seed,
         "step-length": STEP_S,
-        "default.action-step-length": 0.5,  # drivers decide twice a second: three times as fast
+        "default.action-step-length": 0.5,  # drivers decide twice a second: the simulation is three times as fast
         "lanechange.duration": 2,
-        "time-to-teleport": -1,  # nobody vanishes from a jam
+        "time-to-teleport": -1,  # vehicles in a jam are not removed
         "collision.action": "none",
         "no-step-log": "true",
         "no-warnings": "true",
@@ -92,7 +103,7 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
     def note(instant: int, name: str, kind: str, state: State) -> None:
         if name not in index:
             index[name] = len(kinds)
-            kinds.append(kind.partition("@")[0])  # what SUMO makes of a type once somebody's is changed
+            kinds.append(kind.partition("@")[0])  # "type@vehicle" is SUMO's copy of a type for one vehicle
         rows.append((instant, index[name]))
         states.append(state)
 
@@ -115,7 +126,7 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
         light_states.append([libsumo.trafficlight.getRedYellowGreenState(light) for light in lights])
     libsumo.close()
     if director:
-        for instant, step in enumerate(steps):  # only now: a script may say where somebody has been all along
+        for instant, step in enumerate(steps):  # only now, since a script may place a prop at earlier steps
             for prop in director.props(step):
                 note(instant, *prop)
     np.savez(
@@ -131,11 +142,11 @@ def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenari
 
 
 def serve() -> None:
-    """Simulate the jobs whose folders are read, until there are no more."""
+    """Simulate the job in each folder that is read from stdin, each in a fork; print its exit code to stdout."""
     import libsumo  # noqa: F401 - for the forks
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # is the matter of the process that asks, which ends this one
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # nobody waits for the answer any more: end without a word
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # left to the process that asks, which ends this one
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # where the process that asks is gone, end silently
     for line in sys.stdin:
         fork = os.fork()
         if not fork:
@@ -144,7 +155,7 @@ def serve() -> None:
 
 
 def _simulate(folder: Path) -> NoReturn:
-    """Do the job in the folder, and end this process; what it and SUMO say goes into said.txt."""
+    """Simulate the job in the folder, and end this process; its output and SUMO's go to `said.txt`."""
     code = 1
     try:
         with (folder / "said.txt").open("w") as said:

@@ -1,4 +1,4 @@
-"""Traffic of a town by SUMO: everything that moves, and what is parked beside it, as a `Trace`."""
+"""Traffic simulation of a town by SUMO: the smoothed motion of all actors and the parked vehicles, as a `Trace`."""
 
 import json
 import tempfile
@@ -26,19 +26,19 @@ from flcav.world.traffic.sumo_process import STEP_S
 
 Array = NDArray[np.float64]
 
-FILL_S = 30.0  # everybody is under way by then
-SMOOTHING_STEPS = 4  # half width of the window over which a pose is averaged: SUMO turns and changes lanes in jerks
+FILL_S = 30.0  # all actors have departed by then
+SMOOTHING_STEPS = 4  # half width of the moving average of poses, since SUMO turns and changes lanes abruptly
 
 
 def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: Sequence[Scenario] = ()) -> Trace:
-    """Return the traffic of `town` at `times_s` (T,): ascending multiples of 0.1 s after an empty town's time 0.
+    """Return the traffic of `town` at `times_s` (T,), ascending multiples of 0.1 s; at time 0 the town is empty.
 
-    Actors are "cav<i>" (sedans, under way from the start), "veh<i>", "ped<i>" and "parked<i>"; those absent at all of
-    `times_s` are left out. Before `FILL_S` the town is still filling. The same arguments give the same trace. Whoever
-    takes part in one of the `scenarios` and was made for it is called "scripted<i>"; `events` of the trace says which
-    of them happened, and when: each waits from its `at_s` on until the traffic lends itself to it.
-    Raises `InputError` for other times, for more CAVs than are on the road by the first of them, and for somebody who
-    is to run a red light in a town without lights.
+    Actors are "cav<i>" (sedans, under way from the start), "veh<i>", "ped<i>", "parked<i>", and "scripted<i>" for those
+    created for a scenario; actors absent at all of `times_s` are left out. Until `FILL_S` the town is still filling.
+    Each of the `scenarios` waits from its `at_s` on until the traffic allows it; `events` of the trace are those that
+    took place. The same arguments give the same trace. Raises `InputError` for other times, for a negative `cavs`,
+    where not all CAVs are on the road at all times, and for a red-light scenario in a town without traffic lights;
+    `RuntimeError` where SUMO fails.
     """
     times_s = np.asarray(times_s, dtype=np.float64)
     steps = np.rint(times_s / STEP_S).astype(np.int64)
@@ -63,7 +63,7 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
 
 
 def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (T, W) the steps over which the state at each of `steps` (T,) is averaged."""
+    """Return the steps (T, W) over which the state at each of `steps` (T,) is averaged; none before 1."""
     return np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
 
 
@@ -99,7 +99,7 @@ def _trace(
     known = {name: (category, shape) for name, category, shape in types()}
     kinds = [known[str(raw["type"][i])] for i in order] + [(car.category, car.shape) for car in parked]
     size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], dtype=np.float64).reshape(-1, 3)
-    half_length = size[: len(order), 0] / 2  # from an actor's front, which SUMO moves, to its centre
+    half_length = size[: len(order), 0] / 2  # from an actor's front, SUMO's reference point, to its centre
     walk = _walk(*(_centre(step[:, order], half_length) for step in (earlier, state, later)))
     still = np.array([(car.x, car.y, car.yaw, 0.0) for car in parked], dtype=np.float64).reshape(-1, 4)
     state = np.concatenate((state[:, order], np.broadcast_to(still, (len(time_s), *still.shape))), axis=1)
@@ -136,7 +136,7 @@ def _trace(
 
 
 def _smooth(raw: dict[str, NDArray], windows: NDArray[np.int64]) -> Array:
-    """Return (T, A, 4) front x, y, yaw, speed averaged over the rows of each window (T, W); NaN where absent midway."""
+    """Return front x, y, yaw, speed (T, A, 4), averaged over each window (T, W); NaN where absent at its middle."""
     rows = np.unique(windows)
     dense, windows = _dense(raw, rows), np.searchsorted(rows, windows)
     total, count = np.zeros((len(windows), *dense.shape[1:])), np.zeros((len(windows), dense.shape[1], 1))
@@ -151,7 +151,7 @@ def _smooth(raw: dict[str, NDArray], windows: NDArray[np.int64]) -> Array:
 
 
 def _dense(raw: dict[str, NDArray], rows: NDArray[np.int64]) -> Array:
-    """Return (R, A, 4) front x, y, unwrapped yaw, speed at `rows` (R,) of the steps read; NaN where absent."""
+    """Return front x, y, unwrapped yaw, speed (R, A, 4) at `rows` (R,) of the steps read; NaN where absent."""
     out = np.full((len(raw["light_state"]), len(raw["id"]), 4), np.nan)
     out[raw["row"][:, 0], raw["row"][:, 1]] = raw["state"]
     out = out[rows]
@@ -161,9 +161,9 @@ def _dense(raw: dict[str, NDArray], rows: NDArray[np.int64]) -> Array:
 
 
 def _rates(before: Array, now: Array, after: Array) -> Array:
-    """Return (T, A, 4) acceleration [m/s^2] and yaw rate [rad/s] from the states a step before, now, a step after.
+    """Return acceleration [m/s^2] and yaw rate [rad/s] (T, A, 4) by central differences of states one step apart.
 
-    One-sided where an actor has just come or is about to leave; NaN where it is absent now.
+    One-sided where an actor is absent before or after; NaN where it is absent now.
     """
 
     def motion(state: Array) -> Array:
@@ -178,15 +178,16 @@ def _rates(before: Array, now: Array, after: Array) -> Array:
 
 
 def _centre(state: Array, half_length: Array) -> Array:
-    """Return (T, A, 2) the centres of actors whose front, yaw and speed are `state` (T, A, 4)."""
+    """Return the centres (T, A, 2) of actors whose front x, y, yaw and speed are `state` (T, A, 4)."""
     yaw = state[..., 2]
     return state[..., :2] - half_length[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), axis=2)
 
 
 def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
-    """Return velocities [m/s] and accelerations [m/s^2] (T, A, 3) of positions (T, A, 2) a step before, now, and after.
+    """Return velocity [m/s] and acceleration [m/s^2] (T, A, 3) by central differences of positions (T, A, 2).
 
-    One-sided, without an acceleration, where an actor has just come or is about to leave; NaN where it is absent now.
+    Positions are those a step before, now and a step after. Where an actor is absent before or after, the velocity is
+    one-sided and the acceleration 0; NaN where it is absent now.
     """
     steps = np.stack((now - before, after - now)) / STEP_S
     known = ~np.isnan(steps)
@@ -199,7 +200,7 @@ def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
 
 
 def _beside(raw: dict[str, NDArray], parked: list[Parked]) -> list[Parked]:
-    """Return the parked vehicles that are in nobody's way who was made for a scenario."""
+    """Return the parked vehicles that do not overlap the paths of actors created for scenarios."""
     scripted = np.flatnonzero(np.char.startswith(raw["id"], "scripted"))
     ways = []
     for actor in scripted:
