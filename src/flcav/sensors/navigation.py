@@ -51,12 +51,10 @@ def walk(rng: np.random.Generator, time_s: float, start: Array, per_root_s: Arra
 
 
 def _grid(rng: np.random.Generator, time_s: float, axes: int) -> Array:
-    """Return (T, axes) standard normal numbers, one row for each step of the grid up to the one after `time_s`."""
     return rng.standard_normal((int(time_s / STEP_S) + 2, axes))
 
 
 def _read(values: Array, time_s: float) -> Array:
-    """Return (K,) the grid's `values` (T, K), interpolated linearly at `time_s`."""
     step, share = divmod(time_s / STEP_S, 1.0)
     return (1 - share) * values[int(step)] + share * values[int(step) + 1]
 
@@ -74,7 +72,6 @@ def geodetic(origin: GeoReference, enu: Array) -> Array:
 
 
 def _to_earth(at: GeoReference) -> Array:
-    """Return (3,) ECEF coordinates [m] of a place given by latitude, longitude and altitude."""
     lat, lon = np.radians((at.latitude_deg, at.longitude_deg))
     normal = EQUATOR_M / np.sqrt(1 - ECCENTRICITY2 * np.sin(lat) ** 2)
     level = (normal + at.altitude_m) * np.cos(lat)
@@ -84,7 +81,6 @@ def _to_earth(at: GeoReference) -> Array:
 
 
 def _earth_from_enu(at: GeoReference) -> Array:
-    """Return the (3, 3) rotation from east, north, up at a place to ECEF axes."""
     lat, lon = np.radians((at.latitude_deg, at.longitude_deg))
     east = (-np.sin(lon), np.cos(lon), 0.0)
     north = (-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat))
@@ -93,7 +89,6 @@ def _earth_from_enu(at: GeoReference) -> Array:
 
 
 def _from_earth(earth: Array) -> Array:
-    """Return (..., 3) latitude [deg], longitude [deg], altitude [m] of ECEF points (..., 3) [m]: Bowring's method."""
     x, y, z = np.moveaxis(earth, -1, 0)
     level = np.hypot(x, y)
     beyond = ECCENTRICITY2 / (1 - ECCENTRICITY2)
@@ -175,7 +170,7 @@ def reading(
 
 
 def _motion(scene: Scene, at: Array, carrier: int | None) -> tuple[Array, Array]:
-    """Return acceleration (3,) [m/s^2] and angular rate (3,) [rad/s] of the carrier at its point `at` (3,), world frame."""
+    """Return acceleration (3,) [m/s^2] and angular rate (3,) [rad/s] of the carrier at a point (3,), world frame."""
     if carrier is None:
         return np.zeros(3), np.zeros(3)
     trace, index = scene.trace, scene.index

@@ -191,7 +191,7 @@ def _sweep(
 
 
 def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> NDArray[np.int32]:
-    """Return an instance image (H, W), one ray through each pixel's centre: a + 1 at the trace's actor a, else 0."""
+    """Return an instance image (H, W), one ray for each pixel's centre: a + 1 at the trace's actor a, else 0."""
     hits = carrier.scene.cast(world_from_camera, directions(lens), hidden=carrier.own)
     return np.maximum(hits.instance, 0).reshape(lens.height, lens.width)
 
