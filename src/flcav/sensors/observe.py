@@ -143,7 +143,7 @@ class _Carrier:
         return velocity + np.cross(spin, arm)
 
     def poses_at_triggers(self) -> dict[str, Array]:
-        """Return the (4, 4) `world_from_agent` at each trigger time that is not the spin's, by sensor; empty for a pole.
+        """Return the (4, 4) `world_from_agent` at trigger times other than the spin's, by sensor; empty for a pole.
 
         Leaves the scene at the spin.
         """
@@ -191,7 +191,7 @@ def _sweep(
 
 
 def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> NDArray[np.int32]:
-    """Return an instance image (H, W), one ray for each pixel's centre: a + 1 at the trace's actor a, else 0."""
+    """Return an instance image (H, W) by one ray for each pixel: a + 1 at the trace's actor a, else 0."""
     hits = carrier.scene.cast(world_from_camera, directions(lens), hidden=carrier.own)
     return np.maximum(hits.instance, 0).reshape(lens.height, lens.width)
 

@@ -17,9 +17,7 @@ from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.navigation import Gnss, Imu
 from flcav.sensors.radar.radar import Radar
 
-CAMERA_RANGE_M = (
-    100.0  # of ground truth for rigs without LiDAR; what shows in an image is labelled at any distance
-)
+CAMERA_RANGE_M = 100.0  # of ground truth for rigs without LiDAR; what shows in an image is labelled at any distance
 TRIGGER_MS = 100.0  # largest offset of a trigger from the spin
 RESERVED = ("traces", "town")  # folders of a dataset, so no names of sensors
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")

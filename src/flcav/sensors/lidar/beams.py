@@ -4,9 +4,10 @@ Patterns are for `beams: <name>` in a rig: Velodyne VLP-16 (63-9229), HDL-32E (9
 "Alpha Prime" (63-9679) at 10 spins a second, and Ouster OS1-128 in its mode 1024x10. Elevations are nominal: those of
 a unit differ by some hundredths of a degree.
 
-CARLA's `sensor.lidar.ray_cast` (its documentation, core sensors, "Lidar sensor") gives a return at range d the intensity
-exp(-a d), whatever the surface. A share of all rays is lost; of the rest, returns with an intensity below a limit are
-lost with a probability that rises linearly from 0 at the limit to its value at intensity 0. Weather plays no part.
+CARLA's `sensor.lidar.ray_cast` (its documentation, core sensors, "Lidar sensor") gives a return at range d the
+intensity exp(-a d), whatever the surface. A share of all rays is lost; of the rest, returns with an intensity below a
+limit are lost with a probability that rises linearly from 0 at the limit to its value at intensity 0. Weather plays no
+part.
 """
 
 from typing import NamedTuple
