@@ -34,7 +34,7 @@ def openness(scene: Scene, seen: Survey, lens: Lens, hidden: int | None) -> NDAr
 
 
 def _ways() -> NDArray[np.float32]:
-    """Return (SPAN, SPAN, 3) points, even over the unit sphere; added to a normal, they are cosine-weighted directions."""
+    """Return (SPAN, SPAN, 3) points, even over the unit sphere; added to a normal: cosine-weighted directions."""
     count = SPAN * SPAN
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
