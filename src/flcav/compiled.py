@@ -1,4 +1,4 @@
-"""Numba's compiler with its results kept on disk, so that only the first process on a machine waits for it."""
+"""Just-in-time compilation by Numba, cached on disk: only the first process on a machine compiles."""
 
 import hashlib
 from collections.abc import Callable
@@ -12,31 +12,33 @@ T = TypeVar("T")
 
 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """Return `function` compiled on its first call, without the interpreter's lock.
+    """Return `function` compiled by `numba.njit` on its first call; it runs without the interpreter's lock (GIL).
 
-    The result is kept beside the source, else in the user's cache folder (or in NUMBA_CACHE_DIR, where that is set);
-    where none of them can be written it lasts as long as the process. It is made anew when a source changes: Numba sees
-    to the function's own file, the name to those of the compiled functions that it calls.
+    The machine code is cached beside the source, else in the user's cache folder (or in NUMBA_CACHE_DIR, where that is
+    set); where none of these can be written, it lasts as long as the process. The cache is invalid when a source
+    changes: Numba checks the function's own file; for the files of the compiled functions that it calls, a hash of
+    their bytes is appended to the qualified name, which is part of the cache's key.
     """
     if sources := _inlined_files(function):
         digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources)))
         function.__qualname__ += f"_{digest.hexdigest()[:12]}"
     try:
         return numba.njit(nogil=True, cache=True)(function)
-    except RuntimeError:  # nowhere to keep it
+    except RuntimeError:  # no folder for the cache can be written
         return numba.njit(nogil=True)(function)
 
 
 def inlined(function: Callable[P, T]) -> Callable[P, T]:
-    """Return `function` for use inside compiled ones, each of which gets a copy of its body.
+    """Return `function` for use inside compiled functions, each of which gets a copy of its body (inlining).
 
-    A call costs two atomic operations for every array passed, records of arrays included: too much for every pixel.
+    A call costs two atomic reference counts for every array passed, arrays within records included: too much where it
+    is made for every pixel.
     """
     return numba.njit(nogil=True, inline="always")(function)
 
 
 def _inlined_files(function: Callable[P, T]) -> set[Path]:
-    """Return the files of all compiled functions that `function` calls by name, and of those that they call."""
+    """Return the source files of the compiled functions that `function` calls by name, directly or indirectly."""
     files: set[Path] = set()
     met, waiting = {function}, [function]
     while waiting:

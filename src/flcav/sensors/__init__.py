@@ -1,4 +1,4 @@
-"""What an agent observes, and with what."""
+"""Sensor simulation: rigs, cameras, LiDARs, radars, GNSS and IMU, and the ground truth of each frame."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,8 @@
-"""What a rig's calibration is, and what an agent that was calibrated badly believes it to be."""
+"""Calibration of a rig (extrinsics, intrinsics, distortion, trigger times), and random errors of calibration.
+
+The true calibration follows from the rig. The agent works with an assumed one, which differs by one Gaussian error per
+sensor and dataset.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,7 +19,7 @@ from flcav.sensors.rig import Mounted, Rig
 
 
 class CalibrationError(Config):
-    """Standard deviations of an agent's calibration; each sensor's error is drawn once per dataset."""
+    """Standard deviations of the errors of calibration; a sensor's error is drawn once per dataset."""
 
     position_m: float = Field(default=0.0, ge=0, le=10)  # along each axis of the sensor
     rotation_deg: float = Field(default=0.0, ge=0, le=45)  # about each axis of the sensor
@@ -24,7 +28,11 @@ class CalibrationError(Config):
 
 
 def calibration_of(rig: Rig) -> Calibration:
-    """Return the calibration of a rig that is exactly as it says."""
+    """Return the true calibration of `rig`, by sensor name.
+
+    Of all sensors: the mount (4, 4), with optical axes for cameras, and the trigger time [ms] after the LiDAR spin. Of
+    colour and thermal cameras also: the intrinsic matrix (3, 3) [px] and the distortion coefficients (5,).
+    """
     lenses = _lenses(rig)
     return Calibration(
         agent_from_sensor={
@@ -40,9 +48,10 @@ def calibration_of(rig: Rig) -> Calibration:
 
 
 def assume(true: Calibration, error: CalibrationError, *, seed: int, agent: str) -> Calibration:
-    """Return what `agent` believes where its calibration is in error; of no error, `true` itself.
+    """Return the calibration that `agent` assumes: `true` with Gaussian errors; `true` itself where `error` is zero.
 
-    A sensor's error depends on its name, the agent's and the seed alone.
+    Each sensor gets a rigid error of its mount (translation, rotation vector; in the sensor's axes), one of both focal
+    lengths and one of its trigger time. They depend on the seed and the names of the agent and the sensor alone.
     """
     if error == CalibrationError():
         return true
@@ -56,7 +65,7 @@ def assume(true: Calibration, error: CalibrationError, *, seed: int, agent: str)
 
 
 def _draw(error: CalibrationError, seed: int, agent: str, name: str) -> tuple[Array, float, float]:
-    """Return the errors of one sensor: (4, 4) `sensor_from_assumed`, of the focal lengths [px], of the trigger [ms]."""
+    """Return one sensor's errors: (4, 4) `sensor_from_assumed` of the mount, focal length [px], trigger time [ms]."""
     normal = stream(seed, "calibration", agent, name).normal(size=8)
     sensor_from_assumed = np.eye(4)
     sensor_from_assumed[:3, :3] = Rotation.from_rotvec(error.rotation_deg * normal[3:6], degrees=True).as_matrix()

@@ -1,4 +1,17 @@
-"""Satellite navigation and inertial measurement, with drifting errors."""
+"""GNSS and IMU simulation: white noise and drifting biases (Gauss-Markov process, random walk), and WGS 84 geodesy.
+
+Biases are simulated on a grid of STEP_S from time 0 and interpolated linearly, so that the value at a time depends on
+the random stream and that time alone, in whatever order times are asked.
+
+Points of a town (east, north, up around its origin) become latitude, longitude and altitude by way of Earth-centred,
+Earth-fixed (ECEF) coordinates on the WGS 84 ellipsoid, without approximation; from ECEF back to latitude by Bowring's
+iteration ("The accuracy of geodetic latitude and height equations", Survey Review 28:202, 1985), exact to nanometres
+near the ground.
+
+A GNSS receiver has white noise and a first-order Gauss-Markov bias. An IMU measures the specific force f = a - g (at
+rest 9.8 m/s^2 upwards) and the angular rate; its white noise is given as a spectral density and its bias as a random
+walk, as on data sheets (IEEE 952).
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +23,15 @@ from flcav.world.scene import Scene
 
 Array = NDArray[np.float64]
 
-STEP_S = 0.1
+STEP_S = 0.1  # of the grid on which biases are simulated
 
 
 def wander(rng: np.random.Generator, time_s: float, deviation: Array, correlation_s: float) -> Array:
-    """Return (K,) a first-order Gauss-Markov process at `time_s` >= 0.
+    """Return (K,) values of independent first-order Gauss-Markov processes at `time_s` >= 0.
 
-    It has the standard deviations `deviation` (K,) at all times and forgets over `correlation_s`.
+    Each is stationary, with the standard deviation `deviation` (K,) and the autocorrelation exp(-t / `correlation_s`).
     """
-    from scipy.signal import lfilter  # takes a second to import, which who records neither GNSS nor IMU is spared
+    from scipy.signal import lfilter  # imported late: it takes a second, and only GNSS needs it
 
     kept = np.exp(-STEP_S / correlation_s)
     normal = _grid(rng, time_s, len(deviation))
@@ -27,9 +40,9 @@ def wander(rng: np.random.Generator, time_s: float, deviation: Array, correlatio
 
 
 def walk(rng: np.random.Generator, time_s: float, start: Array, per_root_s: Array) -> Array:
-    """Return (K,) a random walk at `time_s` >= 0.
+    """Return (K,) values of independent random walks at `time_s` >= 0.
 
-    It begins with the standard deviations `start` (K,); its increments over t seconds have `per_root_s` * sqrt(t).
+    The initial values have the standard deviations `start` (K,), increments over t seconds `per_root_s` (K,) * sqrt(t).
     """
     normal = _grid(rng, time_s, len(start))
     normal[0] *= start
@@ -46,15 +59,15 @@ def _read(values: Array, time_s: float) -> Array:
     return (1 - share) * values[int(step)] + share * values[int(step) + 1]
 
 
-EQUATOR_M = 6_378_137.0
+EQUATOR_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
 FLATTENING = 1 / 298.257223563
-POLE_M = EQUATOR_M * (1 - FLATTENING)
-ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
-ITERATIONS = 4
+POLE_M = EQUATOR_M * (1 - FLATTENING)  # semi-minor axis
+ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)  # first eccentricity, squared
+ITERATIONS = 4  # of Bowring's method
 
 
 def geodetic(origin: GeoReference, enu: Array) -> Array:
-    """Return (..., 3) latitude [deg], longitude [deg], altitude [m] of points (..., 3) east, north, up [m]."""
+    """Return (..., 3) latitude [deg], longitude [deg], altitude [m], WGS 84, of points (..., 3) east, north, up [m]."""
     return _from_earth(_to_earth(origin) + enu @ _earth_from_enu(origin).T)
 
 
@@ -91,7 +104,7 @@ def _from_earth(earth: Array) -> Array:
 
 
 class Gnss(Config):
-    """How good a receiver is; the defaults are those of a single-frequency receiver under open sky."""
+    """Error model of a GNSS receiver; the defaults are those of a single-frequency receiver under open sky."""
 
     noise_m: float = Field(default=0.3, ge=0, le=1000)  # standard deviation of the white noise, east and north
     noise_up_m: float = Field(default=0.6, ge=0, le=1000)  # the same of the altitude
@@ -105,10 +118,11 @@ class Gnss(Config):
 def fix(
     scene: Scene, world_from_gnss: Array, gnss: Gnss, rng: np.random.Generator, bias_rng: np.random.Generator
 ) -> Array:
-    """Return (3,) latitude [deg], longitude [deg], altitude [m] (WGS 84) of an antenna at the scene's time.
+    """Return one GNSS fix at the scene's time: (3,) latitude [deg], longitude [deg], altitude [m], WGS 84.
 
-    `world_from_gnss` (4, 4) is the antenna's pose. `rng` is the frame's stream; `bias_rng` is at the start of the one
-    stream of this receiver in this scene, so that the bias is the same whatever frames were rendered before.
+    `world_from_gnss` (4, 4) is the antenna's pose. `rng` draws this frame's white noise. `bias_rng` draws the bias: a
+    generator at the start of this receiver's stream of the scene, so that the bias does not depend on which frames were
+    rendered before.
     """
     time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
     noise = rng.standard_normal(3) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
@@ -120,7 +134,7 @@ GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
 
 
 class Imu(Config):
-    """How good a unit is; the defaults are those of an automotive MEMS unit."""
+    """Error model of an IMU; the defaults are those of an automotive MEMS unit."""
 
     rate_hz: float = Field(default=100.0, ge=0.1, le=10_000)  # samples a second: how much of the noise passes
     force_noise: float = Field(default=1.5e-3, ge=0, le=1000)  # white noise of the specific force [m/s^2 / sqrt(Hz)]
@@ -139,11 +153,11 @@ def reading(
     rng: np.random.Generator,
     bias_rng: np.random.Generator,
 ) -> Array:
-    """Return (6,) specific force [m/s^2] and angular rate [rad/s] in the unit's own frame, at the scene's time.
+    """Return one IMU sample at the scene's time: (6,) specific force [m/s^2] and angular rate [rad/s], IMU frame.
 
-    `world_from_imu` (4, 4) is its pose, `carrier` the actor it is on (None: it stands still). `rng` is the frame's
-    stream; `bias_rng` is at the start of the one stream of this unit in this scene, so that the bias is the same
-    whatever frames were rendered before.
+    `world_from_imu` (4, 4) is its pose, `carrier` the actor it is on (None: it stands still). `rng` draws this frame's
+    white noise. `bias_rng` draws the bias: a generator at the start of this unit's stream of the scene, so that the
+    bias does not depend on which frames were rendered before.
     """
     time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
     turn = world_from_imu[:3, :3]
@@ -156,7 +170,7 @@ def reading(
 
 
 def _motion(scene: Scene, at: Array, carrier: int | None) -> tuple[Array, Array]:
-    """Return (3,) acceleration of the carrier's point `at` (3,) and (3,) its angular rate, world frame."""
+    """Return acceleration (3,) [m/s^2] and angular rate (3,) [rad/s] of the carrier at a point (3,), world frame."""
     if carrier is None:
         return np.zeros(3), np.zeros(3)
     trace, index = scene.trace, scene.index

@@ -1,4 +1,4 @@
-"""One agent's frame: what its sensors see, and the truth about everything within their range."""
+"""Simulation of one frame: every sensor of an agent's rig at one instant of the traffic, with ground truth."""
 
 import re
 from dataclasses import dataclass
@@ -37,10 +37,11 @@ def observe(
     weather: Weather = CLEAR,
     error: CalibrationError = EXACT,
 ) -> Frame:
-    """Return what `agent` ("cav0", "pole3") sees with `rig` at instant `index` of the scene's traffic run.
+    """Return the frame of `agent` ("cav0", "pole3") with `rig` at instant `index` of the scene's traffic run.
 
-    Moves `scene` there. The same arguments give the same bytes, whatever was observed before; what a sensor measures
-    does not depend on which others the rig has, nor on `error`, which is in what the agent believes.
+    Moves `scene` there. The same arguments give the same bytes, whatever was observed before: each sensor has a random
+    stream of its own, named by `seed`, scene, instant, agent and sensor, so that it does not depend on the rig's other
+    sensors. `error` changes the frame's assumed calibration alone.
     Raises `InputError` for an agent that the run does not have, or not at that instant.
     """
     carrier = _Carrier(scene, agent, index, _actor_of(scene, agent, index), calibration_of(rig))
@@ -109,16 +110,16 @@ def observe(
 
 @dataclass(frozen=True)
 class _Carrier:
-    """Who carries the sensors through a scene."""
+    """The vehicle or pole that carries the sensors, in a scene, with their true calibration."""
 
     scene: Scene
     agent: str
     index: int
-    own: int | None  # its actor; None for a pole
+    own: int | None  # index of its actor in the trace; None for a pole
     calibration: Calibration
 
     def pose(self) -> Array:
-        """Return the (4, 4) `world_from_agent` where the scene stands."""
+        """Return the (4, 4) `world_from_agent` at the scene's time."""
         if self.own is not None:
             return self.scene.world_from_actor(self.own)
         poles = self.scene.town.poles
@@ -127,12 +128,12 @@ class _Carrier:
         return pose(x, y, z, float(poles.yaw[site]))
 
     def go_to(self, sensor: str) -> Array:
-        """Move the scene to the instant at which `sensor` looks and return its (4, 4) `world_from_sensor` then."""
+        """Move the scene to the trigger time of `sensor` and return its (4, 4) `world_from_sensor` then."""
         self.scene.move_to(self.index, self.calibration.offset_ms[sensor] / 1e3)
         return self.pose() @ self.calibration.agent_from_sensor[sensor]
 
     def velocity(self, world_from_sensor: Array) -> Array:
-        """Return the (3,) velocity of a sensor where the scene stands [m/s]."""
+        """Return the (3,) velocity of a sensor at the scene's time, world frame [m/s]."""
         if self.own is None:
             return np.zeros(3)
         trace, offset_s = self.scene.trace, self.scene.offset_s
@@ -142,7 +143,10 @@ class _Carrier:
         return velocity + np.cross(spin, arm)
 
     def poses_at_triggers(self) -> dict[str, Array]:
-        """Return `world_from_agent` at the triggers of the sensors that do not look at the spin; moves the scene."""
+        """Return the (4, 4) `world_from_agent` at trigger times other than the spin's, by sensor; empty for a pole.
+
+        Leaves the scene at the spin.
+        """
         poses = {}
         for sensor, offset_ms in self.calibration.offset_ms.items():
             if offset_ms and self.own is not None:
@@ -153,7 +157,10 @@ class _Carrier:
 
 
 def _actor_of(scene: Scene, agent: str, index: int) -> int | None:
-    """Move the scene to the instant and return the actor that carries the sensors, None for a pole."""
+    """Move the scene to instant `index` and return the index of the actor called `agent`; None for a pole.
+
+    Raises `InputError` for a pole or vehicle that does not exist, or is not in town at that instant.
+    """
     scene.move_to(index)
     poles = scene.town.poles.id
     if match := re.fullmatch(r"pole(\d+)", agent):
@@ -172,25 +179,28 @@ def _actor_of(scene: Scene, agent: str, index: int) -> int | None:
 def _sweep(
     carrier: _Carrier, name: str, lidar: Lidar, weather: Weather, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], Sweep]:
-    """Return the points of a LiDAR, (N, 4), and what else there is to know of its sweep."""
+    """Return the points (N, 4) of a LiDAR, and its rays and counts for the ground truth."""
     scene, world_from_sensor = carrier.scene, carrier.go_to(name)
     passes = draw_passes(lidar, rng)
     echoes = cast(scene, world_from_sensor, lidar, passes, carrier.own)
     points, actor = measure(scene, world_from_sensor, lidar, echoes, rng, weather)
     count = len(scene.trace.actor)
     returns = np.bincount(actor + 1, minlength=count + 1)[1:]
-    visible = np.bincount(echoes.instance + 1, minlength=count + 2)[2:]  # without what is missed, and the town
+    visible = np.bincount(echoes.instance + 1, minlength=count + 2)[2:]  # without misses (-1) and the town (0)
     return points, Sweep(lidar, world_from_sensor, passes, echoes.distance, echoes.instance, returns, visible)
 
 
 def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> NDArray[np.int32]:
-    """Return (H, W) what the ray through each pixel's centre meets: a + 1 at the trace's actor a, else 0."""
+    """Return an instance image (H, W) by one ray for each pixel: a + 1 at the trace's actor a, else 0."""
     hits = carrier.scene.cast(world_from_camera, directions(lens), hidden=carrier.own)
     return np.maximum(hits.instance, 0).reshape(lens.height, lens.width)
 
 
 def _within_range(carrier: _Carrier, rig: Rig) -> NDArray[np.bool_]:
-    """Return (A,) which actors are present with their box centre within a LiDAR's range, or a lone camera's."""
+    """Return (A,) whether each actor is present and the centre of its box within the range of any LiDAR.
+
+    Where the rig has no LiDAR: within CAMERA_RANGE_M of any camera.
+    """
     scene, world_from_agent = carrier.scene, carrier.pose()
     trace = scene.trace
     center = trace.position[scene.index] + trace.size * (0, 0, 0.5)

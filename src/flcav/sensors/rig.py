@@ -1,4 +1,4 @@
-"""Rigs: which sensors an agent carries, and where."""
+"""Rigs: the sensors of an agent with their mounts and settings, and presets of them."""
 
 import re
 from collections import Counter
@@ -17,20 +17,21 @@ from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.navigation import Gnss, Imu
 from flcav.sensors.radar.radar import Radar
 
-CAMERA_RANGE_M = (
-    100.0  # of labels, where an agent has cameras alone; what shows in an image is labelled at any distance
-)
-TRIGGER_MS = 100.0
-RESERVED = ("traces", "town")  # folders of a dataset
+CAMERA_RANGE_M = 100.0  # of ground truth for rigs without LiDAR; what shows in an image is labelled at any distance
+TRIGGER_MS = 100.0  # largest offset of a trigger from the spin
+RESERVED = ("traces", "town")  # folders of a dataset, so no names of sensors
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
 Reach = Annotated[float, Field(ge=-100, le=100)]  # [m]
-Turn = Annotated[float, Field(ge=-360, le=360)]
+Turn = Annotated[float, Field(ge=-360, le=360)]  # [deg]
 
 
 class Mount(Config):
-    """A sensor's pose on its agent: x forward, y left, z up; a camera looks along x. A positive pitch is downwards."""
+    """A sensor's pose in its agent's frame: x forward, y left, z up.
+
+    A camera looks along x. A positive pitch is downwards.
+    """
 
     x: Reach = 0.0  # forward [m]
     y: Reach = 0.0  # to the left [m]
@@ -40,57 +41,60 @@ class Mount(Config):
     roll_deg: Turn = 0.0  # leaning to the right
 
     def agent_from_sensor(self) -> NDArray[np.float64]:
-        """Return the (4, 4) transform; of a camera, with its body axes, not the optical ones."""
+        """Return the (4, 4) mount; of a camera with body axes (x forward, y left, z up), not optical ones."""
         yaw, pitch, roll = np.radians((self.yaw_deg, self.pitch_deg, self.roll_deg))
         return pose(self.x, self.y, self.z, yaw, pitch, roll)
 
 
 class Mounted(Config):
-    """A sensor's pose, and when it looks."""
+    """A sensor's mount and trigger time: base of all mounted sensors but LiDARs."""
 
     mount: Mount = Mount()  # where it is
     trigger_ms: float = Field(default=0.0, ge=-TRIGGER_MS, le=TRIGGER_MS)  # when it looks, after the LiDAR spin
 
 
 class MountedLidar(Config):
-    """A LiDAR and where it is. Its spin is the frame."""
+    """A LiDAR and its mount. Its spin defines the time of the frame, so it has no trigger time."""
 
     mount: Mount = Mount()  # where it is
     settings: Lidar = Lidar()  # what it is built like
 
 
 class MountedCamera(Mounted):
-    """A camera and where it is."""
+    """A colour camera, its mount and trigger time."""
 
     settings: Camera = Camera()  # what it is built like
 
 
 class MountedInfrared(Mounted):
-    """A thermal camera and where it is."""
+    """A thermal camera, its mount and trigger time."""
 
     settings: Infrared = Infrared()  # what it is built like
 
 
 class MountedRadar(Mounted):
-    """A radar and where it is."""
+    """A radar, its mount and trigger time."""
 
     settings: Radar = Radar()  # what it is built like
 
 
 class MountedGnss(Mounted):
-    """The antenna of a satellite receiver and where it is."""
+    """A GNSS receiver, its antenna's mount and trigger time."""
 
     settings: Gnss = Gnss()  # how good it is
 
 
 class MountedImu(Mounted):
-    """An inertial measurement unit and where it is."""
+    """An inertial measurement unit (IMU), its mount and trigger time."""
 
     settings: Imu = Imu()  # how good it is
 
 
 class Rig(Config):
-    """The sensors of one agent, by name. A car's frame is at its ground centre, a pole's at its mount."""
+    """The sensors of one agent, by kind and name. A car's frame is at its ground centre, a pole's at its mount.
+
+    Names differ over all kinds; at least one LiDAR or camera is needed.
+    """
 
     lidars: dict[str, MountedLidar] = Field(default_factory=dict)  # spinning LiDARs
     cameras: dict[str, MountedCamera] = Field(default_factory=dict)  # colour, with depth and classes of each pixel
@@ -115,23 +119,23 @@ class Rig(Config):
         return self
 
     def sensors(self) -> Mapping[str, MountedLidar | Mounted]:
-        """Return every sensor by its name."""
+        """Return all sensors of all kinds, by name."""
         return {name: sensor for kind in type(self).model_fields for name, sensor in getattr(self, kind).items()}
 
 
 def lidar32() -> Rig:
-    """Return one 32-channel LiDAR above a car's roof."""
+    """Return a rig of one 32-channel LiDAR above a car's roof."""
     return Rig(lidars={"lidar": MountedLidar(mount=Mount(z=1.85), settings=Lidar(channels=32, azimuth_steps=900))})
 
 
 def lidar_pole() -> Rig:
-    """Return one 64-channel LiDAR at a pole's mount, seeing all round and far down."""
+    """Return a rig of one 64-channel LiDAR at a pole's mount, with channels from 2 degrees up to 45 degrees down."""
     settings = Lidar(channels=64, azimuth_steps=1024, range_m=100.0, up_deg=2.0, down_deg=-45.0, sensitivity_m=400.0)
     return Rig(lidars={"lidar": MountedLidar(settings=settings)})
 
 
 def car(cameras: Mapping[str, MountedCamera] | None = None) -> Rig:
-    """Return a car's LiDAR, a camera that looks ahead (or the `cameras` given), a front radar, GNSS and IMU."""
+    """Return a car's rig: 32-channel LiDAR, front camera (or the given `cameras`), front radar, GNSS and IMU."""
     ahead = {"camera": MountedCamera(mount=Mount(x=0.5, z=1.5))}
     return Rig(
         lidars=lidar32().lidars,
@@ -143,7 +147,7 @@ def car(cameras: Mapping[str, MountedCamera] | None = None) -> Rig:
 
 
 def car_surround() -> Rig:
-    """Return a car's sensors with six cameras around, placed and as wide as those of nuScenes."""
+    """Return a car's rig with six surround cameras; directions and fields of view are those of nuScenes."""
     directions = {"front": 0, "front_left": 55, "front_right": -55, "back_left": 110, "back_right": -110, "back": 180}
     cameras = {}
     for name, yaw_deg in directions.items():
@@ -154,7 +158,7 @@ def car_surround() -> Rig:
 
 
 def roadside() -> Rig:
-    """Return a pole's LiDAR and two cameras that look to the left and to the right of where the pole faces."""
+    """Return a pole's rig: 64-channel LiDAR, and two cameras 42 degrees left and right of where the pole faces."""
     cameras = {
         name: MountedCamera(mount=Mount(yaw_deg=yaw_deg, pitch_deg=20.0))
         for name, yaw_deg in (("camera_left", 42.0), ("camera_right", -42.0))
@@ -162,20 +166,21 @@ def roadside() -> Rig:
     return Rig(lidars=lidar_pole().lidars, cameras=cameras)
 
 
-# Velodyne's data sheet: pavement (reflectivity .1) is seen up to 50 m, cars and foliage (.8) up to 120 m: white to 134.
-# Its intensities are compressed, and many returns of dark or glossy bodies come with none.
+# Velodyne's data sheet: range 50 m for pavement (reflectivity 0.1), 120 m for cars and foliage (0.8): 134 m for white.
+# Its intensities are compressed, and many returns from dark or glossy bodies have intensity 0.
 HDL64E = Lidar(beams="hdl64e", sensitivity_m=134.0, roughness_rad=0.6, intensity_gamma=0.5, intensity_floor=0.15)
 
 
 def kitti_lidar() -> Rig:
-    """Return the LiDAR of `kitti` alone."""
+    """Return a rig of KITTI's LiDAR (HDL-64E) alone."""
     return Rig(lidars={"velodyne": MountedLidar(mount=Mount(z=1.73), settings=HDL64E)})
 
 
 def kitti() -> Rig:
-    """Return KITTI's set-up: HDL-64E, left colour camera, GNSS and IMU (Geiger et al., IJRR 32(11), 2013, fig. 3).
+    """Return KITTI's rig: HDL-64E, left colour camera, GNSS and IMU (Geiger et al., IJRR 32(11), 2013, fig. 3).
 
-    Intrinsics and offsets are those of the recordings of 26 September 2011, rotations of less than a degree apart.
+    Intrinsics and positions are those of the recordings of 26 September 2011; their rotations of less than a degree are
+    left out.
     """
     camera = Camera(width=1242, height=375, fx=721.5377, fy=721.5377, cx=609.5593, cy=172.854)
     unit = Mount(x=-0.81, y=0.32, z=0.93)

@@ -1,1 +1,1 @@
-"""Cameras: lens, exposure and tone, infrared."""
+"""Camera simulation: pinhole lens with distortion, colour images, tone mapping, thermal images."""

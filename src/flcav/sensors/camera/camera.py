@@ -1,4 +1,4 @@
-"""A colour camera: deferred shading of what its rays meet, and the truth about every pixel from the same rays."""
+"""Simulation of a colour camera: rendering, tone mapping, sensor noise; depth, semantic and instance images."""
 
 from typing import NamedTuple
 
@@ -17,17 +17,17 @@ from flcav.world.weather import Weather
 
 
 class Camera(Lens):
-    """What a camera is built like; its pose is the rig's."""
+    """Settings of a colour camera; its mount is in the rig."""
 
     noise: float = Field(default=0.8, ge=0, le=20)  # standard deviation of a colour value from 0 to 255
     drops: bool = True  # whether rain leaves drops on the lens
 
 
 class Exposure(NamedTuple):
-    """One image and the truth about its pixels, each from the ray through the pixel's centre."""
+    """A colour image, with depth, semantic and instance ground truth by the rays through the pixels' centres."""
 
     rgb: NDArray[np.uint8]  # (H, W, 3) sRGB
-    depth_m: NDArray[np.float32]  # (H, W) along the optical axis; inf for the sky
+    depth_m: NDArray[np.float32]  # (H, W) z in the optical frame; inf for the sky
     semantic: NDArray[np.uint8]  # (H, W) one of SEMANTICS
     instance: NDArray[np.int32]  # (H, W) 0 none, a + 1 = the trace's actor a, -(t + 1) = thing t of `town_things`
 
@@ -41,10 +41,10 @@ def photograph(
     *,
     hidden: int | None = None,
 ) -> Exposure:
-    """Return the image at the scene's instant, as if the actor `hidden` (the carrier) were not there.
+    """Return the image at the scene's instant and its ground truth, without the actor `hidden` (the carrier).
 
-    `world_from_camera` (4, 4) places the optical frame (x right, y down, z forward): for a sensor mounted by body axes
-    it is `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments, and the same state of `rng`, give the same bytes.
+    `world_from_camera` (4, 4) is the pose of the optical frame (x right, y down, z forward): for a mount with body axes
+    `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments, and the same state of `rng`, give the same bytes.
     """
     picture = render(scene, world_from_camera, camera, weather, rng, hidden=hidden)
     shape = (camera.height, camera.width)

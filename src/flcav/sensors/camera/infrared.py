@@ -1,15 +1,14 @@
-"""A thermal camera: the temperature each pixel seems to have in the long-wave infrared (8 to 14 um).
+"""Simulation of a thermal camera: apparent temperatures in the long-wave infrared (8 to 14 um).
 
-What a pixel shows is t * (e * T + (1 - e) * T_mirrored) + (1 - t) * T_air: the surface's own temperature T, weighted by
-its emissivity e, what it mirrors for the rest, and the air between, which transmits t = exp(-extinction * distance).
-Temperatures are mixed linearly instead of by radiance: within 30 K of each other that is right to about 1 K.
+A pixel's apparent temperature is t * (e * T + (1 - e) * T_mirrored) + (1 - t) * T_air, with the surface's temperature T
+and emissivity e, the temperature T_mirrored of what it reflects, and the transmittance t = exp(-extinction * distance)
+of the air. Temperatures are mixed linearly instead of radiances: within 30 K of each other that is right to about 1 K.
 
-T = T_air + warmth: a surface in the sun is up to `sun_k` warmer (times the cosine of incidence and what clouds let
-through), one that faces a clear night sky up to `sky_k` colder, rain takes most of both away. Vehicles that move are
-warm where engine, tyres, brakes and lamps are; people are as warm as skin and clothes are. Rain and fog hide heat
-less than light: the extinction of fog in the long-wave infrared is taken as 0.6 of that of light, the clear air's as
-0.2 per km. What other things hide from the sky cools less. Window panes mirror what is before them; the ground and
-walls are not as warm everywhere. The lens is no sharper than `BLUR_PX`.
+T = T_air + difference: a surface in the sun is up to `sun_k` warmer (times the cosine of incidence and the clouds'
+transmittance), one that faces a clear night sky up to `sky_k` colder, the less the more of the sky is hidden; rain
+takes most of both away. Moving vehicles are warm at engine, tyres, brakes and lamps, people by skin and clothes. Window
+panes reflect the sky; smooth noise varies the temperatures of the town's surfaces. The extinction of fog in the
+long-wave infrared is taken as 0.6 of that of light, that of clear air as 0.2 per km. The lens blurs by `BLUR_PX`.
 """
 
 from typing import NamedTuple
@@ -35,23 +34,23 @@ from flcav.world.weather import Weather
 Array = NDArray[np.float64]
 
 FAR_M = 1000.0
-KELVIN_STEP = 0.01  # of a thermal image
-FOG_SHARE, CLEAR_AIR_PER_M, RAIN_PER_M = 0.6, 0.0002, 0.0012
-ENGINE_SHARE = 0.28  # of a vehicle's length, from its front
-LAMP_K = 14.0  # how much warmer a lamp is that is on
-BLUR_PX = 0.6  # standard deviation of what the lens makes of a point
-PATCHES_K = 1.6  # between the warmest and the coldest spots of one surface
+KELVIN_STEP = 0.01  # quantisation of a thermal image
+FOG_SHARE, CLEAR_AIR_PER_M, RAIN_PER_M = 0.6, 0.0002, 0.0012  # extinctions: fog's over that of light, air, 1 mm/h
+ENGINE_SHARE = 0.28  # engine compartment, share of a vehicle's length from its front
+LAMP_K = 14.0  # how much warmer a lit lamp is
+BLUR_PX = 0.6  # standard deviation of the lens' point spread function
+PATCHES_K = 1.6  # range of the noise of one surface's temperature
 PANE_EMISSIVITY = 0.85
 
 
 class Warmth(NamedTuple):
-    """How a material's temperature differs from the air's."""
+    """Thermal properties of a material: differences from the temperature of the air, and emissivity."""
 
-    sun_k: float = 10.0  # face on to a clear sun at noon
-    sky_k: float = 4.0  # how far below the air it cools under a clear night sky
+    sun_k: float = 10.0  # warmer by this, facing a clear sun at noon
+    sky_k: float = 4.0  # colder by this under a clear night sky
     emissivity: float = 0.94
-    moving_k: float = 0.0  # when its vehicle drives
-    body_c: float | None = None  # of living things: as warm as this, whatever the weather
+    moving_k: float = 0.0  # warmer by this while its vehicle moves
+    body_c: float | None = None  # body temperature [deg C] of living things, in any weather
 
 
 WARMTH: dict[Material, Warmth] = {
@@ -87,7 +86,7 @@ _BODY = np.array([np.nan if WARMTH[material].body_c is None else WARMTH[material
 
 
 class Infrared(Lens):
-    """What a thermal camera is built like; its pose is the rig's."""
+    """Settings of a thermal camera; its mount is in the rig."""
 
     noise_k: float = Field(default=0.06, ge=0, le=5)  # standard deviation of a pixel
 
@@ -101,9 +100,9 @@ def thermal_image(
     *,
     hidden: int | None = None,
 ) -> NDArray[np.uint16]:
-    """Return (height, width) apparent temperatures [0.01 K], as if the actor `hidden` (the carrier) were not there.
+    """Return a thermal image (H, W) of apparent temperatures [0.01 K], without the actor `hidden` (the carrier).
 
-    `world_from_camera` (4, 4) places the optical frame, as for `camera.photograph`.
+    `world_from_camera` (4, 4) is the pose of the optical frame, as for `camera.photograph`.
     """
     rays = directions(infrared)
     appearance, light = appearance_of(scene), light_of(weather)
@@ -135,32 +134,32 @@ def thermal_image(
 
 
 def air_temperature(weather: Weather) -> float:
-    """Return the air's temperature [K]: mild, warmer the higher the sun, cooler under cloud and in rain."""
+    """Return the temperature of the air [K]: 286 + 9 * sin(sun elevation), less under clouds by day and in rain."""
     warm = 9.0 * np.sin(np.radians(np.clip(weather.sun_elevation_deg, -30, 90)))
     return float(286.0 + warm - 2.5 * weather.cloud_cover * (warm > 0) - min(weather.rain_mm_h / 10.0, 1.0) * 2.0)
 
 
 def sky_temperature(weather: Weather, rise: NDArray[np.float32] | float) -> Array:
-    """Return the sky's apparent temperature [K] where a ray's sine of elevation is `rise`; clouds warm it."""
+    """Return the apparent temperature of the sky [K] at the elevation whose sine is `rise`; clouds are warmer."""
     clear = 42.0 * np.clip(rise, 0, 1) ** 0.5 + 6.0
     return air_temperature(weather) - clear * (1 - 0.85 * weather.cloud_cover)
 
 
 def _sunshine(weather: Weather) -> float:
-    """Return the sun's heat over that of a clear noon."""
+    """Return the heat of the sun through clouds, relative to a clear noon."""
     height = max(np.sin(np.radians(weather.sun_elevation_deg)), 0.0)
     return float(np.clip(height * 3, 0, 1) * (1 - 0.85 * np.clip((weather.cloud_cover - 0.3) / 0.6, 0, 1)))
 
 
 def _living(seen: Survey, material: NDArray[np.uint8], air: float) -> Array:
-    """Return how much warmer people are than the air [K]: clothes lie between the two."""
+    """Return (N,) how much warmer than the air skin and clothes are [K]; 0 for other surfaces."""
     body = _BODY[material] + 273.15
     clothed = np.where(material == Material.SKIN, 1.0, 0.7)
     return np.where(np.isnan(body) | (seen.instance < 1), 0.0, clothed * (body - air))
 
 
 def _driving(scene: Scene, seen: Survey, material: NDArray[np.uint8], lamps_on: bool) -> Array:
-    """Return how much warmer the parts of vehicles under way are [K]."""
+    """Return (N,) how much warmer the parts of vehicles in traffic are than when parked [K]; 0 for other surfaces."""
     trace = scene.trace
     warm = np.zeros(len(seen))
     for actor in np.unique(seen.instance[seen.instance > 0]) - 1:
@@ -181,7 +180,7 @@ def _driving(scene: Scene, seen: Survey, material: NDArray[np.uint8], lamps_on: 
 def _texture_of(
     seen: Survey, appearance: Appearance, infrared: Infrared
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the share (N,) of window panes in each pixel, and by how much (N,) its spot is warmer, -0.5 to 0.5."""
+    """Return each pixel's share (N,) of window panes and its noise of temperature (N,), -0.5 to 0.5."""
     pane, patch = np.zeros(len(seen), np.float32), np.zeros(len(seen), np.float32)
     _texture(seen, appearance, np.float32(1 / infrared.intrinsics()[0, 0]), pane, patch)
     return pane, patch

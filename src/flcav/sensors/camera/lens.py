@@ -1,4 +1,4 @@
-"""Which way the light comes that falls on a pixel: pinhole cameras with Brown-Conrady distortion.
+"""Pinhole camera model with Brown-Conrady distortion: projection and its inverse.
 
 Optical frame: x right, y down, z forward along the optical axis. Pixel (column u, row v); the centre of the first pixel
 is at (0, 0), as in OpenCV. With a = x / z, b = y / z and r^2 = a^2 + b^2 (Brown 1966, OpenCV's order of coefficients):
@@ -17,12 +17,12 @@ from flcav.config import Config
 
 Array = NDArray[np.float64]
 
-BODY_FROM_OPTICAL: Array = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-NEWTON_STEPS = 12
+BODY_FROM_OPTICAL: Array = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # rotation of axes
+NEWTON_STEPS = 12  # by which the distortion is inverted
 
 
 class Lens(Config):
-    """The geometry of an image."""
+    """Image size, intrinsics and distortion of a camera."""
 
     width: int = Field(default=640, ge=16, le=8192)  # columns [px]
     height: int = Field(default=384, ge=16, le=8192)  # rows [px]
@@ -47,7 +47,7 @@ class Lens(Config):
         return self
 
     def intrinsics(self) -> Array:
-        """Return the (3, 3) matrix that takes undistorted a, b, 1 to pixels."""
+        """Return the (3, 3) camera matrix, which maps a', b', 1 to pixels u, v, 1."""
         focal = self.width / 2 / np.tan(np.radians(self.fov_deg) / 2) if self.fx is None else self.fx
         vertical = focal if self.fy is None else self.fy
         cx = (self.width - 1) / 2 if self.cx is None else self.cx
@@ -55,17 +55,17 @@ class Lens(Config):
         return np.array([[focal, 0, cx], [0, vertical, cy], [0, 0, 1.0]])
 
     def distortion(self) -> Array:
-        """Return (5,) k1, k2, p1, p2, k3."""
+        """Return the (5,) distortion coefficients k1, k2, p1, p2, k3."""
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
 
 def project(lens: Lens, points: ArrayLike) -> Array:
-    """Return the pixels (N, 2) u, v of points (N, 3) in the optical frame; NaN for those not in front of the lens."""
+    """Return the pixels (N, 2) u, v of points (N, 3) in the optical frame; NaN for those with z <= 0."""
     return projected(lens.intrinsics(), lens.distortion(), points)
 
 
 def projected(intrinsics: Array, distortion: Array, points: ArrayLike) -> Array:
-    """Return `project` of a lens of which the matrix (3, 3) and the coefficients (5,) are known."""
+    """Return pixels as `project` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
     x, y, z = np.asarray(points, np.float64).reshape(-1, 3).T
     z = np.where(z > 1e-9, z, np.nan)
     fx, fy, cx, cy = _focus(intrinsics)
@@ -73,15 +73,15 @@ def projected(intrinsics: Array, distortion: Array, points: ArrayLike) -> Array:
 
 
 def unproject(lens: Lens, pixels: ArrayLike) -> Array:
-    """Return the undistorted a, b (N, 2) of pixels (N, 2) u, v: where they cross the plane z = 1.
+    """Return the undistorted a, b (N, 2) of pixels (N, 2) u, v: points of the plane z = 1.
 
-    NaN where the distortion lets no direction fall there.
+    Newton's method; NaN where it finds no direction that the distortion maps to the pixel.
     """
     return unprojected(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
 
 
 def directions(lens: Lens) -> NDArray[np.float32]:
-    """Return the (height * width, 3) unit directions that fall on the pixels' centres, row after row; read-only."""
+    """Return the viewing rays of the pixels' centres: (height * width, 3) unit vectors, optical frame; read-only."""
     intrinsics, distortion = lens.intrinsics().ravel().tolist(), lens.distortion().tolist()
     return _directions(lens.width, lens.height, tuple(intrinsics), tuple(distortion))
 
@@ -100,7 +100,7 @@ def _directions(
 
 
 def unprojected(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
-    """Return `unproject` of a lens of which the matrix (3, 3) and the coefficients (5,) are known."""
+    """Return a, b (N, 2) as `unproject` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
     fx, fy, cx, cy = _focus(intrinsics)
     wanted = (pixels - (cx, cy)) / (fx, fy)
     if not distortion.any():
@@ -112,7 +112,7 @@ def unprojected(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
         by_a = (_distort(distortion, found + along_a) - _distort(distortion, found - along_a)) / (2 * step)
         by_b = (_distort(distortion, found + along_b) - _distort(distortion, found - along_b)) / (2 * step)
         slope = by_a[:, 0] * by_b[:, 1] - by_a[:, 1] * by_b[:, 0]
-        slope = np.where(slope > 1e-3, slope, np.nan)  # beyond the fold no direction is the right one
+        slope = np.where(slope > 1e-3, slope, np.nan)  # where the distortion folds over, it has no inverse
         found = found - np.stack(
             (
                 (by_b[:, 1] * error[:, 0] - by_b[:, 0] * error[:, 1]) / slope,

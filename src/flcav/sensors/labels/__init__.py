@@ -1,1 +1,1 @@
-"""The truth about what sensors see of actors, signs and lights."""
+"""Ground truth of a frame: 3-D boxes, occlusion and 2-D boxes of actors, signs and signal heads in images."""

@@ -1,4 +1,4 @@
-"""The ground truth of one frame, from what its sensors met."""
+"""Ground truth of one frame, from the rays of its sensors."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -17,23 +17,23 @@ from flcav.world.scene import Scene
 
 
 class Sweep(NamedTuple):
-    """What a LiDAR met."""
+    """The rays of one LiDAR sweep, and its returns by actor."""
 
     lidar: Lidar
     world_from_sensor: Array  # (4, 4)
-    passes: NDArray[np.bool_]  # see `draw_passes`
+    passes: NDArray[np.bool_]  # (N,) whether a ray goes through glass: see `draw_passes`
     distance: NDArray[np.float32]  # (N,) where the rays ended [m]
-    instance: NDArray[np.int32]  # (N,) and at what: a + 1 at the scene's actor a
-    returns: NDArray[np.int64]  # (A,) points of each of the scene's actors
-    visible: NDArray[np.int64]  # (A,) rays that come back from it, detected or not
+    instance: NDArray[np.int32]  # (N,) what they ended at: a + 1 at the scene's actor a
+    returns: NDArray[np.int64]  # (A,) points from each of the scene's actors
+    visible: NDArray[np.int64]  # (A,) rays that return from each, detected or not
 
 
 class Sight(NamedTuple):
-    """What a camera, infrared ones too, met."""
+    """The instance image of one colour or thermal camera, and its pose."""
 
     lens: Lens
     world_from_camera: Array  # (4, 4) of the optical frame
-    offset_s: float  # after the spin
+    offset_s: float  # trigger time after the spin
     instance: NDArray[np.int32]  # (H, W) 0 none, a + 1 = the scene's actor a, -(t + 1) = thing t of the town
 
 
@@ -46,9 +46,11 @@ def annotate(
     sights: Mapping[str, Sight],
     echoes: Mapping[str, NDArray[np.int64]],
 ) -> tuple[Annotations, NDArray[np.int64]]:
-    """Return the truth about all actors but `own` that are `within` (A,) reach or show in a camera, and their numbers.
+    """Return the annotations of M actors, and their indices (M,) in the trace.
 
-    `echoes` are the (A,) radar detections of each actor. Moves `scene` about its instant, and back to the spin.
+    Annotated are all actors but `own` (the carrier) that are `within` (A,) range or show in a camera. `sweeps` are by
+    LiDAR, `sights` by camera; `echoes` are by radar the number (A,) of detections of each actor. Moves `scene` to the
+    cameras' trigger times, and back to the spin.
     """
     trace, index = scene.trace, scene.index
     regions = {name: actor_regions(sight.instance, len(trace.actor)) for name, sight in sights.items()}
@@ -83,11 +85,11 @@ def annotate(
 
 
 def _occlusion(scene: Scene, sweeps: list[Sweep], actors: NDArray[np.int64]) -> Array:
-    """Return (K,) the share of each actor that is hidden from all LiDARs together; 1 where nothing is visible."""
+    """Return (K,) the occluded share of each actor's rays, all LiDARs together; 1 where none is visible."""
     visible, occluded = np.zeros((2, len(actors)), np.int64)
     for sweep in sweeps:
         visible += sweep.visible[actors]
-    seen = np.flatnonzero(visible)  # of the others nothing is visible, whatever they would show
+    seen = np.flatnonzero(visible)  # the occlusion of the others is 1, whatever the number of occluded rays
     for sweep in sweeps:
         occluded[seen] += occluded_rays(
             scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, sweep.distance, sweep.instance, actors[seen]

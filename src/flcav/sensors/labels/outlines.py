@@ -1,4 +1,4 @@
-"""The amodal rectangle of an actor in an image: around its projected convex hull, exact where nothing distorts."""
+"""Amodal 2-D boxes: bounding rectangles of actors' projected convex hulls, exact for lenses without distortion."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -14,20 +14,20 @@ from flcav.world.scene import Scene
 
 Array = NDArray[np.float64]
 
-NEAR_M = 0.1  # an actor is cut off so far in front of the camera
-BEYOND_IMAGE = 1.3  # a lens that distorts is trusted up to so many times its image's radius
+NEAR_M = 0.1  # depth of the near plane, at which actors are clipped
+BEYOND_IMAGE = 1.3  # distortion is extrapolated up to so many times the image's radius
 
 
 class Hull(NamedTuple):
-    """The convex hull of a mesh."""
+    """The vertices and edges of a mesh's convex hull."""
 
     vertices: Array  # (V, 3) body frame [m]
-    edges: NDArray[np.int64]  # (E, 2) rows of vertices
+    edges: NDArray[np.int64]  # (E, 2) indices of vertices
 
 
 @lru_cache(maxsize=64)
 def hull(category: str, shape: int) -> Hull:
-    """Return the convex hull of an actor's mesh."""
+    """Return the convex hull of the mesh of an actor's `category` and `shape`, body frame."""
     vertices = actor_mesh(category, shape).vertices.astype(np.float64)
     found = ConvexHull(vertices)
     rows = np.searchsorted(found.vertices, found.simplices, sorter=(order := np.argsort(found.vertices)))
@@ -39,9 +39,9 @@ def hull(category: str, shape: int) -> Hull:
 def amodal_boxes(
     scene: Scene, world_from_camera: Array, lens: Lens, actors: NDArray[np.int64], near_m: float = NEAR_M
 ) -> Array:
-    """Return (M, 4) x1 y1 x2 y2 [px] around all of each of `actors` (M,) that lies in front of the camera.
+    """Return the amodal 2-D boxes (M, 4) x1 y1 x2 y2 [px] of `actors` (M,), around all that is beyond the near plane.
 
-    Not clipped to the image, but NaN where they do not touch it. `world_from_camera` (4, 4) is of the optical frame.
+    Not clipped to the image; NaN where they do not touch it. `world_from_camera` (4, 4) is of the optical frame.
     """
     camera_from_world = inverse(world_from_camera)
     boxes = np.full((len(actors), 4), np.nan)
@@ -63,7 +63,7 @@ def amodal_boxes(
 
 
 def clipped(boxes: Array, lens: Lens) -> Array:
-    """Return boxes (M, 4) clipped to the image; of no area where they lie outside, NaN where they were."""
+    """Return boxes (M, 4) clipped to the image; of zero area where they lie outside, NaN where they are NaN."""
     last = (lens.width - 0.5, lens.height - 0.5)
     return np.clip(boxes, -0.5, (*last, *last))
 
@@ -80,7 +80,7 @@ def _area(boxes: Array) -> Array:
 
 
 def _may_show(scene: Scene, camera_from_world: Array, lens: Lens, actors: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return (M,) false for actors whose bounding sphere lies outside the pyramid that the image sees."""
+    """Return (M,) whether each actor's bounding sphere touches the camera's viewing frustum (frustum culling)."""
     trace, index = scene.trace, scene.index
     size = trace.size[actors]
     drift = abs(scene.offset_s) * np.linalg.norm(np.nan_to_num(trace.velocity[index, actors]), axis=1)
@@ -93,14 +93,14 @@ def _may_show(scene: Scene, camera_from_world: Array, lens: Lens, actors: NDArra
 
 
 def _border(lens: Lens) -> Array:
-    """Return pixels on the edges of the image."""
+    """Return (36, 2) pixels u, v on the edges of the image."""
     u, v = np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)
     across = [np.column_stack((u, np.full(9, edge))) for edge in (0, lens.height - 1)]
     return np.concatenate((*across, *(np.column_stack((np.full(9, edge), v)) for edge in (0, lens.width - 1))))
 
 
 def _in_front(points: Array, edges: NDArray[np.int64], near_m: float) -> Array:
-    """Return the corners of the part of a hull beyond the plane z = `near_m`."""
+    """Return the vertices (V, 3) of a hull clipped to z >= `near_m`: those beyond, and edges' cuts with the plane."""
     ahead = points[:, 2] >= near_m
     one, other = (points[end] for end in edges[ahead[edges[:, 0]] != ahead[edges[:, 1]]].T)
     share = (near_m - one[:, 2:]) / (other[:, 2:] - one[:, 2:])
@@ -108,7 +108,7 @@ def _in_front(points: Array, edges: NDArray[np.int64], near_m: float) -> Array:
 
 
 def _project(lens: Lens, points: Array) -> Array:
-    """Return pixels (N, 2) of points in front of the camera; distortion is followed as far as the lens is trusted."""
+    """Return pixels (N, 2) of points (N, 3) before the camera; points too far out for the distortion are drawn in."""
     if lens.distortion().any():
         plane = points[:, :2] / points[:, 2:]
         radius = np.linalg.norm(plane, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The signs and signal heads that show in an image."""
+"""Image annotations of traffic signs and signal heads: classes, signal states, visible boxes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,20 +7,21 @@ from flcav.sensors.frame import Array, SignViews
 from flcav.sensors.labels.views import thing_regions
 from flcav.world.scene import Scene
 
-READABLE = np.cos(np.radians(80.0))  # of the angle between the line of sight and where the sign faces
+READABLE = np.cos(np.radians(80.0))  # of the largest angle between a sign's normal and the line of sight
 STATES = {
     **dict.fromkeys("rR", "red"),
     **dict.fromkeys("yY", "amber"),
     **dict.fromkeys("gG", "green"),
     "u": "red_amber",
-    "s": "red",  # with a green arrow, which the heads do not have
-}  # SUMO's letters; any other is "off"
+    "s": "red",  # in SUMO a red with a green right-turn arrow; the heads have no arrow
+}  # by SUMO's letters for link states; all others are "off"
 
 
 def view_signs(scene: Scene, world_from_camera: Array, instance: NDArray[np.int32]) -> SignViews:
-    """Return the signs and signals of which an image shows the readable side.
+    """Return the signs and signal heads whose front an image shows.
 
-    `instance` (H, W) is -(t + 1) at the town's thing t. The scene stands at the instant of the image.
+    `instance` (H, W) is -(t + 1) at the town's thing t; `world_from_camera` (4, 4) is the camera's pose. The scene is
+    at the instant of the image.
     """
     things = scene.things
     regions = thing_regions(instance, len(things))

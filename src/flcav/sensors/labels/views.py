@@ -1,4 +1,4 @@
-"""What a camera shows of each actor: pixels, boxes, truncation, occlusion."""
+"""Image annotations of actors: visible pixels, visible and amodal boxes, truncation, occlusion."""
 
 from typing import NamedTuple
 
@@ -16,19 +16,19 @@ OUTER_EDGES = np.array((-0.5, -0.5, 0.5, 0.5))  # from the centres of the outerm
 
 
 class Regions(NamedTuple):
-    """The visible pixels of K instances."""
+    """Pixel counts and bounding boxes of K instances in an image."""
 
-    pixels: NDArray[np.int64]  # (K,)
-    box: NDArray[np.float64]  # (K, 4) x1 y1 x2 y2 [px], the pixels' outer edges; NaN where there are none
+    pixels: NDArray[np.int64]  # (K,) number of pixels
+    box: NDArray[np.float64]  # (K, 4) x1 y1 x2 y2 [px], to the pixels' outer edges; NaN where there are none
 
 
 def actor_regions(instance: NDArray[np.int32], count: int) -> Regions:
-    """Return the regions of actors 0 to `count` - 1, which a camera's `instance` (H, W) shows as 1 to `count`."""
+    """Return the regions of actors 0 to `count` - 1, whose values in the `instance` image (H, W) are 1 to `count`."""
     return _regions(instance, count, 1)
 
 
 def thing_regions(instance: NDArray[np.int32], count: int) -> Regions:
-    """Return the regions of things 0 to `count` - 1, which a camera's `instance` (H, W) shows as -1 to -`count`."""
+    """Return the regions of things 0 to `count` - 1, whose values in the `instance` image (H, W) are -1 to -`count`."""
     return _regions(instance, count, -1)
 
 
@@ -54,7 +54,7 @@ def _collect(instance, sign, pixels, box):
                 box[number, 3] = max(box[number, 3], v)
 
 
-SAMPLES = 4096  # of an actor's rectangle, about; a large one is sampled in every n-th row and column
+SAMPLES = 4096  # pixels sampled of an amodal box for its occlusion, about; of larger ones every n-th row and column
 NO_PIXEL = np.zeros((0, 2), np.int64)
 
 
@@ -66,14 +66,15 @@ def view_actors(
     regions: Regions,
     actors: NDArray[np.int64],
 ) -> Views:
-    """Return how `actors` (M,) appear in an image whose `instance` (H, W) is a + 1 at the scene's actor a.
+    """Return the image annotations of `actors` (M,): 2-D boxes, pixels, truncation and occlusion.
 
-    `regions` are those of all the scene's actors. The scene stands at the instant of the image.
+    `instance` (H, W) is a + 1 at the scene's actor a, `regions` are those of all the scene's actors. The scene is at
+    the instant of the image. Occlusion compares an image's pixels with rays cast at the actor alone.
     """
     box = amodal_boxes(scene, world_from_camera, lens, actors)
     occlusion = np.ones(len(actors))
     inside = clipped(box, lens)
-    for row in np.flatnonzero(regions.pixels[actors]):  # of the others nothing is visible, whatever they would show
+    for row in np.flatnonzero(regions.pixels[actors]):  # the occlusion of the others is 1
         actor = int(actors[row])
         sampled = _sampled(inside[row])
         visible = np.count_nonzero(instance[np.ix_(*sampled)] == actor + 1)
@@ -90,7 +91,7 @@ def view_actors(
 
 
 def _sampled(box: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows and the columns of the pixels by which an actor in `box` (4,) is judged."""
+    """Return the rows and the columns of the pixels sampled for the occlusion of an actor with the `box` (4,)."""
     x1, y1, x2, y2 = box
     step = max(1, int(np.sqrt((x2 - x1) * (y2 - y1) / SAMPLES)))
     first_column, first_row = int(np.ceil(x1)), int(np.ceil(y1))
@@ -104,7 +105,7 @@ def _unoccluded(
     actor: int,
     sampled: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> int:
-    """Return how many of the sampled pixels would show the actor in an empty world."""
+    """Return the number of sampled pixels that show the actor in an empty world."""
     rows, columns = sampled
     rays = directions(lens).reshape(lens.height, lens.width, 3)[np.ix_(rows, columns)].reshape(-1, 3)
     if not len(rays):

@@ -1,1 +1,1 @@
-"""LiDAR: beams, returns, weather, motion during a spin."""
+"""LiDAR simulation: beam patterns, ray casting, returns and their intensity, fog and rain, rolling spins, occlusion."""

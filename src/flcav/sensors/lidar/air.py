@@ -1,4 +1,23 @@
-"""Fog, rain and snow between a LiDAR and what it hits: attenuation, backscatter, noise of ranges."""
+"""Fog and rain in front of a LiDAR: extinction, backscatter of fog, returns from drops, noise of ranges.
+
+Fog after Hahner et al., "Fog Simulation on Real LiDAR Point Clouds for 3D Object Detection in Adverse Weather", ICCV
+2021. With the extinction a = ln 20 / MOR and the backscattering b = 0.046 / MOR (MOR: meteorological optical range),
+the return of a surface at R0 is weaker by exp(-2 a R0) (eq. 7), and the fog before it returns (eqs. 9 and 10)
+
+    P(R) / P0' = b / b0 * integral over t in 0..2T of sin^2(pi t / 2T) x(r) exp(-2 a r) / r^2 U(R0 - r) dt,
+    r = R - c t / 2,
+
+where T = 20 ns is the pulse's half-power width, x(r) rises linearly from 0 to 1 as the beam enters the receiver's field
+of view, and b0 = 1e-6 / pi is the paper's differential reflectivity of a surface, here of a white one at normal
+incidence. The fog's return is at the R of the largest P(R), and is detected where it exceeds that of the surface.
+
+Extinction and range noise of rain after Goodin et al., "Predicting the Influence of Rain on LIDAR in ADAS", Electronics
+8:89 (2019), eqs. 6 and 8. Returns from drops after Kilic et al., "LISA", arXiv 2107.07004, section 3: Marshall-Palmer
+sizes n(D) = N0 exp(-L D), each drop a sphere that fills the share (D / beam)^2 of the beam and reflects it by its
+Fresnel reflectance. LISA draws every drop of every beam; here the power of the brightest drop is drawn from its
+distribution in closed form: the number of drops in a beam that are brighter than P is Poisson with the mean
+m(P) = integral of (pi / 4) (b r)^2 n(D > D_P(r)) dr over the beam.
+"""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -13,22 +32,23 @@ from flcav.world.weather import Weather
 
 Floats = NDArray[np.float32]
 
-PULSE_S = 20e-9
-SEEN_FROM_M, SEEN_WHOLLY_M = 0.9, 1.0
-SURFACE_PER_SR = 1e-6 / np.pi
-STEP_M = 0.1
-REACH_M = 16.0  # behind this, fog adds nothing to the peak
-QUANTILES = 256
+PULSE_S = 20e-9  # T, half-power width of the pulse
+SEEN_FROM_M, SEEN_WHOLLY_M = 0.9, 1.0  # ranges where the receiver's overlap x(r) leaves 0 and reaches 1
+SURFACE_PER_SR = 1e-6 / np.pi  # b0
+STEP_M = 0.1  # of ranges in the tables of fog
+REACH_M = 16.0  # fog beyond this does not raise the peak
+QUANTILES = 256  # of the tabulated distribution below
 SPREAD_M = (10.0 * betaincinv(2.0, 20.0, (np.arange(QUANTILES) + 0.5) / QUANTILES)).astype(np.float32)
 """Quantiles of how far behind the peak a soft return is reported: 10 m * Beta(2, 20), as published with the paper."""
 
 
 @lru_cache(maxsize=64)
 def soft_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Floats, Floats]:
-    """Return the fog's largest power before a surface at each range, and the range [m] at which it is received.
+    """Return the peak power of the fog's return before a surface and the range [m] of that peak, by range of surface.
 
-    Both are (K,) float32; entry k is for a surface at k * STEP_M, the last for everything beyond. Power is relative to
-    that from a white surface at 1 m. `fog_per_m` is the fog's own extinction, `extinction_per_m` that of all the air.
+    Both are (K,) float32; entry k is for a surface at k * STEP_M, the last for all ranges beyond. Power is relative to
+    that of a white surface at 1 m. `fog_per_m` is the extinction of the fog alone, `extinction_per_m` of fog and rain.
+    Source: Hahner et al., eqs. 9 and 10.
     """
     r = np.arange(0.0, REACH_M + STEP_M / 2, STEP_M)
     seen = np.clip((r - SEEN_FROM_M) / (SEEN_WHOLLY_M - SEEN_FROM_M), 0.0, 1.0)
@@ -36,54 +56,54 @@ def soft_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Floats, Flo
     delay = 2 * (r[:, None] - r) / speed_of_light  # (received R, scattered r)
     pulse = np.where((delay >= 0) & (delay <= 2 * PULSE_S), np.sin(np.pi * delay / (2 * PULSE_S)) ** 2, 0.0)
     received = np.cumsum(pulse * answer, axis=1) * (2 * STEP_M / speed_of_light)  # (R, R0), integrated over t
-    received = np.triu(received)  # not reported behind the surface
+    received = np.triu(received)  # no fog is seen behind the surface
     backscatter = 0.046 * fog_per_m / np.log(20.0)
     power = received.max(axis=0) * backscatter / SURFACE_PER_SR
     return power.astype(np.float32), r[received.argmax(axis=0)].astype(np.float32)
 
 
-N0 = 8000.0  # [1 / m^3 / mm]
-DROP_REFLECTANCE = ((1.328 - 1) / (1.328 + 1)) ** 2  # of water, face on, at 905 nm
-NEAREST_M = 1.5  # nearer drops are outside the receiver's view
+N0 = 8000.0  # of Marshall and Palmer [1 / m^3 / mm]
+DROP_REFLECTANCE = ((1.328 - 1) / (1.328 + 1)) ** 2  # Fresnel reflectance of water at normal incidence, 905 nm
+NEAREST_M = 1.5  # nearer drops are outside the receiver's field of view
 FARTHEST_M = 40.0  # no drop farther away is ever bright enough
-POWERS = 64
-SHARES = 32
+POWERS = 64  # rows of the table of powers
+SHARES = 32  # quantiles of range for each power
 
 
 class Drops(NamedTuple):
-    """The brightest drop in a beam of unlimited length."""
+    """Distribution of the power and range of the brightest rain drop in a beam of unlimited length."""
 
     number: NDArray[np.float32]  # (POWERS,) mean number of drops brighter than `power`, ascending
-    power: NDArray[np.float32]  # (POWERS,) relative to a white surface at 1 m, descending
+    power: NDArray[np.float32]  # (POWERS,) relative to that of a white surface at 1 m, descending
     range_m: NDArray[np.float32]  # (POWERS, SHARES) evenly spaced quantiles of the range of a drop of that power
 
 
 def rain_extinction(rain_mm_h: float) -> float:
-    """Return the extinction coefficient of rain [1/m]."""
+    """Return the extinction coefficient of rain [1/m] (Goodin et al., eq. 6)."""
     return 0.01 * rain_mm_h**0.6
 
 
 def rain_range_noise(rain_mm_h: float) -> float:
-    """Return the standard deviation of the measured range, as a share of the range."""
+    """Return the standard deviation of the measured range over the range (Goodin et al., eq. 8)."""
     return 0.02 * (1 - np.exp(-rain_mm_h)) ** 2
 
 
 def drops(rain_mm_h: float, extinction_per_m: float, divergence_rad: float, least_power: float) -> Drops:
-    """Return how bright drops are in rain of `rain_mm_h` > 0, down to `least_power`.
+    """Return the distribution of the brightest drop in rain of `rain_mm_h` > 0, for powers of `least_power` and more.
 
-    `extinction_per_m` is that of everything in the air; the beam is as wide as `divergence_rad` times the range.
+    `extinction_per_m` is that of fog and rain; the beam is `divergence_rad` times the range wide. Source: LISA.
     """
     slope = 4.1 * rain_mm_h**-0.21  # L [1/mm]
     edges = np.linspace(NEAREST_M, FARTHEST_M, 512)
     r, dr = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     beam = np.tan(divergence_rad) * r
-    brightest = DROP_REFLECTANCE * np.exp(-2 * extinction_per_m * r) / r**2  # of a drop as wide as the beam
+    brightest = DROP_REFLECTANCE * np.exp(-2 * extinction_per_m * r) / r**2  # return of a drop that fills the beam
     power = np.geomspace(max(brightest.max(), 2 * least_power), least_power, POWERS)
     share = power[:, None] / brightest  # of the beam that the drop fills
-    thicker = N0 / slope * np.exp(-slope * 1e3 * beam * np.sqrt(share))  # drops per m^3 at least that bright
+    thicker = N0 / slope * np.exp(-slope * 1e3 * beam * np.sqrt(share))  # drops per m^3 of at least that power
     count = np.where(share <= 1, thicker, 0.0) * np.pi / 4 * beam**2 * dr
     number = count.sum(axis=1)
-    just = np.diff(count, axis=0, prepend=0.0)  # how many are that bright and no brighter, by range
+    just = np.diff(count, axis=0, prepend=0.0)  # drops between this power and the next higher one, by range
     upto = np.cumsum(just, axis=1)
     wanted = (np.arange(SHARES) + 0.5) / SHARES
     ranges = [np.interp(wanted, row / row[-1], r) if row[-1] > 0 else np.full(SHARES, NEAREST_M) for row in upto]
@@ -95,21 +115,21 @@ NO_DROPS = Drops(np.zeros(1, np.float32), np.zeros(1, np.float32), np.zeros((1, 
 
 
 class Air(NamedTuple):
-    """The air between a LiDAR and what it looks at; powers are relative to a white surface at 1 m."""
+    """Extinction, fog and rain along a LiDAR's beams; powers are relative to that of a white surface at 1 m."""
 
     two_way_per_m: float  # twice the extinction coefficient
-    range_noise: float  # standard deviation of the measured range, as a share of the range
-    soft_power: Floats  # (K,) of the fog before a surface at k * STEP_M; zero without fog
-    soft_range_m: Floats  # (K,)
+    range_noise: float  # standard deviation of the measured range over the range
+    soft_power: Floats  # (K,) peak of the fog's return before a surface at k * STEP_M; zero without fog
+    soft_range_m: Floats  # (K,) range of that peak
     drop_number: Floats  # (L,) mean number of drops in a beam brighter than `drop_power`; zero without rain
-    drop_power: Floats  # (L,)
-    drop_range_m: Floats  # (L, SHARES) quantiles
+    drop_power: Floats  # (L,) descending
+    drop_range_m: Floats  # (L, SHARES) quantiles of a drop's range
 
 
 def air_in(weather: Weather, divergence_rad: float, least_power: float) -> Air | None:
-    """Return the air of `weather`; None where it is clear.
+    """Return the extinction, fog and rain of `weather`; None where there is neither fog nor rain.
 
-    A beam is as wide as `divergence_rad` times the range; drops that send back less than `least_power` do not matter.
+    A beam is `divergence_rad` times the range wide; drops whose return is below `least_power` are left out.
     """
     rain, fog = weather.rain_mm_h, weather.fog_per_m
     if rain == 0 and fog == 0:
@@ -123,12 +143,13 @@ def air_in(weather: Weather, divergence_rad: float, least_power: float) -> Air |
 def through_air(
     distance: Floats, brightness: Floats, air: Air, rng: np.random.Generator
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return (N,) distance and brightness of the strongest echo of each ray, and whether it is the air's own.
+    """Return the strongest return of each of N rays: distance [m], brightness, whether fog or rain sent it; each (N,).
 
-    The arguments are those in clear air: inf and 0 where a ray meets nothing.
+    `distance` and `brightness` (N,) are those in clear air: inf and 0 where a ray meets nothing. Brightness is power
+    times the squared distance: 1 for a white surface at normal incidence.
     """
     rays = len(distance)
-    brightest = rng.standard_exponential(rays, np.float32)  # drops above its power, on average
+    brightest = rng.standard_exponential(rays, np.float32)  # m(P) of the brightest drop's power P
     place = rng.integers(SHARES, size=rays, dtype=np.uint8)
     behind = rng.integers(QUANTILES, size=rays, dtype=np.uint8)
     distance, brightness, aerial = distance.copy(), brightness.copy(), np.zeros(rays, np.bool_)

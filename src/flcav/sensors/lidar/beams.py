@@ -1,4 +1,14 @@
-"""Beam patterns of LiDARs: elevations by name, and the sensor of CARLA."""
+"""Beam patterns of LiDAR models, from their makers' data sheets, and the LiDAR returns of CARLA.
+
+Patterns are for `beams: <name>` in a rig: Velodyne VLP-16 (63-9229), HDL-32E (97-0038), HDL-64E (63-HDL64E), VLS-128
+"Alpha Prime" (63-9679) at 10 spins a second, and Ouster OS1-128 in its mode 1024x10. Elevations are nominal: those of
+a unit differ by some hundredths of a degree.
+
+CARLA's `sensor.lidar.ray_cast` (its documentation, core sensors, "Lidar sensor") gives a return at range d the
+intensity exp(-a d), whatever the surface. A share of all rays is lost; of the rest, returns with an intensity below a
+limit are lost with a probability that rises linearly from 0 at the limit to its value at intensity 0. Weather plays no
+part.
+"""
 
 from typing import NamedTuple
 
@@ -10,11 +20,11 @@ from flcav.config import Config
 
 
 class Beams(NamedTuple):
-    """What the name of a LiDAR stands for."""
+    """The beam pattern and range of a LiDAR model."""
 
     elevations_deg: tuple[float, ...]  # of each channel, from the highest
     azimuth_steps: int  # firings per spin
-    range_m: float
+    range_m: float  # largest range
 
 
 def _even(high: float, low: float, count: int) -> tuple[float, ...]:
@@ -38,7 +48,7 @@ BEAMS: dict[str, Beams] = {
 
 
 class CarlaReturns(Config):
-    """CARLA's sensor attributes and their defaults."""
+    """The attributes of CARLA's LiDAR, with CARLA's names and defaults."""
 
     atmosphere_attenuation_rate: float = Field(default=0.004, ge=0, le=10)  # a of exp(-a distance) [1/m]
     dropoff_general_rate: float = Field(default=0.45, ge=0, le=1)  # share of all rays that is lost
@@ -53,10 +63,10 @@ def carla_returns(
     noise_m: NDArray[np.float32],
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return (M, 4) points and (M,) the rays they come from.
+    """Return the point cloud of CARLA's LiDAR and the ray (M,) of each point.
 
-    `directions` (N, 3) and `distance` (N,) are those of the surfaces met (inf where none), `noise_m` (N,) the errors
-    of the measured ranges.
+    Points (M, 4) are x, y, z [m] in the sensor's frame and intensity. `directions` (N, 3) are unit rays, `distance`
+    (N,) leads to the surfaces met (inf where none), `noise_m` (N,) are the errors of the measured ranges.
     """
     intensity = np.exp(-settings.atmosphere_attenuation_rate * distance)
     at_zero, limit = settings.dropoff_zero_intensity, settings.dropoff_intensity_limit

@@ -1,8 +1,8 @@
-"""A spinning LiDAR: its rays, what they meet through glass and air, and what the detector makes of the echoes.
+"""Simulation of a spinning LiDAR: ray casting through glass, the power equation, fog and rain, and detection.
 
-Power received from a surface, relative to a white one face on at 1 m: P = reflectivity * cos(incidence) / R^2,
-detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3). Rain, fog and wet roads change P; in clear
-weather they cost nothing and draw no random numbers.
+The power received from a surface, relative to that of a white one at normal incidence at 1 m, is
+P = reflectivity * cos(incidence) / R^2; it is detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3).
+Rain, fog and wet roads change P; in clear weather they cost nothing and draw no random numbers.
 """
 
 from functools import lru_cache
@@ -25,7 +25,7 @@ CLEAR = Weather()
 
 
 class Lidar(Config):
-    """What a LiDAR is built like; its pose is the rig's."""
+    """Settings of a spinning LiDAR; its mount is in the rig."""
 
     beams: str | None = None  # name of a model: its elevations, and its azimuth steps and range if not given
     channels: int = Field(default=32, ge=1, le=256)  # beams above each other
@@ -85,9 +85,9 @@ class Lidar(Config):
 
 
 def ray_pattern(lidar: Lidar) -> NDArray[np.float32]:
-    """Return (channels * azimuth_steps, 3) unit directions, sensor frame, channel after channel from the highest.
+    """Return the ray directions of one spin: (channels * azimuth_steps, 3) unit vectors, sensor frame; read-only.
 
-    Within a channel, azimuth runs counter-clockwise once round from straight ahead.
+    Channel after channel from the highest; within a channel, azimuth runs counter-clockwise from straight ahead.
     """
     return _ray_pattern(lidar.channels, lidar.up_deg, lidar.down_deg, lidar.elevations_deg, lidar.azimuth_steps)
 
@@ -107,7 +107,7 @@ def _ray_pattern(
 
 
 def draw_passes(lidar: Lidar, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Return, for each ray of the pattern, whether it passes the panes of glass it meets."""
+    """Return for each ray of the pattern whether it passes all panes of glass that it meets: (N,), drawn at random."""
     return rng.random(lidar.channels * lidar.azimuth_steps, np.float32) < lidar.glass_pass
 
 
@@ -118,9 +118,10 @@ def cast(
     passes: NDArray[np.bool_],
     hidden: int | None = None,
 ) -> Echoes:
-    """Return the first opaque surface within range of each ray, in a world without the actor `hidden`.
+    """Return the surface within range from which each ray of one spin returns, in a world without the actor `hidden`.
 
-    A rolling LiDAR is taken to ride on `hidden`, and to stand still where that is None.
+    `passes` (N,) marks the rays that go through glass. A rolling LiDAR rides on `hidden`; it stands still where that is
+    None.
     """
     pattern, surfaces = ray_pattern(lidar), scene.surfaces
 
@@ -160,7 +161,10 @@ def measure(
     rng: np.random.Generator,
     weather: Weather | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return what the detector reports of `echoes`: see `scan`."""
+    """Return the points that the detector reports, (M, 4), and the actor (M,) each comes from: see `scan`.
+
+    `echoes` are the surfaces from which the spin's rays return, `weather` is clear by default.
+    """
     rays = len(echoes.distance)
     chance = rng.random(rays, np.float32)
     noise = rng.integers(LEVELS, size=rays, dtype=np.uint16)
@@ -215,18 +219,18 @@ def scan(
     hidden: int | None = None,
     weather: Weather | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return one sweep at the scene's instant, as if the actor `hidden` (the carrier) were not there.
+    """Return the point cloud of one spin at the scene's instant, without the actor `hidden` (the carrier).
 
-    The first array is (N, 4): x, y, z [m] in the sensor frame and intensity in [0, 1]; the second (N,): the trace's
-    actor each return comes from, -1 for the town, rain and fog. Where no `weather` is given it is clear.
+    The first array is (N, 4): x, y, z [m] in the sensor's frame and intensity in [0, 1]. The second is (N,): the
+    trace's actor each return comes from, -1 for the town, rain and fog. `weather` is clear by default.
     """
     echoes = cast(scene, world_from_sensor, lidar, draw_passes(lidar, rng), hidden)
     return measure(scene, world_from_sensor, lidar, echoes, rng, weather)
 
 
 def point_times_s(lidar: Lidar, points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return (N,) how long after the middle of the spin each of `points` (N, >=2) was measured [s].
+    """Return the time (N,) of each of `points` (N, >=2, sensor frame) after the middle of the spin [s].
 
-    From -0.5 to 0.5 / `rate_hz` for a rolling LiDAR, else all 0.
+    From -0.5 / `rate_hz` to 0.5 / `rate_hz` for a rolling LiDAR, else 0.
     """
     return time_in_spin_s(points, 1 / lidar.rate_hz) if lidar.rolling else np.zeros(len(points), np.float32)

@@ -1,4 +1,7 @@
-"""From ray hits to echoes: through panes of glass, and into the detector."""
+"""LiDAR returns: surfaces met through panes of glass, their brightness (reflectance models), and detection.
+
+Reflectance is Lambertian, Oren-Nayar for rough surfaces, stronger for retro-reflectors, and lower on wet roads.
+"""
 
 from typing import NamedTuple, Protocol
 
@@ -11,13 +14,13 @@ from flcav.world.materials import Material
 from flcav.world.rays.raycaster import Hits
 
 PANES = 6  # more panes than these stop a ray
-PANE_TRANSMISSION = 0.8  # of the power, there and back
-RETRO_GAIN = 4.0  # how much brighter than a white surface a retro-reflector is
+PANE_TRANSMISSION = 0.8  # of the power, both ways together
+RETRO_GAIN = 4.0  # factor of a retro-reflector's reflectivity, at any incidence
 GLASS = int(Material.GLASS)
 ROAD, SIDEWALK = int(Material.ROAD), int(Material.SIDEWALK)
-WATER_INDEX = 1.33
-TURNED_BACK = 1 - (1 - 0.066) / WATER_INDEX**2  # share of diffuse light that water reflects back to what it covers
-AFTER_PANE_M = 0.002
+WATER_INDEX = 1.33  # of refraction
+TURNED_BACK = 1 - (1 - 0.066) / WATER_INDEX**2  # p: share of diffuse light that the film reflects back down
+AFTER_PANE_M = 0.002  # a ray goes on so far behind a pane
 ROUGH = np.array(
     [
         name in ("GROUND", "ROAD", "SIDEWALK", "WALL", "ROOF", "BARK", "LEAF", "CLOTH", "TROUSERS")
@@ -29,20 +32,20 @@ QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of t
 
 
 class Trace(Protocol):
-    """`Target.trace` with everything but the rays settled, of which it is told the numbers."""
+    """A ray caster over a fixed set of rays, given the indices of those to cast: see `Target.trace`."""
 
     def __call__(self, rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
-        """Return the first hits."""
+        """Return the first hits of `rays`, beyond `near_m` (one for each of them) where given."""
         ...
 
 
 class Echoes(NamedTuple):
-    """The surface each of N rays comes back from."""
+    """The surface from which each of N LiDAR rays returns."""
 
     distance: NDArray[np.float32]  # (N,) [m]; inf where none
-    instance: NDArray[np.int32]  # (N,) -1 where none
-    face: NDArray[np.int32]  # (N,)
-    material: NDArray[np.uint8]  # (N,) a Material; meaningless where none
+    instance: NDArray[np.int32]  # (N,) instance of the scene; -1 where none
+    face: NDArray[np.int32]  # (N,) face of the instance's mesh
+    material: NDArray[np.uint8]  # (N,) a Material; undefined where none
     panes: NDArray[np.uint8]  # (N,) panes of glass on the way
 
 
@@ -52,7 +55,7 @@ def cast_through_glass(
     first: NDArray[np.int64],
     material: NDArray[np.uint8],
 ) -> Echoes:
-    """Return what comes back along N rays when those that `passes` (N,) marks go through glass.
+    """Return the surface from which each of N rays returns; rays marked in `passes` (N,) go through up to PANES panes.
 
     Face f of instance i is of `material[first[i] + f]`.
     """
@@ -73,7 +76,7 @@ def cast_through_glass(
 
 @compiled
 def _look_up(instance, face, first, material, passes, glass):
-    """Return the materials met, and the numbers of the rays that meet glass and pass it."""
+    """Return the material (N,) at each ray's hit, and the indices of the rays that hit glass and pass it."""
     found = np.zeros(len(instance), np.uint8)
     through = np.empty(len(instance), np.int64)
     count = 0
@@ -88,10 +91,12 @@ def _look_up(instance, face, first, material, passes, glass):
 
 @compiled
 def brightness(echoes, directions, surfaces, sensor_from_instance, wetness, roughness=0.0):
-    """Return how bright each ray's surface is seen: 1 for a white one face on, 0 where there is none. (N,) float32.
+    """Return the brightness of each ray's surface, reflectivity * cos(incidence): (N,) float32, 0 where there is none.
 
-    `sensor_from_instance` (I, 3, 3) turns normals. On roads a film of water dims it as `wetness` (0..1) grows. Ground,
-    masonry, plants and cloth are rough by `roughness` [rad], see `rough_cosine`.
+    It is 1 for a white surface at normal incidence. `directions` (N, 3) are unit rays, sensor frame;
+    `sensor_from_instance` (I, 3, 3) rotates normals into that frame. A water film dims roads and sidewalks in
+    proportion to `wetness` (0 to 1). Ground, masonry, plants and cloth are Oren-Nayar surfaces of slope deviation
+    `roughness` [rad]. Each pane on the way costs PANE_TRANSMISSION.
     """
     _, instance, face, materials, panes = echoes
     turn = sensor_from_instance.reshape(-1, 9)
@@ -126,10 +131,10 @@ def brightness(echoes, directions, surfaces, sensor_from_instance, wetness, roug
 
 @compiled
 def rough_cosine(cosine, roughness):
-    """Return what takes the place of the cosine of incidence on a surface of facets, seen from where it is lit.
+    """Return the Oren-Nayar reflectance, seen from the light, over that of a Lambertian surface at normal incidence.
 
-    `roughness` is the standard deviation of the facets' slopes [rad]: Oren and Nayar, "Generalization of Lambert's
-    reflectance model", SIGGRAPH 1994, eq. 30, for equal directions in and out. A street is hardly darker far off.
+    `cosine` is that of the incidence, `roughness` the standard deviation of the facets' slopes [rad]. Source: Oren and
+    Nayar, "Generalization of Lambert's reflectance model", SIGGRAPH 1994, eq. 30, for equal directions in and out.
     """
     square = roughness * roughness
     flat = 1 - 0.5 * square / (square + 0.33)
@@ -138,11 +143,11 @@ def rough_cosine(cosine, roughness):
 
 @compiled
 def under_water(cosine, reflectivity):
-    """Return how bright a diffuse surface is under a film of water, relative to dry.
+    """Return the brightness of a diffuse surface under a water film, relative to dry: (1 - F)^2 / n^2 / (1 - p a).
 
-    Light enters and leaves through the film, whose Fresnel reflectance F grows towards grazing incidence, spreads by
-    1 / n^2 on the way out, and what is turned back inside (p) meets the surface again: Lekner and Dorf, "Why some
-    things are darker when wet", Applied Optics 27:1278 (1988).
+    F is the film's Fresnel reflectance at the incidence of that `cosine`, n the refractive index, p the share that the
+    film reflects back down, a the `reflectivity`: Lekner and Dorf, "Why some things are darker when wet", Applied
+    Optics 27:1278 (1988).
     """
     inside = np.sqrt(1 - (1 - cosine**2) / WATER_INDEX**2)
     across = (cosine - WATER_INDEX * inside) / (cosine + WATER_INDEX * inside)
@@ -166,12 +171,12 @@ def detect(
     points,
     actor,
 ):
-    """Write the detected echoes' `points` (N, 4) and `actor` (N,) and return their number.
+    """Detect returns: write the first M rows of `points` (N, 4) and `actor` (N,), and return M.
 
-    An echo of power P = `brightness` / `distance`^2 is detected with a probability that rises from 0 at 0.7 P_min to
-    `keep` at 1.3 P_min; `chance` (N,) in [0, 1) decides. `inverse_threshold` is 1 / P_min. `source` (N,) is the actor
-    that each echo comes from. `noise` (N,) picks a quantile of the range error, whose standard deviation is `noise_m`
-    and, independently, `noise_share` of the range.
+    A return of power P = `brightness` / `distance`^2 is detected with a probability that rises linearly from 0 at
+    0.7 P_min to `keep` at 1.3 P_min; `inverse_threshold` is 1 / P_min, `chance` (N,) in [0, 1) decides. `noise` (N,) is
+    the quantile of a normal range error of standard deviation hypot(`noise_m`, `noise_share` * distance). A point is
+    x, y, z [m] in the sensor's frame and the brightness, at most 1. `source` (N,) is the actor each return comes from.
     """
     count = 0
     for ray in range(len(directions)):

@@ -1,8 +1,8 @@
-"""A spin takes time: the sensor turns, and meanwhile it and everybody else move on.
+"""Rolling LiDAR spins: motion of the sensor and of the traffic during a spin, and its compensation.
 
-The beams look straight ahead at the scene's instant and turn counter-clockwise, so that a spin begins half its
-duration before and ends half its duration after. Azimuth is cut into SECTORS, each traced with the world as it is when
-the beams pass its middle. Points are left where the sensor measured them, each in the sensor's frame of its own time.
+The beams point straight ahead at the scene's instant and turn counter-clockwise: a spin begins half its duration before
+the instant and ends half its duration after. Azimuth is divided into SECTORS; each is cast with the world at the time
+when the beams pass the sector's middle. Points are not compensated: each is in the sensor's frame at its own time.
 """
 
 from collections.abc import Iterator
@@ -18,16 +18,17 @@ from flcav.world.trace import Trace
 Array = NDArray[np.float64]
 
 SECTORS = 36
-ROUNDING = 1e-6  # of a turn: what looks straight back belongs to the beginning of the spin, not to its end
+ROUNDING = 1e-6  # of a turn: a beam straight back belongs to the beginning of the spin, not to its end
 
 
 def sectors(
     scene: Scene, world_from_sensor: NDArray[np.float64], steps: int, spin_s: float, carrier: int | None
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Yield each sector's columns (C,) of the pattern and the (4, 4) pose of the sensor at its time.
+    """Yield for each sector its columns (C,) of the ray pattern and the (4, 4) pose of the sensor at its time.
 
-    While a sector is out, `scene` stands at its time; afterwards it stands where it was. `world_from_sensor` is the
-    pose at the scene's instant, `steps` the columns of a spin of `spin_s`, `carrier` the actor that the sensor is on.
+    `scene` is at the sector's time while the sector is in use; at the end it is moved back. `world_from_sensor` (4, 4)
+    is the pose at the scene's instant, `steps` the columns of a spin that lasts `spin_s`, `carrier` the actor that
+    carries the sensor (None: it stands still).
     """
     index, instant_s = scene.index, scene.offset_s
 
@@ -35,7 +36,7 @@ def sectors(
         return world_from_sensor if carrier is None else scene.world_from_actor(carrier) @ carrier_from_sensor
 
     carrier_from_sensor = np.eye(4) if carrier is None else inverse(scene.world_from_actor(carrier)) @ world_from_sensor
-    sector = (np.arange(steps) * SECTORS // steps + SECTORS // 2) % SECTORS  # in the order they are traced
+    sector = (np.arange(steps) * SECTORS // steps + SECTORS // 2) % SECTORS  # of each column, in the order of casting
     try:
         for number in range(SECTORS):
             columns = np.flatnonzero(sector == number)
@@ -46,13 +47,13 @@ def sectors(
 
 
 def time_in_spin_s(points: NDArray[np.float32], spin_s: float) -> NDArray[np.float32]:
-    """Return when each point (N, >=2) of a spin, in the sensor's frame, was measured: (N,) [s] after its middle."""
+    """Return the time (N,) [s] of each point (N, >=2, sensor frame) after the middle of the spin, by its azimuth."""
     turned = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
     return (((turned + ROUNDING) % 1.0 - 0.5) * spin_s).astype(np.float32)
 
 
 class Motion(NamedTuple):
-    """How a body moves about an instant of the traffic, as in `Scene.move_to`: world frame, about the vertical."""
+    """Planar rigid motion about an instant: constant acceleration and yaw rate, world frame, as in `Scene.move_to`."""
 
     origin: Array  # (3,) at the instant [m]
     velocity: Array  # (3,) [m/s]
@@ -61,20 +62,20 @@ class Motion(NamedTuple):
 
     @classmethod
     def of(cls, trace: Trace, index: int, actor: int) -> "Motion":
-        """Return the motion of a trace's actor, present at instant `index`."""
+        """Return the motion of `actor` of `trace` at instant `index`, at which it must be present."""
         at = index, actor
         return cls(trace.position[at], trace.velocity[at], trace.acceleration[at], float(trace.yaw_rate[at]))
 
     def carry(self, points: Array, times_s: NDArray[np.floating]) -> Array:
-        """Return (N, 3) where points that the body carries are `times_s` (N,) after the instant.
+        """Return the positions (N, 3), `times_s` (N,) after the instant, of points that the body carries.
 
-        `points` are where they are at the instant, such as those of a sweep, put into the world by its pose then: so
-        they come to lie where they were measured.
+        `points` (N, 3) are their positions at the instant. The points of a rolling sweep, put into the world by the
+        sensor's pose at the instant, are moved to where they were measured.
         """
         return _turn(points - self.origin, self.yaw_rate * times_s) + self.origin + self._way(times_s)
 
     def bring_back(self, points: Array, times_s: NDArray[np.floating]) -> Array:
-        """Return (N, 3) where points on the body, seen at `times_s` (N,) after the instant, are at the instant."""
+        """Return the positions (N, 3), at the instant, of points on the body measured `times_s` (N,) after it."""
         return _turn(points - self.origin - self._way(times_s), -self.yaw_rate * times_s) + self.origin
 
     def _way(self, times_s: NDArray[np.floating]) -> Array:

@@ -1,4 +1,7 @@
-"""How much more of each actor a sensor would see if nothing stood in the way: rays stopped before it, traced on."""
+"""Occlusion of actors for a LiDAR: occluded rays, counted by casting stopped rays again in an empty world.
+
+Only rays that end before an actor's bounding box and pass through it are cast again, against that actor alone.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +12,7 @@ from flcav.sensors.lidar.returns import cast_through_glass
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
 
-BOX_MARGIN_M = 0.01
+BOX_MARGIN_M = 0.01  # by which boxes are grown, so that no ray that grazes a mesh is missed
 
 
 def occluded_rays(
@@ -21,9 +24,10 @@ def occluded_rays(
     instance: NDArray[np.int32],
     actors: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """Return, for each of `actors` (K,), how many more rays of the sweep would come back from it in an empty world.
+    """Return for each of `actors` (K,) the number of rays that would return from it in an empty world, but do not.
 
-    `distance` (N,) is where the rays ended, `instance` (N,) at what: a + 1 at actor a.
+    `distance` (N,) [m] and `instance` (N,) are where the sweep's rays ended and at what: a + 1 at actor a. `passes`
+    (N,) marks the rays that go through glass.
     """
     pattern, surfaces = ray_pattern(lidar), scene.surfaces
     body_from_sensor = _bodies_from(scene.poses()[actors], world_from_sensor)
@@ -31,7 +35,7 @@ def occluded_rays(
         pattern, lidar.azimuth_steps, body_from_sensor, scene.trace.size[actors], BOX_MARGIN_M, distance
     )
     group = np.repeat(np.arange(len(actors)), counts)
-    if lidar.rolling:  # an actor may have been met before, or on its way to, where it is at the scene's instant
+    if lidar.rolling:  # an actor may have been hit at another place than where it is at the scene's instant
         others = instance[rays] != actors[group] + 1
         rays, group = rays[others], group[others]
     directions = pattern[rays]
@@ -45,7 +49,7 @@ def occluded_rays(
 
 
 def _bodies_from(poses: NDArray[np.float64], world_from_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (K, 4, 4) `body_from_sensor` of actors at `poses` (K, 4) x, y, z, yaw."""
+    """Return (K, 4, 4) transforms `body_from_sensor` of actors with the poses (K, 4) x, y, z, yaw."""
     cos, sin, zero, one = np.cos(poses[:, 3]), np.sin(poses[:, 3]), 0 * poses[:, 3], 0 * poses[:, 3] + 1
     turn = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
     found = np.tile(np.eye(4), (len(poses), 1, 1))
@@ -56,7 +60,7 @@ def _bodies_from(poses: NDArray[np.float64], world_from_sensor: NDArray[np.float
 
 @compiled
 def _stopped_rays(directions, steps, body_from_sensor, size, margin, distance):
-    """Return the rays of `rays_into_box` for each of K boxes, one after another, and (K,) how many they are."""
+    """Return the rays that end before each of K boxes on their way, box after box, and their number (K,) by box."""
     counts = np.zeros(len(size), np.int64)
     found = np.empty(1024, np.int64)
     total = 0
@@ -74,10 +78,10 @@ def _stopped_rays(directions, steps, body_from_sensor, size, margin, distance):
 
 @compiled
 def rays_into_box(directions, steps, body_from_sensor, size, margin, distance):
-    """Return the numbers of the rays of a spinning pattern (channels * steps, 3) that end before a box on their way.
+    """Return the indices of the rays of a spinning pattern (channels * steps, 3) that end before a box on their way.
 
-    They end at `distance` (N,) [m]. The box of `size` (3,), grown by `margin` [m], stands on the body's origin. Only
-    the columns between its corners' azimuths are tried.
+    Rays end at `distance` (N,) [m]. The box of `size` (3,), grown by `margin` [m], stands on the origin of the body
+    frame. Slab test, for the columns between the azimuths of the box's corners only.
     """
     low = np.array([-size[0] / 2, -size[1] / 2, 0.0]) - margin
     high = np.array([size[0] / 2, size[1] / 2, size[2]]) + margin
@@ -109,7 +113,7 @@ def rays_into_box(directions, steps, body_from_sensor, size, margin, distance):
 
 @compiled
 def _columns(low, high, body_from_sensor, steps):
-    """Return the first column and the number of columns of the pattern that can meet the box; the first is >= 0."""
+    """Return the first column (>= 0) of the pattern that can hit the box, and the number of such columns."""
     origin = body_from_sensor[:3, 3]
     ahead, left = body_from_sensor[:3, 0].copy(), body_from_sensor[:3, 1].copy()  # the sensor's axes
     middle = (low + high) / 2 - origin

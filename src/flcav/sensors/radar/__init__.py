@@ -1,1 +1,1 @@
-"""Radar: echoes, detector, detections."""
+"""Radar simulation: cross-sections, resolution cells, detection."""

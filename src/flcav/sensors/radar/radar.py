@@ -1,6 +1,6 @@
-"""A 77 GHz radar: rays find what reflects, resolution cells sum it up, and a detector decides what is reported.
+"""Simulation of a 77 GHz radar: ray casting, cross-sections, resolution cells, detection and false alarms.
 
-Only the first surface counts: no reflections by way of the road, none through glass.
+Only direct echoes of the first surface are modelled: no multipath over the road, nothing behind glass.
 """
 
 import numpy as np
@@ -20,8 +20,8 @@ from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
-RAYS_PER_CELL = 3  # along azimuth and elevation
-LIMBS_M_S = {"pedestrian": 0.5, "bicycle": 0.5}  # deviation of the speed of what moves on them
+RAYS_PER_CELL = 3  # along azimuth, and as many along elevation
+LIMBS_M_S = {"pedestrian": 0.5, "bicycle": 0.5}  # standard deviation of limbs' speeds (micro-Doppler)
 
 
 def radar_sweep(
@@ -34,11 +34,11 @@ def radar_sweep(
     hidden: int | None = None,
     weather: Weather | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return one sweep of a radar that moves with `velocity` (3,) [m/s, world], nearest detections first.
+    """Return the detections of one radar sweep, nearest first, and the actor of each.
 
-    The first array is (N, 5): range [m], azimuth [rad, to the left], elevation [rad, upwards], Doppler [m/s, positive
-    where the distance grows] and radar cross-section [dBsm]; the second (N,): the trace's actor that most of the
-    echo comes from, -1 for the town and for false alarms. `hidden` is the carrier.
+    Detections (N, 5) are range [m], azimuth [rad, to the left], elevation [rad, upwards], Doppler [m/s, positive where
+    the distance grows] and radar cross-section [dBsm]. Actors (N,) are the trace's, by the largest share of the echo;
+    -1 for the town and for false alarms. `velocity` (3,) is the radar's [m/s, world frame], `hidden` the carrier.
     """
     directions, solid_angle = rays_of(radar, rng)
     hits = scene.cast(world_from_radar, directions, far_m=radar.range_m, hidden=hidden)
@@ -60,14 +60,14 @@ def radar_sweep(
 
 
 def echo_directions(echoes: NDArray[np.float32]) -> Array:
-    """Return (N, 3) unit vectors from the radar, in its frame, to the (N, 5) detections of a sweep."""
+    """Return (N, 3) unit vectors from the radar to the detections (N, 5) of a sweep, radar frame."""
     azimuth, elevation = echoes[:, 1:3].T.astype(np.float64)
     level = np.cos(elevation)
     return np.column_stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)))
 
 
 def rays_of(radar: Radar, rng: np.random.Generator) -> tuple[NDArray[np.float32], Array]:
-    """Return (N, 3) directions, one at random in each cell of a grid over the field of view, and (N,) their [sr]."""
+    """Return N unit rays (N, 3), one at random in each cell of a grid over the field of view, and cells' (N,) [sr]."""
     _, (left, right), (low, high), _ = radar.extent()
     _, azimuth_cell, elevation_cell, _ = radar.resolution()
     columns = int(np.ceil((right - left) / azimuth_cell * RAYS_PER_CELL))
@@ -81,7 +81,11 @@ def rays_of(radar: Radar, rng: np.random.Generator) -> tuple[NDArray[np.float32]
 
 
 def cross_sections(scene: Scene, world_from_radar: Array, ahead: Array, hits: Hits, solid_angle: Array) -> Array:
-    """Return (N,) [m^2] of the patches of surface that rays along `ahead` (N, 3) meet, for `solid_angle` (N,) [sr]."""
+    """Return (N,) radar cross-sections [m^2] of the surface patches that N rays hit.
+
+    `ahead` (N, 3) are the rays in the radar's frame, `solid_angle` (N,) [sr] what each stands for: its patch has the
+    projected area solid angle * distance^2.
+    """
     surfaces = scene.surfaces
     row = surfaces.first[hits.instance] + hits.face
     turn = world_from_radar[:3, :3].T @ scene.world_from_instance()
@@ -101,7 +105,7 @@ def cross_sections(scene: Scene, world_from_radar: Array, ahead: Array, hits: Hi
 def _range_rates(
     scene: Scene, world_from_radar: Array, ahead: Array, hits: Hits, velocity: Array, rng: np.random.Generator
 ) -> Array:
-    """Return (N,) how fast the distance of what each ray meets grows [m/s]."""
+    """Return (N,) range rates [m/s] of the surface points that N rays hit, positive where the distance grows."""
     trace, index = scene.trace, scene.index
     limbs = np.array([LIMBS_M_S.get(str(category), 0.0) for category in trace.category])
     line = ahead @ world_from_radar[:3, :3].T

@@ -1,1 +1,4 @@
-"""The renderer of camera images: rays, surfaces, light, and what is in the air."""
+"""Renderer of camera images: deferred shading of a G-buffer, with shadows, ambient occlusion, weather and glare.
+
+Colours are linear RGB unless a name says otherwise.
+"""

@@ -1,4 +1,7 @@
-"""How much of the sky a surface sees: one short ray for every fourth pixel, averaged over sixteen of them."""
+"""Ambient occlusion: one short ray for every block of 2 x 2 pixels, averaged over 4 x 4 neighbouring blocks.
+
+Ray directions are cosine-weighted; each of the 16 blocks has another one.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,16 +11,19 @@ from flcav.sensors.camera.lens import Lens
 from flcav.sensors.rendering.gbuffer import Survey
 from flcav.world.scene import Scene
 
-REACH_M = 2.2
-FARTHEST_M = 40.0  # beyond, corners are taken as open
-DARKEST = 0.15
-SPAN = 4  # cells along each side of a block, whose rays go all ways
+REACH_M = 2.2  # length of the rays
+FARTHEST_M = 40.0  # distance beyond which nothing is occluded
+DARKEST = 0.15  # value where all rays are blocked
+SPAN = 4  # blocks along each side of the neighbourhood that is averaged over
 
 
 def openness(scene: Scene, seen: Survey, lens: Lens, hidden: int | None) -> NDArray[np.float32]:
-    """Return (N,) the share of the sky that is free above each pixel's surface, as far as things nearby hide it."""
+    """Return the ambient occlusion (N,) of each pixel: the unoccluded share of the hemisphere, scaled to DARKEST..1.
+
+    Only objects within REACH_M occlude; the actor `hidden` does not.
+    """
     columns, rows = -(-lens.width // 2), -(-lens.height // 2)
-    blocks = (SPAN, SPAN, -(-rows // SPAN), -(-columns // SPAN))  # rays of one way stand together: they trace faster
+    blocks = (SPAN, SPAN, -(-rows // SPAN), -(-columns // SPAN))  # rays of one direction side by side: faster
     origin, towards = np.empty((*blocks, 3), np.float32), np.empty((*blocks, 3), np.float32)
     far = np.full(blocks, -1, np.float32)
     _hemisphere(seen, lens.width, columns, rows, _ways(), origin, towards, far)
@@ -28,7 +34,7 @@ def openness(scene: Scene, seen: Survey, lens: Lens, hidden: int | None) -> NDAr
 
 
 def _ways() -> NDArray[np.float32]:
-    """Return (SPAN, SPAN, 3) points spread evenly over a sphere: added to a normal, directions by cosine."""
+    """Return (SPAN, SPAN, 3) points, even over the unit sphere; added to a normal: cosine-weighted directions."""
     count = SPAN * SPAN
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)

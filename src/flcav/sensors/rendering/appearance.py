@@ -1,4 +1,4 @@
-"""What the surfaces of a scene look like, as tables that shading looks up by surface row and instance."""
+"""Appearance tables of a scene: materials, semantic classes, colours and textures, by surface row and instance."""
 
 import zlib
 from functools import lru_cache
@@ -69,7 +69,7 @@ _RIDER = (Material.SKIN, Material.CLOTH, Material.TROUSERS)
 
 
 class Plates(NamedTuple):
-    """The signs of a town."""
+    """The plates of a town's traffic signs: places, kinds and textures."""
 
     place: NDArray[np.float32]  # (S, 5) centre x, y, z, cosine and sin of the direction to the reader's right
     kind: NDArray[np.uint8]  # (S,) row of SIGN_KINDS
@@ -77,30 +77,30 @@ class Plates(NamedTuple):
 
 
 class Appearance(NamedTuple):
-    """Tables of one scene."""
+    """Appearance tables of one scene with S surface rows, I instances and M materials."""
 
     material: NDArray[np.uint8]  # (S,) by surface row
-    semantic: NDArray[np.uint8]  # (S,)
+    semantic: NDArray[np.uint8]  # (S,) one of SEMANTICS
     thing: NDArray[np.int32]  # (S,) -(t + 1) for thing t of the town, else 0
-    part: NDArray[np.uint8]  # (S,) a Part; meaningless for actors
+    part: NDArray[np.uint8]  # (S,) a Part; undefined for actors
     part_row: NDArray[np.int32]  # (S,) see `StaticWorld.row`
-    first_actor: int  # surface row from which on faces are actors'
+    first_actor: int  # first surface row of the actors' faces; the town's come before
     corner: NDArray[np.float32]  # (S - first_actor, 3, 3) corners of actors' faces, body frame
     corner_normal: NDArray[np.float32]  # (S - first_actor, 3, 3) see `Mesh.corner_normals`
     colour: NDArray[np.float32]  # (I, M, 3) by instance and material: actors differ in paint and clothes
-    mirror: NDArray[np.float32]  # (M,)
-    gloss: NDArray[np.float32]  # (M,)
+    mirror: NDArray[np.float32]  # (M,) specular reflectance at normal incidence
+    gloss: NDArray[np.float32]  # (M,) exponent of the sun's highlight
     markings: Markings
     facades: Facades
     plates: Plates
-    noise: NDArray[np.float32]
+    noise: NDArray[np.float32]  # see `noise.clouds`
 
 
 _KNOWN: WeakKeyDictionary[Scene, Appearance] = WeakKeyDictionary()
 
 
 def appearance_of(scene: Scene) -> Appearance:
-    """Return the tables of `scene`, made once; they hold for all its instants."""
+    """Return the appearance tables of `scene`: cached, the same for all its instants."""
     if scene not in _KNOWN:
         _KNOWN[scene] = _appearance(scene)
     return _KNOWN[scene]
@@ -152,7 +152,7 @@ def _appearance(scene: Scene) -> Appearance:
 
 
 def _markings(town: Town) -> Markings:
-    """Return the paint on a town's roads; a town whose net file is gone has none."""
+    """Return the road markings of a town; none where its net file does not exist."""
     if not town.net.exists():
         return markings_of(MapLayers((), (), (), (), (), ()))
     return markings_of(map_layers(town))
@@ -165,7 +165,7 @@ def _corners(category: str, shape: int) -> tuple[NDArray[np.float32], NDArray[np
 
 
 def _colours(names: list[str]) -> NDArray[np.float32]:
-    """Return each instance's colours by material; the same actor always wears the same."""
+    """Return the colours (I, M, 3) by instance and material, chosen by a hash of each actor's name."""
     out = np.tile(COLOUR, (len(names) + 1, 1, 1))
     for instance, name in enumerate(names, start=1):
         number = zlib.crc32(name.encode())

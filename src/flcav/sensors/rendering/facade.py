@@ -1,4 +1,4 @@
-"""Facades: walls of plaster, brick or panels, with windows where the mesh has its sills and balconies."""
+"""Procedural textures of facades: plaster, brick or panels, with windows aligned to the mesh's sills and balconies."""
 
 from typing import NamedTuple
 
@@ -30,17 +30,17 @@ FRAME_M = 0.07
 
 
 class Facades(NamedTuple):
-    """The B buildings of a town."""
+    """Placement, size, style and colours of the B buildings of a town."""
 
     place: NDArray[np.float32]  # (B, 4) x, y, cos and sin of the yaw
     size: NDArray[np.float32]  # (B, 3) length, width, height of the walls
-    style: NDArray[np.uint8]  # (B,)
+    style: NDArray[np.uint8]  # (B,) PLASTER, BRICK or PANEL
     wall: NDArray[np.float32]  # (B, 3) linear colour
     roof: NDArray[np.float32]  # (B, 3) linear colour
 
 
 def facades_of(name: str, buildings: NDArray[np.float64]) -> Facades:
-    """Return the facades of a town's `buildings` (B, 6)."""
+    """Return the facades of `buildings` (B, 6): x, y, yaw, length, width, height. The town's `name` seeds styles."""
     rng = stream(0, "walls", name)
     count = len(buildings)
     kind = rng.integers(len(WALLS), size=count)
@@ -61,9 +61,10 @@ def facades_of(name: str, buildings: NDArray[np.float64]) -> Facades:
 
 @inlined
 def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
-    """Return red, green, blue, the share of glass, and the window's number, of a wall.
+    """Return red, green, blue, the share of glass, and the window's number, at a point of a building's wall.
 
-    `across` is the pixel's width on a plane face on [m], `slant` the same over the cosine of the incidence.
+    x, y, z is the point, nx, ny the normal, world frame. `across` [m] is the pixel's footprint at normal incidence,
+    `slant` [m] the same over the cosine of the incidence.
     """
     place, cos, sin = facades.place, facades.place[building, 2], facades.place[building, 3]
     dx, dy = x - place[building, 0], y - place[building, 1]
@@ -76,7 +77,7 @@ def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
     if v < 0:
         number += 2
     tone = np.float32(0.90) + np.float32(0.20) * noise_at(table, u * 0.7 + building * 13.0, z * 0.5)
-    tone -= np.float32(0.14) * max(np.float32(0), np.float32(1) - z)  # splashes at the foot
+    tone -= np.float32(0.14) * max(np.float32(0), np.float32(1) - z)  # dirt splashed up from the ground
     style = facades.style[building]
     if style == BRICK:
         tone *= _bricks(u, z, slant, across)

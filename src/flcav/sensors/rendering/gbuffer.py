@@ -1,4 +1,4 @@
-"""What each ray met: the surface, where, and which way it faces."""
+"""G-buffer: surface, position and shading normal at each ray's hit."""
 
 from typing import NamedTuple
 
@@ -10,18 +10,18 @@ from flcav.sensors.rendering.appearance import Appearance
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
 
-LIFT_M = 0.015  # rays that leave a surface start so far off it
+LIFT_M = 0.015  # offset along the normal of secondary rays' origins
 
 
 class Survey(NamedTuple):
-    """N rays' ends, world frame."""
+    """G-buffer: the hits of N rays, world frame."""
 
     ray: NDArray[np.float32]  # (N, 3) unit direction
     distance: NDArray[np.float32]  # (N,) [m]; inf for the sky
-    instance: NDArray[np.int32]  # (N,) of the scene; -1 for the sky
-    row: NDArray[np.int32]  # (N,) of the scene's surfaces; -1 for the sky
-    normal: NDArray[np.float32]  # (N, 3) unit, towards the camera; smooth over the curved surfaces of actors
-    position: NDArray[np.float32]  # (N, 3) [m], `LIFT_M` off the surface
+    instance: NDArray[np.int32]  # (N,) instance of the scene; -1 for the sky
+    row: NDArray[np.int32]  # (N,) row of the scene's surfaces; -1 for the sky
+    normal: NDArray[np.float32]  # (N, 3) unit, towards the camera; interpolated over curved surfaces of actors
+    position: NDArray[np.float32]  # (N, 3) [m], moved `LIFT_M` off the surface
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -34,9 +34,9 @@ def survey(
     directions: NDArray[np.float32],
     hits: Hits,
 ) -> Survey:
-    """Return what the rays `directions` (N, 3), optical frame, met: their `hits`, looked up."""
+    """Return the G-buffer of N rays `directions` (N, 3), unit, optical frame, from their `hits`."""
     count, poses = len(directions), scene.poses()
-    bodies = np.zeros((len(poses) + 1, 5), np.float32)  # x, y, z, cosine and sine of the yaw
+    bodies = np.zeros((len(poses) + 1, 5), np.float32)  # by instance: x, y, z, cosine and sine of the yaw
     bodies[1:] = np.c_[poses[:, :3], np.cos(poses[:, 3]), np.sin(poses[:, 3])]
     out = Survey(
         np.empty((count, 3), np.float32),
@@ -88,14 +88,17 @@ def _look_up(pose, directions, face, first, normals, bodies, appearance, out):
             sx, sy = cos * sx - sin * sy, sin * sx + cos * sy
             if sx * nx + sy * ny + sz * nz < 0:
                 sx, sy, sz = -sx, -sy, -sz
-            if sx * dx + sy * dy + sz * dz < np.float32(-0.02):  # it may not face away from who sees the face
+            if sx * dx + sy * dy + sz * dz < np.float32(-0.02):  # a shading normal must not face away from the camera
                 nx, ny, nz = sx, sy, sz
         out.normal[ray, 0], out.normal[ray, 1], out.normal[ray, 2] = nx, ny, nz
 
 
 @inlined
 def _smooth(x, y, z, corner, normal, face):
-    """Return the unit normal (body frame) of the smooth surface at a point of an actor's face, or zero."""
+    """Return the shading normal at a point of an actor's face: corner normals interpolated by barycentric coordinates.
+
+    Body frame; unit, or zero where the corners have none.
+    """
     ax, ay, az = (
         corner[face, 1, 0] - corner[face, 0, 0],
         corner[face, 1, 1] - corner[face, 0, 1],

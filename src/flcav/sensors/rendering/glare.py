@@ -1,4 +1,4 @@
-"""Halos around lamps, and around the sun, that shine into the lens."""
+"""Lens glare: halos around lamps, and veiling glare of the sun."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +11,17 @@ from flcav.sensors.rendering.state import AMBER, GREEN, RED, State, lamp_places
 from flcav.world.meshes.furniture import LENS_PITCH_M
 from flcav.world.scene import Scene
 
-HEAD, TAIL, STREET, SIGNAL = 9.0, 0.55, 1.6, 0.35  # how strong the halos are
+HEAD, TAIL, STREET, SIGNAL = 9.0, 0.55, 1.6, 0.35  # strengths of the halos
 HEAD_COLOUR, TAIL_COLOUR, STREET_COLOUR = (1.0, 0.95, 0.86), (1.0, 0.05, 0.03), (1.0, 0.74, 0.40)
 SIGNAL_COLOURS = {RED: (1.0, 0.05, 0.03), AMBER: (1.0, 0.5, 0.03), GREEN: (0.06, 1.0, 0.55)}
-FARTHEST_M = 150.0
-SUN_RAYS, SUN_RAD, SUN_REACH_M = 16, 0.0046, 1000.0  # rays over the sun's disc, whose radius is that angle
-SUN_SPREAD_RAD, SUN_VEIL_RAD = 0.016, 0.16  # how wide the lens scatters the sun's light: most of it, and the rest
-SUN_STRENGTH, VEIL_STRENGTH = 9.0, 0.22
-HAZE_M = 500.0  # of air before the sun
-BESIDE = 0.25  # how far beside the picture, over its size, the sun still dazzles
+FARTHEST_M = 150.0  # of lamps with halos
+SUN_RAYS, SUN_RAD, SUN_REACH_M = 16, 0.0046, 1000.0  # rays over the sun's disc, its angular radius, rays' length
+SUN_SPREAD_RAD, SUN_VEIL_RAD = 0.016, 0.16  # widths of the lens' narrow and wide scattering of the sun
+SUN_STRENGTH, VEIL_STRENGTH = 9.0, 0.22  # of the narrow and of the wide scattering
+HAZE_M = 500.0  # path through the air before the sun
+BESIDE = 0.25  # distance of the sun from the image's edge, over its size, up to which it causes glare
 
-Glowing = tuple[NDArray[np.float64], tuple[float, float, float], float]
+Glowing = tuple[NDArray[np.float64], tuple[float, float, float], float]  # place, colour, strength
 
 
 def add_glare(
@@ -33,7 +33,7 @@ def add_glare(
     lens: Lens,
     hidden: int | None,
 ) -> None:
-    """Add halos to an image (H, W, 3) for every lamp that is on and in plain sight."""
+    """Add a halo to an image (H, W, 3) for every lamp that is on and not hidden from the camera."""
     glowing = [row for row in _glowing(scene, state, light, world_from_camera[:3, 3], hidden) if row[2] > 0.01]
     if not glowing:
         return
@@ -68,7 +68,7 @@ def add_sun_glare(
     lens: Lens,
     hidden: int | None,
 ) -> None:
-    """Add to an image (H, W, 3) what a lens scatters of the sun, as much as is in plain sight."""
+    """Add the veiling glare of the sun to an image (H, W, 3), by the share of its disc that is visible."""
     to_sun, eye = np.array(light.to_sun, np.float64), world_from_camera[:3, 3]
     towards = world_from_camera[:3, :3].T @ to_sun
     pixel = project(lens, towards)[0]

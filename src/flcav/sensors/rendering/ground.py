@@ -1,4 +1,9 @@
-"""The ground: asphalt, grass, pavement, and the markings painted on it."""
+"""Procedural textures of asphalt, paving and grass, and anti-aliased road markings.
+
+Markings are rectangles in a grid. A rectangle's coverage of a pixel's footprint is the product of two overlaps of
+intervals, along and across it: exact where the footprint is aligned with the rectangle, elsewhere smooth and right in
+the mean. So lines fade with distance, without aliasing.
+"""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -16,8 +21,8 @@ from flcav.sensors.rendering.noise import fade, hashed, noise_at, overlap
 from flcav.world.map.layers import Arrow, ArrowKind, MapLayers, Marking
 from flcav.world.map.paint import glyph, stripes
 
-CELL_M = 1.0
-REACH_M = 0.3  # how far beyond a rectangle its cells go
+CELL_M = 1.0  # side of the cells of the grid
+REACH_M = 0.3  # margin around a rectangle within which cells list it
 STRIP_M = 0.06  # arrows are cut into strips of this length
 COLOURS = {"white": (0.68, 0.68, 0.66), "yellow": (0.62, 0.42, 0.06)}
 
@@ -25,17 +30,17 @@ Rectangle = tuple[float, float, float, float, float, float]  # centre x, y, dire
 
 
 class Markings(NamedTuple):
-    """Painted rectangles, findable by place."""
+    """Road markings as K rectangles, with a grid whose cells list those nearby."""
 
     rectangle: NDArray[np.float32]  # (K, 6) see Rectangle
     colour: NDArray[np.float32]  # (K, 3)
     corner: NDArray[np.float64]  # (2,) lowest x, y of the grid
-    first: NDArray[np.int32]  # (cells along x, cells along y + 1) where each cell's list begins
-    listed: NDArray[np.int32]  # rows of `rectangle`
+    first: NDArray[np.int32]  # (cells along x, cells along y + 1) start of each cell's list
+    listed: NDArray[np.int32]  # lists of rows of `rectangle`, cell after cell
 
 
 def markings_of(layers: MapLayers) -> Markings:
-    """Return the paint on the roads of a map."""
+    """Return the lane lines, crossings and arrows of a map as rectangles."""
     pieces = [(piece, COLOURS.get(line.colour, COLOURS["white"])) for line in layers.markings for piece in _line(line)]
     white = COLOURS["white"]
     pieces += [(_box(stripe), white) for crossing in layers.crossings for stripe in stripes(crossing)]
@@ -47,9 +52,9 @@ def markings_of(layers: MapLayers) -> Markings:
 
 @inlined
 def paint_at(x, y, look_x, look_y, across, along, markings):
-    """Return the share of a footprint about x, y that is painted, and the rectangle that paints most of it.
+    """Return the painted share of a pixel's footprint around x, y, and the row of the rectangle that covers most of it.
 
-    The footprint is `along` [m] long in the horizontal direction look_x, look_y (unit), and `across` wide.
+    The footprint is `along` [m] long in the horizontal unit direction look_x, look_y, and `across` [m] wide.
     """
     i, j = int((x - markings.corner[0]) / CELL_M), int((y - markings.corner[1]) / CELL_M)
     if i < 0 or j < 0 or i >= markings.first.shape[0] or j >= markings.first.shape[1] - 1:
@@ -83,7 +88,7 @@ def _line(marking: Marking) -> Iterator[Rectangle]:
 
 
 def _box(outline: NDArray[np.float64]) -> Rectangle:
-    """Return the smallest rectangle about a polygon."""
+    """Return the smallest rectangle around a polygon."""
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(Polygon(outline)))
     one, other = corners[1] - corners[0], corners[2] - corners[1]
     length, width = np.hypot(*one), np.hypot(*other)
@@ -99,7 +104,7 @@ def _arrow(arrow: Arrow) -> Iterator[Rectangle]:
 
 @lru_cache(maxsize=16)
 def _strips(kind: ArrowKind) -> tuple[tuple[float, float, float, float], ...]:
-    """Return an arrow about the origin, read along x, as strips: centre x, y, half length, half width."""
+    """Return an arrow at the origin that points along x, as strips: centre x, y, half length, half width [m]."""
     shape = Polygon(glyph(Arrow(kind, 0.0, 0.0, 0.0, "")))
     low_x, low_y, high_x, high_y = shape.bounds
     out = []
@@ -113,7 +118,7 @@ def _strips(kind: ArrowKind) -> tuple[tuple[float, float, float, float], ...]:
 
 
 def _grid(rectangle: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:
-    """Return the grid's corner, and where and what its cells list."""
+    """Return the `corner`, `first` and `listed` of the grid of `Markings`."""
     if not len(rectangle):
         return np.zeros(2), np.zeros((1, 2), np.int32), np.zeros(0, np.int32)
     x, y, tx, ty, length, width = rectangle.T.astype(np.float64)
@@ -140,13 +145,13 @@ def _grid(rectangle: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[
     return corner, first, pairs[:, 1].astype(np.int32)
 
 
-SLAB_M = 0.5
-JOINT_M = 0.012
+SLAB_M = 0.5  # side of a paving slab
+JOINT_M = 0.012  # width of the joints between slabs
 
 
 @inlined
 def asphalt(x, y, footprint, table):
-    """Return the brightness of asphalt over its mean: grain, stains, old and new stretches, sealed cracks."""
+    """Return the brightness of asphalt at x, y relative to its mean colour: grain, stains, repairs, sealed cracks."""
     broad = noise_at(table, x * 0.9, y * 0.9)
     patch = noise_at(table, x * 0.11 + 40.0, y * 0.11)
     tone = np.float32(0.68) + np.float32(0.30) * broad + np.float32(0.40) * patch
@@ -164,7 +169,7 @@ def asphalt(x, y, footprint, table):
 
 @inlined
 def paving(x, y, footprint, table):
-    """Return the brightness of a pavement of slabs over its mean."""
+    """Return the brightness of paving slabs at x, y relative to their mean colour."""
     i, j = int(np.floor(x / SLAB_M)), int(np.floor(y / SLAB_M))
     tone = np.float32(0.86) + np.float32(0.24) * noise_at(table, x * 0.5, y * 0.5)
     near = fade(np.float32(0.5), footprint)
@@ -183,7 +188,7 @@ def paving(x, y, footprint, table):
 
 @inlined
 def grass(x, y, footprint, table):
-    """Return the brightness of grass over its mean, and how dry it is, 0 to 1."""
+    """Return the brightness of grass at x, y relative to its mean colour, and its dryness, 0 to 1."""
     dry = noise_at(table, x * 0.07, y * 0.07)
     tone = np.float32(0.55) + np.float32(0.6) * noise_at(table, x * 0.8, y * 0.8)
     near = fade(np.float32(0.10), footprint)

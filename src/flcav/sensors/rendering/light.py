@@ -1,4 +1,8 @@
-"""Light of the sun, the sky and lamps, and the shadows they cast."""
+"""Illumination: sun, sky and air by weather, and shadows of the sun and of lamps by shadow rays.
+
+One unit of radiance is the brightness that a camera exposed for full daylight shows as white. Shadows take one ray from
+every hit to the sun, and one to the lamp that is strongest there.
+"""
 
 from typing import NamedTuple
 
@@ -50,17 +54,17 @@ _HORIZON = (
 
 
 class Light(NamedTuple):
-    """What shines at one instant."""
+    """The light of the sun and the sky, and the air, under one weather."""
 
     to_sun: Colour  # unit, world
-    sun: Colour  # on a surface face on, through the clouds
+    sun: Colour  # irradiance at normal incidence, through the clouds
     zenith: Colour  # radiance of the clear sky overhead
-    horizon: Colour  # and above the horizon
-    ambient: Colour  # what the whole sky sends to a level surface
-    bounce: Colour  # and what the ground sends back up
-    cloud: Colour  # of a cloud
-    cover: np.float32  # share of the sky that is clouds
-    air: Colour  # what the air between adds where it hides everything
+    horizon: Colour  # radiance of the sky at the horizon
+    ambient: Colour  # irradiance of the whole sky on a horizontal surface
+    bounce: Colour  # irradiance from the ground on a surface that faces down
+    cloud: Colour  # radiance of a cloud
+    cover: np.float32  # share of the sky covered by clouds
+    air: Colour  # radiance of the air itself (airlight), at infinite distance
     extinction: np.float32  # [1/m] by fog, haze and rain
     exposure: np.float32  # factor before tone mapping
     wetness: np.float32
@@ -68,7 +72,7 @@ class Light(NamedTuple):
 
 
 def light_of(weather: Weather) -> Light:
-    """Return the light of `weather`."""
+    """Return the sun, sky and air of `weather`: tables by the sun's elevation, changed by clouds, fog and rain."""
     elevation, azimuth = np.radians(weather.sun_elevation_deg), np.radians(weather.sun_azimuth_deg)
     level = np.cos(elevation)
     to_sun = np.array([level * np.sin(azimuth), level * np.cos(azimuth), np.sin(elevation)])
@@ -90,7 +94,7 @@ def light_of(weather: Weather) -> Light:
     rain = RAIN_EXTINCTION * weather.rain_mm_h**0.63 * 3.0
     lamps = float(np.clip((2.0 - weather.sun_elevation_deg) / 6.0, 0, 1))
     sky = 0.45 * zenith + 0.55 * horizon
-    sky = 0.55 * sky + 0.45 * sky.mean()  # light from many sides: houses and ground take the blue out of it
+    sky = 0.55 * sky + 0.45 * sky.mean()  # houses and ground reflect light of the sky, which makes it less blue
     bounce = 0.16 * (sun * max(to_sun[2], 0.0) + sky)
     ambient = float((0.5 * sun * max(to_sun[2], 0.15) + 0.6 * zenith + 0.4 * horizon).mean())
     return Light(
@@ -119,17 +123,17 @@ def _at(elevation_deg: float, table: tuple[tuple[float, float, float], ...]) -> 
 
 
 def _exposure(ambient: float) -> float:
-    """Return how much longer a camera exposes in less light: not enough to make night day."""
+    """Return the exposure for an `ambient` brightness: a power law of exponent -0.55, so that nights stay dark."""
     return float(0.92 * max(ambient, 2e-3) ** -0.55 if ambient < 1.0 else 0.92)
 
 
-SUN_REACH_M = 300.0
-DARK = 1e-3  # a sun dimmer than this casts no shadow
-SAME = 0.04  # pixels that differ by less of their distance lie on one surface
+SUN_REACH_M = 300.0  # length of shadow rays
+DARK = 1e-3  # irradiance of the sun below which it casts no shadow
+SAME = 0.04  # relative difference of distance up to which two pixels lie on one surface
 
 
 def lamp_light_on(scene: Scene, seen: Survey, lamps: Lamps, hidden: int | None) -> NDArray[np.float32]:
-    """Return (N, 3) what lamps throw on each ray's end; the strongest one there casts shadows, the others none."""
+    """Return the irradiance (N, 3) of lamps at each hit; only the strongest lamp there casts shadows."""
     light, most, towards = (np.zeros((len(seen), 3), np.float32) for _ in range(3))
     far = np.empty(len(seen), np.float32)
     light_up(seen, lamps, light, most, towards, far)
@@ -138,7 +142,7 @@ def lamp_light_on(scene: Scene, seen: Survey, lamps: Lamps, hidden: int | None) 
 
 
 def sunlit(scene: Scene, seen: Survey, light: Light, hidden: int | None) -> NDArray[np.float32]:
-    """Return for each ray's end whether the sun reaches it: 1, or 0 behind something; 1 too where it faces away."""
+    """Return for each hit (N,) 0 where it is in the sun's shadow, else 1; also 1 where it faces away from the sun."""
     far = np.empty(len(seen), np.float32)
     _facing(seen, light.to_sun, max(light.sun) > DARK, far)
     return (
@@ -147,9 +151,9 @@ def sunlit(scene: Scene, seen: Survey, light: Light, hidden: int | None) -> NDAr
 
 
 def soften(lit: NDArray[np.float32], seen: Survey, width: int) -> NDArray[np.float32]:
-    """Return `lit` (N,), a picture's row after row, with edges of shadows as soft as a sun that is no point makes them.
+    """Return `lit` (N,), an image's row after row, with soft shadow edges, as of an extended sun.
 
-    Means over three by three pixels (weights 1, 2, 1 each way) of what lies as far away.
+    A 3 x 3 binomial filter (weights 1, 2, 1 each way) over pixels of similar distance.
     """
     out = np.empty_like(lit)
     _soften(lit, seen.distance, width, out)

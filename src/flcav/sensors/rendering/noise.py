@@ -1,4 +1,4 @@
-"""Repeating noise, as tables and as hashes of whole numbers."""
+"""Procedural noise: a periodic table of fractal noise, and hashes of lattice points; box-filter coverage."""
 
 from functools import lru_cache
 
@@ -8,23 +8,23 @@ from numpy.typing import NDArray
 from flcav.compiled import inlined
 from flcav.seeds import stream
 
-SIDE = 256  # cells of a table, a power of two
+SIDE = 256  # cells along each side of a table, a power of two
 
 
 @lru_cache(maxsize=1)
 def clouds() -> NDArray[np.float32]:
-    """Return (SIDE, SIDE) smooth noise in [0, 1] with detail at every scale; it repeats without a seam."""
+    """Return a table (SIDE, SIDE) of periodic fractal noise, uniformly distributed in [0, 1]: power-law spectrum."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(SIDE), np.fft.rfftfreq(SIDE), indexing="ij")) * SIDE
     amplitude = np.where(frequency > 0, np.maximum(frequency, 2.0) ** -1.7, 0.0)
     phase = np.exp(2j * np.pi * stream(0, "noise").random(frequency.shape))
     field = np.fft.irfft2(amplitude * phase, s=(SIDE, SIDE))
-    rank = field.ravel().argsort().argsort().reshape(SIDE, SIDE)  # every value as often as any other
+    rank = field.ravel().argsort().argsort().reshape(SIDE, SIDE)  # histogram equalisation
     return (rank / rank.max()).astype(np.float32)
 
 
 @inlined
 def noise_at(table, x, y):
-    """Return the value of a table at x, y, in cells, linearly between them."""
+    """Return the value of a table at x, y (in cells, periodic), by bilinear interpolation."""
     i, j = int(np.floor(x)), int(np.floor(y))
     u, v = np.float32(x - i), np.float32(y - j)
     i0, i1, j0, j1 = i & (SIDE - 1), (i + 1) & (SIDE - 1), j & (SIDE - 1), (j + 1) & (SIDE - 1)
@@ -35,7 +35,7 @@ def noise_at(table, x, y):
 
 @inlined
 def hashed(a, b):
-    """Return a number in [0, 1) that looks random and depends on the whole numbers a and b alone."""
+    """Return a hash of the whole numbers a and b, as a number in [0, 1)."""
     word = np.uint32((a * 374761393 + b * 668265263) & 0xFFFFFFFF)
     word = np.uint32(((word ^ (word >> np.uint32(13))) * np.uint64(1274126177)) & np.uint64(0xFFFFFFFF))
     return np.float32((word ^ (word >> np.uint32(16))) & np.uint32(0xFFFFFF)) / np.float32(16777216.0)
@@ -43,12 +43,12 @@ def hashed(a, b):
 
 @inlined
 def fade(scale, footprint):
-    """Return how much of a texture of that scale [m] is left when a pixel is `footprint` [m] wide: 1 to 0."""
+    """Return the contrast, 1 to 0, of a texture of that scale [m] in a pixel `footprint` [m] wide (anti-aliasing)."""
     return min(max(np.float32(1.5) - footprint / scale, np.float32(0)), np.float32(1))
 
 
 @inlined
 def overlap(distance, half, width):
-    """Return the share of an interval of `width` about `distance` that lies within `half` of 0."""
+    """Return the share of an interval of `width` around `distance` that lies within -`half` and `half`."""
     inside = min(distance + 0.5 * width, half) - max(distance - 0.5 * width, -half)
     return max(inside, np.float32(0)) / width

@@ -1,4 +1,4 @@
-"""Wet roads that mirror, falling drops, and drops on the lens."""
+"""Rain in camera images: reflections of wet roads, streaks of falling drops, and drops on the lens."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,18 +8,18 @@ from flcav.sensors.rendering.noise import noise_at
 from flcav.world.materials import Material
 
 ROAD = int(Material.ROAD)
-WATER = 0.02  # reflectance face on
-SMEAR_PX = 15  # half height of the blur of mirrored things, in pixels of half size
-RIPPLE_PX = 4.0  # how far ripples push what they mirror aside, alike
-STREAKS_PER_MM = 55.0  # in a picture of 640 x 384, at 1 mm/h, growing with the rain's power of 0.6
-DROPS_PER_MM = 3.0  # on a lens, at 1 mm/h, growing alike; whatever its size
-DROP_VIEW = 0.45  # of the picture's height that a drop shows, upside down
-BLOCK_PX = 8  # a drop is too near to be sharp: it shows means over squares of this side
+WATER = 0.02  # Fresnel reflectance at normal incidence
+SMEAR_PX = 15  # half height of the blur of reflections, in pixels of an image of half the size
+RIPPLE_PX = 4.0  # sideways displacement by ripples, likewise
+STREAKS_PER_MM = 55.0  # number in an image of 640 x 384 at 1 mm/h; grows as rain^0.6
+DROPS_PER_MM = 3.0  # number on a lens of any size at 1 mm/h, likewise
+DROP_VIEW = 0.45  # share of the image's height that a drop shows, upside down
+BLOCK_PX = 8  # drops are out of focus: they show means over squares of this side
 
 
 @compiled
 def wet_pixels(seen, appearance, width, height):
-    """Return the pixels, one of every four, that show a road."""
+    """Return the indices (K,) of the pixels that show a road, of every second row and column."""
     found = np.empty((width // 2) * (height // 2), np.int64)
     count = 0
     for j in range(height // 2):
@@ -34,7 +34,7 @@ def wet_pixels(seen, appearance, width, height):
 
 @compiled
 def smear(image, weight, width, height, out):
-    """Write the weighted mean `out` (H, W, 3) of `image` over a tall neighbourhood, as ripples do; zero where none."""
+    """Blur `image` (H, W, 3) vertically, as ripples do: write weighted means `out` (H, W, 3), 0 where no weight is."""
     for i in range(width):
         for j in range(height):
             total = np.float32(0)
@@ -52,7 +52,7 @@ def smear(image, weight, width, height, out):
 
 @compiled
 def add_mirrored(radiance, seen, appearance, mirrored, wetness, extinction, width, height):
-    """Add what the wet road mirrors, `mirrored` (H / 2, W / 2, 3), to the pixels that show it: puddles most."""
+    """Add the reflections `mirrored` (H / 2, W / 2, 3) to pixels that show road, by Fresnel reflectance and puddles."""
     for pixel in range(len(radiance)):
         row = seen.row[pixel]
         if row < 0 or seen.instance[pixel] != 0 or appearance.material[row] != ROAD:
@@ -76,10 +76,10 @@ def add_mirrored(radiance, seen, appearance, mirrored, wetness, extinction, widt
 def add_streaks(
     image: NDArray[np.float32], rain_mm_h: float, brightness: NDArray[np.float64], rng: np.random.Generator
 ) -> None:
-    """Draw falling drops into an image (H, W, 3), blurred by their fall, as bright as the sky behind the camera."""
+    """Draw motion-blurred streaks of falling drops, of the radiance `brightness` (3,), into an image (H, W, 3)."""
     height, width = image.shape[:2]
     count = int(STREAKS_PER_MM * rain_mm_h**0.6 * width * height / (640 * 384))
-    size = rng.random(count) ** 3  # few are near
+    size = rng.random(count) ** 3  # 1 is nearest; few are near
     place = rng.random((count, 2)) * (width, height)
     length = (0.02 + 0.16 * size) * height
     slant = rng.normal(0.06, 0.03, count)
@@ -107,7 +107,7 @@ def _draw_streaks(image, place, length, slant, strength, thick, brightness):
 
 
 def add_drops(image: NDArray[np.float32], rain_mm_h: float, rng: np.random.Generator) -> None:
-    """Put drops on the lens of an image (H, W, 3): each a small, blurred view of the scene, upside down."""
+    """Draw drops on the lens into an image (H, W, 3): each shows a small, blurred view of the scene, upside down."""
     height, width = image.shape[:2]
     count = int(rng.poisson(DROPS_PER_MM * rain_mm_h**0.6))
     place = rng.random((count, 2)) * (width, height)
@@ -139,7 +139,7 @@ def _draw_drops(image, blocks, place, radius, tall):
             for x in range(max(int(place[drop, 0] - reach), 0), min(int(place[drop, 0] + reach) + 2, width)):
                 right, down = x - place[drop, 0], (y - place[drop, 1]) / tall[drop]
                 if down < 0:
-                    right *= 1 - 0.25 * down / radius[drop]  # narrower above, where it runs down
+                    right *= 1 - 0.25 * down / radius[drop]  # drops that run down are narrower above
                 apart = np.sqrt(right * right + down * down) / radius[drop]
                 share = np.float32(min(max((1 - apart) * 2, 0.0), 0.9))
                 if share <= 0:

@@ -1,4 +1,7 @@
-"""The renderer of camera images: rays to radiance."""
+"""Deferred renderer: primary rays, G-buffer, shading, wet reflections, supersampling, rain and glare, in this order.
+
+The result is the radiance of every pixel; exposure and tone mapping follow in `flcav.sensors.camera.tone`.
+"""
 
 import ctypes
 import platform
@@ -24,16 +27,16 @@ from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3)
-KEPT_BYTES = 64 << 20
-LARGEST_BYTES = 32 << 20  # the most that glibc takes
+KEPT_BYTES = 64 << 20  # of freed memory that stays with the process
+LARGEST_BYTES = 32 << 20  # the largest M_MMAP_THRESHOLD that glibc accepts
 
 
 @lru_cache(maxsize=1)
 def keep_freed_memory() -> None:
-    """Let this process keep up to `KEPT_BYTES` of what it frees, where the C library is glibc; elsewhere do nothing.
+    """Make glibc keep up to `KEPT_BYTES` of freed memory in this process; does nothing with other C libraries.
 
-    By default glibc hands arrays of megabytes back to the system, which clears every page anew for the next image: a
-    seventh of an image's time.
+    By default glibc returns freed arrays of megabytes to the system, and the pages of the next image's arrays must be
+    mapped and cleared again: a seventh of the time of an image.
     """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
@@ -41,19 +44,19 @@ def keep_freed_memory() -> None:
         library.mallopt(_TRIM_THRESHOLD, KEPT_BYTES)
 
 
-FAR_M = 1000.0
-LOW_SIGHT = 0.002  # [1/m] of extinction from which on vehicles have their lamps on by day
-MIRRORS = 0.2  # wetness from which on a road mirrors
+FAR_M = 1000.0  # length of primary rays
+LOW_SIGHT = 0.002  # extinction [1/m] above which vehicles have their lamps on by day
+MIRRORS = 0.2  # wetness above which roads reflect
 NO_LAMPS = np.zeros((0, 3), np.float32)
 
 
 class Picture(NamedTuple):
-    """An image before it is developed, and what its first rays met."""
+    """An image as radiance, with its exposure, G-buffer and appearance tables."""
 
-    radiance: NDArray[np.float32]  # (N, 3) of each pixel
-    exposure: np.float32
-    seen: Survey
-    painted: NDArray[np.bool_]  # (N,) whether a pixel shows paint on a road
+    radiance: NDArray[np.float32]  # (N, 3) of each pixel, row after row
+    exposure: np.float32  # factor of the radiance before tone mapping
+    seen: Survey  # G-buffer of the primary rays
+    painted: NDArray[np.bool_]  # (N,) whether a pixel shows a road marking
     appearance: Appearance
 
 
@@ -76,7 +79,11 @@ def render(
     *,
     hidden: int | None,
 ) -> Picture:
-    """Return the light that falls on every pixel of `lens`, row after row: see `camera.photograph`."""
+    """Return the radiance of every pixel of `lens` at the scene's instant: see `camera.photograph`.
+
+    `world_from_camera` (4, 4) is the pose of the optical frame, `hidden` the actor left out (the carrier); `rng` draws
+    the rain.
+    """
     keep_freed_memory()
     rays, light, appearance = directions(lens), light_of(weather), appearance_of(scene)
     state = state_of(scene, float(light.lamps), low_sight=bool(light.extinction > LOW_SIGHT))
@@ -119,7 +126,7 @@ def _radiance(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     scene, light, hidden = world.scene, world.light, world.hidden
     lit = sunlit(scene, seen, light, hidden)
-    if width is not None:  # the rays are a whole picture's
+    if width is not None:  # the rays are those of a whole image
         lit = soften(lit, seen, width)
     lamplight = lamp_light_on(scene, seen, world.lamps, hidden) if light.lamps > 0 else NO_LAMPS
     radiance, painted = np.empty((len(seen), 3), np.float32), np.empty(len(seen), np.bool_)
@@ -138,7 +145,7 @@ def _further(
     open_sky: NDArray[np.float32],
     radiance: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Return the light (S, 3) of further rays, each within a `pixel` (S,): what a pixel close by shows, or shaded."""
+    """Return the radiance (S, 3) of further rays, each within a `pixel` (S,): taken from a pixel nearby, or shaded."""
     scene, appearance = world.scene, world.appearance
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=world.hidden)
     donor = np.empty(len(rays), np.int32)
@@ -159,7 +166,7 @@ def _mirror(
     seen: Survey,
     radiance: NDArray[np.float32],
 ) -> None:
-    """Add to wet roads what they mirror: what the same rays meet from below the road, with the world upside down."""
+    """Add planar reflections to wet roads: rays cast from the camera mirrored at the plane of the road, z = 0."""
     wet = rain.wet_pixels(seen, world.appearance, lens.width, lens.height)
     if not len(wet):
         return

@@ -1,4 +1,4 @@
-"""The faces of traffic signs, drawn once into small pictures at several sizes."""
+"""Textures of traffic signs: mip-maps, drawn once, with trilinear filtering."""
 
 from functools import lru_cache
 
@@ -9,18 +9,18 @@ from flcav.compiled import inlined
 from flcav.world.meshes.furniture import SIGN_RADIUS_M
 
 SIGN_KINDS = ("stop", "yield", "speed_30", "speed_60", "speed_90")
-SIDE = 128  # [px] of the largest picture
-LEVELS = 6  # each half of the one before
-DRAWN = 4  # samples along each side of a pixel
+SIDE = 128  # texels along each side of the finest level
+LEVELS = 6  # of the mip-map, each of half the size of the one before
+DRAWN = 4  # samples along each side of a texel
 
 RED, WHITE, BLACK = (0.56, 0.015, 0.020), (0.80, 0.80, 0.79), (0.012, 0.012, 0.012)
 _TEXT = {"stop": "STOP", "speed_30": "30", "speed_60": "60", "speed_90": "90"}
-_TEXT_WIDTH = {"stop": 1.34, "speed_30": 0.98, "speed_60": 0.98, "speed_90": 0.98}  # of a plate of radius 1
+_TEXT_WIDTH = {"stop": 1.34, "speed_30": 0.98, "speed_60": 0.98, "speed_90": 0.98}  # on a plate of radius 1
 
 
 @lru_cache(maxsize=1)
 def pictures() -> NDArray[np.float32]:
-    """Return (kinds, LEVELS, SIDE, SIDE, 3): rows from above; level l fills its first SIDE / 2^l rows and columns."""
+    """Return mip-maps (kinds, LEVELS, SIDE, SIDE, 3), rows from the top; level l fills SIDE / 2^l rows and columns."""
     out = np.zeros((len(SIGN_KINDS), LEVELS, SIDE, SIDE, 3), np.float32)
     for kind, name in enumerate(SIGN_KINDS):
         picture = _draw(name)
@@ -32,7 +32,7 @@ def pictures() -> NDArray[np.float32]:
 
 @inlined
 def sign_at(kind, right, up, footprint, drawn):
-    """Return red, green, blue of a plate `right` and `up` of its centre [m], seen by a pixel `footprint` [m] wide."""
+    """Return red, green, blue of a plate at `right`, `up` of its centre [m], for a pixel's `footprint` [m]."""
     texel = np.float32(2 * SIGN_RADIUS_M / SIDE)
     level = np.log2(max(footprint / texel, np.float32(1)))
     first = min(int(level), LEVELS - 1)
@@ -61,7 +61,7 @@ def _texel(picture, u, v, side):
 
 
 def _draw(kind: str) -> NDArray[np.float64]:
-    """Return (SIDE, SIDE, 3) of a sign; what lies outside its plate is coloured like its rim."""
+    """Return the finest level (SIDE, SIDE, 3) of a sign; texels outside its plate have the colour of its rim."""
     count = SIDE * DRAWN
     step = (np.arange(count) + 0.5) / count * 2 - 1
     x, y = np.meshgrid(step, -step)
@@ -86,7 +86,7 @@ def _painted(inside: NDArray[np.bool_], inner: tuple[float, ...], outer: tuple[f
 
 
 def _text(kind: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return where the letters of a sign are."""
+    """Return, in the shape of `x`, which points `x`, `y` of a plate of radius 1 lie in a sign's letters."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
@@ -99,6 +99,6 @@ def _text(kind: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[
     outlines = letters.to_polygons(closed_only=True)
     from matplotlib.path import Path
 
-    for outline in outlines:  # even-odd: the holes of letters are outlines of their own
+    for outline in outlines:  # even-odd rule: the holes of letters have outlines too
         found[near.ravel()] ^= Path(outline).contains_points(points[near.ravel()])
     return found.reshape(x.shape)

@@ -1,17 +1,17 @@
-"""The sky, clouds and all, and what a mirror sees of a street."""
+"""Radiance of the sky with sun and clouds, and an environment map of a street for mirror reflections."""
 
 import numpy as np
 
 from flcav.compiled import inlined
 from flcav.sensors.rendering.noise import noise_at
 
-SKYLINE = 0.16  # sine of the elevation up to which a street's houses hide the sky
-TOP_OF_FOG_M = 500.0
+SKYLINE = 0.16  # sine of the elevation up to which houses hide the sky, in reflections
+TOP_OF_FOG_M = 500.0  # height of the layer of fog
 
 
 @inlined
 def sky_at(x, y, z, light):
-    """Return the radiance of the sky without clouds in the unit direction x, y, z, world frame."""
+    """Return red, green, blue of the sky without clouds or sun's disc, in the unit direction x, y, z, world frame."""
     low = 1 - max(z, np.float32(0))
     low = low * low * low
     low *= low * np.float32(0.55) + np.float32(0.45)
@@ -29,7 +29,7 @@ def sky_at(x, y, z, light):
 
 @inlined
 def heaven_at(x, y, z, light, table):
-    """Return the radiance where a ray meets nothing: sky, sun, clouds and the air before them."""
+    """Return red, green, blue of a ray that hits nothing: sky, sun, clouds, and the air in between."""
     red, green, blue = sky_at(x, y, z, light)
     beside = x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2]
     sun = min(max((beside - np.float32(0.99992)) / np.float32(0.00004), np.float32(0)), np.float32(1)) * np.float32(30)
@@ -60,11 +60,11 @@ def heaven_at(x, y, z, light, table):
 
 @inlined
 def mirrored_at(x, y, z, light, table):
-    """Return the radiance that a mirror sees in the unit direction x, y, z: sky above dim houses above the ground."""
+    """Return red, green, blue of the environment of a mirror in the unit direction x, y, z: sky, dim houses, ground."""
     red, green, blue = sky_at(x, y, abs(z), light)
     height = np.float32(SKYLINE) * (np.float32(0.4) + np.float32(1.2) * noise_at(table, x * 9.0, y * 9.0))
     above = min(max((z - height) * np.float32(25), np.float32(0)), np.float32(1))
-    level = min(max(z * np.float32(25), np.float32(0)), np.float32(1))  # houses stand on the ground
+    level = min(max(z * np.float32(25), np.float32(0)), np.float32(1))  # houses above, ground below the horizon
     dim = np.float32(1) + np.float32(0.7) * level
     red = dim * light.bounce[0] + above * (red - dim * light.bounce[0])
     green = dim * light.bounce[1] + above * (green - dim * light.bounce[1])

@@ -1,4 +1,4 @@
-"""What shines by itself at one instant: signal lenses, head and tail lamps, street lamps."""
+"""Light sources at one instant: signal lenses, head and tail lamps, street lamps, and the irradiance of lamps."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -12,37 +12,41 @@ from flcav.world.materials import Material
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
 
-RED, AMBER, GREEN = 1, 2, 4
+RED, AMBER, GREEN = 1, 2, 4  # flags of lit lenses
 LENSES = {"r": RED, "R": RED, "y": AMBER, "Y": AMBER, "u": RED | AMBER, "g": GREEN, "G": GREEN, "o": AMBER}
-BRAKING_MS2 = -0.6  # harder than this, brake lamps are on
+BRAKING_MS2 = -0.6  # acceleration below which brake lamps are on
 
 STREET_LAMP = (4.6, 3.3, 1.75)  # intensity straight down
 HEADLAMP = (17.0, 16.2, 14.5)  # intensity on the axis of a low beam
-STREET_REACH_M, BEAM_REACH_M = 20.0, 45.0
-CELL_M = 8.0
+STREET_REACH_M, BEAM_REACH_M = 20.0, 45.0  # distances at which their light is cut off
+CELL_M = 8.0  # side of the cells of the lamps' grid
 
 
 class State(NamedTuple):
-    """By thing and by instance."""
+    """Lit signal lenses by thing of the town, and lamp brightness by instance."""
 
-    lens: NDArray[np.uint8]  # (K,) of each of the town's things: RED, AMBER and GREEN that are lit
-    head: NDArray[np.float32]  # (I,) how bright the head lamps are, 0 to 1
-    tail: NDArray[np.float32]  # (I,) and the tail lamps; braking is brighter
+    lens: NDArray[np.uint8]  # (K,) of each of the town's things: flags RED, AMBER and GREEN
+    head: NDArray[np.float32]  # (I,) brightness of the head lamps, 0 to 1
+    tail: NDArray[np.float32]  # (I,) brightness of the tail lamps, 0 to 1; brakes included
 
 
 class Lamps(NamedTuple):
-    """K lamps that light up what is around them, and which reach each cell of a grid."""
+    """K lamps that illuminate the scene, and a grid whose cells list the lamps in reach."""
 
     position: NDArray[np.float32]  # (K, 3) world [m]
     ahead: NDArray[np.float32]  # (K, 3) unit direction of a beam; zero for a street lamp
     colour: NDArray[np.float32]  # (K, 3) intensity straight down, or on the beam's axis
     corner: NDArray[np.float64]  # (2,) lowest x, y of the grid
-    first: NDArray[np.int32]  # (cells along x, cells along y + 1)
-    listed: NDArray[np.int32]
+    first: NDArray[np.int32]  # (cells along x, cells along y + 1) start of each cell's list
+    listed: NDArray[np.int32]  # lists of lamps, cell after cell
 
 
 def state_of(scene: Scene, lamps_on: float, low_sight: bool) -> State:
-    """Return what is lit; `low_sight`: rain or fog that vehicles have their lamps on in by day."""
+    """Return the lit lenses and vehicle lamps at the scene's instant.
+
+    `lamps_on` (0 to 1) is the brightness of lamps by the sun's elevation; with `low_sight` (rain or fog), vehicles have
+    theirs on by day too. Parked vehicles have none on.
+    """
     trace, index = scene.trace, scene.index
     letters = dict(zip(trace.light.tolist(), trace.light_state[index].tolist()))
     lens = [LENSES.get(letters.get(link, ""), 0) for link in scene.things.link]
@@ -57,7 +61,7 @@ def state_of(scene: Scene, lamps_on: float, low_sight: bool) -> State:
 
 
 def lamps_of(scene: Scene, state: State) -> Lamps:
-    """Return the lamps that are on, the street's first."""
+    """Return the lamps that illuminate the scene: all street lamps, then the head lamps that are on."""
     street = scene.town.lamps - (0.0, 0.0, 0.08)
     places, beams = [street], [np.zeros_like(street)]
     for actor in np.flatnonzero(state.head[1:] > 0.5):
@@ -74,7 +78,7 @@ def lamps_of(scene: Scene, state: State) -> Lamps:
 
 
 def no_lamps() -> Lamps:
-    """Return no lamps at all: those of a day."""
+    """Return an empty set of lamps, for daylight."""
     none = np.zeros((0, 3))
     position, ahead, colour = (none.astype(np.float32) for _ in range(3))
     return Lamps(position, ahead, colour, *_grid(none, none, np.zeros(0)))
@@ -82,7 +86,7 @@ def no_lamps() -> Lamps:
 
 @lru_cache(maxsize=64)
 def lamp_places(category: str, shape: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centres of an actor's head lamps and of its tail lamps, (K, 3) each, body frame."""
+    """Return the centres (K, 3) of an actor's head lamps and those (L, 3) of its tail lamps, body frame [m]."""
     mesh = actor_mesh(category, shape)
     centres = mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64)
 
@@ -96,7 +100,7 @@ def lamp_places(category: str, shape: int) -> tuple[NDArray[np.float64], NDArray
 
 @inlined
 def lamp_light(lamp, x, y, z, nx, ny, nz, lamps):
-    """Return how much light, over its intensity, a lamp throws on a surface at x, y, z that faces nx, ny, nz."""
+    """Return the irradiance of a lamp, over its intensity, at a surface at x, y, z with the unit normal nx, ny, nz."""
     px, py, pz = lamps.position[lamp, 0] - x, lamps.position[lamp, 1] - y, lamps.position[lamp, 2] - z
     square = px * px + py * py + pz * pz
     faced = px * nx + py * ny + pz * nz
@@ -128,9 +132,9 @@ def lamp_light(lamp, x, y, z, nx, ny, nz, lamps):
 
 @compiled
 def light_up(survey, lamps, light, most, towards, distance):
-    """Write what lamps throw on each ray's end: `light` (N, 3) of all but the strongest one, `most` (N, 3) of that.
+    """Write the irradiance of lamps at N hits: `light` (N, 3) of all but the strongest lamp, `most` (N, 3) of that one.
 
-    `towards` (N, 3) and `distance` (N,) lead to the strongest; the distance is -1 where there is none.
+    `towards` (N, 3), unit, and `distance` (N,) [m] are of the shadow ray to the strongest; -1 where there is none.
     """
     for ray in range(len(distance)):
         distance[ray] = -1

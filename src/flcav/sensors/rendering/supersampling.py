@@ -1,4 +1,9 @@
-"""Supersampling of pixels at edges and thin distant objects."""
+"""Adaptive supersampling: further rays for pixels at visible edges and where thin distant objects may cross them.
+
+Pixels at edges get two more rays, which with the first form a pattern of three rooks; pixels that a thin distant object
+may cross get eight more, in a pattern of nine rooks. So a pole covers the share of its pixels that its width is,
+whether or not a pixel's centre hits it.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +17,21 @@ from flcav.world.map.town import Town
 from flcav.world.materials import Material
 
 LEAF = int(Material.LEAF)
-EDGE, THIN = 1, 2  # what a pixel is
-BEND = 0.93  # cosine between normals from which on a surface has no edge
-STEP = 0.02  # out of the neighbour's plane, over the distance
-CONTRAST = 0.03  # difference over sum of what two pixels show, below which nobody sees an edge
-DARK = 0.02  # light after exposure that is added to that sum: no edges in the dark
-THIN_PX = 4.0  # things narrower than this are thin
-REACH_PX = 0.8  # beyond their edges, that they may touch a pixel
-FARTHEST_M = 220.0
-POST_M, SIGN_M, SIGNAL_M = 0.1, 0.42, 0.6  # half widths
+EDGE, THIN = 1, 2  # flags of a pixel
+BEND = 0.93  # cosine between the normals of two pixels below which there is an edge
+STEP = 0.02  # distance from the other pixel's plane, over range, above which there is an edge
+CONTRAST = 0.03  # difference over sum of two pixels' radiance, below which an edge is not visible
+DARK = 0.02  # exposed light that is added to that sum: no edges in the dark
+THIN_PX = 4.0  # objects narrower than this are thin
+REACH_PX = 0.8  # margin beside thin objects
+FARTHEST_M = 220.0  # of thin objects
+POST_M, SIGN_M, SIGNAL_M = 0.1, 0.42, 0.6  # half widths of thin objects
 
 
 def rough_pixels(
     seen: Survey, radiance: NDArray[np.float32], exposure: np.float32, appearance: Appearance, lens: Lens
 ) -> NDArray[np.uint8]:
-    """Return (N,) which pixels are an EDGE, given the `radiance` (N, 3) of each."""
+    """Return (N,) EDGE for pixels at visible edges, else 0, by their G-buffer and `radiance` (N, 3)."""
     out = np.zeros(len(seen), np.uint8)
     _edges(seen, radiance, np.float32(DARK / exposure), appearance.material, lens.width, out)
     return out
@@ -35,7 +40,7 @@ def rough_pixels(
 def mark_thin(
     kind: NDArray[np.uint8], town: Town, world_from_camera: NDArray[np.float64], lens: Lens, seen: Survey
 ) -> None:
-    """Mark the pixels that the town's lamps, masts, signs and signal heads may cross and that show nothing nearer."""
+    """Set THIN in `kind` (N,) for pixels that lamps, masts, signs or signal heads may cross with nothing nearer."""
     bars = thin_bars(town)
     camera_from_world = inverse(world_from_camera)
     ends = [transform_points(camera_from_world, bars[:, part]) for part in (slice(0, 3), slice(3, 6))]
@@ -59,7 +64,7 @@ def mark_thin(
 
 
 def thin_bars(town: Town) -> NDArray[np.float64]:
-    """Return (K, 7) both ends of everything thin in a town, world [m], and its half width."""
+    """Return the thin objects of a town as bars (K, 7): both ends x, y, z, world frame, and half width [m]."""
     rows = [(x, y, 0, x, y, height, POST_M) for x, y, height in town.lamps]
     rows += [(x, y, 0, x, y, z, POST_M) for x, y, z in town.poles.position]
     for x, y, z in town.signs.position:
@@ -117,16 +122,16 @@ def _draw_bars(start, end, half, near, distance, width, height, kind):
 
 
 SIGN = int(Material.SIGN)
-ROOKS = np.float32(3)  # a further ray stands for so much narrower a part of its pixel
+ROOKS = np.float32(3)  # factor by which the footprint of a further ray is narrower than its pixel
 _THREE = np.array([(-1, 1), (1, -1)], np.float32) / 3
 _NINE = np.array([(-4, -1), (-3, 2), (-2, -3), (-1, 4), (1, -4), (2, 3), (3, -2), (4, 1)], np.float32) / 9
-BRIGHTEST = 3.0  # what outshines this after exposure counts no more: edges of lamps would stay jagged
+BRIGHTEST = 3.0  # exposed light at which samples are clamped: else edges of lamps would stay jagged
 
 
 def further_rays(
     rays: NDArray[np.float32], kind: NDArray[np.uint8], lens: Lens
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return the further unit rays (S, 3) of the pixels that need some, and the pixel (S,) each belongs to."""
+    """Return further unit rays (S, 3), optical frame, for pixels flagged in `kind` (N,), and each one's pixel (S,)."""
     total = int(np.bincount(kind, minlength=4) @ (0, len(_THREE), len(_NINE), len(_NINE)))
     directions, pixel = np.empty((total, 3), np.float32), np.empty(total, np.int32)
     _spread(rays, kind, lens.width, lens.height, _THREE, _NINE, directions, pixel)
@@ -135,10 +140,10 @@ def further_rays(
 
 @compiled
 def donors(hits, pixel, seen, first, material, width, out):
-    """Write for each further ray the pixel `out` (S,) that shows the same face: its own or one beside it; else -1.
+    """Write for each further ray the pixel `out` (S,) whose radiance it takes: its own or a neighbour of the same face.
 
-    What is drawn on faces is smooth over pixels, so that such a ray would see the same. Signs have none: their
-    letters are finer. `first` and `material` are those of `Scene.surfaces`.
+    It is -1 where no neighbour has the ray's face, and on signs, whose letters are finer than pixels; textures of other
+    faces are smooth over pixels. `first` and `material` are those of `Scene.surfaces`.
     """
     for sample in range(len(pixel)):
         out[sample] = -1
@@ -156,7 +161,7 @@ def donors(hits, pixel, seen, first, material, width, out):
 
 @compiled
 def average(radiance, further, pixel, ceiling):
-    """Replace the `radiance` of pixels by the mean with that of their `further` rays (S, 3), all below `ceiling`."""
+    """Replace the `radiance` of pixels by the mean with their `further` samples (S, 3), each clamped to `ceiling`."""
     start = 0
     while start < len(pixel):
         own, end = pixel[start], start

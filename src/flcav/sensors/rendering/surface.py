@@ -1,4 +1,8 @@
-"""The radiance of what rays met: its own colour under sun, sky and lamps, what it mirrors, and the air before it."""
+"""Surface shading: diffuse colour under sun, sky and lamps, emission, mirror reflection, and aerial perspective.
+
+Diffuse light is Lambertian, on procedural textures. Mirror reflection grows towards grazing incidence after Schlick's
+approximation of the Fresnel term. The air blends radiance into its own by exp(-extinction * distance).
+"""
 
 import numpy as np
 
@@ -19,19 +23,18 @@ BARK, LEAF, SIGN, HEADLAMP, TAILLAMP, PLATE, LAMP = (
 LENS_RED, LENS_GREEN = int(Material.LENS_RED), int(Material.LENS_GREEN)
 BUILDING, CLUTTER = int(Part.BUILDING), int(Part.CLUTTER)
 
-LENS_RADIANCE = 2.2
-LOW_SUN = 0.4  # sine of the elevation below which a dry road gleams towards the sun
-SHEEN, SHEEN_GLOSS = 0.28, 22.0
-ROAD_LINE = 0.5  # share of a pixel from which on paint is what it shows
+LENS_RADIANCE = 2.2  # of a lit signal lens
+LOW_SUN = 0.4  # sine of the sun's elevation below which dry roads have a sheen towards the sun
+SHEEN, SHEEN_GLOSS = 0.28, 22.0  # strength and exponent of that sheen
+ROAD_LINE = 0.5  # painted share of a pixel above which its class is road marking
 
 
 @compiled
 def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angle, radiance, painted):
-    """Write the `radiance` (N, 3) of what N rays met, and whether it is `painted` (N,) road.
+    """Shade the N hits of a G-buffer: write their `radiance` (N, 3), and whether they are `painted` (N,) road.
 
-    `lit` (N,) is the share of the sun's light that arrives, `lamplight` (N, 3) what lamps throw there (or (0, 3): none
-    is on),
-    `open_sky` (N,) how much of the sky is free; a pixel sees `pixel_angle` [rad].
+    `lit` (N,) is the share of the sun that is not in shadow, `lamplight` (N, 3) the irradiance of lamps ((0, 3) where
+    none is on), `open_sky` (N,) the ambient occlusion (1: open), `pixel_angle` [rad] the angle that a pixel covers.
     """
     lamps_on = len(lamplight) > 0
     table = appearance.noise
@@ -54,7 +57,7 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
         mirror, gloss = appearance.mirror[material], appearance.gloss[material]
         shine_r, shine_g, shine_b = np.float32(0), np.float32(0), np.float32(0)
         sunny = lit[ray]
-        through = np.float32(0)  # share of the sun that shines through from behind
+        through = np.float32(0)  # translucency: share of sunlight transmitted from behind
         if material == ROAD:
             tone = asphalt(x, y, slant, table)
             red, green, blue = red * tone, green * tone, blue * tone
@@ -173,7 +176,7 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             arrive_r += lamplight[ray, 0] * light.lamps
             arrive_g += lamplight[ray, 1] * light.lamps
             arrive_b += lamplight[ray, 2] * light.lamps
-            if material in (SIGN, PLATE):  # sends head lamps' light back
+            if material in (SIGN, PLATE):  # retro-reflective in the light of lamps
                 arrive_r, arrive_g, arrive_b = arrive_r * 2, arrive_g * 2, arrive_b * 2
         red, green, blue = red * arrive_r, green * arrive_g, blue * arrive_b
 
