@@ -19,7 +19,7 @@ class Rectangles:
     """The N labelled 2D bounding boxes of one image."""
 
     label: NDArray[np.int64]  # (N,) index into the chosen list of CLASSES
-    box: NDArray[np.float64]  # (N, 4) left, top, right, bottom of the visible part [px], origin at the upper left corner
+    box: NDArray[np.float64]  # (N, 4) left, top, right, bottom of the visible part [px], from the image's corner
     pixels: NDArray[np.int64]  # (N,) number of visible pixels
     row: NDArray[np.int64]  # (N,) index into the frame's annotations, or into the image's signs
 

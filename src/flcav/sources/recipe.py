@@ -149,6 +149,6 @@ def load_recipe(path: Path | str) -> Recipe:
     """
     recipe = read_config(Recipe, Path(path))
     folder = Path(path).absolute().parent / recipe.town
-    if recipe.town in TOWNS or not os.path.isdir(folder):  # noqa: PTH112 - Path.is_dir raises for names that no file can have
+    if recipe.town in TOWNS or not os.path.isdir(folder):  # noqa: PTH112 - Path.is_dir raises for too long a name
         return recipe
     return recipe.model_copy(update={"town": str(folder)})
