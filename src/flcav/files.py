@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from typing_extensions import TypeAliasType  # of typing from Python 3.12 on: what pydantic checks by
+from typing_extensions import TypeAliasType  # typing has it from Python 3.12 on; pydantic needs it for recursive types
 
 Json = TypeAliasType("Json", "bool | int | float | str | Sequence[Json] | Mapping[str, Json] | None")
 

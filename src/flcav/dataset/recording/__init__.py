@@ -1,1 +1,1 @@
-"""Recording of datasets: the recorder, its tasks, and the engines that perform them."""
+"""Recording of datasets: the recorder, its jobs, and the engines that perform them."""

@@ -1,7 +1,7 @@
-"""The tasks of a recording, how one is performed, and their scheduling.
+"""The jobs of a recording: their division of the frames, how one is performed, and their scheduling.
 
-A scene of a `Replayable` source is one task for its traffic and one for each part of its frames; any other scene is one
-task. A task writes below `work/SCENE`: the traffic, or the folder of a part, which appears there when it is complete. A
+A scene of a `Replayable` source is one job for its traffic and one for each part of its frames; any other scene is one
+job. A job writes below `work/SCENE`: the traffic, or the folder of a part, which appears there when it is complete. A
 scene's traffic is scheduled before its parts, and only a few scenes are under way at a time.
 """
 
@@ -33,13 +33,13 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 class Traffic(NamedTuple):
-    """The task that simulates the traffic of a scene, which its parts replay."""
+    """The job that simulates the traffic of a scene, which its parts replay."""
 
     scene: str
 
 
 class Part(NamedTuple):
-    """The task that records `frames` consecutive frames of a scene, from number `first` on."""
+    """The job that records `frames` consecutive frames of a scene, from number `first` on."""
 
     scene: str
     number: int
@@ -62,7 +62,7 @@ def parts(source: Source, scene: str) -> list[Part]:
 
 
 def perform(source: Source, task: Task, work: Path, wrote_frame: Callable[[], None]) -> None:
-    """Perform `task` below the folder `work`, replacing leftovers of an earlier attempt.
+    """Perform the job `task` below the folder `work`, replacing leftovers of an earlier attempt.
 
     Calls `wrote_frame` after each frame. Raises ValueError where the source violates its protocol: it has no traffic to
     replay, yields a frame twice or of another scene, uses unsafe names, or moves sensors on their mounts.
@@ -123,22 +123,22 @@ def _check_names(frame: Frame, scene: str) -> None:
         raise ValueError(f"{frame.key}: scene, agent or sensor names that a dataset cannot hold: {names}")
 
 
-AHEAD = 2  # tasks submitted beyond an engine's slots, so that no worker idles
+AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
 class Engine(Protocol):
-    """An executor of tasks, in any order, `slots` at a time."""
+    """An executor of jobs, in any order, `slots` at a time."""
 
     slots: int
 
     def submit(self, task: Task) -> None:
-        """Enqueue a task."""
+        """Enqueue a job."""
         ...
 
     def wait(self) -> Iterable[Task]:
-        """Block until a submitted task is done; return those done since the last call, at least one.
+        """Block until a submitted job is done; return those done since the last call, at least one.
 
-        Raises the exception of a failed task, and OSError where a worker was killed.
+        Raises the exception of a failed job, and OSError where a worker was killed.
         """
         ...
 
@@ -149,7 +149,7 @@ def pending(source: Source, scene: str, work: Path) -> list[Part]:
 
 
 def record_scenes(source: Source, engine: Engine, work: Path) -> None:
-    """Perform all remaining tasks of all scenes on `engine`, the traffic of a scene before its parts."""
+    """Perform all remaining jobs of all scenes on `engine`, the traffic of a scene before its parts."""
     scenes = deque(scene for scene in source.scenes() if pending(source, scene, work))
     ready: deque[Task] = deque()
     busy = 0

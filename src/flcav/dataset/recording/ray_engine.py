@@ -1,4 +1,4 @@
-"""Recording engine on a Ray cluster: actors on any of its machines perform the tasks.
+"""Recording engine on a Ray cluster: actors on any of its machines perform the jobs.
 
 The dataset's folder must be on storage shared by all machines, and flcav installed on each. RAY_ADDRESS names the
 cluster; without it, Ray is started on this machine.
@@ -18,12 +18,12 @@ from flcav.extras import installation
 from flcav.sources.source import Source
 from flcav.threads import VARIABLES
 
-STORE_BYTES = 128_000_000  # object store of a Ray started here: only tasks and pieces of files pass through it
+STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
 
 
 @contextlib.contextmanager
 def ray_cluster(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
-    """Yield an engine of `jobs` Ray actors that perform tasks of `source` below the folder `work`.
+    """Yield an engine of `jobs` Ray actors that perform jobs of `source` below the folder `work`.
 
     It calls `wrote` with the number of frames written so far, as parts are completed. Raises `InputError` where Ray is
     not installed.
@@ -64,7 +64,7 @@ def ray_session(jobs: int) -> Iterator[Any]:
 
 
 class _Worker:
-    """A Ray actor that performs tasks in sequence; its source keeps the scene that it built last."""
+    """A Ray actor that performs jobs in sequence; its source keeps the scene that it built last."""
 
     def __init__(self, source: Source, work: Path) -> None:
         self._source, self._work = source, work
@@ -78,7 +78,7 @@ class _Worker:
 
 
 class _Actors:
-    """An engine that hands each queued task to an idle Ray actor."""
+    """An engine that hands each queued job to an idle Ray actor."""
 
     def __init__(self, actors: list[Any], wrote: Callable[[int], None]) -> None:
         self.slots = len(actors)

@@ -23,9 +23,9 @@ _job: Any = None  # in a worker process: source, folder, and the shared counter 
 
 @contextlib.contextmanager
 def processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
-    """Yield an engine of `jobs` processes that perform tasks of `source` below the folder `work`.
+    """Yield an engine of `jobs` processes that perform jobs of `source` below the folder `work`.
 
-    It calls `wrote` with the number of frames written so far. A single job runs in this process; more run in child
+    It calls `wrote` with the number of frames written so far. A single one is this process; more are child
     processes, which end with this one, even if it is killed.
     """
     if jobs == 1:
@@ -42,7 +42,7 @@ def processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None
 
 
 class _Here:
-    """An engine that performs tasks in sequence in this process."""
+    """An engine that performs jobs in sequence in this process."""
 
     slots = 1
 
