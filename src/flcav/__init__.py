@@ -1,6 +1,7 @@
-"""Design and verify federated learning for connected autonomous vehicle (CAV) perception.
+"""Federated learning for the perception of connected autonomous vehicles (CAVs): simulation, planning, training.
 
-What most programs need is here by name; each package has more of its own. Nothing is imported before it is asked for.
+The names here are those that most programs need; each package has further ones. A name's module is imported when the
+name is first used.
 """
 
 from typing import TYPE_CHECKING

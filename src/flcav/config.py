@@ -1,4 +1,4 @@
-"""User-facing configuration: YAML in, a frozen and checked record out, one sentence where it is wrong."""
+"""Validation of user-facing configuration: YAML and JSON files to frozen records, with one-sentence error messages."""
 
 import json
 from pathlib import Path
@@ -9,21 +9,21 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from flcav.files import Json
 
-SHOWN = 80  # characters of a wrong value in the sentence about it
+SHOWN = 80  # most characters of a wrong value that an error message quotes
 
 
 class InputError(ValueError):
-    """What the user gave cannot be used. The message is one sentence for them; the command line exits with 2."""
+    """Invalid user input. The message is one sentence for the user; the command line prints it and exits with 2."""
 
 
 class Config(BaseModel):
-    """Base of every user-facing configuration: frozen, no unknown field passes, and no number that nobody can mean.
+    """Base class of user-facing configurations: frozen; rejects unknown fields and numbers of implausible magnitude.
 
-    Numbers far beyond what can be measured overflow in arithmetic, long after they were read.
+    Numbers far beyond any measurement are rejected here because they would overflow in later arithmetic.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-    magnitudes: ClassVar[tuple[float, float]] = (0.0, 1e15)  # least and most of a number other than 0, sign apart
+    magnitudes: ClassVar[tuple[float, float]] = (0.0, 1e15)  # limits of |x| of every float x other than 0
 
     @field_validator("*", mode="after")
     @classmethod
@@ -36,11 +36,14 @@ class Config(BaseModel):
 
 
 ConfigT = TypeVar("ConfigT", bound=Config)
-Place = tuple[int | str, ...]  # of a field within fields
+Place = tuple[int | str, ...]  # path to a nested field: names of fields, indices and keys, as pydantic's `loc`
 
 
 def parse_config(model: type[ConfigT], values: object, origin: str) -> ConfigT:
-    """Return `values` as a checked `model`; raises `InputError` naming `origin`, the field, the value, the rule."""
+    """Return `values` as a validated instance of `model`.
+
+    Raises `InputError` that names `origin`, the field, its value and the violated rule.
+    """
     if not isinstance(values, dict):
         raise InputError(f"{origin}: expected a mapping of fields, found {type(values).__name__}")
     try:
@@ -50,12 +53,15 @@ def parse_config(model: type[ConfigT], values: object, origin: str) -> ConfigT:
 
 
 def read_config(model: type[ConfigT], path: Path) -> ConfigT:
-    """Return the YAML file at `path` as a checked `model`; raises `InputError`."""
+    """Return the YAML file at `path` as a validated instance of `model`.
+
+    Raises `InputError` where the file is missing, is not YAML, or violates a rule of `model`.
+    """
     return parse_config(model, read_yaml(path), str(path))
 
 
 def read_yaml(path: Path) -> object:
-    """Return what the YAML (or JSON) file at `path` holds; raises `InputError`."""
+    """Return the value in the YAML (or JSON) file at `path`; raises `InputError` if it is missing or not YAML."""
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -65,7 +71,7 @@ def read_yaml(path: Path) -> object:
 
 
 def read_json(path: Path) -> Json:
-    """Return what the JSON file at `path` holds; raises `InputError`."""
+    """Return the value in the JSON file at `path`; raises `InputError` if it is missing or not JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -75,13 +81,17 @@ def read_json(path: Path) -> Json:
 
 
 def shorten(value: object) -> str:
-    """Return a value as a sentence shows it."""
+    """Return the `repr` of a value for an error message; more than SHOWN characters are cut in the middle."""
     text = repr(value)
     return text if len(text) <= SHOWN else f"{text[: SHOWN // 2]} ... {text[-SHOWN // 4 :]}"
 
 
 def tell(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return the first of the deepest faults that were found in fields of `model`, in words."""
+    """Return a validation error of `model` as a clause for an error message.
+
+    It tells the first of the most deeply nested faults and counts the others: an outer field is reported as wrong
+    whenever an inner one is.
+    """
     errors = error.errors()
     deepest = [each for each in errors if not any(_inside(other["loc"], each["loc"]) for other in errors)]
     first = deepest[0]
@@ -103,12 +113,15 @@ def tell(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def _inside(place: Place, outer: Place) -> bool:
-    """Return whether `place` lies within `outer`: a fault there makes the whole faulty too."""
+    """Return whether the field at `place` is nested within the field at `outer`."""
     return len(place) > len(outer) and place[: len(outer)] == outer
 
 
 def _models_at(model: type[BaseModel], place: Place) -> list[type[BaseModel]]:
-    """Return the models that may stand at `place`; numbers, keys and tags of unions lead from none to another."""
+    """Return the models that the type annotations allow at `place`.
+
+    Indices, keys and tags of unions in the path do not change the model.
+    """
     found = [model]
     for part in place:
         within = [owner.model_fields[part].annotation for owner in found if part in owner.model_fields]

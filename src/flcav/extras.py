@@ -1,4 +1,4 @@
-"""What flcav works without: the packages of its extras, and how to get them."""
+"""Optional dependencies: the packages of flcav's extras and the command that installs them."""
 
 import shlex
 import sys
@@ -6,7 +6,7 @@ from importlib.metadata import requires
 
 
 def installation(extra: str) -> str:
-    """Return the command that installs an extra's packages for this Python, wherever flcav itself came from."""
+    """Return the pip command that installs the packages of `extra`, as flcav's metadata list them, for this Python."""
     lines = (line.partition(";") for line in requires("flcav") or ())
     wanted = f"extra == '{extra}'"  # a build back end may write either quotes
     packages = [package.strip() for package, _, condition in lines if wanted in condition.replace('"', "'")]

@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Atomic file writing, JSON files and SHA-256 checksums."""
 
 import contextlib
 import hashlib
@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from typing_extensions import TypeAliasType  # of typing from Python 3.12 on: what pydantic checks by
+from typing_extensions import TypeAliasType  # typing has it from Python 3.12 on; pydantic needs it for recursive types
 
 Json = TypeAliasType("Json", "bool | int | float | str | Sequence[Json] | Mapping[str, Json] | None")
 
@@ -17,9 +17,10 @@ PIECE_BYTES = 1 << 16
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling of `path` to write; renamed to `path` on success, removed on any failure.
+    """Yield a temporary file beside `path` to write to; it is renamed to `path` on success and removed on failure.
 
-    An `OSError` that does not know its file, as those of writing, names `path`.
+    Creates missing parent folders. An `OSError` without a file name, such as one raised by a write, is raised on with
+    `path` as its file name.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -35,12 +36,15 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise `OSError` where nothing can be written below `folder`; leaves nothing behind."""
+    """Raise `PermissionError` if no file can be created in `folder`, or in its nearest existing parent.
+
+    Leaves no file behind.
+    """
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
         tempfile.TemporaryFile(dir=nearest).close()
     except OSError as error:
-        # even where the system says that something is not there: it is not the user who named a wrong input
+        # PermissionError whatever the cause: a FileNotFoundError would be reported as a wrong input of the user
         raise PermissionError(error.errno, error.strerror, str(folder)) from None
 
 
@@ -51,18 +55,24 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def fill(path: Path, data: bytes | memoryview) -> None:
-    """Write `data` to `path`, in pieces: for large ones the kernel seeks runs of free memory, at six times the cost."""
+    """Write `data` to `path` in pieces of PIECE_BYTES.
+
+    For one large write the kernel looks for contiguous free memory, which takes six times as long.
+    """
     with path.open("wb") as file:
         for start in range(0, len(data), PIECE_BYTES):
             file.write(memoryview(data)[start : start + PIECE_BYTES])
 
 
 def write_json(path: Path, value: Json, *, sort: bool = True) -> None:
-    """Write `value` as indented JSON to `path`, atomically; with sorted keys, or in their own order."""
+    """Write `value` as indented JSON to `path`, atomically, with keys sorted or (`sort=False`) in their own order.
+
+    Raises ValueError for a number that is not finite.
+    """
     write_bytes(path, (json.dumps(value, indent=1, sort_keys=sort, allow_nan=False) + "\n").encode())
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, as hex."""
+    """Return the SHA-256 checksum of a file as 64 hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

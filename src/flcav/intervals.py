@@ -1,7 +1,7 @@
-"""Intervals of what is measured: the bootstrap over scenes, and Student's over seeds.
+"""95 % confidence intervals: the percentile bootstrap over scenes and Student's t over seeds.
 
-Frames of one scene share their traffic, so whole scenes are redrawn (Efron and Tibshirani, "An Introduction to the
-Bootstrap", 1993, ch. 13: percentile intervals). Seeds differ in training and traffic, and are few: Student's t.
+Frames of one scene share their traffic, so the bootstrap resamples whole scenes (Efron and Tibshirani, "An Introduction
+to the Bootstrap", 1993, ch. 13: percentile intervals). Results of different seeds are independent but few: Student's t.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,14 +18,17 @@ TAILS = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its 95 % interval, which is None where one scene or one seed leaves it unknown."""
+    """An estimate with its 95 % confidence interval; `low` and `high` are None where one scene or seed gives none."""
 
     mean: float
     low: float | None
     high: float | None
 
     def told(self, *, sign: bool = False) -> str:
-        """Return "mean (low to high)", with their signs if asked; the mean alone where the interval is unknown."""
+        """Return the text "mean (low to high)" with three decimals; only the mean where there is no interval.
+
+        With `sign`, positive numbers have a plus.
+        """
         form = "+.3f" if sign else ".3f"
         if self.low is None or self.high is None:
             return f"{self.mean:{form}}"
@@ -34,7 +37,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class MeanOverSeeds(Estimate):
-    """A mean over seeds with Student's 95 % interval, which has no width of a single one."""
+    """The mean over seeds with Student's 95 % confidence interval, of zero width for a single seed."""
 
     low: float
     high: float
@@ -47,10 +50,11 @@ def over_scenes(
     *,
     rng: np.random.Generator,
 ) -> tuple[float, float]:
-    """Return the 95 % percentile interval of a measure under `n` redrawings of the scenes; NaN where it is never known.
+    """Return the ends of the 95 % percentile interval of a measure, from `n` bootstrap resamples of the scenes.
 
-    `measure` takes (n, F), how often each frame counts in each redrawing, and returns (n,) values, NaN where it is not
-    defined; `scene_of_frame` (F,) names each frame's scene.
+    `measure` takes (n, F) counts, how often each of F frames is in each resample, and returns (n,) values, NaN where it
+    is undefined; such resamples are left out, and both ends are NaN where none is left. `scene_of_frame` (F,) names
+    the scene of each frame.
     """
     names, scene = np.unique(np.asarray(scene_of_frame), return_inverse=True)
     times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=n)
@@ -63,7 +67,7 @@ def over_scenes(
 
 
 def mean_over_seeds(values: Sequence[float]) -> MeanOverSeeds:
-    """Return the mean of `values`, one per seed."""
+    """Return the mean of `values`, one per seed, and its 95 % interval: mean ± t(n - 1, 97.5 %) · s / √n."""
     array = np.asarray(values, dtype=np.float64)
     half = 0.0
     if len(array) > 1:

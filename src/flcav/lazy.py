@@ -1,4 +1,4 @@
-"""Names that a package gives without importing what they name until they are asked for (PEP 562)."""
+"""Lazy imports: module attributes that are imported on first access (PEP 562)."""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -7,13 +7,16 @@ from typing import Any
 
 
 def lazy_names(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package whose names lie in other modules: `places`, name -> module."""
+    """Return `__getattr__` and `__dir__` for `package`; `places` maps each public name to the module that defines it.
+
+    The returned `__getattr__` raises AttributeError for any other name.
+    """
 
     def __getattr__(name: str) -> Any:
         if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         found = getattr(import_module(places[name]), name)
-        setattr(sys.modules[package], name, found)  # there from now on
+        setattr(sys.modules[package], name, found)  # so that it is looked up once
         return found
 
     def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""Parquet files as tables, read strictly."""
+"""Strict reading of Parquet files."""
 
 from pathlib import Path
 
@@ -9,9 +9,9 @@ from flcav.config import InputError
 
 
 def read_parquet(path: Path) -> pa.Table:
-    """Return the table in a Parquet file; its text is UTF-8.
+    """Return the table in a Parquet file, validated in full: its strings are UTF-8.
 
-    Raises `InputError` where the file is missing, no Parquet or damaged.
+    Raises `InputError` where the file is missing, not Parquet, or damaged.
     """
     try:
         table = pq.ParquetFile(path).read()

@@ -1,4 +1,4 @@
-"""What users bring of their own, named on the command line or in a recipe as `module:NAME`."""
+"""Plug-ins: tasks, strategies and study charts of users, named `module:NAME` on the command line or in a recipe."""
 
 import importlib
 import re
@@ -14,11 +14,12 @@ PLACE = re.compile(r"\w+(\.\w+)*:\w+")
 
 
 def load_own(kind: str, name: str, known: Iterable[str], wanted: type) -> Any:
-    """Return the `kind` (a task, a strategy) that `name`, a `module:NAME`, stands for.
+    """Return the object named `name`, written `module:NAME`; `kind` (a task, a strategy) names it in messages.
 
-    The module is imported with the working directory on the path, as by `python -m`. A class stands for what it makes
-    without arguments. Raises `InputError` for a name without a colon, listing the `known` ones, for a module that is
-    not there or cannot be imported, and for an object without the public members of the protocol `wanted`.
+    The module is imported with the working directory on the path, as by `python -m`. A class is instantiated without
+    arguments. Raises `InputError` for a name without a colon, listing the `known` ones, for a module that is missing or
+    cannot be imported, a name that the module lacks, a class that cannot be instantiated so, and an object without all
+    public members of the protocol `wanted`.
     """
     place, colon, attribute = name.partition(":")
     told = f"{kind} '{name}'"
@@ -55,7 +56,7 @@ def _imported(place: str, told: str) -> ModuleType:
 
 
 def _said(error: BaseException) -> str:
-    """Return an exception in words, with the file and line that raised it."""
+    """Return the type and message of an exception, and the file and line that raised it."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next

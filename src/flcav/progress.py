@@ -1,4 +1,4 @@
-"""Progress of long work: a callable that work reports to, and a live display of it on stderr."""
+"""Progress reporting: the callback type of long-running functions, and a progress bar on stderr."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -10,14 +10,14 @@ Report = Callable[[int, int, str], None]  # done, total, note (e.g. "loss 0.31")
 
 
 def silent(done: int, total: int, note: str = "") -> None:
-    """Report nothing."""
+    """Do nothing: the default `Report`, without a display."""
 
 
 @contextlib.contextmanager
 def live(title: str) -> Iterator[Report]:
-    """Yield a `Report` that draws a bar with the time left on stderr, where that is a terminal.
+    """Yield a `Report` that draws a progress bar with the estimated time left on stderr, if stderr is a terminal.
 
-    What its first call says to be done was done before: it does not count for the speed.
+    The `done` of the first call is taken as finished earlier and does not count towards the speed.
     """
     columns = (
         TextColumn("{task.description}", markup=False),

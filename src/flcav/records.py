@@ -1,4 +1,4 @@
-"""Records and JSON: the one place that turns a frozen dataclass into what JSON holds, and back."""
+"""Conversion of frozen dataclasses to JSON values and back, by pydantic."""
 
 from functools import cache
 from typing import Annotated, Any, Self, TypeVar
@@ -8,32 +8,32 @@ from pydantic import Field, TypeAdapter, ValidationError
 from flcav.config import InputError
 from flcav.files import Json
 
-Class = Annotated[str, Field(alias="class")]  # a field that JSON calls "class", a word that Python keeps for itself
-LEFT_OUT = Field(exclude_if=lambda value: value is None)  # of a field, in `Annotated`: None is not in JSON
+Class = Annotated[str, Field(alias="class")]  # a field named "class" in JSON, a reserved word in Python
+LEFT_OUT = Field(exclude_if=lambda value: value is None)  # for `Annotated`: not in the JSON where it is None
 
 RecordT = TypeVar("RecordT")
 
 
 class Record:
-    """A frozen dataclass of JSON values, and of records, mappings and tuples of them."""
+    """Base class of frozen dataclasses whose fields are JSON values, records, or mappings and tuples of these."""
 
     def as_json(self) -> dict[str, Json]:
-        """Return the record as JSON has it, its fields in their order."""
+        """Return the record as a JSON object, with its fields in the order of their definition."""
         return to_json(self, type(self))
 
     @classmethod
     def of_json(cls, values: Json, origin: str) -> Self:
-        """Return what `as_json` returned as a record again; raises `InputError` naming `origin` where it is no such."""
+        """Return the record that `as_json` made `values` of; raises `InputError` naming `origin` if they do not fit."""
         return of_json(cls, values, origin)
 
 
 def to_json(record: RecordT, kind: type[RecordT]) -> dict[str, Json]:
-    """Return a dataclass as JSON has it, its fields in their order; `kind` is its class, with what it is generic in."""
+    """Return a dataclass as a JSON object, with its fields in order; `kind` is its class with its type arguments."""
     return _adapter(kind).dump_python(record, mode="json", by_alias=True)
 
 
 def of_json(kind: type[RecordT], values: Json, origin: str) -> RecordT:
-    """Return what `to_json` returned as a record again; raises `InputError` naming `origin` where it is no such."""
+    """Return the `kind` that `to_json` made `values` of; raises `InputError` naming `origin` if they do not fit."""
     try:
         return _adapter(kind).validate_python(values)
     except ValidationError as error:

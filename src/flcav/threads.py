@@ -1,4 +1,4 @@
-"""Threads of the numerical libraries: their number decides the order of sums, and with it the last bits of a result."""
+"""Thread count of the numerical libraries. It decides the order of sums, and so the last bits of results."""
 
 import os
 import sys
@@ -7,9 +7,10 @@ VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMB
 
 
 def use_threads(count: int) -> None:
-    """Have this process, and those it starts, compute on `count` threads each.
+    """Set the thread count of the numerical libraries in this process and its children.
 
-    Libraries read the environment when they are loaded; of those that are loaded, torch is told.
+    Sets the environment variables in VARIABLES, which a library reads when it is loaded, and torch's own setting if
+    torch is loaded already; other libraries loaded before keep theirs.
     """
     os.environ.update(dict.fromkeys(VARIABLES, str(count)))
     if torch := sys.modules.get("torch"):

@@ -1,4 +1,4 @@
-"""What an interval decides, and the words for it on every page."""
+"""Verdicts on claims and targets from 95 % confidence intervals, and their wording."""
 
 from flcav.intervals import MeanOverSeeds
 
@@ -6,7 +6,10 @@ HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
 
 
 def verdict(low: float | None, high: float | None) -> str:
-    """Return what the interval [low, high] of a difference says of the claim that it is positive; None: no interval."""
+    """Return the verdict on the claim that a difference with the interval [low, high] is positive.
+
+    HELD if the interval lies above 0, NOT_HELD if below 0, else UNDECIDED, also where there is no interval (None).
+    """
     if low is None or high is None:
         return UNDECIDED
     if low > 0:
@@ -15,7 +18,7 @@ def verdict(low: float | None, high: float | None) -> str:
 
 
 def verdict_words(decided: str, runs: int = 1) -> str:
-    """Return a clause on where the interval lies and what that says of the claim, in one run or over several."""
+    """Return a clause that explains the verdict `decided` of `verdict`, for one run or several (`runs`)."""
     where = " in this run" if runs == 1 else ""
     who = "this run does" if runs == 1 else "these runs do"
     return {
@@ -26,10 +29,10 @@ def verdict_words(decided: str, runs: int = 1) -> str:
 
 
 def aim_sentence(aim: str, wanted: float, reached: MeanOverSeeds, seeds: int, *, at_most: bool = False) -> str:
-    """Return "*aim*: **verdict**, mean (low to high) over so many seeds", without a full stop.
+    """Return the sentence "*aim*: **verdict**, mean (low to high) over n seeds" in Markdown, without a full stop.
 
-    Reached, or not, where the whole interval of `reached` says so; else undecided. The aim is to come
-    to `wanted` or above, or where `at_most`, to it or below.
+    The aim is a mean of at least `wanted`, or with `at_most` of at most `wanted`. The verdict is "reached" or "not
+    reached" where the whole interval of `reached` lies on one side of `wanted`, else UNDECIDED.
     """
     low, high = reached.low, reached.high
     good, bad = (high <= wanted, low > wanted) if at_most else (low >= wanted, high < wanted)
@@ -39,5 +42,5 @@ def aim_sentence(aim: str, wanted: float, reached: MeanOverSeeds, seeds: int, *,
 
 
 def signed(value: float, digits: int = 3) -> str:
-    """Return the number with its sign, a minus as long as the plus."""
+    """Return `value` with its sign and `digits` decimals; a minus is U+2212."""
     return f"{value:+.{digits}f}".replace("-", "−")

@@ -1,4 +1,4 @@
-"""Recorded frames on disk: write, read, check."""
+"""Datasets: recording, reading, validation, and export to other formats."""
 
 from typing import TYPE_CHECKING
 

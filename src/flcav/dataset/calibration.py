@@ -1,7 +1,7 @@
-"""The calibration file of a dataset: for each agent, how its sensors are, and how it believes them to be.
+"""The calibration file of a dataset: true and assumed extrinsics, intrinsics and trigger times of each agent's sensors.
 
-agent -> "true" | "assumed" -> sensor -> {"agent_from_sensor": 16 numbers row by row, "offset_ms", and of a camera
-"intrinsics": 9 numbers row by row, "distortion": 5}.
+JSON: agent -> "true" | "assumed" -> sensor -> {"agent_from_sensor": 16 numbers, row-major, "offset_ms": number [ms],
+and for a camera "intrinsics": 9 numbers, row-major [px], "distortion": 5 numbers}. See `flcav.sensors.frame`.
 """
 
 from collections.abc import Mapping
@@ -17,19 +17,23 @@ SHAPES = {"agent_from_sensor": (4, 4), "intrinsics": (3, 3), "distortion": (5,)}
 
 
 class Calibrations(NamedTuple):
-    """Of one agent."""
+    """The true calibration of one agent, and the one that the agent assumes."""
 
     true: Calibration
     assumed: Calibration
 
 
 def to_json(frame: Frame) -> dict[str, Any]:
-    """Return the calibration of the frame's agent as it is kept in the file."""
+    """Return the entry of the frame's agent in the calibration file: {"true": ..., "assumed": ...}."""
     return {"true": _sensors(frame.calibration), "assumed": _sensors(frame.assumed)}
 
 
 def read_calibrations(path: Path, sensors: Mapping[str, set[str]]) -> dict[str, Calibrations]:
-    """Return the calibrations by agent; raises `InputError` where one of its `sensors` is missing or malformed."""
+    """Return agent -> calibrations, read from the calibration file at `path`.
+
+    `sensors` maps each agent to the names of its sensors. Raises `InputError` where the file is missing or not JSON, an
+    agent's entry is missing or malformed, or a sensor has no mount.
+    """
     values: Any = read_json(path)
     found = {}
     for agent, names in sensors.items():

@@ -1,4 +1,4 @@
-"""Tables that are handed to users and their tools: CSV or Parquet, by the ending of the file's name."""
+"""Tables for users, written as CSV or Parquet by the suffix of the file's name."""
 
 from pathlib import Path
 
@@ -13,13 +13,13 @@ ENDINGS = (".csv", ".parquet")
 
 
 def check_ending(path: Path) -> None:
-    """Raise `InputError` where the ending of `path` names no format of tables."""
+    """Raise `InputError` where the suffix of `path` is none of ENDINGS."""
     if path.suffix not in ENDINGS:
         raise InputError(f"{path}: tables are written as {' or '.join(ENDINGS)}; end the name with one of them")
 
 
 def write_table(table: pa.Table, path: Path) -> None:
-    """Write `table` atomically as the ending of `path` says; raises `InputError` for another ending."""
+    """Write `table` atomically to `path`, as CSV or Parquet by its suffix; raises `InputError` for any other suffix."""
     check_ending(path)
     with atomic_path(path) as temporary:
         if path.suffix == ".csv":

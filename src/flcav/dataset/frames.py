@@ -1,4 +1,4 @@
-"""Rows of the tables as parts of a frame: the way back from `flcav.dataset.rows`."""
+"""Decoding of table rows into the parts of a frame, the inverse of `flcav.dataset.rows`."""
 
 from collections.abc import Iterable, Sequence
 
@@ -24,9 +24,10 @@ from flcav.world.weather import Weather
 def annotations_of(
     rows: pa.Table, points: pa.Table, views: pa.Table, signs: pa.Table, ranging: Iterable[str], cameras: Iterable[str]
 ) -> Annotations:
-    """Return the annotations of a frame from its rows in four tables, for its LiDARs and radars and its cameras.
+    """Return the annotations of one frame from its rows in the tables `annotations`, `points`, `views` and `signs`.
 
-    Raises `InputError` where a row speaks of an actor that is not annotated.
+    `ranging` names the frame's LiDARs and radars, `cameras` its cameras, infrared ones included. Raises `InputError`
+    where a row refers to an actor that is not annotated.
     """
     count, cameras = len(rows), list(cameras)
     return Annotations(
@@ -43,12 +44,12 @@ def annotations_of(
 
 
 def vectors_of(rows: pa.Table, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Return the numbers in `columns` by the sensor of the row."""
+    """Return sensor -> (C,) values of its row in the C `columns`."""
     return dict(zip(rows["sensor"].to_pylist(), _numbers(rows, columns)))
 
 
 def weather_of(rows: pa.Table) -> Weather | None:
-    """Return the weather of a frame, None where it is not known; raises `InputError` where it is none."""
+    """Return the weather of a frame from its row, None without a row; raises `InputError` for values out of range."""
     if not len(rows):
         return None
     row = rows.slice(0, 1).to_pylist()[0]
@@ -62,7 +63,10 @@ def _points(rows: pa.Table, count: int) -> NDArray[np.int64]:
 
 
 def _actors(rows: pa.Table, count: int) -> NDArray[np.int64]:
-    """Return (R,) the rows of the frame's `count` annotations that the rows of another table speak of."""
+    """Return (R,) the indices into the frame's `count` annotations that the R `rows` of another table refer to.
+
+    Raises `InputError` for an index that is out of range.
+    """
     at = rows["row"].to_numpy()
     if ((at < 0) | (at >= count)).any():
         raise InputError(

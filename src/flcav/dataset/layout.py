@@ -1,4 +1,4 @@
-"""Where things lie in a dataset folder, and its manifest."""
+"""The layout of a dataset folder: the paths of its files, and its manifest."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,28 +13,28 @@ from flcav.files import Json
 FORMAT = 2
 MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
 CALIBRATION = "calibration.json"  # see `flcav.dataset.calibration`
-FILES = "files"  # table of the payload files: all that is neither a table, the calibration nor the manifest
+FILES = "files"  # table that lists all other files: payloads, traffic, the town's files
 TRACES = "traces"
-TOWN = "town"  # holds the folder of a town that does not come with flcav
-WORK = ".recording"  # what a recording under way keeps; gone when it is done
-PACKAGES = ("flcav", "embreex", "libsumo", "numba", "numpy", "pillow", "pyarrow")  # those that decide the bytes
+TOWN = "town"  # contains the folder of a town that does not come with flcav
+WORK = ".recording"  # folder of an unfinished recording; removed at its end
+PACKAGES = ("flcav", "embreex", "libsumo", "numba", "numpy", "pillow", "pyarrow")  # those that determine the bytes
 
 
 class Strict(BaseModel):
-    """Base of what must be in a manifest; nothing is taken for something else, and more may be there."""
+    """Base class of the records of a manifest: types are not coerced, and additional fields are allowed."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
 
 class TableFile(Strict):
-    """A table's file."""
+    """Size [bytes] and SHA-256 checksum of a file listed in the manifest."""
 
     bytes: int
     sha256: str
 
 
 class Counts(Strict):
-    """How much a dataset holds."""
+    """Counts of the contents of a dataset."""
 
     frames: int
     scenes: int
@@ -45,7 +45,7 @@ class Counts(Strict):
 
 
 class Manifest(Strict):
-    """What every manifest holds."""
+    """The manifest of a dataset: format version, resolved recipe, package versions, counts, scenes, files of tables."""
 
     format: int
     recipe: Mapping[str, Json]
@@ -57,7 +57,7 @@ class Manifest(Strict):
 
 @dataclass(frozen=True)
 class FrameKey:
-    """Which frame."""
+    """The identity of a frame: scene, spin and agent; and its time."""
 
     scene: str
     index: int  # spin number within the scene
@@ -66,32 +66,38 @@ class FrameKey:
 
 
 def table_path(name: str) -> str:
-    """Return the file of the table `name`."""
+    """Return the path of the table `name`, relative to the dataset folder."""
     return f"{name}.parquet"
 
 
 def payload_path(sensor: str, key: str, suffix: str) -> str:
-    """Return the file of what `sensor` measured in the frame `key`, in an encoding of `flcav.dataset.payloads`."""
+    """Return the relative path of a measurement of `sensor` in the frame `key`.
+
+    `suffix` names its encoding, see `flcav.dataset.payloads`.
+    """
     return f"{sensor}/{key}.{suffix}"
 
 
 def trace_path(scene: str) -> str:
-    """Return the file of a scene's traffic."""
+    """Return the relative path of a scene's traffic."""
     return f"{TRACES}/{scene}.parquet"
 
 
 def package_versions(names: Sequence[str] = PACKAGES) -> dict[str, str]:
-    """Return the versions of packages, by default of those that decide what is recorded."""
+    """Return package -> installed version, by default of the packages that determine the recorded bytes."""
     return {name: version(name) for name in names}
 
 
 def town_path(town: str) -> str:
-    """Return the folder of a town that the dataset brings with it."""
+    """Return the relative path of the folder of a town that is copied into the dataset."""
     return f"{TOWN}/{town}"
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Return a dataset's manifest; raises `InputError` where the folder holds no finished dataset of this format."""
+    """Return the manifest of the dataset in `folder`.
+
+    Raises `InputError` where the folder is missing, holds no finished dataset, or one of another format version.
+    """
     path = folder / MANIFEST
     if not folder.is_dir():
         raise InputError(f"{folder}: no such dataset folder")

@@ -1,6 +1,7 @@
-"""What sensors measure as files: one encoding for each kind, all without loss but the depth's last bits.
+"""Encoding and decoding of measurement files (payloads): point clouds, images, depth, radar detections.
 
-Chosen by size and CPU time, see `benchmarks/bench_recording.py`.
+All encodings are lossless but that of depth, which rounds the mantissa to DEPTH_BITS. They were chosen by size and CPU
+time, see `benchmarks/bench_recording.py`.
 """
 
 import io
@@ -17,22 +18,22 @@ from flcav.config import InputError
 from flcav.dataset.layout import payload_path
 from flcav.sensors.frame import Frame
 
-DEPTH_BITS = 14  # of a depth's mantissa that are kept: 3 mm at 100 m
+DEPTH_BITS = 14  # bits kept of a depth's mantissa: rounds by up to 3 mm at 100 m
 _DROPPED = 23 - DEPTH_BITS
 PLANES = {"rgb": "webp", "depth_m": "depth.zst", "semantic": "semantic.png", "instance": "instance.png"}
 POINTS, TIMES, RADAR, INFRARED = "bin", "times.bin", "radar.bin", "infrared.png"
-COLUMNS = {POINTS: 4, TIMES: 1, RADAR: 5}  # little-endian float32, row after row
+COLUMNS = {POINTS: 4, TIMES: 1, RADAR: 5}  # of little-endian float32 in row-major order
 
 
 class Payload(NamedTuple):
-    """One file of a frame."""
+    """One measurement file of a frame: its path relative to the dataset folder, and its contents."""
 
     path: str
     data: bytes | memoryview
 
 
 def payloads(frame: Frame) -> Iterator[Payload]:
-    """Yield the files of what the frame's sensors measured."""
+    """Yield the encoded measurement files of a frame: of its LiDARs, cameras, infrared cameras and radars."""
     for name, points in frame.lidar.items():
         yield Payload(payload_path(name, frame.key, POINTS), encode_rows(points))
     for name, times in frame.point_times.items():
@@ -47,12 +48,15 @@ def payloads(frame: Frame) -> Iterator[Payload]:
 
 
 def encode_rows(rows: NDArray[np.float32]) -> memoryview:
-    """Return the rows of a LiDAR or a radar as the bytes of little-endian float32, without a copy where they are."""
+    """Return (N, C) or (N,) measurements of a LiDAR or radar as little-endian float32 bytes, row-major.
+
+    The buffer is not copied where it has this form already.
+    """
     return np.ascontiguousarray(rows, dtype="<f4").reshape(-1).view(np.uint8).data
 
 
 def encode_plane(plane: str, pixels: NDArray) -> bytes:
-    """Return one of PLANES of a `CameraImage` as the bytes of a file."""
+    """Return the encoded file of one of the PLANES of a `CameraImage`: WebP (lossless), Zstandard or PNG."""
     if plane == "rgb":
         data = io.BytesIO()
         Image.fromarray(pixels).save(data, "webp", lossless=True, quality=0, method=0)
@@ -61,9 +65,10 @@ def encode_plane(plane: str, pixels: NDArray) -> bytes:
 
 
 def encode_depth(depth_m: NDArray[np.float32]) -> bytes:
-    """Return depths (H, W), rounded to `DEPTH_BITS`, compressed by Zstandard.
+    """Return (H, W) depths as Zstandard-compressed bytes, the mantissa rounded to DEPTH_BITS.
 
-    Below is NumPy's .npy file of an array (4, H, W) uint8: the bytes of the little-endian float32, lowest first.
+    The compressed content is a NumPy .npy file of (4, H, W) uint8: the byte planes of little-endian float32, least
+    significant first.
     """
     bits = np.ascontiguousarray(depth_m, dtype="<f4").view("<u4")
     rounded = (bits + np.uint32(1 << (_DROPPED - 1))) & np.uint32(0xFFFFFFFF << _DROPPED & 0xFFFFFFFF)
@@ -74,7 +79,10 @@ def encode_depth(depth_m: NDArray[np.float32]) -> bytes:
 
 
 def read_rows(path: Path, suffix: str, expected: int) -> NDArray[np.float32]:
-    """Return the `expected` rows of a LiDAR or radar file; raises `InputError` where it is missing or holds others."""
+    """Return the (expected, C) float32 rows of a LiDAR or radar file; C is the entry of COLUMNS for `suffix`.
+
+    Raises `InputError` where the file is missing or of another length.
+    """
     row_bytes = 4 * COLUMNS[suffix]
     try:
         found = path.stat().st_size
@@ -87,14 +95,20 @@ def read_rows(path: Path, suffix: str, expected: int) -> NDArray[np.float32]:
 
 
 def read_plane(path: Path, plane: str) -> NDArray:
-    """Return one of PLANES of a `CameraImage`; raises `InputError` where the file is missing or no such image."""
+    """Return one of the PLANES of a `CameraImage`, (H, W) or, for "rgb", (H, W, 3).
+
+    Raises `InputError` where the file is missing or not an image of this kind.
+    """
     if plane == "depth_m":
         return _read_depth(path)
     return read_image(path, np.uint16 if plane == "instance" else np.uint8, channels=3 if plane == "rgb" else 1)
 
 
 def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArray:
-    """Return the pixels (H, W) of an image file, or (H, W, 3); raises `InputError` where it is missing or none."""
+    """Return the pixels of a PNG or WebP file as `dtype`, (H, W), or (H, W, channels) for more than one channel.
+
+    Raises `InputError` where the file is missing, not such an image, or has another number of channels.
+    """
     try:
         with Image.open(path, formats=("PNG", "WEBP")) as image:
             found = len(image.getbands())
@@ -117,12 +131,12 @@ def _read_depth(path: Path) -> NDArray[np.float32]:
         return np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f4")[..., 0]
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
-    except Exception as error:  # NumPy parses an array's header as Python, and raises whatever that trips over
+    except Exception as error:  # np.load evaluates the header as a Python literal, which may raise anything
         raise InputError(f"{path}: not a readable depth image ({error})") from None
 
 
 def encode_png(pixels: NDArray) -> bytes:
-    """Return a PNG of (H, W, 3) red, green, blue or (H, W) levels of 8 or 16 bits."""
+    """Return a PNG file of (H, W, 3) RGB pixels, or of (H, W) grey levels of 8 or 16 bits."""
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "png", compress_level=1)
     return data.getvalue()

@@ -1,4 +1,4 @@
-"""The 2D labels of a picture: signs and traffic lights, or actors."""
+"""2D bounding-box labels of an image: of traffic signs and lights, or of actors."""
 
 from dataclasses import dataclass
 
@@ -10,27 +10,28 @@ from flcav.world.trace import CATEGORIES
 
 SIGNS = ("stop", "yield", "speed_30", "speed_60", "speed_90", "light_red", "light_yellow", "light_green")
 LIGHTS = {"red": "light_red", "red_amber": "light_red", "amber": "light_yellow", "green": "light_green"}
-HALF_PX = 0.5  # a frame's pixels have their centres at whole numbers
+HALF_PX = 0.5  # shift from a frame's pixel coordinates, whole numbers at pixel centres, to those of an image's corner
 CLASSES = {"signs": SIGNS, "actors": CATEGORIES}
 
 
 @dataclass(frozen=True)
 class Rectangles:
-    """What shows in one picture."""
+    """The N labelled 2D bounding boxes of one image."""
 
-    label: NDArray[np.int64]  # (N,) index into the list of CLASSES
-    box: NDArray[np.float64]  # (N, 4) left, top, right, bottom of what is visible [px], from the image's corner
-    pixels: NDArray[np.int64]  # (N,) that show it
-    row: NDArray[np.int64]  # (N,) which of the frame's annotations, or of the picture's signs, it is
+    label: NDArray[np.int64]  # (N,) index into the chosen list of CLASSES
+    box: NDArray[np.float64]  # (N, 4) left, top, right, bottom of the visible part [px], from the image's corner
+    pixels: NDArray[np.int64]  # (N,) number of visible pixels
+    row: NDArray[np.int64]  # (N,) index into the frame's annotations, or into the image's signs
 
     def __len__(self) -> int:
         return len(self.label)
 
 
 def rectangles(frame: Frame, camera: str, labels: str, min_pixels: int) -> Rectangles:
-    """Return what shows at least `min_pixels` of itself in a picture; `labels` is a key of CLASSES.
+    """Return the 2D labels of objects with at least `min_pixels` visible pixels in the image of `camera`.
 
-    Red and amber together is red. Lights that are off, and signs of other kinds, are no objects.
+    `labels` is a key of CLASSES. A light that shows red and amber counts as red. Lights that are off, and signs of
+    other kinds than in SIGNS, are left out.
     """
     if labels == "actors":
         views = frame.annotations.views[camera]

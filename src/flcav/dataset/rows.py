@@ -1,4 +1,4 @@
-"""A frame as rows of the tables."""
+"""Encoding of frames as table rows; `flcav.dataset.frames` is the inverse."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -24,14 +24,17 @@ Columns = Mapping[str, Any]
 
 
 def rows_of(frame: Frame) -> dict[str, Columns]:
-    """Return the columns of the rows of `frame` by the name of their table; tables without any are left out."""
+    """Return table -> columns of the rows of `frame`; tables of sensors that the frame lacks are left out.
+
+    Columns are lists or arrays of equal length by column name, see `flcav.dataset.tables.SCHEMAS`.
+    """
     truth = frame.annotations
     parts = {"views": truth.views, "signs": truth.signs, "points": truth.points, "gnss": frame.gnss, "imu": frame.imu}
     return {name: columns(frame) for name, columns in COLUMNS.items() if parts.get(name, True)}
 
 
 def table_of(name: str, parts: Sequence[Columns]) -> pa.Table:
-    """Return the table `name` of the rows of several frames."""
+    """Return the Arrow table `name` with the rows of all `parts`, in order."""
     schema = SCHEMAS[name]
     return pa.table({column: _stack([part[column] for part in parts]) for column in schema.names}, schema=schema)
 
@@ -159,7 +162,7 @@ COLUMNS: dict[str, Callable[[Frame], Columns]] = {
 
 
 def _named(frame: Frame, counts: Mapping[str, int]) -> Columns:
-    """Return the columns `frame` and `sensor` for so many rows of each sensor."""
+    """Return the columns `frame` and `sensor`; `counts` maps each sensor to its number of rows."""
     sensors = [name for name, count in counts.items() for _ in range(count)]
     return {"frame": [frame.key] * len(sensors), "sensor": sensors}
 

@@ -1,4 +1,4 @@
-"""A recorded dataset, read frame by frame in any order."""
+"""Random access to the frames of a recorded dataset."""
 
 import re
 from collections import defaultdict
@@ -34,15 +34,15 @@ from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
 
 POINT_BYTES = 16  # four float32
-KINDS = ("lidar", "radar", "cameras", "infrared")  # of sensors, columns of `frames`
-NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")  # of a frame, scene, agent or sensor: they are files' names
-NOT_IN_SAMPLE = ("ax", "ay", "az")  # columns of `annotations` that nobody learns from
+KINDS = ("lidar", "radar", "cameras", "infrared")  # columns of `frames` that list sensors
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")  # of a frame, scene, agent or sensor: part of file names
+NOT_IN_SAMPLE = ("ax", "ay", "az")  # columns of `annotations` that are no part of a training sample
 
 Value = TypeVar("Value")
 
 
 class Dataset:
-    """A dataset folder: tables in memory, what sensors measured is read when asked for.
+    """A recorded dataset: its tables in memory, its measurements read from disk on demand.
 
     >>> from flcav import Dataset
     >>> data = Dataset.open("data")
@@ -78,9 +78,10 @@ class Dataset:
 
     @classmethod
     def open(cls, path: Path | str, *, checked: bool = True) -> "Dataset":
-        """Return the dataset in the folder `path`; raises `InputError` naming the file that is not as it should be.
+        """Return the dataset in the folder `path`; raises `InputError` that names the missing or damaged file.
 
-        Unless `checked` is false, what nobody can have measured is refused too, here and where frames are read.
+        With `checked`, `InputError` is also raised for impossible values, here and when frames are read: see
+        `flcav.dataset.checks`.
         """
         folder = Path(path)
         manifest = read_manifest(folder)
@@ -110,13 +111,14 @@ class Dataset:
         return len(self.keys)
 
     def numbers(self, frames: Sequence[int] | None) -> Sequence[int]:
-        """Return the frame numbers `frames`, or all for None."""
+        """Return `frames`, or the numbers of all frames for None."""
         return range(len(self)) if frames is None else frames
 
     def frame(self, i: int) -> Frame:
-        """Return frame `i`; images are read when first asked for.
+        """Return frame `i`; its images are read on first access.
 
-        Raises `InputError` where a point cloud is missing or not as long as the table says; so does asking for images.
+        Raises `InputError` where a point cloud is missing or not of the length in the table, and on access to an image
+        that is missing or damaged.
         """
         key, calibration = self.keys[i], self.calibrations[self.keys[i].agent]
         poses = self._tables["poses"].slice(i, 1).to_pylist()[0]
@@ -155,20 +157,23 @@ class Dataset:
         return frame
 
     def plane(self, i: int, camera: str, plane: str) -> NDArray:
-        """Return one plane ("rgb", "depth_m", "semantic", "instance") of one image of frame `i`: see `CameraImage`."""
+        """Return one plane ("rgb", "depth_m", "semantic" or "instance") of an image of frame `i`: see `CameraImage`.
+
+        Raises `InputError` where its file is missing or damaged.
+        """
         return read_plane(self.plane_path(i, camera, plane), plane)
 
     def plane_path(self, i: int, camera: str, plane: str) -> Path:
-        """Return the file of one plane of one image of frame `i`."""
+        """Return the path of the file of one plane of an image of frame `i`."""
         return self.folder / payload_path(camera, self._name[i], PLANES[plane])
 
     def trace(self, scene: str) -> Trace | None:
-        """Return the traffic of a scene, None where it was not known; raises `InputError` where it cannot be read."""
+        """Return the traffic of a scene, None if it was not recorded; raises `InputError` if its file is damaged."""
         path = self.folder / trace_path(scene)
         return Trace.load(path) if path.is_file() else None
 
     def town(self) -> Town | None:
-        """Return the town of the dataset, None where it is not known."""
+        """Return the town of the dataset, from the dataset or from flcav; None where neither has it."""
         name = str(self.manifest.recipe.get("town", ""))
         kept = self.folder / town_path(name)
         try:
@@ -177,7 +182,7 @@ class Dataset:
             return None
 
     def payload_bytes(self, i: int) -> int:
-        """Return the bytes of frame `i` as a labelled sample: its point clouds and its annotation rows."""
+        """Return the size of frame `i` as a labelled sample [bytes]: its point clouds and annotation rows."""
         return sum(self._lidar[i].values()) * POINT_BYTES + self._rows("annotations", i).drop(NOT_IN_SAMPLE).nbytes
 
     def select(
@@ -187,7 +192,7 @@ class Dataset:
         scenes: Collection[str] | None = None,
         spins: Collection[int] | None = None,
     ) -> list[int]:
-        """Return the numbers of the frames of these agents, scenes and spins, in order; None selects all."""
+        """Return the numbers of the frames of the given agents, scenes and spins, in order; None does not restrict."""
         return [
             i
             for i, key in enumerate(self.keys)
@@ -197,7 +202,7 @@ class Dataset:
         ]
 
     def name(self, i: int) -> str:
-        """Return the key of frame `i` as one word: `Frame.key`."""
+        """Return the key of frame `i` as text: `Frame.key`."""
         return self._name[i]
 
     def lidars(self, i: int) -> list[str]:
@@ -213,7 +218,7 @@ class Dataset:
         return list(self._infrared[i])
 
     def number(self, name: str) -> int:
-        """Return the number of the frame with this key; raises `InputError` where there is none."""
+        """Return the number of the frame with the key `name`; raises `InputError` where there is none."""
         try:
             return self._name.index(name)
         except ValueError:
@@ -230,7 +235,10 @@ class Dataset:
         }
 
     def _point_times(self, i: int) -> dict[str, NDArray[np.float32]]:
-        """Return the times of the points of the LiDARs that have them; `validate` finds a file that is missing."""
+        """Return LiDAR -> (N,) the times of its points [s], for LiDARs with such a file.
+
+        A missing file is not an error here, since only rolling LiDARs have one; `validate` reports it.
+        """
         paths = {sensor: self.folder / payload_path(sensor, self._name[i], TIMES) for sensor in self._lidar[i]}
         timed = {sensor: count for sensor, count in self._lidar[i].items() if paths[sensor].is_file()}
         return {sensor: times[:, 0] for sensor, times in self._rows_of(i, timed, TIMES).items()}
@@ -247,7 +255,7 @@ class Dataset:
 
 
 class ReadWhenAsked(Mapping[str, Value], Generic[Value]):
-    """Values by name, each read when first asked for and kept."""
+    """A mapping whose values are read on first access and cached."""
 
     def __init__(self, names: Collection[str], read: Callable[[str], Value]) -> None:
         self._names, self._read = list(names), read
@@ -268,13 +276,13 @@ class ReadWhenAsked(Mapping[str, Value], Generic[Value]):
 
 
 def _refuse(where: Path, problems: Iterable[str]) -> None:
-    """Raise `InputError` with the first of the problems where there is one."""
+    """Raise `InputError` with the first of `problems`, if any."""
     for problem in problems:
         raise InputError(f"{where}: {problem}")
 
 
 def _check_frames(frames: pa.Table, path: Path) -> None:
-    """Raise `InputError` where the names in the rows can be no files, or sensors do not go with their counts."""
+    """Raise `InputError` where a name is not safe in file names, or the counts of points do not match the sensors."""
     for row in frames.to_pylist():
         names = [row["key"], row["scene"], row["agent"], *(name for kind in KINDS for name in row[kind])]
         if odd := [name for name in names if not NAME.fullmatch(name)]:
@@ -285,7 +293,7 @@ def _check_frames(frames: pa.Table, path: Path) -> None:
 
 
 def _other_names(frames: pa.Table) -> Iterator[str]:
-    """Yield the frames that are not called as their rows say, or whose time is none."""
+    """Yield a sentence for each frame whose key does not match its row, or whose time is not finite."""
     for row in frames.to_pylist():
         if row["key"] != f"{row['scene']}_{row['index']:04d}_{row['agent']}":
             yield f"'{row['key']}' is not spin {row['index']} of {row['agent']} in '{row['scene']}'"
@@ -294,7 +302,10 @@ def _other_names(frames: pa.Table) -> Iterator[str]:
 
 
 def _first_rows(table: pa.Table, frames: pa.Table, path: Path) -> NDArray[np.int64]:
-    """Return (F + 1,) the first row of each frame; raises `InputError` where rows are of no frame, or out of order."""
+    """Return (F + 1,) offsets: the rows of frame i in `table` are [offset i, offset i + 1).
+
+    Raises `InputError` where a row belongs to no frame, or rows are not in the order of the frames.
+    """
     number = pc.call_function(
         "index_in", [table["frame"]], pc.SetLookupOptions(value_set=frames["key"].combine_chunks())
     )
@@ -304,7 +315,7 @@ def _first_rows(table: pa.Table, frames: pa.Table, path: Path) -> NDArray[np.int
 
 
 def _sensors(frames: pa.Table) -> dict[str, set[str]]:
-    """Return the names of each agent's LiDARs, radars and cameras."""
+    """Return agent -> names of its LiDARs, radars, cameras and infrared cameras."""
     found: dict[str, set[str]] = defaultdict(set)
     for kind in KINDS:
         for agent, names in zip(frames["agent"].to_pylist(), frames[kind].to_pylist()):

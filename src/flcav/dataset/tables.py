@@ -1,6 +1,6 @@
-"""The Parquet tables of a dataset: their columns, and how they are written, joined and read.
+"""Schemas, writing, concatenation and reading of the Parquet tables of a dataset.
 
-`frames` has one row per frame; so does `poses`. All other tables have any number of rows per frame, in frame order.
+`frames` and `poses` have one row per frame. All other tables have any number of rows per frame, in frame order.
 """
 
 from collections.abc import Iterable
@@ -38,21 +38,21 @@ SCHEMAS: dict[str, pa.Schema] = {
             ("index", pa.int64()),  # spin number within the scene
             ("agent", pa.string()),
             ("time_s", pa.float64()),
-            ("lidar", pa.list_(pa.string())),  # names of the frame's LiDARs: folders of the point clouds
-            ("points", pa.list_(pa.int64())),  # points of each
+            ("lidar", pa.list_(pa.string())),  # names of LiDARs, which are folders of point clouds
+            ("points", pa.list_(pa.int64())),  # number of points of each LiDAR
             ("radar", pa.list_(pa.string())),
-            ("detections", pa.list_(pa.int64())),  # of each radar
+            ("detections", pa.list_(pa.int64())),  # number of detections of each radar
             ("cameras", pa.list_(pa.string())),
             ("infrared", pa.list_(pa.string())),
-            ("annotations", pa.int64()),  # rows of the frame in `annotations`
+            ("annotations", pa.int64()),  # number of rows of the frame in `annotations`
         ]
     ),
     "poses": pa.schema(
         [
             ("frame", pa.string()),
-            ("world_from_agent", pa.list_(pa.float64(), 16)),  # at the spin, row by row
-            ("triggered", pa.list_(pa.string())),  # sensors that look at another time
-            ("world_from_agent_then", pa.list_(pa.float64())),  # 16 numbers of each
+            ("world_from_agent", pa.list_(pa.float64(), 16)),  # at the spin, row-major
+            ("triggered", pa.list_(pa.string())),  # sensors with another trigger time than the spin
+            ("world_from_agent_then", pa.list_(pa.float64())),  # at each of these times, 16 numbers, row-major
         ]
     ),
     "annotations": pa.schema(
@@ -60,26 +60,26 @@ SCHEMAS: dict[str, pa.Schema] = {
             ("frame", pa.string()),
             ("track", pa.string()),
             ("category", pa.string()),
-            *_numbers(BOX_COLUMNS),  # geometric centre, world frame [m], [rad]
+            *_numbers(BOX_COLUMNS),  # geometric centre and size [m], yaw [rad], world frame
             *_numbers(VELOCITY_COLUMNS),  # world frame [m/s]
             *_numbers(ACCELERATION_COLUMNS),  # world frame [m/s^2]
             ("returns", pa.int64()),
             ("occlusion", pa.float64()),
         ]
     ),
-    "points": pa.schema(  # on actors; rows of actors that have any
+    "points": pa.schema(  # number of a sensor's points on each actor that has any
         [
             ("frame", pa.string()),
             ("sensor", pa.string()),  # a LiDAR or a radar
-            ("row", pa.int64()),  # of the frame's annotations
+            ("row", pa.int64()),  # index into the frame's annotations
             ("points", pa.int64()),
         ]
     ),
-    "views": pa.schema(  # see `Views`; rows of actors whose amodal box is a number
+    "views": pa.schema(  # see `Views`; one row for each actor whose amodal box is not NaN
         [
             ("frame", pa.string()),
-            ("sensor", pa.string()),  # a camera, infrared ones too
-            ("row", pa.int64()),  # of the frame's annotations
+            ("sensor", pa.string()),  # a camera or an infrared camera
+            ("row", pa.int64()),  # index into the frame's annotations
             *_numbers(AMODAL_COLUMNS),
             *_numbers(VISIBLE_COLUMNS),
             ("pixels", pa.int64()),
@@ -107,14 +107,14 @@ FILES_SCHEMA = pa.schema([("path", pa.string()), ("bytes", pa.int64()), ("sha256
 
 
 def write_table(table: pa.Table, path: Path) -> None:
-    """Write a table so that equal rows give equal bytes."""
+    """Write a table as Parquet with fixed settings, so that equal rows give equal bytes."""
     pq.write_table(table.combine_chunks(), path, row_group_size=ROWS_PER_GROUP, compression="zstd")
 
 
 def join_tables(parts: Iterable[Path], schema: pa.Schema, path: Path) -> int:
-    """Write the rows of all `parts`, one after another, as one table and return their number.
+    """Concatenate the Parquet files `parts`, of the same `schema`, into the file `path`; return the number of rows.
 
-    Equal rows give equal bytes; never more than one row group is in memory.
+    Equal rows give equal bytes. At most a row group and one part are in memory.
     """
     rows = 0
     waiting = schema.empty_table()
@@ -130,7 +130,10 @@ def join_tables(parts: Iterable[Path], schema: pa.Schema, path: Path) -> int:
 
 
 def read_table(path: Path, name: str) -> pa.Table:
-    """Return the table `name` that a file holds; raises `InputError` naming the file where it does not."""
+    """Return the table `name` from the file `path`.
+
+    Raises `InputError` that names the file where it is missing or damaged, has other columns, or has null values.
+    """
     table = read_parquet(path)
     schema = SCHEMAS.get(name, FILES_SCHEMA)
     if not table.schema.equals(schema):

@@ -1,4 +1,4 @@
-"""Poses, boxes, projections; the only implementation of each."""
+"""Rigid transforms and oriented 3D boxes."""
 
 from flcav.geometry.boxes import Boxes, concatenate, points_in_boxes
 from flcav.geometry.poses import inverse, is_rigid, pose, transform_points, wrap_angle, yaw_of

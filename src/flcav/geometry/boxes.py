@@ -1,4 +1,4 @@
-"""The only box record of the project, and what can be asked of boxes."""
+"""Upright oriented 3D boxes: transforms, corners, points in boxes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,9 +11,9 @@ from flcav.geometry.poses import Array, transform_points, wrap_angle, yaw_of
 
 @dataclass(frozen=True)
 class Boxes:
-    """N upright 3D boxes in one frame (which one is said by whoever hands them over).
+    """N oriented 3D boxes, upright (yaw only), in one frame that the owner of the record states.
 
-    Raises ValueError where the arrays do not fit together.
+    Raises ValueError where the lengths or shapes of the arrays do not match.
 
     >>> from flcav import Boxes
     >>> cars = Boxes.from_array([[10.0, 2.0, 0.8, 4.4, 1.8, 1.6, 0.0]], "Car")
@@ -57,29 +57,35 @@ class Boxes:
 
     @classmethod
     def empty(cls) -> "Boxes":
-        """Return no boxes."""
+        """Return a record of 0 boxes."""
         return cls.from_array(np.zeros((0, 7)), np.zeros(0, dtype=str))
 
     @classmethod
     def from_array(cls, array: ArrayLike, label: ArrayLike, score: ArrayLike | None = None) -> "Boxes":
-        """Return boxes from (N, 7) rows x, y, z, length, width, height, yaw and (N,) labels (or one for all)."""
+        """Return boxes from (N, 7) rows x, y, z, length, width, height [m], yaw [rad] and (N,) labels (or one for all).
+
+        `score` is (N,), if given.
+        """
         rows = np.asarray(array, dtype=np.float64).reshape(-1, 7)
         labels = np.broadcast_to(np.asarray(label, dtype=np.str_), len(rows))
         scores = None if score is None else np.asarray(score, dtype=np.float64)
         return cls(rows[:, :3], rows[:, 3:6], rows[:, 6], labels, scores)
 
     def array(self) -> Array:
-        """Return (N, 7) rows x, y, z, length, width, height, yaw."""
+        """Return (N, 7) rows x, y, z, length, width, height [m], yaw [rad]."""
         return np.concatenate((self.center, self.size, self.yaw[:, None]), axis=1)
 
     def transformed(self, target_from_source: Array) -> "Boxes":
-        """Return the boxes in another frame; the transform's roll and pitch move centres but do not tilt boxes."""
+        """Return the boxes in the target frame of a rigid (4, 4) transform.
+
+        Its roll and pitch move the centres but do not tilt the boxes. Variances are left as they are.
+        """
         center = transform_points(target_from_source, self.center)
         yaw = wrap_angle(self.yaw + yaw_of(target_from_source))
         return replace(self, center=center, yaw=yaw)
 
     def corners(self) -> Array:
-        """Return (N, 8, 3) corners: the bottom four counter-clockwise from front left, then the top four."""
+        """Return (N, 8, 3) corners [m]: the bottom four counter-clockwise from front left, then the top four."""
         signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
         unit = np.concatenate((np.c_[signs, np.full(4, -0.5)], np.c_[signs, np.full(4, 0.5)]))
         local = unit[None] * self.size[:, None]
@@ -90,7 +96,10 @@ class Boxes:
 
 
 def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> NDArray[np.bool_]:
-    """Return (N, P): whether point p (P, >=3) of the boxes' frame lies in box n grown by `margin_m` on every side."""
+    """Return (N, P) whether each of P points lies in each of N boxes, enlarged by `margin_m` on every side.
+
+    `points` is (P, >= 3), x, y, z [m] first, in the frame of the boxes. Faces count as inside.
+    """
     xyz = np.asarray(points)[:, :3].astype(np.float64)
     x, y = np.ascontiguousarray(xyz[:, :2].T)
     inside = np.zeros((len(boxes), len(xyz)), dtype=bool)
@@ -106,7 +115,7 @@ def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> N
 
 
 def concatenate(parts: Sequence[Boxes]) -> Boxes:
-    """Return all boxes of `parts` in order; scores and variances survive where every part has them."""
+    """Return the boxes of all `parts` in order, with scores and variances if every non-empty part has them."""
     parts = [part for part in parts if len(part)]
     if not parts:
         return Boxes.empty()

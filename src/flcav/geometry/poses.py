@@ -1,6 +1,7 @@
-"""Rigid transforms as 4x4 matrices named `target_from_source`, so that products read off.
+"""Rigid transforms as 4x4 homogeneous matrices, named `target_from_source`: a_from_c = a_from_b @ b_from_c.
 
-World: ENU, right-handed, z up, metres. Body: x forward, y left, z up. Yaw counter-clockwise from east, radians.
+World frame: ENU (x east, y north, z up) [m]. Body frame: x forward, y left, z up. Yaw is counter-clockwise from east
+[rad].
 """
 
 import numpy as np
@@ -10,9 +11,9 @@ Array = NDArray[np.float64]
 
 
 def pose(x: float, y: float, z: float = 0.0, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Array:
-    """Return the (4, 4) transform of a body at x, y, z [m], rotated by yaw, then pitch, then roll [rad].
+    """Return the (4, 4) `world_from_body` of a body at x, y, z [m] with Tait-Bryan angles yaw, pitch, roll [rad].
 
-    Intrinsic z-y-x rotation; a positive pitch turns the nose down (right-hand rule about the left axis).
+    Intrinsic z-y'-x'' rotation; a positive pitch turns the nose down (right-hand rule about the left axis).
     """
     cy, sy, cp, sp, cr, sr = (
         np.cos(yaw),
@@ -33,7 +34,7 @@ def pose(x: float, y: float, z: float = 0.0, yaw: float = 0.0, pitch: float = 0.
 
 
 def inverse(target_from_source: Array) -> Array:
-    """Return `source_from_target` of a rigid (4, 4) transform."""
+    """Return the inverse (4, 4) `source_from_target` of a rigid transform, by the transpose of its rotation."""
     rotation = target_from_source[:3, :3].T
     out = np.eye(4)
     out[:3, :3] = rotation
@@ -42,11 +43,11 @@ def inverse(target_from_source: Array) -> Array:
 
 
 def is_rigid(target_from_source: Array) -> bool:
-    """Return whether a (4, 4) matrix is a rotation and a shift, to 1e-6."""
+    """Return whether a (4, 4) matrix is a rigid transform: a proper rotation, to 1e-6, and a translation."""
     rotation = target_from_source[:3, :3]
     return bool(
         np.isfinite(target_from_source).all()
-        and np.abs(rotation).max() < 2  # before numbers are multiplied that overflow
+        and np.abs(rotation).max() < 2  # first, since products of huge numbers overflow
         and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
         and np.linalg.det(rotation) > 0
         and np.array_equal(target_from_source[3], (0, 0, 0, 1))
@@ -54,12 +55,12 @@ def is_rigid(target_from_source: Array) -> bool:
 
 
 def yaw_of(target_from_source: Array) -> float:
-    """Return the heading [rad] of the source's x axis in the target's x-y plane."""
+    """Return the yaw [rad] of a (4, 4) transform: the heading of the source's x axis in the target's x-y plane."""
     return float(np.arctan2(target_from_source[1, 0], target_from_source[0, 0]))
 
 
 def transform_points(target_from_source: Array, points: ArrayLike) -> NDArray:
-    """Return (N, 3) points moved from source to target, in the dtype they came in."""
+    """Return (N, 3) `points` of the source frame in the target frame, in their dtype."""
     points = np.asarray(points)
     moved = points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
     return moved.astype(points.dtype, copy=False)

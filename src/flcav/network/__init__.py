@@ -1,4 +1,4 @@
-"""What moves over which link, and what it costs."""
+"""Communication cost: the sizes of messages, the price of a training plan, and the ledger of uplink budgets."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Every message that crossed a link, in bytes, and the uplink budgets that none may exceed."""
+"""Communication ledger: the bytes of every message on every link, under uplink budgets that it enforces."""
 
 import json
 from collections.abc import Iterable
@@ -21,12 +21,12 @@ BYTES_PER_MB = 1_000_000
 
 
 class BudgetExceeded(InputError):
-    """A message that would not fit in what is left of its link's uplink budget."""
+    """Raised for an uplink message that is larger than what is left of the budget of its link."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Uplink megabytes that a run may spend on each link."""
+    """Uplink budget of a run on each link [MB; 1 MB = 10^6 bytes]."""
 
     wireless_mb: float
     wireline_mb: float
@@ -38,7 +38,10 @@ class Budget:
 
 @dataclass(frozen=True)
 class LedgerEntry:
-    """One message that crossed one link."""
+    """One message on one link.
+
+    Raises ValueError for an unknown link or direction, or a negative size.
+    """
 
     stage: str  # pretrain | edge | cloud
     task: str  # e.g. "objects"
@@ -58,7 +61,7 @@ class LedgerEntry:
 
 
 class Ledger:
-    """The entries of one run under one budget. Its whole state is `budget` and `entries`.
+    """The ledger of one run: its uplink budget and the messages entered so far.
 
     >>> from flcav import Ledger
     >>> from flcav.network import Budget, LedgerEntry
@@ -73,7 +76,7 @@ class Ledger:
     """
 
     def __init__(self, budget: Budget, entries: Iterable[LedgerEntry] = ()) -> None:
-        """Start from `entries`, each entered in turn; raises `BudgetExceeded` where they do not fit."""
+        """Enter `entries` in order; raises `BudgetExceeded` at the first that does not fit."""
         self.budget = budget
         self._entries: list[LedgerEntry] = []
         self._up = dict.fromkeys(LINKS, 0)
@@ -82,11 +85,11 @@ class Ledger:
 
     @property
     def entries(self) -> tuple[LedgerEntry, ...]:
-        """Return everything entered so far, in order."""
+        """Return all entries in the order in which they were entered."""
         return tuple(self._entries)
 
     def enter(self, entry: LedgerEntry) -> None:
-        """Record `entry`; raises `BudgetExceeded`, recording nothing, if an uplink message does not fit."""
+        """Append `entry`; raises `BudgetExceeded` and appends nothing if it is an uplink message over the budget."""
         if entry.direction == "up":
             used, budget = self._up[entry.link], self.budget.bytes_on(entry.link)
             if used + entry.bytes > budget:
@@ -99,7 +102,7 @@ class Ledger:
         self._entries.append(entry)
 
     def left_mb(self, link: Link) -> float:
-        """Return what is left of the uplink budget of `link` [MB]."""
+        """Return the unspent part of the uplink budget of `link` [MB]."""
         return (self.budget.bytes_on(link) - self._up[link]) / BYTES_PER_MB
 
     def used_bytes(
@@ -110,7 +113,7 @@ class Ledger:
         task: str | None = None,
         direction: Direction = "up",
     ) -> int:
-        """Return the bytes entered in `direction` on `link`, in `stage`, for `task` (each: all of them if None)."""
+        """Return the bytes of the entries in `direction`, restricted to a `link`, `stage` and `task` unless None."""
         return sum(
             entry.bytes
             for entry in self._entries
@@ -128,11 +131,11 @@ class Ledger:
         task: str | None = None,
         direction: Direction = "up",
     ) -> float:
-        """Return `used_bytes` in MB."""
+        """Return `used_bytes` in MB (10^6 bytes)."""
         return self.used_bytes(link, stage=stage, task=task, direction=direction) / BYTES_PER_MB
 
     def save(self, path: Path) -> None:
-        """Write budget and entries as one Parquet file, atomically."""
+        """Write the ledger atomically to a Parquet file: a row per entry, the budget in the schema's metadata."""
         columns = {field.name: [getattr(entry, field.name) for entry in self._entries] for field in fields(LedgerEntry)}
         table = pa.table(columns, schema=_SCHEMA.with_metadata({"budget": json.dumps(asdict(self.budget))}))
         with atomic_path(path) as temporary:
@@ -140,7 +143,7 @@ class Ledger:
 
     @classmethod
     def load(cls, path: Path) -> "Ledger":
-        """Read a ledger that `save` wrote; raises `InputError` where `path` is not one."""
+        """Return the ledger that `save` wrote to `path`; raises `InputError` where the file is missing or not one."""
         table = read_parquet(path)
         try:
             budget = Budget(**json.loads((table.schema.metadata or {})[b"budget"]))

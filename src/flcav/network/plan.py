@@ -1,11 +1,11 @@
-"""What a plan moves, and the one arithmetic of what that costs."""
+"""Training plans of the three stages and their uplink traffic (Wang et al., IEEE Network 37(3), 2023)."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class MessageSizes:
-    """Sizes of what crosses a link [MB; 1 MB = 10^6 bytes]."""
+    """Sizes of the messages of one task [MB; 1 MB = 10^6 bytes]."""
 
     sample_mb: float  # one labelled sample
     model_mb: float  # one model update
@@ -13,7 +13,9 @@ class MessageSizes:
 
 @dataclass(frozen=True)
 class StagePlan:
-    """How much of each training stage one task takes (Wang et al., IEEE Network 37(3), 2023).
+    """The training plan of one task: samples of stage I, rounds of stages II and III, vehicles of each edge server.
+
+    Wang et al., IEEE Network 37(3), 2023.
 
     >>> from flcav import StagePlan
     >>> plan = StagePlan(samples=200, edge_rounds=6, cloud_rounds=3, edge_groups=(4, 3))
@@ -25,19 +27,19 @@ class StagePlan:
     edge_rounds: int  # stage II rounds, in every region
     cloud_rounds: int  # stage III rounds
     edge_groups: tuple[int, ...]  # vehicles per edge server
-    edge_rounds_per_cloud_round: int = 1  # k
+    edge_rounds_per_cloud_round: int = 1  # k: stage III
 
 
 @dataclass(frozen=True)
 class Price:
-    """Uplink megabytes per link."""
+    """Uplink traffic on each link [MB]."""
 
     wireless_mb: float
     wireline_mb: float
 
 
 def price(plan: StagePlan, sizes: MessageSizes) -> Price:
-    """Return what `plan` costs on each uplink [MB].
+    """Return the uplink traffic of `plan` on each link [MB].
 
     wireless = samples * sample + (edge_rounds + k * cloud_rounds) * vehicles * model;
     wireline = samples * sample + cloud_rounds * edge_servers * model.

@@ -1,4 +1,4 @@
-"""Where frames come from."""
+"""Sources of frames: the protocol, recording recipes, and the built-in simulator."""
 
 from typing import TYPE_CHECKING
 

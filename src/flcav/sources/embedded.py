@@ -1,4 +1,4 @@
-"""The built-in simulator as a source: SUMO traffic in one of our towns, seen by our sensors."""
+"""The built-in simulator as a source: SUMO traffic in a town, observed by simulated sensors."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -17,16 +17,21 @@ from flcav.world.scene import Scene
 from flcav.world.trace import Trace
 from flcav.world.traffic.traffic import simulate
 
-_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")  # it begins the names of scenes
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")  # the town's name is the prefix of the names of scenes
 
 
 class EmbeddedSource:
-    """The frames of a recipe. Scene i has the same traffic whatever the number of scenes, agents apart."""
+    """A `Replayable` source of the frames of a recipe.
+
+    The traffic of scene i depends on the town, the seed, the number of vehicles, the times of the spins and the
+    scenarios, not on the number of scenes.
+    """
 
     def __init__(self, recipe: Recipe, beside: Path | None = None) -> None:
-        """Load the town, a folder's from `beside` too: the recipe's own folder.
+        """Load the town of `recipe`; a town's folder may also be relative to `beside`, the folder of the recipe.
 
-        Raises `InputError` where the town, a pole or an observer is missing, or a mount below ground.
+        Raises `InputError` where the town or a pole does not exist, there is neither a vehicle nor a pole to observe,
+        or a sensor is not mounted above the ground.
         """
         self.recipe = recipe
         self.town = load_town(recipe.town, beside)
@@ -49,7 +54,7 @@ class EmbeddedSource:
         self._last_scene: tuple[str, Scene] | None = None
 
     def describe(self) -> Mapping[str, Json]:
-        """Return the recipe with every name resolved: the poles, the rigs, what the town was built from."""
+        """Return the recipe as JSON values, with names resolved: numbers of poles, rigs, hashes of the town's files."""
         return {
             **self.recipe.model_dump(mode="json"),
             "town": self.town.name,
@@ -60,24 +65,24 @@ class EmbeddedSource:
         }
 
     def town_files(self) -> Mapping[str, bytes]:
-        """Return the files of the town's folder by name; none of a town that comes with flcav."""
+        """Return the contents of the town's files by name; empty for a town that comes with flcav."""
         return {} if self.recipe.town in TOWNS else {path.name: path.read_bytes() for path in self._town_paths()}
 
     def scenes(self) -> list[str]:
-        """Return the names of the scenes: town, seed and number, so that no two runs share a name."""
+        """Return the names of the scenes, `<town>-<seed>-<number>`."""
         count = -(-self._frames // self._per_scene)
         return [f"{self.town.name}-{self.recipe.seed}-{scene:03d}" for scene in range(count)]
 
     def frame_count(self, scene: str) -> int:
-        """Return how many frames `frames(scene)` yields: fewer in the last scene where the recipe limits frames."""
+        """Return the number of frames of a scene; the last scene has fewer where the recipe limits frames."""
         return min(self._per_scene, self._frames - self.scenes().index(scene) * self._per_scene)
 
     def frames(self, scene: str) -> Iterator[Frame]:
-        """Yield the scene's frames: spin after spin, the vehicles of each before its poles."""
+        """Yield the scene's frames by spin, and within a spin the vehicles' before the poles'."""
         yield from self.replay(scene, self.trace(scene), range(self.frame_count(scene)))
 
     def replay(self, scene: str, trace: Trace, numbers: range) -> Iterator[Frame]:
-        """Yield some of the scene's frames in the traffic that `trace(scene)` gave: see `Replayable`."""
+        """Yield the scene's frames with the given `numbers`, observed in the traffic `trace`: see `Replayable`."""
         if self._last_scene is None or self._last_scene[0] != scene:
             self._last_scene = scene, Scene(self.town, trace)
         world, recipe = self._last_scene[1], self.recipe
@@ -96,7 +101,7 @@ class EmbeddedSource:
             )
 
     def trace(self, scene: str) -> Trace:
-        """Return the scene's traffic at the times of its spins."""
+        """Return the simulated traffic of the scene, sampled at the times of its spins."""
         if self._last_trace is None or self._last_trace[0] != scene:
             seed = child_seed(self.recipe.seed, "traffic", self.scenes().index(scene))
             warmup = stream(self.recipe.seed, scene, "warmup").integers(*self.recipe.warmup_steps, endpoint=True)
@@ -113,7 +118,10 @@ class EmbeddedSource:
 
 
 def _check_mounts(field: str, rig: Rig, carrier: str, mount_m: float) -> None:
-    """Raise `InputError` where a sensor would not be above the ground on a carrier whose frame is `mount_m` up."""
+    """Raise `InputError` where a sensor of `rig` is not above the ground.
+
+    The origin of the carrier's frame is `mount_m` above the ground. `field` is the recipe's field of the rig.
+    """
     for name, sensor in rig.sensors().items():
         if mount_m + sensor.mount.z <= 0:
             raise InputError(

@@ -1,4 +1,4 @@
-"""What a user asks to have recorded."""
+"""Recording recipes: validated YAML files that say what a dataset contains."""
 
 import os
 from pathlib import Path
@@ -15,8 +15,8 @@ from flcav.world.map.town import TOWNS
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
-STEP_S = 0.1  # of the traffic
-MOST = 10**6  # scenes, frames, spins
+STEP_S = 0.1  # step of the traffic simulation
+MOST = 10**6  # upper limit of scenes, frames and spins
 
 
 def _multiple_of_step(value: float) -> float:
@@ -56,11 +56,10 @@ NamedRig = Annotated[Rig, BeforeValidator(_rig)]
 
 
 class Recipe(Config):
-    """Traffic runs in a town, and the vehicles and poles that look at them.
+    """A recording recipe: a town, its traffic runs, and the agents that observe them.
 
-    A scene is one run with its own traffic and its own parked cars; in it, every agent observes
-    `spins_per_scene` spins, `every_s` apart, after `warmup_s` in which the town fills.
-    Fields are checked as a recipe is made, by pydantic, whose ValidationError names the field.
+    A scene is one traffic run with its own parked cars. After a warm-up of `warmup_s`, in which the town fills, every
+    agent observes `spins_per_scene` spins, `every_s` apart. Raises pydantic's ValidationError, which names the field.
 
     >>> from flcav import Recipe
     >>> recipe = Recipe(town="grid", seed=1, scenes=6, cavs=4, poles="all")
@@ -109,16 +108,16 @@ class Recipe(Config):
         return round(ends[0] / STEP_S), round(ends[1] / STEP_S)
 
     def times_s(self, warmup_steps: int) -> NDArray[np.float64]:
-        """Return the (spins_per_scene,) times of the spins in a run after a warm-up of so many steps [s]."""
+        """Return (spins_per_scene,) the times of the spins [s] after a warm-up of `warmup_steps` steps of STEP_S."""
         steps = warmup_steps + np.arange(self.spins_per_scene) * round(self.every_s / STEP_S)
         return np.round(steps * np.float64(STEP_S), 1)
 
 
 def recipe_path(name: str) -> Path:
-    """Return the file of a recipe that comes with flcav: "objects", or of a kind, "allocation/three_tasks".
+    """Return the file of the recipe `name` that comes with flcav, e.g. "objects" or "allocation/three_tasks".
 
-    They are the folder `recipes/` of a checkout, and within the package where it was installed. Raises `InputError` for
-    an unknown name.
+    Recipes are in the folder `recipes/` of a checkout, and within the package of an installation. Raises `InputError`
+    for an unknown name.
     """
     package = Path(__file__).parents[1]
     folder = next(filter(Path.is_dir, (package / "recipes", package.parents[1] / "recipes")))
@@ -129,7 +128,7 @@ def recipe_path(name: str) -> Path:
 
 
 def find_recipe(path: Path) -> Path:
-    """Return `path`; where there is no such file, the recipe that comes with flcav by this path: recipes/grid.yaml."""
+    """Return `path`, or the recipe that comes with flcav if `path` is "recipes/NAME.yaml" and no such file exists."""
     if path.parts[:1] != ("recipes",) or path.suffix != ".yaml" or path.exists():
         return path
     try:
@@ -139,10 +138,10 @@ def find_recipe(path: Path) -> Path:
 
 
 def load_recipe(path: Path | str) -> Recipe:
-    """Return the recipe in the YAML file at `path`, see docs/recipes.md.
+    """Return the recipe in the YAML file at `path`; docs/recipes.md lists its fields.
 
-    A town's folder that lies beside the file is named by its whole path. Raises `InputError` naming file, field, value
-    and rule where it is none.
+    The field `town` becomes an absolute path where it names a folder beside the file. Raises `InputError` that names
+    file, field, value and violated rule.
 
     >>> from flcav import load_recipe
     >>> load_recipe("recipes/suburb.yaml").town
@@ -150,6 +149,6 @@ def load_recipe(path: Path | str) -> Recipe:
     """
     recipe = read_config(Recipe, Path(path))
     folder = Path(path).absolute().parent / recipe.town
-    if recipe.town in TOWNS or not os.path.isdir(folder):  # noqa: PTH112 - which takes a name that can be none
+    if recipe.town in TOWNS or not os.path.isdir(folder):  # noqa: PTH112 - Path.is_dir raises for too long a name
         return recipe
     return recipe.model_copy(update={"town": str(folder)})

@@ -1,4 +1,4 @@
-"""Whatever observes traffic: the built-in simulator, another simulator, a log."""
+"""Protocols of sources of frames: a simulator, or a reader of logs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol, runtime_checkable
@@ -9,49 +9,49 @@ from flcav.world.trace import Trace
 
 
 class Source(Protocol):
-    """Frames, scene by scene: scenes in any order, the frames of a scene in order.
+    """A source of frames, scene by scene: scenes are read in any order, the frames of a scene in sequence.
 
-    A scene is one traffic run, started afresh, so that a source that can only play forward qualifies too. To be
-    recorded by several processes a source has to survive pickling.
+    A scene is one traffic run from its start, so a source that can only play forward is enough. Recording by several
+    processes pickles the source.
     """
 
     def describe(self) -> Mapping[str, Json]:
-        """Return all that decides the frames, as plain JSON values; two equal descriptions give equal frames."""
+        """Return everything that determines the frames, as JSON values: equal descriptions mean equal frames."""
         ...
 
     def scenes(self) -> Sequence[str]:
-        """Return the names of the scenes: safe in file names, and never used again for other traffic."""
+        """Return the names of the scenes: safe in file names, and unique to their traffic."""
         ...
 
     def frame_count(self, scene: str) -> int:
-        """Return how many frames `frames(scene)` yields."""
+        """Return the number of frames that `frames(scene)` yields."""
         ...
 
     def frames(self, scene: str) -> Iterator[Frame]:
-        """Yield the scene's frames by time, and by agent within one time."""
+        """Yield the scene's frames ordered by time, then by agent."""
         ...
 
     def trace(self, scene: str) -> Trace | None:
-        """Return the traffic of a scene whose frames have been consumed; None from a source that knows none."""
+        """Return the traffic of a scene, once all its frames were yielded; None where the source does not know it."""
         ...
 
 
 @runtime_checkable
 class Replayable(Source, Protocol):
-    """A source that observes any frame of a scene once its traffic is there, so that frames go in parallel.
+    """A source that can produce any frame of a scene from its traffic, so that frames are recorded in parallel.
 
-    Its `trace(scene)` may be asked at any time and gives the traffic.
+    Its `trace(scene)` returns the traffic at any time, before the frames too, and never None.
     """
 
     def replay(self, scene: str, trace: Trace, numbers: range) -> Iterator[Frame]:
-        """Yield frames `numbers`, counted as `frames(scene)` yields them, of the scene whose traffic is `trace`."""
+        """Yield the frames with the given `numbers`, positions in `frames(scene)`, of a scene with traffic `trace`."""
         ...
 
 
 @runtime_checkable
 class Located(Source, Protocol):
-    """A source whose town has a folder that may not be there where its dataset is read: the dataset keeps it."""
+    """A source whose town's files are copied into the dataset, for readers that do not have the town."""
 
     def town_files(self) -> Mapping[str, bytes]:
-        """Return the files of the town's folder by name; none of a town that comes with flcav."""
+        """Return the contents of the town's files by name; empty for a town that comes with flcav."""
         ...

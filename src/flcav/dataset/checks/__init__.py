@@ -1,1 +1,1 @@
-"""Checks of a dataset, one sentence per problem."""
+"""Consistency checks of a dataset; each yields one sentence per problem."""

@@ -1,4 +1,7 @@
-"""What can be wrong with a dataset's calibrations: each check returns sentences, none where all is well."""
+"""Checks of calibrations: rigid mounts, valid intrinsics, plausible calibration errors.
+
+Each check yields one sentence per problem.
+"""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -11,12 +14,12 @@ from flcav.geometry import inverse, is_rigid
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Calibration
 
-SIGMAS = 6.0  # a drawn error is never so many standard deviations off
-EXACT = 1e-6  # [m], [rad], [px], [ms]
+SIGMAS = 6.0  # a larger error, in standard deviations, is reported
+EXACT = 1e-6  # tolerance of rounding, in the unit of each error: [m], [degrees], [px], [ms]
 
 
 def check_calibrations(calibrations: Mapping[str, Calibrations], recipe: Mapping[str, Any]) -> Iterator[str]:
-    """Check that mounts are rigid and lenses possible, and that beliefs are as wrong as the recipe says."""
+    """Check true and assumed calibrations by agent, and their difference against `calibration_error` of the recipe."""
     error = CalibrationError.model_validate(recipe.get("calibration_error") or {})
     for agent, (true, assumed) in calibrations.items():
         for which, calibration in (("true", true), ("assumed", assumed)):
@@ -25,7 +28,10 @@ def check_calibrations(calibrations: Mapping[str, Calibrations], recipe: Mapping
 
 
 def check_calibration(name: str, calibration: Calibration) -> Iterator[str]:
-    """Check one calibration."""
+    """Check one calibration: rigid mounts, pinhole intrinsics without skew, finite distortion and trigger times.
+
+    `name` names it in the sentences.
+    """
     for sensor, mount in calibration.agent_from_sensor.items():
         if not is_rigid(mount):
             yield f"{name}: the mount of '{sensor}' is not a rigid transform"
@@ -42,7 +48,10 @@ def check_calibration(name: str, calibration: Calibration) -> Iterator[str]:
 
 
 def check_belief(agent: str, true: Calibration, assumed: Calibration, error: CalibrationError) -> Iterator[str]:
-    """Check that what `agent` believes differs from the truth by no more than errors of that size."""
+    """Check that the assumed calibration of `agent` differs from the true one by at most SIGMAS standard deviations.
+
+    `error` gives the standard deviations.
+    """
     for sensor in sorted(true.agent_from_sensor.keys() & assumed.agent_from_sensor.keys()):
         if not (is_rigid(true.agent_from_sensor[sensor]) and is_rigid(assumed.agent_from_sensor[sensor])):
             continue

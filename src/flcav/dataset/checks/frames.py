@@ -1,4 +1,7 @@
-"""What can be wrong inside one frame: each check returns sentences, none where all is well."""
+"""Checks of one frame: ranges of values, complete LiDAR sweeps, points in boxes, agreement with the traffic.
+
+Each check yields one sentence per problem.
+"""
 
 from collections.abc import Iterator
 
@@ -12,18 +15,18 @@ from flcav.sensors.lidar.rolling import Motion
 from flcav.world.scene import OFFSET_S
 from flcav.world.trace import CATEGORIES, Trace
 
-MARGIN_M = 0.15  # a return may lie so far outside its actor's box: range noise, mirrors
-SIGMAS = 4.0  # and further where rain blurs its range
-INSIDE = 0.95  # share of an actor's returns that must lie in its box, grown by the margin
+MARGIN_M = 0.15  # distance by which a return may lie outside its actor's box: range noise, wing mirrors
+SIGMAS = 4.0  # additional margin in standard deviations of the range noise of rain
+INSIDE = 0.95  # share of an actor's returns that must lie in its enlarged box
 LONGEST_SPIN_S = 2 * OFFSET_S
-GAP_DEG = 30.0  # a whole spin has returns in every sector so wide
-FORCE = 200.0  # [m/s^2] no vehicle survives
-RATE = 20.0  # [rad/s]
-EXACT = 1e-6  # of what is stored twice [m], [rad], [m/s]
+GAP_DEG = 30.0  # widest azimuth sector without returns in a complete sweep
+FORCE = 200.0  # limit of the specific force [m/s^2]
+RATE = 20.0  # limit of the angular rate [rad/s]
+EXACT = 1e-6  # tolerance between values that are stored twice [s], [m], [rad], [m/s]
 
 
 def check_values(frame: Frame) -> Iterator[str]:
-    """Check that numbers are finite and within their range, poses rigid, names known and single."""
+    """Check that numbers are finite and in range, the pose is rigid, classes are known and tracks unique."""
     truth = frame.annotations
     for name, points in frame.lidar.items():
         if not np.isfinite(points).all():
@@ -52,7 +55,7 @@ def check_values(frame: Frame) -> Iterator[str]:
 
 
 def check_sweeps(frame: Frame) -> Iterator[str]:
-    """Check that each LiDAR whose points are finite has seen all round."""
+    """Check that each LiDAR's sweep covers all azimuths; LiDARs with a point that is not finite are skipped."""
     for name, points in frame.lidar.items():
         if not np.isfinite(points).all():
             continue
@@ -63,7 +66,7 @@ def check_sweeps(frame: Frame) -> Iterator[str]:
 
 
 def check_measurements(frame: Frame) -> Iterator[str]:
-    """Check that what radars, satellite receivers and inertial units report is possible."""
+    """Check that measurements of radars, GNSS receivers and inertial measurement units are physically possible."""
     for name, detections in frame.radar.items():
         if not np.isfinite(detections).all() or (detections[:, 0] <= 0).any():
             yield f"{frame.key}: '{name}' has a detection that is not finite, or at no range"
@@ -78,10 +81,10 @@ def check_measurements(frame: Frame) -> Iterator[str]:
 
 
 def check_points(frame: Frame, trace: Trace | None = None) -> Iterator[str]:
-    """Check that each box, grown by the margin, holds as many points as its actor is said to have returned.
+    """Check that each actor's enlarged box contains as many points as the annotation counts returns.
 
-    Points of a spin that takes time are judged by where carrier and actor were when each was measured, and not at all
-    where the frame's traffic is not known, or a point is not finite.
+    Points of a rolling LiDAR are compensated for the motion of the carrier and the actor by `trace`. The check is
+    skipped without `trace` for such a LiDAR, and where a point is not finite.
     """
     if not frame.lidar or (frame.point_times and trace is None):
         return
@@ -101,7 +104,10 @@ def check_points(frame: Frame, trace: Trace | None = None) -> Iterator[str]:
 
 
 def _in_world(frame: Frame, carrier: Motion | None) -> tuple[Array, NDArray[np.float32]]:
-    """Return all LiDARs' points (N, 3) where they were measured, and (N,) when [s] after the spin."""
+    """Return (N, 3) points of all LiDARs in the world frame [m], and (N,) their times [s] after the spin.
+
+    `carrier` is the motion of the agent during the spin; None leaves it at its pose at the spin.
+    """
     clouds, times = [], []
     for name, points in frame.lidar.items():
         cloud = transform_points(frame.world_from_sensor(name), points[:, :3].astype(np.float64))
@@ -111,7 +117,7 @@ def _in_world(frame: Frame, carrier: Motion | None) -> tuple[Array, NDArray[np.f
 
 
 def _motions(frame: Frame, trace: Trace) -> dict[str, Motion]:
-    """Return how everybody in town moves at the spin, by name."""
+    """Return actor -> its motion at the time of the spin; empty where `trace` has no such instant."""
     motions = {}
     for instant in np.flatnonzero(np.abs(trace.time_s - frame.time_s) < EXACT)[:1].tolist():
         for actor in np.flatnonzero(trace.present[instant]).tolist():
@@ -120,7 +126,7 @@ def _motions(frame: Frame, trace: Trace) -> dict[str, Motion]:
 
 
 def check_traffic(frame: Frame, trace: Trace) -> Iterator[str]:
-    """Check that the vehicle and every box are where the traffic run has them at that time."""
+    """Check that the pose of the agent and all annotations agree with the traffic `trace` at the frame's time."""
     instant = np.flatnonzero(np.abs(trace.time_s - frame.time_s) < EXACT)
     if not len(instant):
         yield f"{frame.key}: the traffic of '{frame.scene}' has no instant at {frame.time_s} s"

@@ -1,4 +1,4 @@
-"""What can be wrong with images and what is said of them: each check returns sentences, none where all is well."""
+"""Checks of images and their 2D annotations; each check yields one sentence per problem."""
 
 from collections.abc import Iterator
 
@@ -11,15 +11,15 @@ from flcav.sensors.frame import Array, CameraImage, Frame, SignViews, Views
 from flcav.sensors.labels.signs import STATES
 from flcav.sensors.labels.views import actor_regions
 
-MARGIN_M = 0.3  # a pixel may lie so far outside its actor's box: mirrors, turning between the spin and the trigger
-MARGIN_PX = 3.0
-INSIDE = 0.95  # share of an actor's pixels that must lie in its box, grown by the margin
-JUDGED = 40  # pixels from which on an actor is judged, and by how many at most
+MARGIN_M = 0.3  # distance by which a pixel may lie outside its actor's 3D box: wing mirrors, turning since the spin
+MARGIN_PX = 3.0  # distance by which a pixel may lie outside its actor's amodal box
+INSIDE = 0.95  # share of an actor's sampled pixels that must lie in its enlarged box
+JUDGED = 40  # pixels sampled of each actor; actors with fewer are skipped
 SIGN_STATES = {"", "off", *STATES.values()}
 
 
 def check_images(frame: Frame) -> Iterator[str]:
-    """Check every image of a frame and what its annotations say of it."""
+    """Check every image of a frame and its annotations of actors, signs and lights."""
     for name in (*frame.images, *frame.infrared):
         yield from check_views(frame.key, name, frame.annotations.views[name])
         yield from check_signs(frame.key, name, frame.annotations.signs[name])
@@ -34,7 +34,10 @@ def check_images(frame: Frame) -> Iterator[str]:
 
 
 def check_views(key: str, name: str, views: Views) -> Iterator[str]:
-    """Check that shares are shares and boxes are boxes."""
+    """Check that truncation and occlusion are in [0, 1] and that boxes have an area.
+
+    `key` names the frame and `name` the camera, here and below.
+    """
     shares = np.column_stack((views.truncation, views.occlusion))
     if not ((shares >= 0) & (shares <= 1)).all():
         yield f"{key}: '{name}' has a truncation or an occlusion outside 0 to 1"
@@ -45,7 +48,7 @@ def check_views(key: str, name: str, views: Views) -> Iterator[str]:
 
 
 def check_planes(key: str, name: str, image: CameraImage, actors: int) -> Iterator[str]:
-    """Check that the planes of an image go together."""
+    """Check that the planes of an image agree in shape, depths are positive, and instances are of its `actors`."""
     if not _fit(image):
         yield f"{key}: the planes of '{name}' differ in shape"
         return
@@ -56,14 +59,14 @@ def check_planes(key: str, name: str, image: CameraImage, actors: int) -> Iterat
 
 
 def _fit(image: CameraImage) -> bool:
-    """Return whether the planes of an image are of one shape."""
+    """Return whether the planes of an image have one height and width."""
     shape = image.rgb.shape[:2]
     others = (image.depth_m, image.semantic, image.instance)
     return image.rgb.shape[2:] == (3,) and all(plane.shape == shape for plane in others)
 
 
 def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[str]:
-    """Check that the pixels and visible boxes of actors are those of the instance image."""
+    """Check that the pixel counts and visible boxes of actors agree with the instance image."""
     truth, views = frame.annotations, frame.annotations.views[name]
     found = actor_regions(image.instance.astype(np.int32), max(len(truth), int(image.instance.max(initial=0))))
     for i in np.flatnonzero(views.pixels != found.pixels[: len(truth)]):
@@ -76,14 +79,14 @@ def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[st
 
 
 def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) -> Iterator[str]:
-    """Check that pixels, put where their depth says, lie in their actors' boxes, and in the amodal rectangles."""
+    """Check that each actor's pixels, back-projected by their depth, lie in its 3D box, and in its amodal box."""
     truth, views = frame.annotations, frame.annotations.views[name]
     boxes = _boxes_then(frame, frame.calibration.offset_ms.get(name, 0.0) / 1e3)
     rays = directions(lens).astype(np.float64).reshape(*image.instance.shape, 3)
     for i in np.flatnonzero(views.pixels >= JUDGED):
         v, u = np.nonzero(image.instance == i + 1)
         if len(v) < JUDGED:
-            continue  # `check_visibility` tells that they are not those of the annotations
+            continue  # the annotated count is wrong, which `check_visibility` reports
         chosen = np.linspace(0, len(v) - 1, JUDGED).astype(int)
         v, u = v[chosen], u[chosen]
         points = rays[v, u] * (image.depth_m[v, u] / rays[v, u, 2])[:, None]
@@ -100,7 +103,7 @@ def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) ->
 
 
 def check_signs(key: str, name: str, signs: SignViews) -> Iterator[str]:
-    """Check that the boxes, pixels, distances and states of signs and lights are such."""
+    """Check that annotated signs and lights have known states, boxes with area, pixels, distances, and are unique."""
     if set(signs.state.tolist()) - SIGN_STATES:
         yield f"{key}: '{name}' shows a light in an unknown state; known: {', '.join(sorted(SIGN_STATES))}"
     if not (np.isfinite(signs.box).all() and (signs.box[:, 2:] > signs.box[:, :2]).all()):
@@ -119,7 +122,7 @@ def check_placed_signs(key: str, name: str, signs: SignViews, lens: Lens) -> Ite
 
 
 def _lens(frame: Frame, name: str, image: CameraImage) -> Lens:
-    """Return the lens of a camera; raises `InputError` where its calibration is that of none."""
+    """Return the lens model of a camera from its calibration; raises `InputError` where that is out of range."""
     fx, fy, cx, cy = frame.calibration.intrinsics[name][[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     coefficients = zip(("k1", "k2", "p1", "p2", "k3"), frame.calibration.distortion[name].tolist())
     height, width = image.rgb.shape[:2]
@@ -128,7 +131,7 @@ def _lens(frame: Frame, name: str, image: CameraImage) -> Lens:
 
 
 def _boxes_then(frame: Frame, offset_s: float) -> Boxes:
-    """Return the annotated boxes `offset_s` after the spin."""
+    """Return the annotated boxes `offset_s` after the spin, moved with constant acceleration and without turning."""
     truth = frame.annotations
     moved: Array = truth.boxes.center + offset_s * truth.velocity + offset_s**2 / 2 * truth.acceleration
     return Boxes(moved, truth.boxes.size, truth.boxes.yaw, truth.boxes.label)

@@ -1,4 +1,4 @@
-"""What no single frame shows: sensors whose view is blocked, actors whose motion and recorded speed disagree."""
+"""Checks over several frames: blocked LiDARs, and actors whose motion contradicts their recorded velocity."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -8,29 +8,29 @@ import numpy as np
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
-CLOSE_M = 1.0  # from a LiDAR: its mount, or what stands in its way
-MOST, ALMOST_ALL = 0.5, 0.95  # shares of a LiDAR's points
-LONGEST_STEP_S = 1.0  # over longer ones the speeds at both ends say little
-DRIFT_M, DRIFT_MPS = 0.3, 2.5  # by how much an actor may miss what its speeds say: at once, and per second
+CLOSE_M = 1.0  # points closer to the LiDAR are from its mount or an obstruction
+MOST, ALMOST_ALL = 0.5, 0.95  # shares of close points from which the view is blocked, and almost entirely
+LONGEST_STEP_S = 1.0  # longer steps are skipped: the velocities at both ends do not predict the motion
+DRIFT_M, DRIFT_MPS = 0.3, 2.5  # tolerance of a position predicted from velocities: constant, and per second
 
 
 class Sight:
-    """How many of each LiDAR's points are close to it, over all frames of a dataset."""
+    """Detector of blocked LiDARs: counts the points close to each LiDAR over all frames of a dataset."""
 
     def __init__(self) -> None:
         self._points: Counter[tuple[str, str]] = Counter()  # by agent and LiDAR
         self._close: Counter[tuple[str, str]] = Counter()
 
     def add(self, frame: Frame) -> None:
-        """Count the points of one frame."""
+        """Add the points of one frame to the counts."""
         for name, points in frame.lidar.items():
-            with np.errstate(invalid="ignore"):  # signalling NaNs, which the frame's own checks tell
+            with np.errstate(invalid="ignore"):  # signalling NaNs, which `check_values` reports
                 close = np.linalg.norm(points[:, :3].astype(np.float64), axis=1) < CLOSE_M
             self._points[frame.agent, name] += len(points)
             self._close[frame.agent, name] += int(close.sum())
 
     def problems(self) -> Iterator[str]:
-        """Yield a sentence for each LiDAR whose view is blocked."""
+        """Yield a sentence for each LiDAR with more than a share MOST of its points closer than CLOSE_M."""
         for (agent, name), count in self._points.items():
             share = self._close[agent, name] / max(count, 1)
             told = f"{share:.1%} of its {count} points lie within {CLOSE_M:g} m of it"
@@ -41,9 +41,9 @@ class Sight:
 
 
 def check_motion(scene: str, trace: Trace) -> Iterator[str]:
-    """Check that every actor moves from instant to instant as its recorded velocities say; the worst of each is told.
+    """Check that every actor moves between instants as its recorded velocities predict, by the trapezoidal rule.
 
-    Where the actor should be is the trapezoidal sum of the velocities at both ends of a step.
+    Yields one sentence for each actor that does not, about its worst step.
     """
     step_s = np.diff(trace.time_s)[:, None]
     moved = np.diff(trace.position, axis=0)

@@ -1,4 +1,7 @@
-"""Validation of a dataset: what is wrong with it, one sentence per problem."""
+"""Validation of a dataset folder, and leakage between datasets of different splits.
+
+The files are checked against the manifest (size, checksum), then their contents by the checks of this package.
+"""
 
 import contextlib
 from collections import defaultdict
@@ -21,9 +24,9 @@ from flcav.world.trace import Trace
 
 
 def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
-    """Return the problems of the dataset in the folder `path`, one sentence each; none is the good case.
+    """Return the problems of the dataset in the folder `path`, one sentence each; empty for a valid dataset.
 
-    Raises `InputError` where there is no finished dataset at all.
+    Raises `InputError` where `path` holds no finished dataset.
 
     >>> from flcav import validate
     >>> validate("data")
@@ -72,7 +75,10 @@ def _frame_problems(frame: Frame, trace: Trace | None) -> Iterator[str]:
 
 
 def check_order(keys: Sequence[FrameKey]) -> list[str]:
-    """Return where time does not run: forward from spin to spin, one time per spin, each agent once in each."""
+    """Return a sentence for each frame out of order.
+
+    Within a scene, spins and times increase together, and each agent has one frame per spin.
+    """
     problems = []
     agents: dict[tuple[str, int], set[str]] = defaultdict(set)
     last: dict[str, FrameKey] = {}
@@ -91,9 +97,9 @@ def check_order(keys: Sequence[FrameKey]) -> list[str]:
 
 
 def _listed_files(folder: Path, manifest: Manifest) -> dict[str, tuple[int, str]]:
-    """Return the bytes and the hash of every file of the dataset but the manifest."""
+    """Return path -> (bytes, SHA-256) of every file that the dataset lists, all but the manifest."""
     listed = {name: (entry.bytes, entry.sha256) for name, entry in manifest.tables.items()}
-    with contextlib.suppress(InputError):  # named as damaged
+    with contextlib.suppress(InputError):  # a damaged listing is among `manifest.tables` and reported there
         files = read_table(folder / table_path(FILES), FILES).to_pydict()
         listed |= {name: (size, digest) for name, size, digest in zip(files["path"], files["bytes"], files["sha256"])}
     return listed
@@ -124,15 +130,15 @@ def _other_counts(dataset: Dataset) -> Iterator[str]:
 
 
 def _trace(dataset: Dataset, scene: str, damaged: Collection[str]) -> Trace | None:
-    """Return a scene's traffic where there is any and it can be trusted."""
+    """Return the traffic of a scene; None if it was not recorded or its file is among the `damaged`."""
     return None if trace_path(scene) in damaged else dataset.trace(scene)
 
 
 def leaks(manifests: Mapping[str, Manifest]) -> list[str]:
-    """Return a sentence for every two datasets (name -> manifest) of different splits that share traffic.
+    """Return a sentence for each pair of datasets of different splits that share traffic; `manifests` is by name.
 
-    Frames of one scene show the same cars at the same places, so a scene belongs to one split; and a traffic seed
-    drives a town the same way in every recipe that uses it.
+    Frames of one scene show the same cars at the same places, so a scene belongs in one split. So does a traffic seed
+    of a town, which gives the same traffic in every recipe.
     """
     return [sentence for pair in combinations(manifests.items(), 2) for sentence in _shared(*pair)]
 

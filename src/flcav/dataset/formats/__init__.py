@@ -1,1 +1,1 @@
-"""Other people's dataset formats: exported to all of `FORMATS`, read from KITTI."""
+"""Dataset formats of the field: export to each of `export.FORMATS`, and reading of KITTI."""

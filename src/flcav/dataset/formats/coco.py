@@ -1,6 +1,7 @@
-"""A dataset in COCO's layout: `images/<split>` and `annotations/<labels>_<split>.json`, signs and actors apart.
+"""Export to COCO: `images/<split>` and `annotations/<labels>_<split>.json`, separate for signs and actors.
 
-Actors have their mask as COCO's compressed run lengths; signs have their rectangle only.
+Actors have instance masks in COCO's compressed run-length encoding (RLE); signs have bounding boxes only. Lin et al.,
+"Microsoft COCO", ECCV 2014.
 """
 
 import json
@@ -21,7 +22,7 @@ from flcav.sensors.frame import Frame
 
 
 def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write every picture of `dataset` with the rectangles and masks in it: see `Exporter`."""
+    """Write every image of `dataset` with its bounding boxes and masks: see `Exporter`."""
     split_of = split_scenes(dataset, options)
     tables = {(labels, split): _empty(labels) for labels in CLASSES for split in split_of.values()}
     counts: Counter[str] = Counter(images=0, signs=0, actors=0)
@@ -51,7 +52,7 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
 
 
 def run_lengths(mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return COCO's compressed run lengths of (H, W) pixels: its `size`, and `counts` as text."""
+    """Return COCO's compressed run-length encoding of an (H, W) mask: {"size": [H, W], "counts": text}."""
     encoded = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
     return {"size": list(mask.shape), "counts": encoded["counts"].decode("ascii")}
 

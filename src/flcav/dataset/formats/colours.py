@@ -1,4 +1,4 @@
-"""The colours that actors and signs have in other people's viewers."""
+"""Colours of actor classes and signs for viewers."""
 
 COLOURS = {  # red, green, blue, each 0 to 1
     "car": (0.20, 0.55, 0.95),

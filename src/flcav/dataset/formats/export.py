@@ -1,4 +1,4 @@
-"""A dataset in another format's layout: a folder that is whole, or not there."""
+"""Export of a dataset to a format of the field, into a folder that appears only when it is complete."""
 
 import contextlib
 import shutil
@@ -20,10 +20,10 @@ from flcav.progress import Report, silent
 
 @dataclass(frozen=True)
 class Format:
-    """How a format is written."""
+    """An export format: its exporter, and the options that apply to it."""
 
     write: Exporter
-    options: tuple[str, ...]  # those of `ExportOptions` that it has a use for
+    options: tuple[str, ...]  # fields of `ExportOptions` that apply
 
 
 FORMATS: Mapping[str, Format] = {
@@ -40,10 +40,10 @@ DEFAULTS = ExportOptions()
 def export(
     dataset: Dataset, name: str, out: Path, options: ExportOptions = DEFAULTS, *, progress: Report = silent
 ) -> Exported:
-    """Write `dataset` in the format `name` to the new or empty folder `out`; returns what was written and what not.
+    """Write `dataset` in the format `name`, one of FORMATS, to the new or empty folder `out`; return counts.
 
-    Raises `InputError` for an unknown format, an option that is set but of no use to the format, a folder that holds
-    files, and a dataset that lacks what the format needs. However it ends early, `out` does not appear.
+    Raises `InputError` for an unknown format, an option that is set but does not apply to the format, a folder that is
+    not empty, and a dataset that lacks what the format needs. After any failure no partial output is left.
     """
     if name not in FORMATS:
         raise InputError(f"format '{name}': unknown; known formats: {', '.join(FORMATS)}")
@@ -57,13 +57,16 @@ def export(
 
 @contextlib.contextmanager
 def _new_folder(path: Path) -> Iterator[Path]:
-    """Yield a hidden sibling of `path` to fill: renamed to `path` on success, removed on any failure."""
+    """Yield a hidden folder beside `path` to write into; it is renamed to `path` on success and removed on failure.
+
+    Raises `InputError` where `path` is a file or a folder that is not empty.
+    """
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; an export needs a folder")
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path}: holds other files; export into a new or empty folder")
     part = path.absolute().with_name(f".{path.absolute().name}.part")
-    shutil.rmtree(part, ignore_errors=True)  # of an export that was killed
+    shutil.rmtree(part, ignore_errors=True)  # leftover of a killed export
     part.mkdir(parents=True)
     try:
         yield part

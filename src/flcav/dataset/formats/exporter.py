@@ -1,4 +1,4 @@
-"""The protocol of an exporter, its options, and the split of a dataset's scenes."""
+"""What all exporters share: their signature, options and results, and the split of scenes into train, val and test."""
 
 import math
 from collections import Counter
@@ -19,50 +19,50 @@ from flcav.sensors.frame import Frame
 
 
 class ExportOptions(Config):
-    """What can be asked of an export; a format that has no use for what is asked refuses it."""
+    """Options of an export; `export.FORMATS` lists those that apply to each format."""
 
-    labels: Literal["signs", "actors"] = "signs"  # YOLO has one list of classes
-    validation: float = Field(default=0.2, ge=0, lt=1)  # share of the scenes that validate
-    min_pixels: int = Field(default=1, ge=1)  # 2D labels of what shows fewer are left out
-    min_points: int = Field(default=1, ge=0)  # objects with fewer points of the LiDAR in their box are not labelled
+    labels: Literal["signs", "actors"] = "signs"  # classes of a YOLO export, which has one list
+    validation: float = Field(default=0.2, ge=0, lt=1)  # share of the scenes in the validation split
+    min_pixels: int = Field(default=1, ge=1)  # least visible pixels of a 2D label
+    min_points: int = Field(default=1, ge=0)  # least LiDAR points in the box of a labelled object
     calibration: Literal["true", "assumed"] = "true"  # which of a frame's two calibrations is written
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export wrote of a dataset, and which of its frames it did not."""
+    """The result of an export: counts of what was written, and of the frames left out."""
 
-    counts: Counter[str]  # of what was written, by name
-    left_out: Counter[tuple[str, str]] = field(default_factory=Counter)  # (why, which) -> how many frames
+    counts: Counter[str]  # kind, e.g. "frames", "objects" -> number written
+    left_out: Counter[tuple[str, str]] = field(default_factory=Counter)  # (reason, agent or spin) -> number of frames
 
 
-# Writes a dataset in one format into an empty folder; raises `InputError` where it lacks what the format needs.
+# Writes a dataset in one format into an empty folder; raises `InputError` where the dataset lacks what that needs.
 Exporter = Callable[[Dataset, Path, ExportOptions, Report], Exported]
 
 
 def read_frame(dataset: Dataset, i: int, options: ExportOptions) -> Frame:
-    """Return frame `i` with the calibration that is asked for in the place of the true one."""
+    """Return frame `i` with the calibration that `options` ask for, true or assumed, as its `calibration`."""
     frame = dataset.frame(i)
     return frame if options.calibration == "true" else replace(frame, calibration=frame.assumed)
 
 
 def points_in_each_box(frame: Frame, sensor: str, points: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return (M,) how many of the (N, >= 3) points of a LiDAR or radar lie in the box of each annotation.
+    """Return (M,) numbers of the (N, >= 3) `points` [m] of a LiDAR or radar that lie in the box of each annotation.
 
-    Readers of an export count them so. A frame's `annotations.points` differ: those are of the actor itself, whose
-    points may lie beyond its box, and others' within.
+    Readers of an export count in this way. `annotations.points` differ: they count points on the actor itself, which
+    may lie outside its box, and no points of others inside it.
     """
     world = transform_points(frame.world_from_sensor(sensor), points[:, :3].astype(np.float64))
     return points_in_boxes(world, frame.annotations.boxes).sum(axis=1)
 
 
 def lacks(dataset: Dataset, name: str, needed: str, who: str = "the dataset") -> InputError:
-    """Return the error that says what a format misses in a dataset, or in one of its agents."""
+    """Return the error for a dataset, or an agent (`who`), without what the format `name` needs."""
     return InputError(f"{dataset.folder}: cannot be exported to {name}, which needs {needed}; {who} has none")
 
 
 def check_rectified(frame: Frame, camera: str, name: str) -> None:
-    """Raise `InputError` where a camera distorts, whose images the format `name` wants rectified."""
+    """Raise `InputError` where the lens of `camera` distorts; the format `name` needs rectified images."""
     if np.any(frame.calibration.distortion.get(camera, 0)):
         raise InputError(
             f"{frame.key}: '{camera}' distorts; {name} wants rectified images, so record without distortion"
@@ -73,10 +73,11 @@ SPLITS = ("train", "val", "test")
 
 
 def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
-    """Return scene -> "train", "val" or "test". A scene is never divided: its frames show the same cars.
+    """Return scene -> "train", "val" or "test". Scenes are not divided, since their frames show the same cars.
 
-    A dataset recorded for validation or for testing goes there whole; raises `InputError` where a share that validates
-    is asked for all the same. Of any other, the last scenes validate: that share of them, rounded up, but never all.
+    A dataset whose recipe says validation or test belongs to that split entirely; raises `InputError` where a share of
+    validation scenes is requested nevertheless. Of any other dataset, the last scenes are the validation split: the
+    requested share of them, rounded up, but never all.
     """
     scenes = list(dict.fromkeys(key.scene for key in dataset.keys))
     recorded_for = str(dataset.manifest.recipe.get("split", ""))
@@ -93,9 +94,9 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
 
 
 def split_validated(dataset: Dataset, options: ExportOptions, name: str) -> Mapping[str, str]:
-    """Return `split_scenes` for a format `name` that trains on no dataset unless scenes of it validate.
+    """Return `split_scenes` for a format `name` whose readers need a validation split to train.
 
-    Raises `InputError` where the only scene trains, unless it is asked that none validates.
+    Raises `InputError` where all scenes are in the training split, unless `options` ask for no validation scenes.
     """
     split_of = split_scenes(dataset, options)
     if set(split_of.values()) == {"train"} and options.validation:

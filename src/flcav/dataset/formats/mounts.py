@@ -1,4 +1,7 @@
-"""Where sensors stand on their agent, and how the agent moved, in the terms of other formats."""
+"""Mounts of sensors and motion of agents in terms of other formats.
+
+Assignment of cameras and radars to named channels by their direction, rotations as quaternions, and agents' velocities.
+"""
 
 from collections.abc import Mapping
 
@@ -10,31 +13,35 @@ from scipy.spatial.transform import Rotation
 from flcav.dataset.store import Dataset
 from flcav.geometry import wrap_angle
 
-LEVEL_RAD = np.radians(2.0)  # a camera tilted or rolled by less is level
-AHEAD_RAD = np.radians(30.0)  # a camera turned by less looks ahead
+LEVEL_RAD = np.radians(2.0)  # largest tilt of a level camera
+AHEAD_RAD = np.radians(30.0)  # largest yaw of a camera that looks ahead
 
 
 def optical_yaw(agent_from_camera: NDArray[np.float64]) -> float:
-    """Return the direction [rad] of a camera's axis (z of its optical frame), counter-clockwise from straight ahead."""
+    """Return the yaw [rad] of a camera's optical axis (z of its optical frame), counter-clockwise from straight ahead.
+
+    `agent_from_camera` is (4, 4).
+    """
     return float(np.arctan2(agent_from_camera[1, 2], agent_from_camera[0, 2]))
 
 
 def is_level(agent_from_camera: NDArray[np.float64]) -> bool:
-    """Return whether a camera's y axis (optical frame) points straight down."""
+    """Return whether the y axis of a camera's optical frame points down, to LEVEL_RAD."""
     return bool(-agent_from_camera[2, 1] >= np.cos(LEVEL_RAD))
 
 
 def front_camera(agent_from_camera: Mapping[str, NDArray[np.float64]]) -> str | None:
-    """Return the name of the level camera that looks most nearly ahead; None where none does."""
+    """Return the name of the level camera with the least yaw, None if none is within AHEAD_RAD."""
     turned = {name: abs(optical_yaw(mount)) for name, mount in agent_from_camera.items() if is_level(mount)}
     name = min(turned, key=turned.__getitem__, default=None)
     return name if name is not None and turned[name] <= AHEAD_RAD else None
 
 
 def channels(yaw: Mapping[str, float], named: Mapping[str, float]) -> dict[str, str]:
-    """Return sensor name -> channel: of the channels `named` by their direction [rad] those that fit all best.
+    """Return sensor -> channel, the assignment with the least sum of angles between them.
 
-    Sensors in excess of the channels are left out.
+    `yaw` are the directions [rad] of the sensors, `named` those of the channels. Sensors in excess of the channels are
+    left out.
     """
     sensors, known = list(yaw), list(named)
     away = np.abs(wrap_angle(np.subtract.outer([yaw[name] for name in sensors], [named[name] for name in known])))
@@ -43,13 +50,13 @@ def channels(yaw: Mapping[str, float], named: Mapping[str, float]) -> dict[str, 
 
 
 def quaternion(matrix: NDArray[np.float64]) -> list[float]:
-    """Return w, x, y, z of the rotation in a (3, 3) or (4, 4) transform."""
+    """Return the unit quaternion [w, x, y, z], w >= 0, of the rotation in a (3, 3) or (4, 4) transform."""
     x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True).tolist()
     return [w, x, y, z]
 
 
 def agent_velocities(dataset: Dataset, scene: str) -> dict[tuple[str, int], NDArray[np.float64]]:
-    """Return (agent, spin) -> (3,) velocity, world [m/s]; zero of an agent that is not in the scene's traffic."""
+    """Return (agent, spin) -> (3,) velocity, world frame [m/s]; zero for an agent outside the traffic, as a pole."""
     keys = [dataset.keys[i] for i in dataset.select(scenes=[scene])]
     velocities = {(key.agent, key.index): np.zeros(3) for key in keys}
     trace = dataset.trace(scene)

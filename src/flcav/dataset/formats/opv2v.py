@@ -1,7 +1,7 @@
-"""A dataset in OPV2V's layout, as OpenCOOD reads it: `<split>/<scenario>/<agent>/<time>.yaml`, `.pcd`, `_camera0.png`.
+"""Export to OPV2V, as OpenCOOD reads it: `<split>/<scenario>/<agent>/<time>.yaml`, `.pcd`, `_camera0.png`.
 
-Everything is in CARLA's left-handed frames (y to the right), poses are x, y, z [m], roll, yaw, pitch [degrees]. Agents
-and vehicles share one list of numbers. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `transformation_utils.x_to_world`.
+All frames are CARLA's left-handed ones (y to the right); poses are x, y, z [m], roll, yaw, pitch [degrees]. Agents and
+vehicles are numbered in one list. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `transformation_utils.x_to_world`.
 """
 
 from collections import Counter, defaultdict
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 FOLDERS = {"train": "train", "val": "validate", "test": "test"}
 VEHICLES = ("car", "van", "truck", "bus")
-CAMERAS = {  # where they look, counter-clockwise from ahead [rad]
+CAMERAS = {  # yaw, counter-clockwise from ahead [rad]
     "camera0": 0.0,
     "camera1": np.radians(-100),
     "camera2": np.radians(100),
@@ -46,7 +46,10 @@ FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built wi
 
 
 def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write one scenario for each scene of `dataset`: see `Exporter`."""
+    """Write one scenario for each scene of `dataset`: see `Exporter`.
+
+    Spins that not every agent of a scene has are left out.
+    """
     split_of = split_validated(dataset, options, "OPV2V")
     exported = Exported(Counter(scenarios=0, frames=0, objects=0))
     counts, done = exported.counts, 0
@@ -80,7 +83,10 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
 
 
 def _shared_spins(dataset: Dataset, scene: str) -> set[int]:
-    """Return the spins that every agent of a scene has: of a recording cut to a number of frames, not the last."""
+    """Return the spins that every agent of a scene has; a recording limited to a number of frames may end in others.
+
+    Raises `InputError` where there is none.
+    """
     spins: dict[str, set[int]] = defaultdict(set)
     for i in dataset.select(scenes=[scene]):
         spins[dataset.keys[i].agent].add(dataset.keys[i].index)
@@ -91,7 +97,7 @@ def _shared_spins(dataset: Dataset, scene: str) -> set[int]:
 
 
 def agent_numbers(agents: list[str]) -> dict[str, int]:
-    """Return the numbers of a scene's agents: those of vehicles sort before those of poles."""
+    """Return agent -> number; vehicles sort before poles, since OpenCOOD takes the first agent as the ego vehicle."""
     cars = [agent for agent in agents if not agent.startswith("pole")]
     poles = [agent for agent in agents if agent.startswith("pole")]
     return {
@@ -101,7 +107,10 @@ def agent_numbers(agents: list[str]) -> dict[str, int]:
 
 
 def carla_pose(world_from_body: Array) -> list[float]:
-    """Return x, y, z, roll, yaw, pitch in CARLA's left-handed world of a body with axes x ahead, y left, z up."""
+    """Return [x, y, z [m], roll, yaw, pitch [degrees]] in CARLA's left-handed world of a (4, 4) `world_from_body`.
+
+    The body's axes are x ahead, y left, z up.
+    """
     matrix = MIRROR @ world_from_body @ MIRROR
     roll = np.arctan2(-matrix[2, 1], matrix[2, 2])
     yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
@@ -140,7 +149,7 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, dict[str, Any]]
 
 
 def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[int, dict[str, Any]]:
-    """Return number -> box of the vehicles that have so many of the LiDAR's points in it."""
+    """Return number -> OPV2V's box of each vehicle with at least `min_points` points of the first LiDAR in its box."""
     truth, boxes = frame.annotations, frame.annotations.boxes
     enough = points_in_each_box(frame, *next(iter(frame.lidar.items()))) >= min_points
     vehicles = {}
@@ -158,7 +167,10 @@ def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[in
 
 
 def pcd(points: NDArray[np.float32]) -> bytes:
-    """Return a binary PCD of (N, 4) x, y, z, intensity, mirrored; the intensity is the colour's red, as OPV2V's is."""
+    """Return a binary PCD v0.7 file of (N, 4) x, y, z [m], intensity [0, 1], with y mirrored.
+
+    The intensity is the red channel of the colour, as in OPV2V.
+    """
     red = np.clip(np.rint(points[:, 3] * 255), 0, 255).astype("<u4") << 16
     rows = np.column_stack((points[:, :3] * np.array([1, -1, 1], np.float32), red.view("<f4"))).astype(
         "<f4", copy=False

@@ -1,6 +1,7 @@
-"""A dataset in YOLO's layout: `images`, `labels` with one text file each, and `data.yaml`.
+"""Export to Ultralytics YOLO: `images`, `labels` with a text file for each image, and `data.yaml`.
 
-A row of a label file is a class number and the visible rectangle's centre, width and height as shares of the image.
+A row of a label file is a class number and the visible bounding box: x and y of its centre, width, height, as fractions
+of the image's width and height.
 """
 
 from collections import Counter
@@ -16,7 +17,7 @@ from flcav.progress import Report
 
 
 def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write every picture of `dataset` with the signs and lights in it, or with its actors: see `Exporter`."""
+    """Write every image of `dataset` with its signs and lights, or its actors: see `Exporter`."""
     split_of = split_validated(dataset, options, "YOLO")
     counts: Counter[str] = Counter(images=0, objects=0)
     for i, key in enumerate(dataset.keys):
@@ -33,7 +34,7 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     if not counts["images"]:
         raise lacks(dataset, "YOLO", "camera images")
     folders = {split: f"images/{split}" for split in ("train", "val", *split_of.values())}
-    for folder in folders.values():  # Ultralytics wants the first two named and there, if only to test
+    for folder in folders.values():  # Ultralytics requires the first two, even for a test
         (out / folder).mkdir(exist_ok=True)
     names = dict(enumerate(CLASSES[options.labels]))
     (out / "data.yaml").write_text(yaml.safe_dump({**folders, "names": names}, sort_keys=False), encoding="utf-8")
@@ -41,7 +42,7 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
 
 
 def label_text(found: Rectangles, width: int, height: int) -> str:
-    """Return the label file of a picture of that many pixels."""
+    """Return the text of the label file of an image of `width` x `height` pixels."""
     left, top, right, bottom = (found.box / (width, height, width, height)).T
     rows = zip(found.label, (left + right) / 2, (top + bottom) / 2, right - left, bottom - top)
     return "".join(f"{label} " + " ".join(f"{value:.6f}" for value in box) + "\n" for label, *box in rows)

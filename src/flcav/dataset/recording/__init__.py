@@ -1,1 +1,1 @@
-"""Recording of datasets: jobs, workers, and the recorder that resumes."""
+"""Recording of datasets: the recorder, its jobs, and the engines that perform them."""

@@ -1,4 +1,9 @@
-"""The jobs of a recording, a scene or a spin each, and the order they are done in."""
+"""The jobs of a recording: their division of the frames, how one is performed, and their scheduling.
+
+A scene of a `Replayable` source is one job for its traffic and one for each part of its frames; any other scene is one
+job. A job writes below `work/SCENE`: the traffic, or the folder of a part, which appears there when it is complete. A
+scene's traffic is scheduled before its parts, and only a few scenes are under way at a time.
+"""
 
 import hashlib
 import json
@@ -21,20 +26,20 @@ from flcav.sensors.frame import Frame
 from flcav.sources.source import Replayable, Source
 from flcav.world.trace import Trace
 
-PART_FRAMES = 16  # few enough to lose, many enough to start for
+PART_FRAMES = 16  # frames of a part: few are lost by an interruption, and starting a part is cheap beside them
 TRAFFIC = "traffic.parquet"
-PAYLOADS = "payloads"  # folder of what goes into the dataset as it is
+PAYLOADS = "payloads"  # folder of a part with the files that are moved into the dataset unchanged
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 class Traffic(NamedTuple):
-    """A scene's traffic, which its parts replay."""
+    """The job that simulates the traffic of a scene, which its parts replay."""
 
     scene: str
 
 
 class Part(NamedTuple):
-    """Some of a scene's frames."""
+    """The job that records `frames` consecutive frames of a scene, from number `first` on."""
 
     scene: str
     number: int
@@ -42,7 +47,7 @@ class Part(NamedTuple):
     first: int = 0
 
     def folder(self, work: Path) -> Path:
-        """Return where the part lies when it is complete."""
+        """Return the folder of the completed part below the folder `work`."""
         return work / self.scene / f"{self.number:05d}"
 
 
@@ -50,14 +55,18 @@ Task = Traffic | Part
 
 
 def parts(source: Source, scene: str) -> list[Part]:
-    """Return the parts of a scene, which do not depend on who records it."""
+    """Return the parts of a scene: of PART_FRAMES each for a `Replayable` source, else one of all frames."""
     count = source.frame_count(scene)
     step = PART_FRAMES if isinstance(source, Replayable) else max(count, 1)
     return [Part(scene, number, min(step, count - first), first) for number, first in enumerate(range(0, count, step))]
 
 
 def perform(source: Source, task: Task, work: Path, wrote_frame: Callable[[], None]) -> None:
-    """Do `task`, whatever an earlier attempt has left; calls `wrote_frame` after each frame."""
+    """Perform the job `task` below the folder `work`, replacing leftovers of an earlier attempt.
+
+    Calls `wrote_frame` after each frame. Raises ValueError where the source violates its protocol: it has no traffic to
+    replay, yields a frame twice or of another scene, uses unsafe names, or moves sensors on their mounts.
+    """
     if isinstance(task, Traffic):
         trace = source.trace(task.scene)
         if trace is None:
@@ -114,30 +123,33 @@ def _check_names(frame: Frame, scene: str) -> None:
         raise ValueError(f"{frame.key}: scene, agent or sensor names that a dataset cannot hold: {names}")
 
 
-AHEAD = 2  # tasks handed over beyond those under way, so that nobody waits
+AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
 class Engine(Protocol):
-    """Whoever does tasks, in any order, `slots` at once."""
+    """An executor of jobs, in any order, `slots` at a time."""
 
     slots: int
 
     def submit(self, task: Task) -> None:
-        """Take a task."""
+        """Enqueue a job."""
         ...
 
     def wait(self) -> Iterable[Task]:
-        """Return tasks that have been done since, at least one; raises what a task raised."""
+        """Block until a submitted job is done; return those done since the last call, at least one.
+
+        Raises the exception of a failed job, and OSError where a worker was killed.
+        """
         ...
 
 
 def pending(source: Source, scene: str, work: Path) -> list[Part]:
-    """Return the parts of a scene that are not there yet."""
+    """Return the parts of a scene that are not completed yet."""
     return [part for part in parts(source, scene) if not part.folder(work).is_dir()]
 
 
 def record_scenes(source: Source, engine: Engine, work: Path) -> None:
-    """Do what is left of all scenes."""
+    """Perform all remaining jobs of all scenes on `engine`, the traffic of a scene before its parts."""
     scenes = deque(scene for scene in source.scenes() if pending(source, scene, work))
     ready: deque[Task] = deque()
     busy = 0

@@ -1,7 +1,7 @@
-"""An engine on a Ray cluster: the same tasks, done by actors on any of its machines.
+"""Recording engine on a Ray cluster: actors on any of its machines perform the jobs.
 
-The dataset's folder has to be on storage that all of them see, and flcav installed on each. The cluster is the one that
-RAY_ADDRESS names; where it names none, Ray is started on this machine.
+The dataset's folder must be on storage shared by all machines, and flcav installed on each. RAY_ADDRESS names the
+cluster; without it, Ray is started on this machine.
 """
 
 import contextlib
@@ -18,14 +18,15 @@ from flcav.extras import installation
 from flcav.sources.source import Source
 from flcav.threads import VARIABLES
 
-STORE_BYTES = 128_000_000  # of a Ray started here; only tasks, and pieces of files, pass through it
+STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
 
 
 @contextlib.contextmanager
 def ray_cluster(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
-    """Yield an engine of `jobs` actors that calls `wrote` with the number of frames written so far.
+    """Yield an engine of `jobs` Ray actors that perform jobs of `source` below the folder `work`.
 
-    Raises `InputError` where Ray is not installed.
+    It calls `wrote` with the number of frames written so far, as parts are completed. Raises `InputError` where Ray is
+    not installed.
     """
     with ray_session(jobs) as ray:
         shared = ray.put(source)
@@ -35,12 +36,12 @@ def ray_cluster(source: Source, work: Path, jobs: int, wrote: Callable[[int], No
 
 @contextlib.contextmanager
 def ray_session(jobs: int) -> Iterator[Any]:
-    """Yield the package `ray`, connected to the cluster or, where RAY_ADDRESS names none, to one of `jobs` processors.
+    """Yield the module `ray`, connected to the cluster of RAY_ADDRESS or, without it, to a local one of `jobs` CPUs.
 
     Its workers compute on one thread each. Raises `InputError` where Ray is not installed.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray warns without
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without it, Ray prints a warning
     try:
         import ray  # pyright: ignore[reportMissingImports]: an extra
     except ImportError:
@@ -49,7 +50,7 @@ def ray_session(jobs: int) -> Iterator[Any]:
     local: dict[str, Any] = {}
     if "RAY_ADDRESS" not in os.environ:
         local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
-        variables["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # modules are found as they are here
+        variables["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # workers find modules as this process does
     ray.init(
         **local,
         runtime_env={"env_vars": variables},
@@ -63,7 +64,7 @@ def ray_session(jobs: int) -> Iterator[Any]:
 
 
 class _Worker:
-    """On one of the machines: does one task after another, and keeps the scene that it has built."""
+    """A Ray actor that performs jobs in sequence; its source keeps the scene that it built last."""
 
     def __init__(self, source: Source, work: Path) -> None:
         self._source, self._work = source, work
@@ -77,7 +78,7 @@ class _Worker:
 
 
 class _Actors:
-    """Tasks in actors, each of which takes as many as it is given, in turn."""
+    """An engine that hands each queued job to an idle Ray actor."""
 
     def __init__(self, actors: list[Any], wrote: Callable[[int], None]) -> None:
         self.slots = len(actors)

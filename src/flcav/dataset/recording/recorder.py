@@ -1,8 +1,8 @@
-"""Any source to a dataset folder: resumable, and the same bytes whoever does the work.
+"""Resumable recording of a source into a dataset folder, with the same bytes for any engine and number of workers.
 
-Everything is first written below the hidden `.recording`: a part of a scene appears there when it is whole. When all
-have, their files move into the folder, their tables are joined, and the manifest comes last. An interruption at any
-point costs the parts that were under way.
+Parts of scenes are first written below the hidden folder `.recording`. When all are complete, their files are moved
+into the dataset, their tables are concatenated, and the manifest is written last. An interruption at any point loses
+only the parts that were under way.
 """
 
 import json
@@ -40,7 +40,7 @@ from flcav.sources.source import Located, Source
 
 ENGINES = {"processes": processes, "ray": ray_cluster}
 HEADER = "recipe.json"
-JOINED = "joined"  # below `.recording`: what becomes of the parts
+JOINED = "joined"  # folder below `.recording` of the concatenated tables and the calibration
 
 
 def record(
@@ -51,12 +51,11 @@ def record(
     engine: str = "processes",
     progress: Report = silent,
 ) -> bool:
-    """Record a source, or what a recipe asks for, into the folder `out` by `jobs` workers of one of ENGINES.
+    """Record a source, or the built-in simulator with a recipe, into the folder `out`.
 
-    Returns whether anything was left to record.
-
-    False says that `out` already held this very dataset. A folder whose recording was interrupted is finished.
-    Raises `InputError` where `out` holds anything else, `OSError` where it cannot be written.
+    `jobs` workers of the `engine`, one of ENGINES, do the work. Returns True if anything was recorded, False if `out`
+    already held this very dataset. An interrupted recording of the same source is resumed. Raises `InputError` where
+    `out` holds anything else, or `jobs`, `engine` or the recipe is wrong; OSError where `out` cannot be written.
 
     >>> from flcav import Recipe, record
     >>> recipe = Recipe(town="ring", cavs=1, spins_per_scene=1, warmup_s=5.0)
@@ -77,14 +76,14 @@ def record(
         _write(source, out / WORK, jobs, engine, progress)
         _assemble(source, out, header)
     except OSError as error:
-        if error.strerror and error.filename is None:  # a write does not know its file
+        if error.strerror and error.filename is None:  # errors of writes have no file name
             error.filename = str(out)
         raise
     return True
 
 
 def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report) -> None:
-    """Do what is left of the recording below `.recording`."""
+    """Record all remaining parts below `.recording`."""
     total = sum(source.frame_count(scene) for scene in source.scenes())
     missing = sum(part.frames for scene in source.scenes() for part in pending(source, scene, work))
     start = time.perf_counter()
@@ -98,7 +97,10 @@ def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report)
 
 
 def _claim(out: Path, header: dict[str, Any]) -> bool:
-    """Make `out` the folder of this recording; False where it is finished already."""
+    """Prepare `out` for this recording; return False if it holds the finished dataset already.
+
+    Raises `InputError` where `out` is a file, or holds another dataset, another recording or other files.
+    """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; a dataset needs a folder")
     if (out / MANIFEST).exists():
@@ -127,7 +129,7 @@ def _refuse_other(out: Path, what: str, held: dict[str, Any], wanted: dict[str, 
 
 
 def _assemble(source: Source, out: Path, header: dict[str, Any]) -> None:
-    """Make the dataset of the parts below `.recording`; may be repeated after an interruption."""
+    """Assemble the dataset from the parts below `.recording`; can be repeated after an interruption."""
     work, scenes = out / WORK, list(source.scenes())
     joined = work / JOINED
     joined.mkdir(exist_ok=True)
@@ -169,7 +171,7 @@ def _assemble(source: Source, out: Path, header: dict[str, Any]) -> None:
 
 
 def _write_town(source: Source, work: Path, out: Path) -> bool:
-    """Write the files of a town that the dataset brings with it, and their listing; return whether there are any."""
+    """Write the source's town files and their listing; return whether there are any."""
     files = source.town_files() if isinstance(source, Located) else {}
     if not files:
         return False
@@ -181,13 +183,13 @@ def _write_town(source: Source, work: Path, out: Path) -> bool:
 
 
 def _list(files: Mapping[str, Path], folder: Path) -> None:
-    """Write the listing of `files` by what they are called in the dataset into `folder`."""
+    """Write the listing of `files`, path in the dataset -> file, into `folder`."""
     rows = [(name, path.stat().st_size, sha256(path)) for name, path in files.items()]
     write_table(pa.table(dict(zip(FILES_SCHEMA.names, zip(*rows))), schema=FILES_SCHEMA), folder / table_path(FILES))
 
 
 def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
-    """Move the traffic of a scene into the dataset and return its listing; None of a scene that has none."""
+    """Move the traffic of a scene into the dataset and return the file of its listing; None without traffic."""
     traffic, listing = folder / TRAFFIC, folder / table_path(FILES)
     if traffic.exists():
         _list({trace_path(scene): traffic}, folder)
@@ -196,7 +198,7 @@ def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
 
 
 def _calibrations(folders: list[Path]) -> dict[str, Any]:
-    """Return the calibrations of all agents in all parts."""
+    """Return the calibration file's content: the union of those of all parts; raises ValueError if they differ."""
     found: dict[str, Any] = {}
     for folder in folders:
         for agent, calibration in json.loads((folder / CALIBRATION).read_text()).items():
@@ -206,7 +208,7 @@ def _calibrations(folders: list[Path]) -> dict[str, Any]:
 
 
 def _values(path: Path, column: str) -> pa.Array:
-    """Return the values of a column; of one of lists, their elements."""
+    """Return the values of a column of a Parquet file; of a column of lists, their concatenated elements."""
     values = pq.ParquetFile(path).read(columns=[column])[column].combine_chunks()
     return values.flatten() if isinstance(values, pa.ListArray) else values
 

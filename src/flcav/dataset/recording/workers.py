@@ -1,4 +1,4 @@
-"""Engines on one machine: this process, or several beside it."""
+"""Recording engines on this machine: in this process, or in a pool of processes."""
 
 import contextlib
 import multiprocessing
@@ -18,14 +18,15 @@ from flcav.threads import VARIABLES
 
 POLL_S = 0.2
 
-_job: Any = None  # in a worker: the source, the folder, and the count of frames that all workers share
+_job: Any = None  # in a worker process: source, folder, and the shared counter of written frames
 
 
 @contextlib.contextmanager
 def processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
-    """Yield an engine of `jobs` processes that calls `wrote` with the number of frames written so far.
+    """Yield an engine of `jobs` processes that perform jobs of `source` below the folder `work`.
 
-    One job works in this process. More are processes of their own, which end with this one however it ends.
+    It calls `wrote` with the number of frames written so far. A single one is this process; more are child
+    processes, which end with this one, even if it is killed.
     """
     if jobs == 1:
         yield _Here(source, work, wrote)
@@ -41,7 +42,7 @@ def processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None
 
 
 class _Here:
-    """One task after another in this process."""
+    """An engine that performs jobs in sequence in this process."""
 
     slots = 1
 
@@ -64,7 +65,7 @@ class _Here:
 
 
 class _Pool:
-    """Tasks in processes."""
+    """An engine on a process pool."""
 
     def __init__(self, slots: int, pool: ProcessPoolExecutor, report: Callable[[], None]) -> None:
         self.slots, self._pool, self._report = slots, pool, report
@@ -97,7 +98,7 @@ def _begin(source: Source, work: Path, written: Any) -> None:
 
 
 def end_with_parent() -> None:
-    """In a worker: leave Ctrl-C, which reaches the whole group, to the parent, and end when it has, however it did."""
+    """Make this worker process ignore Ctrl-C, which the parent handles, and exit when the parent has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_after_parent, daemon=True).start()
 

@@ -1,6 +1,6 @@
-"""KITTI's 3D object benchmark: read (`frame`, `folder`) and written (`export`).
+"""KITTI's 3D object detection benchmark: its files read (`read`) and written (`write`).
 
-Geiger et al., Are we ready for autonomous driving? CVPR 2012, and the benchmark's development kit.
+Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the benchmark's development kit.
 """
 
 from flcav.dataset.formats.kitti.read import (

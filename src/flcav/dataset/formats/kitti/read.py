@@ -1,4 +1,9 @@
-"""KITTI's object detection files, read strictly: a frame, and a folder of them."""
+"""Strict reading of KITTI's object detection files: point clouds, calibrations, labels, and whole folders.
+
+KITTI labels boxes in its rectified camera frame (x right, y down, z ahead): the location is the centre of a box's
+bottom face, and the rotation about y is zero along x. Records of this module are in KITTI's LiDAR frame (x ahead,
+y left, z up).
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,22 +16,23 @@ from flcav.config import InputError
 from flcav.geometry import Boxes, inverse, transform_points, wrap_angle
 
 POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
-LABEL_FIELDS = 15  # a 16th is the score of a detection
+LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
 MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where the left colour camera is, seen from the LiDAR."""
+    """Extrinsics and projection of the left colour camera (camera 2)."""
 
     camera_from_lidar: NDArray[np.float64]  # (4, 4), rectified camera frame
     image_from_camera: NDArray[np.float64]  # (3, 4) projection to pixels
 
 
 def read_points(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x, y, z [m] and reflectance of a point cloud, LiDAR frame.
+    """Return (N, 4) x, y, z [m] and reflectance [0, 1] of a point cloud, LiDAR frame.
 
-    Raises `InputError` where the file is missing, empty, cut off in a point, or holds a number that is not finite.
+    Raises `InputError` where the file is missing, empty, truncated within a point, or holds a number that is not
+    finite.
     """
     try:
         data = path.read_bytes()
@@ -45,7 +51,10 @@ def read_points(path: Path) -> NDArray[np.float32]:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Return the calibration of a frame; raises `InputError` where one of its matrices is missing or cannot be one."""
+    """Return the calibration of a frame from its file; raises `InputError` for a missing, malformed or singular matrix.
+
+    Needs the matrices in MATRICES.
+    """
     rows = dict(line.split(":", 1) for line in _lines(path) if ":" in line)
     matrices = {}
     for name, (height, width) in MATRICES.items():
@@ -63,7 +72,7 @@ def read_calibration(path: Path) -> Calibration:
 
 @dataclass(frozen=True)
 class Objects:
-    """The labelled objects of a frame, DontCare regions left out."""
+    """The N labelled objects of a frame, without DontCare regions."""
 
     boxes: Boxes  # (N,) LiDAR frame, KITTI's class names
     truncation: NDArray[np.float64]  # (N,) share outside the image
@@ -73,10 +82,11 @@ class Objects:
 
 
 def read_objects(path: Path, calibration: Calibration) -> Objects:
-    """Return the labelled objects of a frame.
+    """Return the labelled objects of a frame from its label file.
 
-    A box stays upright in the LiDAR frame: the degree or so by which the camera tilts against it is dropped from its
-    orientation, not from its place. Scores are kept where every row has one. Raises `InputError` for other text.
+    Boxes are upright in the LiDAR frame: the tilt of about a degree between camera and LiDAR is neglected in their
+    orientation, but not in their position. Scores are kept where every row has one. Raises `InputError` where the file
+    is missing or a line is not a label.
     """
     label, rows = [], []
     for number, line in enumerate(_lines(path), 1):
@@ -109,7 +119,7 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
 
 
 def read_labels(path: Path, calibration: Calibration) -> Boxes:
-    """Return the labelled objects as boxes only: see `read_objects`."""
+    """Return the boxes of the labelled objects, LiDAR frame: see `read_objects`."""
     return read_objects(path, calibration).boxes
 
 
@@ -124,7 +134,7 @@ def _lines(path: Path) -> list[str]:
 
 CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
 SUFFIXES = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}
-MARGIN_PX = 1.0  # real labels end up to a pixel beyond the image
+MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
 
 
 @dataclass(frozen=True)
@@ -139,7 +149,7 @@ class KittiFrame:
 
 
 class KittiFolder:
-    """The frames of `training`: of one list of `ImageSets`, or all that have a point cloud; of "test", `testing`."""
+    """A KITTI folder: the frames of a split, or all frames with a point cloud."""
 
     def __init__(self, folder: Path, names: list[str]) -> None:
         self.folder = folder
@@ -147,7 +157,11 @@ class KittiFolder:
 
     @classmethod
     def open(cls, path: Path | str, split: str | None = None) -> "KittiFolder":
-        """Return the KITTI folder `path`; raises `InputError` where a file of a frame is missing."""
+        """Return the frames of the KITTI folder `path` that `ImageSets/<split>.txt` lists, or all of `training`.
+
+        The split "test" is read from `testing`, any other from `training`. Raises `InputError` where the folder, the
+        list or a file of a frame is missing.
+        """
         root, part_of = Path(path), "testing" if split == "test" else "training"
         folder = root / part_of
         if not folder.is_dir():
@@ -166,7 +180,7 @@ class KittiFolder:
         return len(self.names)
 
     def frame(self, i: int) -> KittiFrame:
-        """Return frame `i`; raises `InputError` for a file that is not as it should be."""
+        """Return frame `i`; raises `InputError` for a malformed file, or a label that does not fit the image."""
         paths = {part: self.folder / part / f"{self.names[i]}.{suffix}" for part, suffix in SUFFIXES.items()}
         calibration = read_calibration(paths["calib"])
         image = _read_image(paths["image_2"])

@@ -1,7 +1,7 @@
-"""A dataset in the layout of KITTI's 3D object benchmark, as OpenPCDet and the development kit read it.
+"""Export to KITTI's 3D object detection benchmark, as OpenPCDet and the development kit read it.
 
-A frame is one spin of an agent that has a LiDAR and a level camera ahead. The camera takes the place of all four of
-KITTI's, and its optical frame that of the rectified camera frame.
+A frame is one spin of an agent with a LiDAR and a level camera that looks ahead. This camera stands for all four of
+KITTI's, and its optical frame for the rectified camera frame.
 """
 
 import csv
@@ -38,13 +38,16 @@ CLASSES = {
     "pedestrian": "Pedestrian",
 }
 PARTLY, LARGELY = 0.1, 0.5  # occlusion from which an object counts as partly and as largely occluded
-UNKNOWN = 3  # KITTI's occlusion of what shows no pixel
-NOTHING = "DontCare -1 -1 -10 0 0 1 1 -1 -1 -1 -1000 -1000 -1000 -10"  # of a frame without labels: readers want a line
-FRAMES = "frames.csv"  # which frame of the dataset each number is
+UNKNOWN = 3  # KITTI's occlusion level of objects without a visible pixel
+NOTHING = "DontCare -1 -1 -10 0 0 1 1 -1 -1 -1 -1000 -1000 -1000 -10"  # for a frame without labels: readers need a line
+FRAMES = "frames.csv"  # maps each number to a frame of the dataset
 
 
 def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write `dataset` as `training` (or, recorded for testing, `testing`) and `ImageSets`: see `Exporter`."""
+    """Write `dataset` as `training` and `ImageSets`, a dataset recorded for testing as `testing`: see `Exporter`.
+
+    Frames without a LiDAR or a level camera that looks ahead are left out.
+    """
     split_of = split_scenes(dataset, options)
     numbers: dict[str, list[str]] = defaultdict(list)
     rows = []
@@ -93,15 +96,16 @@ def _write_frame(frame: Frame, camera: str, folder: Path, number: str, min_point
 
 
 def label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -> tuple[list[str], list[str]]:
-    """Return KITTI's labels of the actors in the image, and the DontCare regions where others show.
+    """Return the lines of a label file: of labelled actors, and of DontCare regions around other visible actors.
 
-    Labelled is what has at least `min_points` of the LiDAR in its box and, where that is 0, at least shows.
+    Labelled are actors in the image and ahead of the camera with at least `min_points` LiDAR points in their box, and
+    at least one point or visible pixel.
     """
     truth, views = frame.annotations, frame.annotations.views[camera]
     height, width = frame.images[camera].rgb.shape[:2]
     edge = (width - 1, height - 1, width - 1, height - 1)
     rectangle = np.clip(views.amodal_box, 0, edge)
-    within = (rectangle[:, 2:] > rectangle[:, :2]).all(axis=1)  # false where the box is not a number
+    within = (rectangle[:, 2:] > rectangle[:, :2]).all(axis=1)  # False where the box is NaN
     camera_from_world = inverse(frame.world_from_sensor(camera))
     boxes = truth.boxes
     bottom = transform_points(camera_from_world, boxes.center - boxes.size * (0, 0, 0.5))
@@ -125,13 +129,16 @@ def label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -> tuple
 
 
 def dont_care(rectangle: NDArray[np.float64]) -> str:
-    """Return KITTI's line for a region [px] in which objects are not labelled."""
+    """Return the label line of a DontCare region: (4,) left, top, right, bottom [px]."""
     left, top, right, bottom = (f"{number:.4f}" for number in rectangle)
     return f"DontCare -1 -1 -10 {left} {top} {right} {bottom} -1 -1 -1 -1000 -1000 -1000 -10"
 
 
 def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (M,) KITTI's levels: 0 fully visible, 1 partly occluded, 2 largely, 3 unknown."""
+    """Return (M,) KITTI's occlusion levels: 0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown.
+
+    `occlusion` is (M,) in [0, 1], `pixels` (M,) the visible ones.
+    """
     level = np.digitize(occlusion, (PARTLY, LARGELY))
     return np.where(pixels > 0, level, UNKNOWN)
 
@@ -139,7 +146,10 @@ def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) 
 def calibration_lines(
     intrinsics: NDArray[np.float64], camera_from_lidar: NDArray[np.float64], lidar_from_imu: NDArray[np.float64]
 ) -> list[str]:
-    """Return the lines of a calibration file, in the order that readers count on."""
+    """Return the lines of a calibration file, in the order that readers expect.
+
+    `intrinsics` is (3, 3), the transforms are (4, 4).
+    """
     projection = np.column_stack((intrinsics, np.zeros(3)))
     matrices = {
         **{f"P{i}": projection for i in range(4)},

@@ -1,4 +1,4 @@
-"""MCAP files with Foxglove's schemas: they open in Foxglove, and in whatever reads MCAP."""
+"""Export to MCAP files with Foxglove's schemas, for Foxglove and any other reader of MCAP."""
 
 from flcav.dataset.formats.mcap.write import export_mcap
 

@@ -1,4 +1,9 @@
-"""A frame as Foxglove messages: sensors, transforms, annotations."""
+"""Foxglove messages of a frame: measurements, transforms, annotations; JSON messages where Foxglove has no schema.
+
+Topics and coordinate frames of an agent are prefixed by its name. Frames of sensors are children of the agent's frame,
+and that one of `world` (ENU, z up). Transforms are given at the spin, and at the trigger time of every sensor with
+another.
+"""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -37,7 +42,7 @@ from flcav.sensors.radar.radar import echo_directions
 
 
 def scene_update(frame: Frame, stamp: Timestamp) -> SceneUpdate:
-    """Return the boxes of a frame in the world, in place of those before; fainter without a LiDAR return."""
+    """Return the 3D boxes of a frame, world frame, which replace the earlier ones; fainter without a LiDAR return."""
     truth, boxes = frame.annotations, frame.annotations.boxes
     entities = []
     for i, label in enumerate(boxes.label.tolist()):
@@ -62,7 +67,7 @@ def scene_update(frame: Frame, stamp: Timestamp) -> SceneUpdate:
 
 
 def image_annotations(frame: Frame, camera: str, stamp: Timestamp) -> ImageAnnotations:
-    """Return the visible rectangles of actors, signs and signals in a picture, pixels from its corner."""
+    """Return the visible 2D boxes of actors, signs and signals in an image, in pixels from its upper left corner."""
     truth = frame.annotations
     rectangles = []
     if camera in truth.views:
@@ -86,7 +91,7 @@ def image_annotations(frame: Frame, camera: str, stamp: Timestamp) -> ImageAnnot
 
 
 def pose_message(matrix: NDArray[np.float64]) -> Pose:
-    """Return a (4, 4) transform as a message."""
+    """Return a rigid (4, 4) transform as a pose message: position and unit quaternion."""
     w, x, y, z = quaternion(matrix)
     px, py, pz = matrix[:3, 3].tolist()
     return Pose(position=Vector3(x=px, y=py, z=pz), orientation=Quaternion(x=x, y=y, z=z, w=w))
@@ -95,7 +100,7 @@ def pose_message(matrix: NDArray[np.float64]) -> Pose:
 def _rectangle(
     box: NDArray[np.float64], colour: tuple[float, float, float], about: dict[str, str], stamp: Timestamp
 ) -> PointsAnnotation:
-    left, top, right, bottom = (box + 0.5).tolist()  # ours are from the centre of the first pixel
+    left, top, right, bottom = (box + 0.5).tolist()  # a frame's pixel coordinates are 0 at the centre of the first
     corners = ((left, top), (right, top), (right, bottom), (left, bottom))
     return PointsAnnotation(
         timestamp=stamp,
@@ -117,20 +122,20 @@ def _metadata(about: dict[str, str]) -> list[KeyValuePair]:
 
 
 LIDAR_FIELDS = ("x", "y", "z", "intensity")
-TIME_FIELD = "time"  # of a point [s] after the cloud's time stamp, as ROS drivers of spinning LiDARs have it
+TIME_FIELD = "time"  # of a point [s] after the cloud's time stamp, as in ROS drivers of spinning LiDARs
 RADAR_FIELDS = ("x", "y", "z", "range_m", "azimuth_rad", "elevation_rad", "doppler_m_s", "rcs_dbsm")
 IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^2], [rad/s], body frame
 
 
 class Json(NamedTuple):
-    """A message that Foxglove has no schema for."""
+    """A JSON message, for data without a schema of Foxglove's."""
 
     kind: str
     values: dict[str, Any]
 
 
 class Logged(NamedTuple):
-    """A message, its topic below the agent's, and when it was measured."""
+    """A message, its topic below the agent's name, and its simulation time [s]."""
 
     topic: str
     message: Message | Json
@@ -138,7 +143,7 @@ class Logged(NamedTuple):
 
 
 def messages(frame: Frame) -> Iterator[Logged]:
-    """Yield all that a frame holds."""
+    """Yield the messages of everything in a frame: transforms, measurements of each sensor, weather, annotations."""
     true, spin_s = frame.calibration, frame.time_s
 
     def looks_s(sensor: str) -> float:
@@ -181,7 +186,7 @@ def messages(frame: Frame) -> Iterator[Logged]:
 
 
 def radar_points(echoes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return (N, 8): x, y, z [m] in the radar's frame before range, azimuth, elevation, Doppler and RCS."""
+    """Return (N, 8) columns RADAR_FIELDS of (N, 5) radar returns: x, y, z [m] in the radar's frame are prepended."""
     return np.concatenate((echoes[:, :1] * echo_directions(echoes), echoes), axis=1).astype(np.float32)
 
 
@@ -213,7 +218,7 @@ def _thermal(picture: NDArray[np.uint16], **place: Any) -> RawImage:
 
 
 def _transforms(tree: list[tuple[str, str, NDArray[np.float64]]], time_s: float) -> FrameTransforms:
-    """Return parent, child and (4, 4) parent_from_child as one message."""
+    """Return one message of the transforms in `tree`: triples of parent, child and (4, 4) parent_from_child."""
     return FrameTransforms(
         transforms=[
             FrameTransform(

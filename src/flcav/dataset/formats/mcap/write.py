@@ -1,4 +1,4 @@
-"""A dataset as MCAP files, one for each scene. Times are those of the simulation."""
+"""Writer of MCAP files, one for each scene, with time stamps of the simulation."""
 
 import json
 from collections import Counter
@@ -37,7 +37,7 @@ def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: R
 
 
 class _Log:
-    """A file under way: a channel for each topic, opened by its first message."""
+    """An open MCAP file with a channel for each topic, registered by its first message."""
 
     def __init__(self, writer: Writer) -> None:
         writer.start(profile="", library="flcav")
@@ -64,7 +64,7 @@ class _Log:
 
 
 def _schema_of(value: Any) -> dict[str, Any]:
-    """Return the JSON schema that a value is of."""
+    """Return the JSON schema of a value made of objects, texts and numbers."""
     if isinstance(value, dict):
         return {"type": "object", "properties": {name: _schema_of(part) for name, part in value.items()}}
     return {"type": "string" if isinstance(value, str) else "number"}

@@ -1,4 +1,4 @@
-"""What one agent sees of a scene, as a scene of nuScenes: its files and rows."""
+"""One agent's frames of a scene as a nuScenes scene: its files and table rows."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -20,20 +20,20 @@ from flcav.sensors.radar.radar import echo_directions
 Array = NDArray[np.float64]
 
 NO_CHANNELS = np.zeros(0)
-UNDATED = "1970-01-01"  # simulated time has no date
+UNDATED = "1970-01-01"  # date of capture: simulated time has none
 
 
 @dataclass
 class Drive:
-    """One nuScenes scene under way."""
+    """A nuScenes scene that collects table rows while frames are added, and writes their files."""
 
     number: int  # of the scene, from 1
-    scene: str  # of the dataset
+    scene: str  # its name in the dataset
     agent: str
     location: str
     out: Path
     global_from_world: Array  # (4, 4)
-    elevations: Mapping[str, Array]  # LiDAR -> elevations of its channels: see `lidar_bin`
+    elevations: Mapping[str, Array]  # LiDAR -> elevations of its channels [rad]: see `lidar_bin`
     samples: list[Row] = field(default_factory=list)
     sensors: dict[str, Row] = field(default_factory=dict)  # by channel
     calibrated: dict[str, Row] = field(default_factory=dict)  # by channel
@@ -44,11 +44,14 @@ class Drive:
 
     @property
     def name(self) -> str:
-        """Return the name of the scene."""
+        """Return the name of the nuScenes scene, e.g. "scene-0001"."""
         return f"scene-{self.number:04d}"
 
     def add(self, frame: Frame, velocity: Array) -> None:
-        """Write the files of a frame and add its rows; the agent moves with `velocity` (3,) in the world [m/s]."""
+        """Write the files of a frame and add its rows; `velocity` is the agent's (3,), world frame [m/s].
+
+        Raises `InputError` where a camera distorts.
+        """
         self.samples.append(
             {
                 "token": token(self.name, "sample", frame.index),
@@ -105,7 +108,7 @@ class Drive:
         )
 
     def _micros(self, time_s: float) -> int:
-        """Return a time stamp; those of no two scenes are equal, since the devkit cannot sort scenes that are."""
+        """Return a time stamp [µs], shifted by the scene's number: the devkit cannot sort scenes with equal ones."""
         return round(time_s * 1e6) + self.number
 
     def _add_annotations(self, frame: Frame) -> None:
@@ -136,7 +139,7 @@ class Drive:
             )
 
     def rows(self) -> dict[str, list[Row]]:
-        """Return the rows of the scene by table."""
+        """Return table -> rows of the scene, and link consecutive rows (`prev`, `next`)."""
         for rows in (self.samples, *self.data.values(), *self.annotations.values()):
             chain(rows)
         scene = {

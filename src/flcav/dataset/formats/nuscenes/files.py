@@ -1,4 +1,4 @@
-"""Point clouds, radar sweeps and the map in nuScenes' encodings."""
+"""nuScenes' file encodings of point clouds, radar sweeps and the map."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,8 +7,8 @@ from PIL import Image, ImageDraw
 from flcav.sensors.radar.radar import echo_directions
 from flcav.world.map.town import Town
 
-OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # theirs: x right, y ahead
-RESOLUTION_M = 0.1  # of the map
+OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # nuScenes': x right, y ahead
+RESOLUTION_M = 0.1  # size of a pixel of the map
 RADAR = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z")]
     + [("dyn_prop", "i1"), ("id", "<i2")]
@@ -16,14 +16,15 @@ RADAR = np.dtype(
     + [(name, "i1") for name in ("is_quality_valid", "ambig_state", "x_rms", "y_rms")]
     + [(name, "i1") for name in ("invalid_state", "pdh0", "vx_rms", "vy_rms")]
 )
-MOVING_M_S = 0.5  # a radar echo faster than this over ground is moving
+MOVING_M_S = 0.5  # speed over ground from which a radar return counts as moving
 MOVING, STATIONARY, UNAMBIGUOUS, CERTAIN = 0, 1, 3, 1
 
 
 def lidar_bin(points: NDArray[np.float32], elevations: NDArray[np.float64]) -> bytes:
-    """Return (N, 5) float32 x, y, z, intensity 0 to 255, ring of points in our LiDAR frame.
+    """Return the bytes of (N, 5) float32 x, y, z [m] in nuScenes' LiDAR frame, intensity 0 to 255, ring.
 
-    A ring is the channel nearest in elevation, of those that `elevations` [rad] lists from the lowest.
+    `points` is (N, 4) x, y, z, intensity [0, 1] in our LiDAR frame (x ahead, y left). The ring is the index of the
+    channel nearest in elevation; `elevations` [rad] lists the channels from the lowest. Without any, it is 0.
     """
     x, y, z, intensity = points.T
     ring = np.zeros(len(points), np.float32)
@@ -34,10 +35,11 @@ def lidar_bin(points: NDArray[np.float32], elevations: NDArray[np.float64]) -> b
 
 
 def radar_pcd(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> bytes:
-    """Return a binary PCD of (N, 5) range, azimuth, elevation, Doppler, RCS of a radar that moves with `velocity`.
+    """Return a binary PCD file of (N, 5) radar returns: range [m], azimuth, elevation [rad], Doppler [m/s], RCS [dBsm].
 
-    The velocity is (3,) [m/s] in the radar's frame. Of an echo's own, the part along the ray is known: `vx`, `vy`
-    are the Doppler's, `vx_comp`, `vy_comp` the same over ground. Without echoes there is one that is not a number.
+    `velocity` is the radar's own (3,) [m/s], in its frame. Only the radial velocity of a return is measured: `vx`, `vy`
+    are its components relative to the radar, `vx_comp`, `vy_comp` those over ground, with the radar's own motion added.
+    Without returns the file has a single point, at NaN.
     """
     rows = np.zeros(max(len(echoes), 1), RADAR)
     if not len(echoes):
@@ -75,7 +77,10 @@ def radar_pcd(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> byt
 
 
 def map_mask(town: Town) -> NDArray[np.uint8]:
-    """Return (H, W) 255 on roads and sidewalks, north up; its lower left corner is that of the town's bounds."""
+    """Return the (H, W) mask of a town at RESOLUTION_M, north up: 255 on roads and sidewalks, else 0.
+
+    Its lower left corner is that of the town's bounds.
+    """
     x_min, y_min, x_max, y_max = town.bounds
     width, height = (round(extent / RESOLUTION_M) for extent in (x_max - x_min, y_max - y_min))
     image = Image.new("L", (width, height))

@@ -1,4 +1,4 @@
-"""The rows of nuScenes' tables that are the same whatever is exported, and how one row names another."""
+"""nuScenes' tables: constant rows, classes, attributes and channels, tokens, and links between rows."""
 
 from hashlib import sha256
 from typing import Any
@@ -39,9 +39,9 @@ ATTRIBUTES = (
     "pedestrian.moving",
     "pedestrian.standing",
 )
-VISIBILITY = (0.4, 0.6, 0.8)  # visible share from which the levels 2, 3 and 4 hold
-MOVING_M_S = 0.2
-CAMERAS = {  # channel -> where it looks, counter-clockwise from ahead [rad]
+VISIBILITY = (0.4, 0.6, 0.8)  # visible share from which the levels 2, 3 and 4 apply
+MOVING_M_S = 0.2  # speed above which an actor counts as moving
+CAMERAS = {  # channel -> yaw, counter-clockwise from ahead [rad]
     "CAM_FRONT": 0.0,
     "CAM_FRONT_LEFT": np.radians(55),
     "CAM_FRONT_RIGHT": np.radians(-55),
@@ -59,12 +59,12 @@ RADARS = {
 
 
 def token(*names: object) -> str:
-    """Return 32 hexadecimal digits, the same for the same names."""
+    """Return the token of a row, 32 hexadecimal digits of the SHA-256 of its `names`."""
     return sha256("/".join(map(str, names)).encode()).hexdigest()[:32]
 
 
 def constant_rows() -> dict[str, list[Row]]:
-    """Return all tables, with the rows of `category`, `attribute` and `visibility`."""
+    """Return table -> rows of all TABLES: `category`, `attribute` and `visibility` filled, the others empty."""
     shares = ("0 to 40 %", "40 to 60 %", "60 to 80 %", "80 to 100 %")
     tables: dict[str, list[Row]] = {name: [] for name in TABLES}
     tables["category"] = [
@@ -80,12 +80,15 @@ def constant_rows() -> dict[str, list[Row]]:
 
 
 def visibility(occlusion: float) -> str:
-    """Return the token of the level at which an object is visible."""
+    """Return the token of the visibility level of an object, from its `occlusion` in [0, 1]."""
     return str(int(np.digitize(1 - occlusion, VISIBILITY)) + 1)
 
 
 def attribute(category: str, track: str, speed_m_s: float) -> str:
-    """Return the token of what an actor does."""
+    """Return the token of an actor's attribute, e.g. "vehicle.moving".
+
+    It follows from the actor's class, its track id, which says whether it is parked, and its speed.
+    """
     moves = speed_m_s > MOVING_M_S
     if category == "pedestrian":
         name = "pedestrian.moving" if moves else "pedestrian.standing"
@@ -99,7 +102,7 @@ def attribute(category: str, track: str, speed_m_s: float) -> str:
 
 
 def chain(rows: list[Row]) -> None:
-    """Make each of `rows` name the one before and after it; they belong together and are in order."""
+    """Set `prev` and `next` of each of the consecutive `rows` to the tokens of its neighbours, "" at the ends."""
     for row, before, after in zip(rows, [None, *rows], [*rows[1:], None]):
         row["prev"] = before["token"] if before else ""
         row["next"] = after["token"] if after else ""

@@ -1,7 +1,7 @@
-"""A dataset as nuScenes' tables, `samples` and `maps`, to be opened as version `v1.0-flcav`.
+"""Export to nuScenes: tables, `samples` and `maps`, to be opened as version `v1.0-flcav`.
 
-nuScenes knows one vehicle at a time: what one agent sees of a scene is a scene of its own. Every spin is a key frame.
-The global frame is our world, shifted so that the map's lower left corner is its origin.
+A nuScenes scene has one vehicle, so each agent of a scene becomes a scene of its own. Every spin is a key frame. The
+global frame is the world frame, shifted so that the map's lower left corner is its origin.
 """
 
 import json
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 VERSION = "v1.0-flcav"
 MAP = "maps/map.png"
-UNKNOWN_MARGIN_M = 120.0  # of the map around the agents, where the town is not known
+UNKNOWN_MARGIN_M = 120.0  # margin of the map around the agents where the town is unknown
 
 
 def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
@@ -73,20 +73,20 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
 
 
 def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:
-    """Return LiDAR name -> elevations [rad] of its channels from the lowest, as far as the recipe has the rig."""
+    """Return LiDAR -> elevations [rad] of its channels from the lowest; empty where the manifest has no rig."""
     rig = dataset.manifest.recipe.get("pole_rig" if agent.startswith("pole") else "vehicle_rig")
     lidars = rig.get("lidars") if isinstance(rig, Mapping) else None
     elevations = {}
     for name, lidar in lidars.items() if isinstance(lidars, Mapping) else ():
         assert isinstance(lidar, Mapping)
         settings = Lidar.model_validate(lidar["settings"])
-        first = ray_pattern(settings)[:: settings.azimuth_steps].astype(np.float64)  # of each channel
+        first = ray_pattern(settings)[:: settings.azimuth_steps].astype(np.float64)  # (C, 3) first ray of each channel
         elevations[name] = np.arcsin(first[::-1, 2])
     return elevations
 
 
 def _write_map(dataset: Dataset, path: Path) -> Array:
-    """Write the mask of roads and sidewalks, empty where the dataset's town is not known; return global_from_world."""
+    """Write the map, all zero where the dataset's town is unknown; return the (4, 4) `global_from_world`."""
     path.parent.mkdir(parents=True)
     town = dataset.town()
     if town is None:
