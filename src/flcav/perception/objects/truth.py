@@ -59,7 +59,7 @@ class Truth:
 
     @cached_property
     def faint(self) -> Mask:
-        """Return (M,) whether the object is faint: of a known class, in range, with one to `MIN_RETURNS` - 1 returns."""
+        """Return (M,) whether the object is faint: of a known class, in range, with some returns but too few."""
         return self.known & self.inside & (self.returns > 0) & ~self.enough
 
     @cached_property
