@@ -121,7 +121,7 @@ def in_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:
 def thinned(sample: Sample, kept: NDArray[np.bool_]) -> Sample:
     """Return the sample with the returns of the mask `kept` (N,) alone.
 
-    Objects left with fewer than `MIN_RETURNS` are ignored; those left with none are removed.
+    Objects left with fewer than `MIN_RETURNS` returns are ignored; those left with none are removed.
     """
     points = sample.points[kept]
     returns = _counted(points, sample.boxes)
@@ -148,7 +148,7 @@ class Cutouts:
 
 
 def cut(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
-    """Return the ground-truth database of samples: objects in range, of known pose, with `MIN_RETURNS` or more."""
+    """Return the ground-truth database of samples: objects in range, of known pose, with enough returns."""
     boxes, points = [Boxes.empty()], []
     for sample in samples:
         known = np.ones(len(sample.boxes), dtype=bool) if sample.exact is None else sample.exact

@@ -33,9 +33,9 @@ class Sample:
 def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Sample:
     """Return the frame's sweep with its ground truth as labels.
 
-    Objects with `MIN_RETURNS` or more are to be detected. Those with fewer but some are ignored, and so are lookalikes
-    with any; objects without a return are background. Objects out of range are kept, since augmentation may move them
-    in; points that it cannot move into the range of `config` are left out.
+    Objects with `MIN_RETURNS` returns or more are to be detected. Those with fewer but some are ignored, and so are
+    lookalikes with any; objects without a return are background. Objects out of range are kept, since augmentation may
+    move them in; points that it cannot move into the range of `config` are left out.
 
     lidar: name of the LiDAR; None: the frame's first. Raises `InputError` where the frame has none of that name.
     """

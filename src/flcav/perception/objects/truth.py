@@ -49,12 +49,12 @@ class Truth:
 
     @cached_property
     def enough(self) -> Mask:
-        """Return (M,) whether the object is of a known class with `MIN_RETURNS` or more, in range or not."""
+        """Return (M,) whether the object is of a known class with enough returns for a target, in range or not."""
         return self.known & (self.returns >= MIN_RETURNS)
 
     @cached_property
     def target(self) -> Mask:
-        """Return (M,) whether the object is a target: of a known class, in range, with `MIN_RETURNS` or more."""
+        """Return (M,) whether the object is a target: of a known class, in range, with enough returns."""
         return self.enough & self.inside
 
     @cached_property
