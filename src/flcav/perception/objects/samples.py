@@ -90,7 +90,10 @@ def fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
 
 
 def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:
-    """Return the points (N', 4) that the augmentation of `config` may move into its range, of points (N, 4)."""
+    """Return the points (N', 4) of a sweep (N, 4) that global augmentation may move into the range of `config`.
+
+    Global augmentation is mirroring, turning, scaling, shifting, tilting and lifting; the bounds are approximate.
+    """
     x0, _, z0, _, _, z1 = config.range_m
     most = config.augmentation
     x, side, z = points[:, 0], np.abs(points[:, 1]), points[:, 2]
