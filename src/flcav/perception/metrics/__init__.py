@@ -1,4 +1,4 @@
-"""Detection metrics."""
+"""Metrics of detection: matching, average precision, orientation similarity, calibration error; and of tracking."""
 
 from flcav.perception.metrics.average_precision import (
     average_precision,

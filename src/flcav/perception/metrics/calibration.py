@@ -1,4 +1,4 @@
-"""Whether a score says how often one is right, and how to make it so."""
+"""Expected calibration error of detection scores, and Platt scaling."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -6,14 +6,15 @@ from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 BINS = 10
-PULL = 0.01  # of the prior on the summand and on the factor's logarithm
+PULL = 0.01  # weight of the quadratic penalty on the summand and on the logarithm of the factor
 
 
 def calibration_error(score: ArrayLike, hit: ArrayLike, bins: int = BINS) -> float:
-    """Return the expected calibration error of scores (D,) in [0, 1] of detections that are right where `hit` (D,).
+    """Return the expected calibration error (ECE) of D detections, in [0, 1]; NaN without detections.
 
-    The mean over detections of |mean score - share of hits| of the detection's bin, bins of equal width (Naeini et al.,
-    "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015). NaN without detections.
+    score (D,) in [0, 1]; hit (D,) whether the detection is correct. The ECE is the mean over detections of |mean score
+    - share of hits| in the detection's bin, `bins` of equal width (Naeini et al., "Obtaining well calibrated
+    probabilities using Bayesian binning", AAAI 2015).
     """
     scores, hits = np.asarray(score, dtype=np.float64), np.asarray(hit, dtype=np.float64)
     if not len(scores):
@@ -24,10 +25,10 @@ def calibration_error(score: ArrayLike, hit: ArrayLike, bins: int = BINS) -> flo
 
 
 def fit_logistic(score: ArrayLike, hit: ArrayLike) -> tuple[float, float]:
-    """Return factor and summand of the logits of scores (D,) that make `hit` (D,) likeliest; the factor is positive.
+    """Return factor (positive) and summand of Platt scaling: calibrated logit = factor * logit + summand.
 
-    Platt scaling, with his smoothed targets (Platt, "Probabilistic outputs for support vector machines", 1999, sec.
-    2.2). (1, 0), no change, where all or none are right.
+    Fitted by penalised maximum likelihood to scores (D,) in [0, 1] and hits (D,), with the smoothed targets of Platt,
+    "Probabilistic outputs for support vector machines", 1999, sec. 2.2. (1, 0), no change, where all or none are hits.
     """
     x = logit(np.clip(np.asarray(score, dtype=np.float64), 1e-7, 1 - 1e-7))
     hits = np.asarray(hit, dtype=bool)

@@ -1,4 +1,4 @@
-"""Which detection found which object."""
+"""Greedy matching of detections to ground truth by IoU, with neutral objects as in the KITTI benchmark."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,13 +13,16 @@ from flcav.perception.ops.rotated import Kind, intersection_area, iou
 
 @dataclass(frozen=True)
 class Matches:
-    """The D detections of F frames that count either way, best score first."""
+    """True and false positives: the D detections of F frames that count, highest score first.
+
+    Detections that lie on a neutral object are not among them.
+    """
 
     score: NDArray[np.float64]  # (D,)
-    hit: NDArray[np.bool_]  # (D,) whether it found a target
-    turned: NDArray[np.float64]  # (D,) angle between its heading and its target's [rad], in [0, pi]; NaN without target
-    frame: NDArray[np.int64]  # (D,)
-    targets: NDArray[np.int64]  # (F,) objects to find
+    hit: NDArray[np.bool_]  # (D,) True: true positive; False: false positive
+    turned: NDArray[np.float64]  # (D,) heading error [rad], in [0, pi]; NaN for a false positive
+    frame: NDArray[np.int64]  # (D,) number of the frame, 0 to F - 1
+    targets: NDArray[np.int64]  # (F,) number of targets in each frame
 
 
 def match(
@@ -29,11 +32,13 @@ def match(
     overlap: float,
     kind: Kind = "3d",
 ) -> Matches:
-    """Return the matches of one class over frames; the three sequences run over the same frames.
+    """Return the true and false positives of one class over frames; the three sequences run over the same frames.
 
-    In each frame detections choose in order of score: the free target of highest IoU, if that is at least `overlap`.
-    One without a target is left out where it lies on a neutral object, see `on_neutral`; otherwise it is a false
-    positive. (The rule of the KITTI benchmark, with greedy assignment by score.)
+    In each frame, in order of score, a detection is matched to the unmatched target of highest IoU (of `kind`), if that
+    is at least `overlap`. An unmatched detection is left out where it lies on a neutral object, see `on_neutral`;
+    otherwise it is a false positive. This is the rule of the KITTI benchmark, with greedy assignment by score.
+
+    Raises ValueError where there are detections without scores.
     """
     parts = [_match_frame(*one, overlap, kind) for one in zip(detections, targets, neutral, strict=True)]
     frame = np.repeat(np.arange(len(parts)), [len(scores) for scores, _ in parts])
@@ -44,7 +49,11 @@ def match(
 
 
 def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind = "3d") -> NDArray[np.int64]:
-    """Return (D,) the target each detection found, -1 for none: greedy by score, each target once."""
+    """Return (D,) the index of the target matched to each detection, -1 for none.
+
+    Assignment is greedy by score, by IoU of `kind` from `overlap` on; each target is matched once at most. Raises
+    ValueError where there are detections without scores.
+    """
     found = np.full(len(detections), -1)
     if not len(detections) or not len(targets):
         return found
@@ -60,7 +69,8 @@ def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind
 def on_neutral(detections: Boxes, neutral: Boxes) -> NDArray[np.bool_]:
     """Return (D,) whether at least half of a detection's footprint lies on one neutral object.
 
-    By the detection's own area, not by IoU: a car found on a bus covers a small part of the bus.
+    The intersection is divided by the area of the detection. IoU would not do: a car detected on a bus covers a small
+    part of the bus.
     """
     out = np.zeros(len(detections), dtype=bool)
     if not len(neutral):
@@ -79,7 +89,7 @@ def on_neutral(detections: Boxes, neutral: Boxes) -> NDArray[np.bool_]:
 def _match_frame(
     detections: Boxes, targets: Boxes, neutral: Boxes, overlap: float, kind: Kind
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (D,) scores of the detections that count, and `Matches.turned` of each."""
+    """Return the scores (D,) of one frame's detections that count, and their heading errors (D,), see `Matches`."""
     found = assign_targets(detections, targets, overlap, kind)
     hit = found >= 0
     turned = np.full(len(found), np.nan)

@@ -1,8 +1,9 @@
-"""How well tracks follow the true ones: CLEAR MOT, and its mean over recalls.
+"""CLEAR MOT metrics of multi-object tracking (MOTA, MOTP), and AMOTA.
 
-MOTA is one minus misses, false positives and switches of identity per object to be followed (Bernardin and
-Stiefelhagen, "Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics", 2008). AMOTA is the mean of the
-scaled MOTA over 40 recalls, each reached by leaving out the tracks of lowest score (Weng et al., IROS 2020, eqs. 4-5).
+MOTA is one minus misses, false positives and identity switches per object to be tracked (Bernardin and Stiefelhagen,
+"Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics", 2008). AMOTA is the mean of scaled MOTA over
+40 recalls, each reached by leaving out the tracks of lowest score (Weng et al., "3D Multi-Object Tracking: A Baseline
+and New Evaluation Metrics", IROS 2020, eqs. 4-5).
 """
 
 from collections.abc import Sequence
@@ -15,57 +16,58 @@ from scipy.optimize import linear_sum_assignment
 Array = NDArray[np.float64]
 
 RECALLS = np.arange(1, 41) / 40
-APART_M = 2.0  # centres further apart, seen from above, are different objects (as in nuScenes)
+APART_M = 2.0  # largest distance in the plane between the centres of an object and its track, as in nuScenes
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Objects and tracks of one class in one frame of one sequence; places are x, y in any one frame [m]."""
+    """Ground truth and tracks of one class in one frame of a sequence; positions in one coordinate frame [m]."""
 
-    objects: NDArray[np.str_]  # (M,) identity of each object that is to be followed
-    places: Array  # (M, 2)
+    objects: NDArray[np.str_]  # (M,) identity of each object to be tracked
+    places: Array  # (M, 2) position x, y of each object
     tracks: NDArray[np.int64]  # (N,) identity of each track
-    found: Array  # (N, 2)
+    found: Array  # (N, 2) position x, y of each track
     score: Array  # (N,) of the whole track
-    neutral: NDArray[np.bool_]  # (N,) a track of what is neither right nor wrong to follow
+    neutral: NDArray[np.bool_]  # (N,) whether the track lies on a neutral object: no false positive
 
 
 @dataclass(frozen=True)
 class Clear:
-    """Counts over all frames."""
+    """CLEAR MOT counts, summed over all frames."""
 
-    objects: int
+    objects: int  # to be tracked
     misses: int
     false_positives: int
-    switches: int
-    distance_m: float  # sum over pairs
+    switches: int  # of identity
+    distance_m: float  # sum over pairs of an object and its track
 
     @property
     def hits(self) -> int:
-        """Return the pairs of an object and its track."""
+        """Return the number of pairs of an object and its track."""
         return self.objects - self.misses
 
     @property
     def mota(self) -> float:
-        """Return MOTA, at most 1; NaN without objects."""
+        """Return the multiple object tracking accuracy (MOTA), at most 1; NaN without objects."""
         wrong = self.misses + self.false_positives + self.switches
         return 1 - wrong / self.objects if self.objects else float("nan")
 
     @property
     def motp_m(self) -> float:
-        """Return the mean distance of an object from its track [m]; NaN without pairs."""
+        """Return the multiple object tracking precision (MOTP): mean distance of the pairs [m]; NaN without pairs."""
         return self.distance_m / self.hits if self.hits else float("nan")
 
 
 def clear(sequences: Sequence[Sequence[Moment]], threshold: float = -np.inf, apart_m: float = APART_M) -> Clear:
-    """Return the counts for tracks that score at least `threshold`; each sequence's moments are in time order.
+    """Return the CLEAR MOT counts of the tracks that score at least `threshold`.
 
-    A pair of before stays one while it is within `apart_m`; the rest is paired by least distance.
+    sequences: the frames of each, in time order. A pair of the frame before is kept while it is within `apart_m`; other
+    objects and tracks are paired by the Hungarian method with least total distance.
     """
     counts = np.zeros(4, dtype=np.int64)
     distance = 0.0
     for moments in sequences:
-        last: dict[str, int] = {}  # object -> the track that had it last
+        last: dict[str, int] = {}  # object -> its latest track
         for moment in moments:
             kept = np.flatnonzero(moment.score >= threshold)
             apart = np.linalg.norm(moment.places[:, None] - moment.found[None, kept], axis=2)
@@ -84,7 +86,10 @@ def clear(sequences: Sequence[Sequence[Moment]], threshold: float = -np.inf, apa
 
 
 def amota(sequences: Sequence[Sequence[Moment]], apart_m: float = APART_M) -> float:
-    """Return AMOTA in [0, 1]; a recall that is not reached counts 0. NaN without objects."""
+    """Return AMOTA in [0, 1], the mean of scaled MOTA over 40 recalls; NaN without objects.
+
+    A recall that is not reached counts 0. Thresholds are the scores of the tracks, at most 200 quantiles of them.
+    """
     everything = clear(sequences, apart_m=apart_m)
     if not everything.objects:
         return float("nan")
@@ -107,7 +112,7 @@ def _scaled_mota(counts: Clear, recall: float) -> float:
 def _pairs(
     moment: Moment, kept: NDArray[np.int64], apart: Array, last: dict[str, int], apart_m: float
 ) -> list[tuple[int, int]]:
-    """Return pairs (object, place in `kept`)."""
+    """Return the pairs (index of an object, index into `kept`) of one frame; apart (M, K): their distances [m]."""
     place = {int(track): t for t, track in enumerate(moment.tracks[kept])}
     pairs = []
     for o, identity in enumerate(moment.objects):

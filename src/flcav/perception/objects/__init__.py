@@ -1,4 +1,4 @@
-"""3D object detection from LiDAR (SECOND)."""
+"""3D object detection in LiDAR point clouds (SECOND): network, labels, training samples, evaluation."""
 
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect, detect_all

@@ -1,4 +1,4 @@
-"""What an evaluation asks for: where objects have to lie, and with how many returns, said beside its numbers."""
+"""Target criteria of an evaluation: range and number of LiDAR returns, stated beside its results."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,10 +10,10 @@ from flcav.perception.objects.truth import MIN_RETURNS
 
 
 def narrowed(config: SecondConfig, text: str) -> SecondConfig:
-    """Return `config` with the range `text`: metres ahead, a comma, metres to either side, as in "48,24".
+    """Return `config` with the smaller range `text`: metres ahead, a comma, metres to either side, as in "48,24".
 
-    Networks of different ranges are asked for the same objects within it. Raises `InputError` for anything else, and
-    where the network does not see so far.
+    Networks of different ranges are thus evaluated on the same objects. Raises `InputError` for any other text, and
+    where the range exceeds that of the network.
     """
     try:
         ahead, side = map(float, text.split(","))
@@ -29,14 +29,14 @@ def narrowed(config: SecondConfig, text: str) -> SecondConfig:
 
 @dataclass(frozen=True)
 class Rules:
-    """What makes an object a target, and the level of intervals."""
+    """Criteria that make an object a target, and the confidence level of intervals."""
 
-    range_m: tuple[float, ...]  # of its centre: least x, y, z, then the most [m]
-    min_returns: int
-    confidence: float
+    range_m: tuple[float, ...]  # of its centre, LiDAR frame: minima x, y, z, then maxima [m]
+    min_returns: int  # LiDAR returns from it
+    confidence: float  # in (0, 1)
 
     def lines(self) -> list[str]:
-        """Return them in words."""
+        """Return the criteria in words: a line on targets, a line on intervals."""
         return [
             f"targets: centre {_extent(self.range_m)}, {self.min_returns} LiDAR returns or more; "
             "others are neutral, and so are trucks and buses beside cars",
@@ -45,7 +45,7 @@ class Rules:
 
 
 def rules(config: SecondConfig) -> Rules:
-    """Return the rules of an evaluation as `config` has them."""
+    """Return the target criteria of an evaluation of a network of `config`."""
     return Rules(tuple(config.range_m), MIN_RETURNS, CONFIDENCE)
 
 

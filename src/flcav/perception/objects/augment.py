@@ -1,4 +1,13 @@
-"""Augmentation of sweeps: the whole turned, scaled and mirrored, and objects of other sweeps pasted in."""
+"""Data augmentation of LiDAR sweeps: global transforms, object scaling, dropped returns, ground-truth sampling.
+
+Global mirroring, turning and scaling, and ground-truth sampling are those of SECOND (Yan et al. 2018, sec. 3.2.1). The
+others vary what differs between LiDARs, cars and countries: sizes of objects (random object scaling of Yang et al.,
+"ST3D", CVPR 2021), pose of the sensor, lost returns, field of view.
+
+Ground-truth sampling pastes an object with its returns at the place where it was recorded, so that their density is
+that of its distance. It is left out where its footprint overlaps another; returns of the scene inside its box are
+removed.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -13,11 +22,15 @@ from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import MIN_RETURNS, in_range
 from flcav.perception.ops.rotated import iou
 
-VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's view to either side, down and up: KITTI's left colour camera
+VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's field of view, sideways, down and up: KITTI's left colour camera
 
 
 def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Sample:
-    """Return the sample changed by random amounts drawn from `rng`, as far as `how` allows."""
+    """Return the sample augmented by random amounts drawn from `rng`, within the limits of `how`.
+
+    The order is: cars resized; the whole mirrored, turned and scaled; shifted; tilted and lifted; returns dropped; cut
+    to a camera's field of view.
+    """
     mirror = -1.0 if how.flip and rng.random() < 0.5 else 1.0
     turn = rng.uniform(-how.turn_rad, how.turn_rad)
     scale = rng.uniform(1 - how.scale, 1 + how.scale)
@@ -41,7 +54,7 @@ def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Samp
 
 
 def transformed(sample: Sample, mirror: float, turn_rad: float, scale: float) -> Sample:
-    """Return the sample with y times `mirror` (1 or -1), turned counter-clockwise, then scaled."""
+    """Return the sample with y times `mirror` (1 or -1), then turned counter-clockwise by `turn_rad`, then scaled."""
     cos, sin = np.cos(turn_rad) * scale, np.sin(turn_rad) * scale
     plane = np.array([[cos, sin], [-mirror * sin, mirror * cos]])  # right factor of rows (x, y)
     points = sample.points.copy()
@@ -57,16 +70,16 @@ def transformed(sample: Sample, mirror: float, turn_rad: float, scale: float) ->
 
 
 def resized(sample: Sample, factor: NDArray[np.float64]) -> Sample:
-    """Return the sample with the length, width and height of box n, and the returns in it, times factor[n] (N, 3).
+    """Return the sample with length, width and height of box n and the returns inside it scaled by factor[n] (N, 3).
 
-    An object keeps the middle of its foot.
+    The centre of an object's bottom face stays in place.
     """
     boxes, points = sample.boxes, sample.points.copy()
     foot = boxes.center - boxes.size * (0, 0, 0.5)
     changed = np.flatnonzero((factor != 1).any(1))
     for row, inside in zip(changed, points_in_boxes(sample.points, boxes[changed]), strict=True):
         along = _unit(boxes.yaw[row])
-        frame = np.array([[*along, 0], [-along[1], along[0], 0], [0, 0, 1]])  # rows: the box's axes
+        frame = np.array([[*along, 0], [-along[1], along[0], 0], [0, 0, 1]])  # rows: axes of the box
         stretch = frame.T @ np.diag(factor[row]) @ frame
         points[inside, :3] = (sample.points[inside, :3] - foot[row]) @ stretch + foot[row]
     size = boxes.size * factor
@@ -74,7 +87,7 @@ def resized(sample: Sample, factor: NDArray[np.float64]) -> Sample:
 
 
 def shifted(sample: Sample, by_m: NDArray[np.float64]) -> Sample:
-    """Return the sample with x, y moved by `by_m` (2,): cars stand nearer to some streets' lanes than to others'."""
+    """Return the sample shifted in x, y by `by_m` (2,) [m]: the distance of parked cars from the lane varies."""
     points = sample.points.copy()
     points[:, :2] += by_m.astype(np.float32)
     step = np.append(by_m, 0)
@@ -87,7 +100,7 @@ def shifted(sample: Sample, by_m: NDArray[np.float64]) -> Sample:
 
 
 def sheared(sample: Sample, slope: NDArray[np.float64], lift_m: float) -> Sample:
-    """Return the sample lifted by `lift_m` plus `slope` (2,) times x, y: a tilt as small as those of cars and hills."""
+    """Return the sample with z raised by lift_m + slope . (x, y), slope (2,): a small tilt, with boxes kept upright."""
     points = sample.points.copy()
     points[:, 2] += (points[:, :2] @ slope + lift_m).astype(np.float32)
 
@@ -99,14 +112,17 @@ def sheared(sample: Sample, slope: NDArray[np.float64], lift_m: float) -> Sample
 
 
 def in_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which points (N, >=3) a camera at the sensor, looking ahead, would show."""
+    """Return (N,) whether points (N, >= 3), LiDAR frame, lie in the field of view of a forward camera at the sensor."""
     side, down, up = VIEW
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     return (x > 0) & (np.abs(y) < side * x) & (z > -down * x) & (z < up * x)
 
 
 def thinned(sample: Sample, kept: NDArray[np.bool_]) -> Sample:
-    """Return the sample with the returns `kept` (N,): objects that have too few left are ignored, or gone with none."""
+    """Return the sample with the returns of the mask `kept` (N,) alone.
+
+    Objects left with fewer than `MIN_RETURNS` returns are ignored; those left with none are removed.
+    """
     points = sample.points[kept]
     returns = _counted(points, sample.boxes)
     enough = returns >= MIN_RETURNS
@@ -125,14 +141,14 @@ def _unit(angle: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Cutouts:
-    """Objects with the returns in their boxes, LiDAR frame."""
+    """Ground-truth database: objects with the returns inside their boxes, LiDAR frame."""
 
     boxes: Boxes  # label = detection class
     points: tuple[NDArray[np.float32], ...]  # of each box (N, 4) x, y, z [m], intensity [0, 1]
 
 
 def cut(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
-    """Return the objects in range of all samples: those whose pose is known, with enough returns."""
+    """Return the ground-truth database of samples: objects in range, of known pose, with enough returns."""
     boxes, points = [Boxes.empty()], []
     for sample in samples:
         known = np.ones(len(sample.boxes), dtype=bool) if sample.exact is None else sample.exact
@@ -145,7 +161,10 @@ def cut(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
 
 
 def pasted(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator) -> Sample:
-    """Return the sample filled up to `most` objects of each class with cut-outs drawn by `rng` that meet nothing."""
+    """Return the sample with objects of the ground-truth database pasted in, up to `most` of each class in all.
+
+    Candidates are drawn by `rng` without replacement; those whose footprints overlap another object's are left out.
+    """
     drawn = []
     for label in np.unique(cutouts.boxes.label):
         known = np.flatnonzero(cutouts.boxes.label == label)
@@ -161,7 +180,10 @@ def pasted(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator
 
 
 def free(candidates: Boxes, there: Boxes) -> NDArray[np.int64]:
-    """Return the numbers of the candidates that meet nothing from above, the first first: nor one another."""
+    """Return the indices of candidates, chosen greedily in order, that overlap no other box in bird's-eye view.
+
+    Neither those `there` nor one another.
+    """
     everything = torch.from_numpy(np.concatenate((there.array(), candidates.array())))
     meets = (iou(torch.from_numpy(candidates.array()), everything, "bev") > 0).numpy()
     blocked = np.asarray(meets[:, : len(there)].any(axis=1))

@@ -1,4 +1,4 @@
-"""Scores that say how often a detection is right, and how far that, and its variance, can be trusted."""
+"""Score calibration by Platt scaling, and reliability of scores (ECE) and of predicted variances, per class."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -13,11 +13,14 @@ from flcav.perception.objects.model import Second
 from flcav.records import Class
 from flcav.sensors.frame import Frame
 
-OVERLAP = 0.5  # 3D IoU that makes a detection right
+OVERLAP = 0.5  # 3D IoU from which a detection is a true positive
 
 
 def calibrate(network: Second, frames: Iterable[Frame]) -> None:
-    """Set the calibration of `network` from frames that it was not trained on, see `fit_logistic`."""
+    """Set the Platt scaling in the configuration of `network`, fitted per class on frames it was not trained on.
+
+    See `flcav.perception.metrics.calibration.fit_logistic`.
+    """
     network.config = replace(network.config, calibration=None)
     detections, truths = detections_and_truths(network, frames)
     fitted = []
@@ -29,16 +32,19 @@ def calibrate(network: Second, frames: Iterable[Frame]) -> None:
 
 @dataclass(frozen=True)
 class Trust:
-    """How far the scores of a class's detections, and their variances, can be trusted; None where that is not known."""
+    """Reliability of one class's scores and predicted variances; None without detections or variances."""
 
     label: Class
-    detections: int
-    ece: float | None  # expected calibration error of the scores
-    variance_ratio: float | None  # mean squared error of found objects' x and y over the mean variance predicted
+    detections: int  # true and false positives
+    ece: float | None  # expected calibration error of the scores, in [0, 1]
+    variance_ratio: float | None  # mean squared error of x and y of true positives / mean predicted variance
 
 
 def trust(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> tuple[Trust, ...]:
-    """Return for each class how far to trust its detections; of a variance ratio 1 is right, more is too sure."""
+    """Return calibration error and variance ratio per class; detections and truths run over the same frames.
+
+    A variance ratio of 1 is calibrated, above 1 overconfident, below 1 underconfident.
+    """
     rows = []
     for name in classes:
         matches = _matches(detections, truths, name)

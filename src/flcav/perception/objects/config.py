@@ -1,4 +1,4 @@
-"""Which network, and how it is trained: the first is stored beside the weights and rebuilds it."""
+"""Configuration of a SECOND network and its data augmentation, stored beside the weights; and the anchors by class."""
 
 import math
 from typing import Annotated
@@ -7,62 +7,62 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-CELLS = 4096  # of the grid, along an axis, at most
+CELLS = 4096  # most voxels along an axis of the grid
 Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 Count = Annotated[int, Field(gt=0, le=4096)]
 Layers = Annotated[int, Field(ge=0, le=64)]
-Span = tuple[Positive, Positive]  # from, to
+Span = tuple[Positive, Positive]  # minimum, maximum
 Portion = Annotated[float, Field(ge=0, lt=1)]
 
 
 @dataclass(frozen=True, config=STRICT)
 class Anchor:
-    """The box an object class is regressed from, at every place of the grid, heading along x and along y."""
+    """Anchor box of a class, placed at every cell of the head's grid with headings along x and along y."""
 
     name: str  # detection class
     length_m: Positive
     width_m: Positive
     height_m: Positive
     matched_iou: Share  # bird's-eye IoU from which an anchor is positive
-    unmatched_iou: Share  # and below which it is negative
+    unmatched_iou: Share  # bird's-eye IoU below which an anchor is negative
 
 
 @dataclass(frozen=True, config=STRICT)
 class Augmentation:
-    """What training changes about its samples at random; amounts are uniform up to the one given."""
+    """Data augmentation of training samples; amounts are drawn uniformly up to the limits given here."""
 
-    flip: bool = False  # left-right, in one of two samples: streets with traffic on the other side, so headings suffer
-    turn_rad: Annotated[float, Field(ge=0, lt=math.pi / 2)] = 0.3  # about the sensor, to either side
-    scale: Portion = 0.03  # of the whole scene, 1 -/+ scale
-    shift_m: Annotated[float, Field(ge=0)] = 0.0  # of the whole scene, ahead or back and to either side
-    resize: tuple[Span, Span, Span] = ((1, 1), (1, 1), (1, 1))  # factor of each car's length, width and height
-    resized: Annotated[float, Field(ge=0, le=1)] = 1.0  # share of the cars
-    tilt_rad: Portion = 0.0  # of the sensor, about any level axis
+    flip: bool = False  # mirror left-right, with probability 1/2; traffic then keeps to the other side: headings suffer
+    turn_rad: Annotated[float, Field(ge=0, lt=math.pi / 2)] = 0.3  # rotation about the sensor, to either side
+    scale: Portion = 0.03  # factor of the whole scene in [1 - scale, 1 + scale]
+    shift_m: Annotated[float, Field(ge=0)] = 0.0  # of the whole scene, along x and along y, to either side
+    resize: tuple[Span, Span, Span] = ((1, 1), (1, 1), (1, 1))  # factors of a car's length, width and height
+    resized: Annotated[float, Field(ge=0, le=1)] = 1.0  # probability that a car is resized
+    tilt_rad: Portion = 0.0  # of the sensor, about any horizontal axis
     lift_m: Portion = 0.0  # of the sensor, up or down
-    drop: Portion = 0.0  # share of the returns that are lost
-    paste: Annotated[int, Field(ge=0)] = 0  # objects of each class from other samples, at most
-    view: Annotated[float, Field(ge=0, le=1)] = 0.0  # share of the samples cut to what a camera ahead sees
+    drop: Portion = 0.0  # share of the returns that are dropped
+    paste: Annotated[int, Field(ge=0)] = 0  # ground-truth sampling: objects per class up to which a sample is filled
+    view: Annotated[float, Field(ge=0, le=1)] = 0.0  # probability of a cut to the field of view of a forward camera
 
 
 @dataclass(frozen=True, config=STRICT)
 class SecondConfig:
-    """A SECOND network in the LiDAR frame: x forward, y left, z up, metres, origin at the sensor."""
+    """Configuration of a SECOND network, in the LiDAR frame: x forward, y left, z up, metres, origin at the sensor."""
 
-    anchors: Annotated[tuple[Anchor, ...], Field(min_length=1)]  # one per class; their order is the order of the scores
+    anchors: Annotated[tuple[Anchor, ...], Field(min_length=1)]  # one per class, in the order of the scores
     range_m: tuple[float, float, float, float, float, float]  # x, y, z minima, then maxima
     voxel_m: tuple[Positive, Positive, Positive]  # x, y, z
-    sparse_channels: tuple[Count, Count, Count, Count]  # at strides 1, 2, 4, 8
-    sparse_out: Count  # after the last convolution along z
-    bev_layers: tuple[Layers, Layers]  # 3x3 convolutions after the first, at head strides 1 and 2
-    bev_channels: tuple[Count, Count]
-    bev_up_channels: tuple[Count, Count]
-    ground_z_m: float = -1.8  # height of the ground the anchors stand on: the sensor's height, negated
-    intensity: bool = True  # whether the network sees it
-    uncertainty: bool = False  # whether it predicts the variance of each residual beside it
-    bfloat16: bool = False  # whether training multiplies in it where the hardware does: on a CPU in the 2D part alone
-    calibration: tuple[tuple[float, float], ...] | None = None  # of each class: factor and summand of its logits
-    augmentation: Augmentation = Augmentation()
+    sparse_channels: tuple[Count, Count, Count, Count]  # of the 3D backbone at strides 1, 2, 4, 8
+    sparse_out: Count  # channels after the last convolution along z
+    bev_layers: tuple[Layers, Layers]  # 3x3 convolutions after the first, at strides 1 and 2 of the head's grid
+    bev_channels: tuple[Count, Count]  # of these two scales
+    bev_up_channels: tuple[Count, Count]  # of these two scales, brought to the head's grid
+    ground_z_m: float = -1.8  # height of the ground that anchors stand on: minus the sensor's height
+    intensity: bool = True  # whether intensity is an input
+    uncertainty: bool = False  # whether the network predicts a variance of each residual
+    bfloat16: bool = False  # autocast in training where the hardware supports it: on a CPU in the 2D part alone
+    calibration: tuple[tuple[float, float], ...] | None = None  # Platt scaling, per class: factor and summand of logits
+    augmentation: Augmentation = Augmentation()  # of training samples
 
     @model_validator(mode="after")
     def _positive_extent(self) -> "SecondConfig":
@@ -79,12 +79,12 @@ class SecondConfig:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Return the detection classes, in the order of the scores."""
+        """Return the names of the detection classes, in the order of the scores."""
         return tuple(anchor.name for anchor in self.anchors)
 
     @property
     def reach_m(self) -> float:
-        """Return the largest distance from the sensor's axis to a corner of the range [m]."""
+        """Return the largest horizontal distance from the sensor to a corner of the range [m]."""
         x0, y0, _, x1, y1, _ = self.range_m
         return max(math.hypot(x, y) for x in (x0, x1) for y in (y0, y1))
 

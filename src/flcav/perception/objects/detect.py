@@ -1,4 +1,4 @@
-"""Boxes from point clouds."""
+"""Inference: boxes from point clouds, by decoding of anchors, score calibration and non-maximum suppression."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,13 +15,14 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.targets import anchor_boxes, anchor_classes, decode, decoded_variance
 from flcav.perception.ops.rotated import nms
 
-CANDIDATES = 256  # best-scoring anchors per class that suppression looks at
+CANDIDATES = 256  # anchors of highest score per class that enter non-maximum suppression
 
 
 def detect(network: Second, points: NDArray[np.float32], *, score_threshold: float = 0.1) -> Boxes:
-    """Return the boxes found in a point cloud (N, 4), LiDAR frame, best score first within a class.
+    """Return the boxes detected in a point cloud (N, 4) x, y, z [m], intensity [0, 1], LiDAR frame.
 
-    They have variances where the network predicts them.
+    They have class labels and scores of at least `score_threshold`, class by class, highest score first, and variances
+    where the network predicts them.
     """
     return detect_all(network, [points], score_threshold=score_threshold)[0]
 
@@ -29,7 +30,10 @@ def detect(network: Second, points: NDArray[np.float32], *, score_threshold: flo
 def detect_all(
     network: Second, clouds: Sequence[NDArray[np.float32]], *, score_threshold: float = 0.1, batch: int = 4
 ) -> list[Boxes]:
-    """Return `detect` of every point cloud; the network's mode is left as it was."""
+    """Return the boxes detected in each point cloud as `detect` does, `batch` clouds at a time.
+
+    The network runs in evaluation mode; its mode is restored.
+    """
     training = network.training
     network.eval()
     found: list[Boxes] = []
@@ -49,7 +53,7 @@ def detect_all(
 
 
 def calibrated(logits: Tensor, config: SecondConfig) -> Tensor:
-    """Return the logits (..., classes) whose sigmoid is the score: the network's own, or put right by calibration."""
+    """Return the calibrated logits (..., classes), whose sigmoid is the score; unchanged without a calibration."""
     if config.calibration is None:
         return logits
     factor, summand = logits.new_tensor(config.calibration).T

@@ -1,7 +1,7 @@
-"""What a detector of objects misses and invents.
+"""Error registry of object detection: misses and false positives.
 
-A mistake is a target or a faint object (see `truth`) that was missed, or a detection, with a return in it, of nothing:
-both within the detector's range.
+A miss is a target or faint object (see `flcav.perception.objects.truth`) without a detection. A false positive is a
+detection on no annotated object with at least one LiDAR return in its box. Both lie within the range of the network.
 """
 
 from collections.abc import Iterable, Iterator
@@ -15,15 +15,17 @@ from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
 from flcav.sensors.frame import Frame
 
-OVERLAP = 0.5  # 3D IoU that counts as found
+OVERLAP = 0.5  # 3D IoU from which an object is detected
 
 
 def register_errors(
     frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float = THRESHOLD
 ) -> tuple[PerceptionError, ...]:
-    """Return the mistakes of `detections` (LiDAR frame, one `Boxes` per frame) that score at least `threshold`.
+    """Return the misses and false positives of the detections of score `threshold` or more, at world coordinates.
 
-    A mistake is registered where and as it was first made; `frames` are gone through in the order they come.
+    detections: one `Boxes` per frame, LiDAR frame. An error that repeats over frames is registered once, as it was in
+    the first of them, see `flcav.perception.errors`. Raises ValueError where `detections` and `frames` differ in
+    length.
     """
     return keep_first(_all_errors(frames, detections, config, threshold))
 
@@ -39,7 +41,7 @@ def _all_errors(
 
 
 def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[PerceptionError]:
-    """Return the objects not found, and mark in `matched` the detections that found something or lie on something."""
+    """Return the missed objects, and set `matched` (N,) for detections that match or lie on an annotated object."""
     truth, annotations = ground_truth(frame, config), frame.annotations
     label, asked = truth.boxes.label, truth.target | truth.faint
     missed = asked.copy()

@@ -1,4 +1,4 @@
-"""How well detections agree with the truth: AP and AOS per class, in 3D and bird's-eye, at IoU 0.5 and 0.7."""
+"""Evaluation of detections against ground truth: AP and AOS per class, 3D and bird's-eye view, at IoU 0.5 and 0.7."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -27,41 +27,42 @@ from flcav.sensors.frame import Frame
 from flcav.world.weather import weather_class
 
 OVERLAPS: tuple[tuple[Kind, float], ...] = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
-LOWEST_SCORE = 0.05  # detections below add nothing that the intervals would show
+LOWEST_SCORE = 0.05  # of detections that are evaluated; lower ones change AP by less than its interval
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What one frame holds for a network to find, LiDAR frame, detection classes."""
+    """Ground truth of one frame for evaluation: targets, neutral and hidden objects, LiDAR frame, detection classes."""
 
     scene: str
     targets: Boxes  # see `flcav.perception.objects.truth`
-    neutral: Boxes  # finding them is neither right nor wrong; label = the class they are neutral for
-    hidden: Boxes  # in range without a return: counted, not asked for
-    occlusion: NDArray[np.float64] | None = None  # (targets,) share that is hidden, in [0, 1]; None: not known
-    weather: str | None = None  # class of the frame's weather; None between the classes, and where it is not known
+    neutral: Boxes  # a detection on them is neither true nor false; label = the class they are neutral for
+    hidden: Boxes  # in range without a return: counted, and neutral too
+    occlusion: NDArray[np.float64] | None = None  # (targets,) occluded share in [0, 1]; None: not known
+    weather: str | None = None  # weather class of the frame; None between the classes, and where it is not known
 
 
 @dataclass(frozen=True)
 class Score:
-    """The result for one class under one measure of overlap; numbers are None where there was nothing to find."""
+    """AP and AOS of one class for one kind of overlap and IoU threshold; None where there are no targets."""
 
     label: Class
     kind: Kind
-    iou: float  # that makes a detection a hit
-    ap: float | None  # [0, 1]
-    low: float | None  # 95 % interval over scenes; None where one scene holds all targets
+    iou: float  # from which a detection is a true positive
+    ap: float | None  # average precision AP|R40, [0, 1]
+    low: float | None  # 95 % interval of AP over scenes; None where one scene holds all targets
     high: float | None
     aos: float | None  # average orientation similarity, [0, ap]
-    right_headings: float | None  # share of found objects whose heading is off by less than 90 degrees
-    targets: int  # objects asked for
-    hidden: int  # objects in range without a single return
+    right_headings: float | None  # share of true positives with a heading error below 90 degrees; None without any
+    targets: int
+    hidden: int  # objects in range without a return
 
 
 def asked_of(frame: Frame, config: SecondConfig) -> Asked:
-    """Return what `frame` holds for a network of `config` to find: its targets.
+    """Return the targets, neutral and hidden objects of `frame` for the evaluation of a network of `config`.
 
-    Faint and hidden objects, objects out of range and lookalikes are neutral.
+    Faint and hidden objects, objects out of range and lookalikes are neutral. Raises `InputError` where the frame has
+    no LiDAR.
     """
     truth = ground_truth(frame, config)
     neutral = (truth.known & ~truth.target) | truth.lookalike
@@ -79,9 +80,11 @@ def detections_and_truths(
     total: int = 0,
     progress: Report = silent,
 ) -> tuple[list[Boxes], list[Asked]]:
-    """Return what `network` finds in each frame, from `LOWEST_SCORE` on, and what there is to find.
+    """Return the detections of `network` in each frame, from `LOWEST_SCORE` on, and the ground truth of each frame.
 
-    `asked`: a configuration of smaller range, beyond which no object is asked for and no detection counts.
+    asked: a configuration of smaller range (None: the network's own); objects beyond it are neutral, and detections
+    beyond it are dropped. total: number of frames where it is known, for `progress`. Raises `InputError` where a frame
+    has no LiDAR.
     """
     truths: list[Asked] = []
     detections: list[Boxes] = []
@@ -96,9 +99,10 @@ def detections_and_truths(
 def score_detections(
     detections: Sequence[Boxes], truths: Sequence[Asked], classes: tuple[str, ...], *, seed: int = 0
 ) -> tuple[Score, ...]:
-    """Return the scores of `detections` (LiDAR frame) against `truths`, frame by frame.
+    """Return AP and AOS with intervals, by class, kind of overlap and IoU threshold (`OVERLAPS`).
 
-    Raises `InputError` where there are no frames.
+    detections (LiDAR frame) and truths run over the same frames; seed: of the bootstrap over scenes. Raises
+    `InputError` where there are no frames.
     """
     if not truths:
         raise InputError("evaluation on 0 frames: at least one is wanted")
@@ -119,10 +123,10 @@ def score_detections(
 
 
 def of_class(boxes: Boxes, name: str) -> Boxes:
-    """Return the boxes of one class."""
+    """Return the boxes with the label `name`."""
     return boxes[boxes.label == name]
 
 
 def number_or_none(value: float) -> float | None:
-    """Return what JSON knows of a number that may be NaN."""
+    """Return the number rounded to six decimals, or None for NaN, which JSON cannot hold."""
     return None if np.isnan(value) else round(value, 6)

@@ -1,4 +1,4 @@
-"""Point clouds from what a user names, and the objects found in them."""
+"""Point clouds of files, folders and datasets for inference, and detected objects as JSON records."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,17 +22,18 @@ from flcav.records import Class
 
 
 class Cloud(NamedTuple):
-    """A point cloud to look into."""
+    """A point cloud to detect objects in, LiDAR frame."""
 
-    path: Path  # its own
+    path: Path  # of the file; of a dataset, folder / key of the frame
     points: NDArray[np.float32]  # (N, 4) x, y, z [m], intensity [0, 1]
-    view: Callable[[], CameraView | None]  # of a camera that looks the same way, read when asked for
+    view: Callable[[], CameraView | None]  # reads the view of a camera with the same direction, None without one
 
 
 def point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterator[Cloud]:
-    """Yield the point clouds of a KITTI .bin file, a folder of them, or `frames` of a dataset folder (None: all).
+    """Yield the point clouds of a KITTI .bin file, of a folder of them, or of `frames` (None: all) of a dataset folder.
 
-    Raises `InputError` for anything else, and for a cloud that is empty, truncated or not of finite numbers.
+    Raises `InputError` where `path` is none of these, a frame has no LiDAR, or a cloud is empty, truncated or not of
+    finite numbers.
     """
     if (path / MANIFEST).is_file():
         clouds = _recorded(path, frames)
@@ -50,27 +51,27 @@ def point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterator[Cl
 
 @dataclass(frozen=True)
 class ObjectFound:
-    """A box around an object, LiDAR frame."""
+    """A detected object: class, score and 3D box, LiDAR frame (x forward, y left, z up)."""
 
     label: Class
     score: float  # [0, 1]
-    x: float  # of its centre [m]
+    x: float  # of the box's centre [m]
     y: float
     z: float
     length: float  # [m]
     width: float
     height: float
-    yaw: float  # [rad]
+    yaw: float  # counter-clockwise from the x axis [rad]
 
 
 @dataclass(frozen=True)
 class ObjectsFound(Result):
-    """The objects of a point cloud."""
+    """The objects detected in a point cloud."""
 
     boxes: tuple[ObjectFound, ...]
 
     def lines(self) -> list[str]:
-        """Return one line per box."""
+        """Return the number of objects, then one line per box."""
         lines = [f"{len(self.boxes)} objects"]
         for box in self.boxes:
             place = f"at ({box.x:.1f}, {box.y:.1f}, {box.z:.1f}) m, yaw {box.yaw:.2f} rad"
@@ -80,14 +81,14 @@ class ObjectsFound(Result):
 
 
 def box_rows(boxes: Boxes) -> tuple[ObjectFound, ...]:
-    """Return each box with its class; scores that are not known are 1."""
+    """Return the boxes as records, one per box; a score that is not known is 1."""
     scores = boxes.score if boxes.score is not None else np.ones(len(boxes))
     rows = zip(boxes.label.tolist(), scores.tolist(), boxes.array().tolist(), strict=True)
     return tuple(ObjectFound(label, score, *row) for label, score, row in rows)
 
 
 def boxes_of_rows(rows: Sequence[ObjectFound]) -> Boxes:
-    """Return the boxes that `box_rows` made rows of."""
+    """Return the records as boxes: the inverse of `box_rows`."""
     array = np.array([(b.x, b.y, b.z, b.length, b.width, b.height, b.yaw) for b in rows]).reshape(-1, 7)
     return Boxes.from_array(array, [row.label for row in rows], [row.score for row in rows])
 

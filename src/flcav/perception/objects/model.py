@@ -1,7 +1,7 @@
-"""SECOND: sparse 3D convolutions, a bird's-eye 2D network, one anchor head.
+"""SECOND: a sparse 3D convolutional backbone, a 2D network in bird's-eye view, one anchor head.
 
-Yan, Mao, Li, "SECOND: Sparsely Embedded Convolutional Detection", Sensors 18(10):3337, 2018. Widths of `second_paper`
-are those of the configuration the community publishes for KITTI (8x sparse backbone, 5.3 M parameters).
+Yan, Mao, Li, "SECOND: Sparsely Embedded Convolutional Detection", Sensors 18(10):3337, 2018. The widths of
+`second_paper` are those of the public configuration for KITTI (8x sparse backbone, 5.3 M parameters).
 """
 
 import math
@@ -17,16 +17,16 @@ from flcav.perception.ops.norm import NormReLU
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d
 from flcav.perception.ops.voxels import grid_shape, voxelize
 
-HEADINGS = 2  # anchors per class and place: along x, along y
+HEADINGS = 2  # anchors per class and cell: along x, along y
 
 
 class HeadOutput(NamedTuple):
-    """Raw predictions for A = H W * classes * headings anchors of B samples."""
+    """Raw predictions of the anchor head for A = H * W * classes * headings anchors of B samples."""
 
     score: Tensor  # (B, A, classes) logits
-    box: Tensor  # (B, A, 7) residuals, see `targets.encode`
-    direction: Tensor  # (B, A, 2) logits: which half-turn
-    log_variance: Tensor | None = None  # (B, A, 7) of the residuals, where the network predicts it
+    box: Tensor  # (B, A, 7) residuals, see `flcav.perception.objects.targets.encode`
+    direction: Tensor  # (B, A, 2) logits of the direction classes
+    log_variance: Tensor | None = None  # (B, A, 7) of the residuals; None where the network predicts none
 
 
 class SparseBlock(nn.Module):
@@ -38,13 +38,16 @@ class SparseBlock(nn.Module):
         self.norm = NormReLU(channels)
 
     def forward(self, x: SparseTensor) -> SparseTensor:
-        """Return the block's output voxels."""
+        """Return the output of the block, on the voxels of the convolution."""
         x = self.convolution(x)
         return x.with_features(self.norm(x.features))
 
 
 def sparse_backbone(channels: tuple[int, int, int, int], out_channels: int) -> nn.Sequential:
-    """Return the 3D part: four scales of submanifold blocks, then one convolution that halves the height."""
+    """Return the 3D backbone, 4 channels in: submanifold blocks at strides 1, 2, 4, 8, then a convolution along z.
+
+    The last convolution has kernel 3 and stride 2 along z, and halves the height.
+    """
     blocks = [SparseBlock(SubmanifoldConv3d(i, channels[0]), channels[0]) for i in (4, channels[0])]
     for wide, narrow, padding in zip(channels[1:], channels, ((1, 1, 1), (1, 1, 1), (0, 1, 1)), strict=False):
         blocks.append(SparseBlock(StridedConv3d(narrow, wide, (3, 3, 3), (2, 2, 2), padding), wide))
@@ -58,7 +61,7 @@ def _convolved(size: int, kernel: int, stride: int, padding: int) -> int:
 
 
 def head_shape(config: SecondConfig) -> tuple[int, int]:
-    """Return the rows (y) and columns (x) of the head's grid."""
+    """Return the rows (y) and columns (x) of the head's grid, at stride 8 of the voxel grid."""
     _, rows, columns = grid_shape(config.range_m, config.voxel_m)
     for _ in range(3):
         rows, columns = _convolved(rows, 3, 2, 1), _convolved(columns, 3, 2, 1)
@@ -66,10 +69,10 @@ def head_shape(config: SecondConfig) -> tuple[int, int]:
 
 
 class Pointwise(nn.Linear):
-    """1x1 convolution of (B, C, H, W) maps, as the one matrix product it is."""
+    """1x1 convolution of (B, C, H, W) maps, computed as one matrix product."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """Return (B, C', H, W)."""
+        """Return the convolved map (B, C', H, W)."""
         return super().forward(input.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
@@ -82,7 +85,7 @@ def _scale(inputs: int, outputs: int, stride: int, layers: int) -> nn.Sequential
 
 
 class BirdsEye(nn.Module):
-    """Two scales of 2D convolutions, brought to the first one's grid and joined."""
+    """2D backbone in bird's-eye view: convolutions at strides 1 and 2, upsampled to the first grid and concatenated."""
 
     def __init__(self, inputs: int, config: SecondConfig) -> None:
         super().__init__()
@@ -93,7 +96,7 @@ class BirdsEye(nn.Module):
         self.far_up = nn.Sequential(nn.ConvTranspose2d(far, far_up, 2, 2, bias=False), NormReLU(far_up))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return (B, sum of bev_up_channels, H, W) from (B, C, H, W)."""
+        """Return the feature map (B, sum of bev_up_channels, H, W) of a map (B, C, H, W)."""
         near = self.near(x)
         far = self.far_up(self.far(near))
         rows, columns = near.shape[2:]
@@ -101,7 +104,7 @@ class BirdsEye(nn.Module):
 
 
 class Second(nn.Module):
-    """The network of a `SecondConfig`."""
+    """SECOND network of a configuration: voxelisation, sparse 3D backbone, 2D backbone, anchor head."""
 
     def __init__(self, config: SecondConfig) -> None:
         super().__init__()
@@ -118,11 +121,14 @@ class Second(nn.Module):
         self.head = Pointwise(sum(config.bev_up_channels), self.anchors_per_cell * sum(self.per_anchor))
         nn.init.normal_(self.head.weight, 0, 0.001)
         nn.init.zeros_(self.head.bias)
-        with torch.no_grad():  # a foreground probability of .01 (Lin et al., "Focal Loss", sec. 3.3)
+        with torch.no_grad():  # initial foreground probability 0.01 (Lin et al., "Focal Loss", sec. 3.3)
             self.head.bias[: self.anchors_per_cell * classes] = -math.log(99)
 
     def voxels(self, points: Tensor, sample: Tensor, samples: int) -> SparseTensor:
-        """Return the input voxels of points (N, 4) [LiDAR frame] of samples (N,), coordinates scaled to [-1, 1]."""
+        """Return the input voxels of a batch of `samples` point clouds, with coordinates scaled to [-1, 1].
+
+        points (N, 4) x, y, z [m], intensity, LiDAR frame; sample (N,) number of each point's cloud.
+        """
         features, keys = voxelize(points, sample, self.config.range_m, self.config.voxel_m, self.shape)
         bounds = features.new_tensor(self.config.range_m).view(2, 3)
         center, half = bounds.mean(0), (bounds[1] - bounds[0]) / 2
@@ -131,7 +137,7 @@ class Second(nn.Module):
         return SparseTensor(scaled, keys, self.shape, samples)
 
     def forward(self, voxels: SparseTensor) -> HeadOutput:
-        """Return the raw predictions for every anchor."""
+        """Return the raw predictions for every anchor of each sample."""
         features = voxels.features
         with bfloat16(features.device, self.training and self.config.bfloat16):
             maps = self.head(self.birds_eye(self.backbone(voxels).birds_eye()))
@@ -141,12 +147,15 @@ class Second(nn.Module):
 
 
 def second(config: SecondConfig) -> Second:
-    """Return a fresh network of `config`; torch's global generator draws its weights."""
+    """Return a new SECOND network of `config`, its weights drawn by torch's global generator."""
     return Second(config)
 
 
 def tiny_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -> SecondConfig:
-    """Return what the demo trains on a CPU: 0.33 M parameters, 0-48 m ahead, 24 m to either side."""
+    """Return the configuration of the demo, for a CPU: 0.33 M parameters, 0-48 m ahead, 24 m to either side.
+
+    Raises `InputError` for unknown classes.
+    """
     return SecondConfig(
         anchors=_anchors(classes),
         range_m=(0, -24, -3, 48, 24, 1),
@@ -161,19 +170,20 @@ def tiny_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -
 
 
 def second_tiny(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -> Second:
-    """Return a fresh network of `tiny_config`."""
+    """Return a new network of `tiny_config`."""
     return second(tiny_config(classes, ground_z_m))
 
 
 def small_config(
     classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), ground_z_m: float = -1.73
 ) -> SecondConfig:
-    """Return what a CPU trains in minutes: 0-51.2 m ahead, 28.8 m to either side, voxels of 0.1 m.
+    """Return the configuration of the study, trained on a CPU: 0-51.2 m ahead, 28.8 m to either side, voxels of 0.1 m.
 
-    KITTI's benchmark asks for cars of 25 pixels and more, which ends at 43 m. The network sees no intensity, which
-    every LiDAR reports in its own way, and its training varies what differs between a simulated street and a real one:
-    the sensor's tilt and height, how near cars stand and how large they are, lost returns, the field of view. Cars on
-    KITTI's streets are smaller than ours: its mean car is the published anchor, and half of the cars are resized.
+    KITTI's benchmark asks for cars of 25 pixels or more, which are within 43 m. Intensity is no input, since each LiDAR
+    reports it in its own way. The augmentation varies what differs between simulated and real streets: tilt and height
+    of the sensor, distance and size of cars, lost returns, field of view. KITTI's cars are smaller than the simulated
+    ones, so the anchor is the published one, KITTI's mean car, and half of the cars are resized. Raises `InputError`
+    for unknown classes.
     """
     return SecondConfig(
         anchors=tuple(KITTI_CAR if anchor.name == "Car" else anchor for anchor in _anchors(classes)),
@@ -204,12 +214,15 @@ def small_config(
 
 
 def second_small(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), ground_z_m: float = -1.73) -> Second:
-    """Return a fresh network of `small_config`."""
+    """Return a new network of `small_config`."""
     return second(small_config(classes, ground_z_m))
 
 
 def paper_config(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), ground_z_m: float = -1.8) -> SecondConfig:
-    """Return the published widths: 5.3 M parameters, 0-70.4 m ahead, 40 m to either side."""
+    """Return the configuration with the published widths: 5.3 M parameters, 0-70.4 m ahead, 40 m to either side.
+
+    Raises `InputError` for unknown classes.
+    """
     return SecondConfig(
         anchors=_anchors(classes),
         range_m=(0, -40, -3, 70.4, 40, 1),
@@ -225,7 +238,7 @@ def paper_config(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), gr
 
 
 def second_paper(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), ground_z_m: float = -1.8) -> Second:
-    """Return a fresh network of `paper_config`."""
+    """Return a new network of `paper_config`."""
     return second(paper_config(classes, ground_z_m))
 
 

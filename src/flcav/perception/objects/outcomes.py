@@ -1,4 +1,4 @@
-"""What a detector of objects did in each frame, and average precision from it."""
+"""Matches of an object detector per test frame, kept to recompute average precision on resampled scenes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -22,13 +22,16 @@ KEPT: Mapping[str, tuple[Kind, float]] = {MEASURED: ("3d", 0.5), "3d70": ("3d", 
 
 
 class ObjectsOutcomes:
-    """Average precision (AP|R40) in 3D at IoU 0.5, the mean over classes."""
+    """Mean average precision: AP|R40 in 3D at IoU 0.5, the mean over classes, from matches kept per frame."""
 
     measure_name = "AP50"
     redraws = REDRAWS
 
     def outcomes(self, network: Second, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
-        """Return which detections of which frames hit."""
+        """Return the matches of each class and kind of overlap (`KEPT`), by frame, and the number of hidden objects.
+
+        Raises `InputError` where there are no frames, or one has no LiDAR.
+        """
         found, truths = detections_and_truths(network, map(data.frame, frames), total=len(frames), progress=progress)
         classes = network.config.classes
         if not truths:
@@ -45,11 +48,18 @@ class ObjectsOutcomes:
         return Outcomes(np.array([truth.scene for truth in truths]), arrays)
 
     def measure(self, outcomes: Outcomes, times: Times) -> Values:
-        """Return the mean over classes of AP; of classes that have targets."""
+        """Return (n,) the mean AP over the classes with targets, for each of n resamples of the frames `times` (n, F).
+
+        NaN where no class has targets.
+        """
         return self._mean_precision(outcomes, MEASURED, times)
 
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
-        """Return AP at IoU 0.7 and from above, AOS, the share of right headings, targets, hidden objects."""
+        """Return further metrics by name, means over the classes with targets; None where there are none.
+
+        AP in 3D at IoU 0.7 and in bird's-eye view at 0.5, AOS, the share of right headings, and the numbers of targets
+        and hidden objects.
+        """
         once = np.ones((1, len(outcomes.scene)), dtype=np.int64)
         each = [matches_of(outcomes, name) for name in outcomes.arrays[CLASSES]]
         known = [matches for matches in each if matches.targets.any()]
@@ -71,7 +81,7 @@ class ObjectsOutcomes:
 
 
 def matches_of(outcomes: Outcomes, name: str, key: str = MEASURED) -> Matches:
-    """Return the matches of a class under a measure of overlap, one of `KEPT`."""
+    """Return the matches of class `name` for the kind of overlap and IoU `key`, one of `KEPT`."""
     return Matches(**{field.name: outcomes.arrays[f"{name}/{key}/{field.name}"] for field in fields(Matches)})
 
 

@@ -1,4 +1,4 @@
-"""The evaluation of an object detector: AP as a whole and by distance, occlusion and weather, and trust in scores."""
+"""Evaluation of an object detector: AP in total and broken down by distance, occlusion and weather, and calibration."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,36 +18,39 @@ from flcav.perception.tracking.evaluate import TracksEvaluation
 from flcav.records import LEFT_OUT, Class
 from flcav.world.weather import WEATHER_CLASSES
 
-DISTANCES_M = ((0, 20), (20, 40), (40, 80))
-OCCLUSIONS = ((0.0, 0.2), (0.2, 0.6), (0.6, 1.01))
-BORDER_M = 2.0  # a detection this far beyond a range of distances may still be of an object in it
+DISTANCES_M = ((0, 20), (20, 40), (40, 80))  # from, to: in the plane from the LiDAR to the centre of the box
+OCCLUSIONS = ((0.0, 0.2), (0.2, 0.6), (0.6, 1.01))  # from, to: occluded share
+BORDER_M = 2.0  # detections up to this far outside a range of distances are kept: they may be of objects in it
 
 
 class Slice(NamedTuple):
-    """Some of the objects, or some of the frames."""
+    """One part of a breakdown: the objects of a range of distance or occlusion, or the frames of a weather."""
 
     by: str  # distance | occlusion | weather
-    name: str
-    detections: list[Boxes]
-    wanted: list[NDArray[np.bool_]]  # of each frame, (targets,): which of them are asked for; others are neutral
-    frames: NDArray[np.int64]
+    name: str  # of the part: "0-20 m", "20%-60%", "fog"
+    detections: list[Boxes]  # of each frame
+    wanted: list[NDArray[np.bool_]]  # of each frame (targets,): whether the target is in the part; others are neutral
+    frames: NDArray[np.int64]  # indices of the frames in the part
 
 
 @dataclass(frozen=True)
 class SlicePrecision:
-    """Average precision of one class in a slice, under one measure of overlap."""
+    """Average precision of one class in one part of a breakdown, for one kind of overlap and IoU threshold."""
 
     by: str  # distance | occlusion | weather
-    slice: str
+    slice: str  # name of the part
     label: Class
     kind: Kind
-    iou: float
-    ap: float | None
-    targets: int
+    iou: float  # from which a detection is a true positive
+    ap: float | None  # AP|R40, [0, 1]
+    targets: int  # in the part
 
 
 def sliced(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> tuple[SlicePrecision, ...]:
-    """Return AP and number of targets of each slice that holds targets of a class, by kind of overlap and IoU."""
+    """Return the breakdown of AP: a row for each part, class with targets in it, kind of overlap and IoU threshold.
+
+    detections (LiDAR frame) and truths run over the same frames.
+    """
     rows = []
     for part in slices(detections, truths):
         for label in classes:
@@ -66,7 +69,7 @@ def sliced(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequen
 
 
 def slice_lines(rows: Sequence[SlicePrecision], overlap: float) -> list[str]:
-    """Return the rows of `sliced` in words, of one IoU: a line per class and slice, of one class after the other."""
+    """Return a breakdown at IoU `overlap` in words: a line per class and part, class by class."""
     own = [row for row in rows if row.iou == overlap]
     ap = {(row.label, row.by, row.slice, row.kind): row.ap for row in own}
     known = {(row.label, row.by, row.slice): row.targets for row in own}
@@ -79,7 +82,10 @@ def slice_lines(rows: Sequence[SlicePrecision], overlap: float) -> list[str]:
 
 
 def slices(detections: Sequence[Boxes], truths: Sequence[Asked]) -> Iterator[Slice]:
-    """Yield the slices of frames; occlusions where they are known, weathers where there are several."""
+    """Yield the parts of the breakdown, by distance, occlusion and weather.
+
+    Occlusion is left out unless every frame has it, weather unless the frames have several.
+    """
     everything = np.arange(len(truths))
     for low, high in DISTANCES_M:
         near = [_between(_distance(boxes), low - BORDER_M, high + BORDER_M) for boxes in detections]
@@ -109,24 +115,28 @@ def _between(value: NDArray[np.float64], low: float, high: float) -> NDArray[np.
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectsEvaluation(Evaluated):
-    """The scores of one network on one set of frames."""
+    """Evaluation of one network on one set of frames: AP and AOS, breakdown, calibration, tracking."""
 
     frames: int
     scenes: int
-    scores: tuple[Score, ...]  # a class after the other
-    rules: Annotated[Rules | None, LEFT_OUT] = None  # always there, but in results of before
-    slices: tuple[SlicePrecision, ...]
-    trust: tuple[Trust, ...]
-    tracks: Annotated[TracksEvaluation | None, LEFT_OUT] = None  # where they were asked for
+    scores: tuple[Score, ...]  # class by class
+    rules: Annotated[Rules | None, LEFT_OUT] = None  # target criteria; None in results of earlier versions
+    slices: tuple[SlicePrecision, ...]  # breakdown of AP
+    trust: tuple[Trust, ...]  # calibration of scores and variances, one per class
+    tracks: Annotated[TracksEvaluation | None, LEFT_OUT] = None  # None unless asked for
 
     @property
     def score(self) -> float:
-        """Return the mean over classes of AP in 3D at IoU 0.5; 0 where there was nothing to find."""
+        """Return the mean AP in 3D at IoU 0.5 over the classes with an AP above 0; 0 where there is none."""
         known = [row.ap for row in self.scores if (row.kind, row.iou) == ("3d", 0.5) and row.ap]
         return float(np.mean(known)) if known else 0.0
 
     def numbers(self) -> Mapping[str, float]:
-        """Return AP in 3D and from above of each class, AOS, headings, the error of calibration, MOTA of tracks."""
+        """Return the metrics that are known, by name, for each class.
+
+        AP for every kind of overlap and IoU; AOS and the share of right headings in 3D at IoU 0.5; expected calibration
+        error; MOTA and AMOTA where tracks were evaluated.
+        """
         ap = {f"{row.label} AP {row.kind} at {row.iou}": row.ap for row in self.scores}
         headings = {
             f"{row.label} {name}": value
@@ -143,7 +153,11 @@ class ObjectsEvaluation(Evaluated):
         return {name: value for name, value in (ap | headings | errors | tracks).items() if value is not None}
 
     def lines(self) -> list[str]:
-        """Return one line per class, kind of overlap and IoU, one per class and slice, and those of tracks."""
+        """Return the evaluation in words.
+
+        Frames and target criteria; a line per class, kind of overlap and IoU; a line per class and part of the
+        breakdown; calibration errors; tracking.
+        """
         lines = [f"{self.frames} frames of {self.scenes} scenes", *(self.rules.lines() if self.rules else ())]
         for row in self.scores:
             found = "nothing to find"

@@ -1,4 +1,4 @@
-"""What the detector learns from: a point cloud, the boxes to find, the places to leave out of the loss."""
+"""Training samples of the detector: LiDAR sweeps with labels, from recorded frames."""
 
 import math
 from collections.abc import Sequence
@@ -16,26 +16,28 @@ from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.truth import ground_truth, only_lidar
 from flcav.sensors.frame import Frame
 
-HEIGHT_SLACK_M = 0.5  # between a LiDAR's height and the one that a network expects
+HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one that a network expects
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One labelled sweep, LiDAR frame."""
+    """A labelled LiDAR sweep, LiDAR frame."""
 
     points: NDArray[np.float32]  # (N, 4) x, y, z [m], intensity [0, 1]
-    boxes: Boxes  # objects to find; label = detection class
-    ignore: Boxes = field(default_factory=Boxes.empty)  # objects that are neither positive nor negative
-    free: NDArray[np.float32] | None = None  # (K, 2) x, y [m] known to be free of objects; None: wherever no box is
-    exact: NDArray[np.bool_] | None = None  # (B,) whether `boxes` say size and pose, not only "here is one"; None: all
+    boxes: Boxes  # (B,) objects to detect; label = detection class
+    ignore: Boxes = field(default_factory=Boxes.empty)  # objects left out of the loss, neither positive nor negative
+    free: NDArray[np.float32] | None = None  # (K, 2) positions x, y [m] without objects; None: wherever no box is
+    exact: NDArray[np.bool_] | None = None  # (B,) whether size and pose of the box are learned too; None: all
 
 
 def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Sample:
     """Return the frame's sweep with its ground truth as labels.
 
-    Objects with enough returns are to be found, with fewer but some they are ignored, and so are lookalikes; objects
-    without a return are background. Those out of range are kept, since training may turn them in. Points that cannot
-    come into `config`'s range, turned and scaled as training does, are left out.
+    Objects with `MIN_RETURNS` returns or more are to be detected. Those with fewer but some are ignored, and so are
+    lookalikes with any; objects without a return are background. Objects out of range are kept, since augmentation may
+    move them in; points that it cannot move into the range of `config` are left out.
+
+    lidar: name of the LiDAR; None: the frame's first. Raises `InputError` where the frame has none of that name.
     """
     truth = ground_truth(frame, config, lidar)
     ignored = (truth.returns > 0) & ((truth.known & ~truth.enough) | truth.lookalike)
@@ -44,7 +46,7 @@ def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = No
 
 
 class RecordedSweeps(Sequence[Sample]):
-    """The frames of a dataset as samples with their ground truth, read when asked for.
+    """Frames of a dataset as a sequence of samples with ground truth as labels, each read on access.
 
     Raises `InputError` where one of the frames has no LiDAR.
     """
@@ -62,12 +64,13 @@ class RecordedSweeps(Sequence[Sample]):
 
 
 def fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
-    """Return the frames whose LiDAR is mounted within `HEIGHT_SLACK_M` of the height that `config` expects.
+    """Return the numbers of the frames whose first LiDAR is mounted within `HEIGHT_SLACK_M` of the height expected.
 
-    Heights are those of the calibration, above the agent's origin: a vehicle's is on the ground, a pole's where its
-    sensors are, so that a pole's LiDAR does not fit. All frames where none has a LiDAR: who reads them says so.
+    The height is that of the calibration above the agent's origin, the expected one is -config.ground_z_m. A vehicle's
+    origin is on the ground, a pole's at its sensors, so that a pole's LiDAR does not fit. All frames are returned where
+    none has a LiDAR; reading them as samples then raises.
 
-    Raises `InputError` where LiDARs are there but none fits.
+    Raises `InputError` where there are LiDARs but none fits.
     """
     height_m: dict[int, float] = {}
     for number, key in enumerate(data.keys):
@@ -87,13 +90,16 @@ def fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
 
 
 def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:
-    """Return the points that mirroring, turning, scaling and tilting in training may bring into the range."""
+    """Return the points (N', 4) of a sweep (N, 4) that global augmentation may move into the range of `config`.
+
+    Global augmentation is mirroring, turning, scaling, shifting, tilting and lifting; the bounds are approximate.
+    """
     x0, _, z0, _, _, z1 = config.range_m
     most = config.augmentation
     x, side, z = points[:, 0], np.abs(points[:, 1]), points[:, 2]
     distance = np.hypot(x, side)
     toward = x * math.cos(most.turn_rad) + side * math.sin(most.turn_rad)
-    ahead = np.where(side < x * math.tan(most.turn_rad), distance, toward)  # furthest ahead that a turn brings it
+    ahead = np.where(side < x * math.tan(most.turn_rad), distance, toward)  # largest x by any turn
     grow = 1 / (1 - most.scale)
     kept = distance <= config.reach_m * grow + most.shift_m * math.sqrt(2)
     kept &= ahead >= min(x0 * grow, x0 / grow) - most.shift_m * math.sqrt(2)
@@ -103,7 +109,10 @@ def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.
 
 
 def checked_points(points: NDArray[np.float32], origin: str | Path) -> NDArray[np.float32]:
-    """Return the points, or raise `InputError` where a detector can do nothing with them."""
+    """Return the points unchanged; raises `InputError` unless they are (N, 4), N >= 1, of finite numbers.
+
+    origin: their file or frame, named in the message.
+    """
     if points.ndim != 2 or points.shape[1] != 4:
         raise InputError(f"{origin}: a point cloud of shape {points.shape}; (N, 4) x, y, z, intensity is wanted")
     if not len(points):

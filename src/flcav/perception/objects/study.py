@@ -1,4 +1,4 @@
-"""The study of the object task: three towns to learn from, other scenes of each to test, weathers and tracks besides.
+"""Study recipe of the object task: training in three towns, tests on other scenes of each, in weather and of tracking.
 
 The sweeps are those of recipes/objects.yaml, in every town.
 """

@@ -1,4 +1,10 @@
-"""Anchors, and what each is to learn: class, box residuals, direction."""
+"""Anchors and their training targets: class, box residuals, direction.
+
+There is one anchor per class and heading at the centre of every cell of the head's grid. Anchors are matched by IoU in
+bird's-eye view after turning boxes to the nearest axis (Yan et al. 2018, sec. 3.2: for cars positive from 0.6, negative
+below 0.45); the best anchors of an object are positive even below that. Residuals are those of Zhou and Tuzel,
+"VoxelNet", CVPR 2018, eq. 1.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 def cell_size(config: SecondConfig) -> tuple[float, float]:
-    """Return the x and y size [m] of a cell of the head's grid."""
+    """Return the size along x and along y [m] of a cell of the head's grid."""
     rows, columns = head_shape(config)
     x0, y0, _, x1, y1, _ = config.range_m
     return (x1 - x0) / columns, (y1 - y0) / rows
@@ -25,7 +31,10 @@ def cell_size(config: SecondConfig) -> tuple[float, float]:
 
 @lru_cache(maxsize=4)
 def anchor_boxes(config: SecondConfig) -> Array:
-    """Return (A, 7) anchors x, y, z, length, width, height, yaw (LiDAR frame), A = rows, columns, class, heading."""
+    """Return the anchors (A, 7), rows x, y, z, length, width, height [m], yaw [rad], LiDAR frame; read-only.
+
+    They are ordered by row, column, class, heading; A = rows * columns * classes * headings.
+    """
     rows, columns = head_shape(config)
     dx, dy = cell_size(config)
     boxes = np.zeros((rows, columns, len(config.anchors), HEADINGS, 7))
@@ -42,30 +51,34 @@ def anchor_boxes(config: SecondConfig) -> Array:
 
 @lru_cache(maxsize=4)
 def anchor_classes(config: SecondConfig) -> NDArray[np.int64]:
-    """Return (A,) the class index of every anchor."""
+    """Return (A,) the class index of every anchor, in the order of `anchor_boxes`; read-only."""
     rows, columns = head_shape(config)
     classes = np.tile(np.repeat(np.arange(len(config.anchors)), HEADINGS), rows * columns)
     classes.flags.writeable = False
     return classes
 
 
-IGNORE_IOU = 0.1  # an anchor that overlaps a neutral box this much says nothing
-IGNORE_MARGIN_M = 0.5  # nor does one whose centre lies in a neutral box grown by this
+IGNORE_IOU = 0.1  # an anchor is ignored where its IoU with an ignored box exceeds this
+IGNORE_MARGIN_M = 0.5  # and where its centre lies in an ignored box enlarged by this on each side
 
 
 @dataclass(frozen=True)
 class Targets:
-    """For A anchors of one sample."""
+    """Training targets of one sample with A anchors, P of them positive."""
 
-    positive: Tensor  # (P,) int64 anchor indices
-    weight: Tensor  # (A,) float32: 1 where the anchor counts in the classification loss, else 0
-    residual: Tensor  # (P, 7) float32
-    exact: Tensor  # (P,) float32: 1 where residual and direction are to be learned, else 0
-    direction: Tensor  # (P,) int64: 1 where the heading is in [-3/4 pi, pi/4) turned by half, see `direction_of`
+    positive: Tensor  # (P,) int64 indices of the positive anchors
+    weight: Tensor  # (A,) float32: 1 for positive and negative anchors, 0 for ignored ones
+    residual: Tensor  # (P, 7) float32, see `encode`
+    exact: Tensor  # (P,) float32: 1 where residual and direction are learned, else 0
+    direction: Tensor  # (P,) int64 direction class: 1 where the yaw is in [-3/4 pi, pi/4), else 0
 
 
 def encode(boxes: Array, anchors: Array) -> Array:
-    """Return (P, 7) residuals of boxes (P, 7) from anchors (P, 7): offsets by diagonal and height, log sizes, yaw."""
+    """Return the residuals (P, 7) of boxes (P, 7) from anchors (P, 7) (VoxelNet, eq. 1).
+
+    With d the diagonal of the anchor's footprint and its height h_a: (x - x_a) / d, (y - y_a) / d, (z - z_a) / h_a,
+    logarithms of the ratios of length, width and height, yaw - yaw_a.
+    """
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
     plane = (boxes[:, :2] - anchors[:, :2]) / diagonal
     height = (boxes[:, 2] - anchors[:, 2]) / anchors[:, 5]
@@ -74,7 +87,11 @@ def encode(boxes: Array, anchors: Array) -> Array:
 
 
 def decode(residual: Array, direction: NDArray[np.int64], anchors: Array) -> Array:
-    """Return (P, 7) boxes from residuals, the inverse of `encode` where `direction` is the boxes' `direction_of`."""
+    """Return the boxes (P, 7) of residuals (P, 7), direction classes (P,) and anchors (P, 7); yaw in [-pi, pi).
+
+    The inverse of `encode` where `direction` is the class of the box's yaw. Logarithms of size ratios are clipped to
+    [-2, 2].
+    """
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
     plane = residual[:, :2] * diagonal + anchors[:, :2]
     height = residual[:, 2] * anchors[:, 5] + anchors[:, 2]
@@ -85,9 +102,9 @@ def decode(residual: Array, direction: NDArray[np.int64], anchors: Array) -> Arr
 
 
 def decoded_variance(variance: Array, boxes: Array, anchors: Array) -> Array:
-    """Return (P, 7) variances of boxes [m^2, rad^2] from those of the residuals they were decoded from.
+    """Return the variances (P, 7) of decoded boxes [m^2, rad^2] from the variances (P, 7) of their residuals.
 
-    To first order: a size is the exponential of its residual, the others are linear in theirs.
+    First-order error propagation: a size is the exponential of its residual, the others are linear in theirs.
     """
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
     slope = np.column_stack((diagonal, diagonal, anchors[:, 5], boxes[:, 3:6], np.ones(len(boxes))))
@@ -95,14 +112,14 @@ def decoded_variance(variance: Array, boxes: Array, anchors: Array) -> Array:
 
 
 def direction_of(yaw: Array) -> NDArray[np.int64]:
-    """Return 0 where the heading lies in [pi/4, 5/4 pi), else 1: what a box's axis alone leaves open."""
+    """Return the direction class (P,) of each yaw: 0 in [pi/4, 5/4 pi), else 1. It tells front from back."""
     return (np.mod(yaw - np.pi / 4, 2 * np.pi) >= np.pi).astype(np.int64)
 
 
 def free_cells(free: NDArray[np.float32], config: SecondConfig) -> NDArray[np.bool_]:
-    """Return (rows, columns) of the head's grid: True where one of the positions (K, 2) x, y [m] falls.
+    """Return a mask (rows, columns) of the head's grid, True for cells with one of the free positions (K, 2) x, y [m].
 
-    Give positions at most half a cell apart where an area is known to be free, or a turned sample has holes.
+    Positions should be at most half a cell apart in a free area; otherwise cells of a turned sample are missed.
     """
     rows, columns = head_shape(config)
     dx, dy = cell_size(config)
@@ -115,7 +132,13 @@ def free_cells(free: NDArray[np.float32], config: SecondConfig) -> NDArray[np.bo
 
 
 def assign(sample: Sample, config: SecondConfig) -> Targets:
-    """Return the targets of a sample. Boxes outside the range are ignored, as those in `sample.ignore` are."""
+    """Return the training targets of a sample: positive, negative and ignored anchors, residuals, directions.
+
+    An anchor is positive for the object of its class with the highest IoU, if that is at least the class's
+    `matched_iou`, and for an object of which it is the best anchor, if their IoU is above 0.1. Other anchors are
+    ignored from `unmatched_iou` on, on boxes of `sample.ignore` or outside the range, and in cells not known to be free
+    where `sample.free` is given. The rest are negative.
+    """
     anchors, classes = anchor_boxes(config), anchor_classes(config)
     inside = in_range(sample.boxes, config)
     boxes, labels = sample.boxes.array()[inside], sample.boxes.label[inside]
@@ -153,7 +176,7 @@ def assign(sample: Sample, config: SecondConfig) -> Targets:
 
 
 def _near(boxes: Array, config: SecondConfig) -> NDArray[np.int64]:
-    """Return the indices of anchors in cells that any of the boxes could overlap."""
+    """Return the indices of the anchors in cells near any of the boxes (B, 7): all that could overlap one."""
     rows, columns = head_shape(config)
     dx, dy = cell_size(config)
     close = np.zeros((rows, columns), dtype=bool)
@@ -180,7 +203,7 @@ def _touched(boxes: Array, config: SecondConfig) -> NDArray[np.int64]:
 
 
 def _axis_aligned_iou(a: Array, b: Array) -> Array:
-    """Return (A, B) bird's-eye IoU of boxes (., 7) after turning each to the nearest axis."""
+    """Return the IoU (A, B) in bird's-eye view of boxes a (A, 7) with b (B, 7), each turned to the nearest axis."""
     a_low, a_high = _axis_aligned(a)
     b_low, b_high = _axis_aligned(b)
     shared = np.minimum(a_high[:, None], b_high) - np.maximum(a_low[:, None], b_low)

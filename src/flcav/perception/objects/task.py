@@ -1,4 +1,4 @@
-"""Object detection as a `Task`."""
+"""3D object detection as a perception task: samples, loss, evaluation, inference and error registry of SECOND."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -31,7 +31,7 @@ from flcav.progress import Report, silent
 
 
 class ObjectsTask(ObjectsOutcomes):
-    """3D boxes of road users in a LiDAR sweep."""
+    """3D object detection in LiDAR sweeps by SECOND, as a perception task (see `flcav.perception.task.Task`)."""
 
     name = "objects"
     family = "second"
@@ -42,30 +42,36 @@ class ObjectsTask(ObjectsOutcomes):
     threshold = THRESHOLD
 
     def __init__(self) -> None:
-        self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # what was cut out last, and of which samples
+        self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # the latest ground-truth database and its samples
 
     def study(self) -> StudyRecipe:
-        """Return how it is studied, see `flcav.perception.objects.study`."""
+        """Return the study recipe of the task, see `flcav.perception.objects.study`."""
         from flcav.perception.objects.study import STUDY
 
         return STUDY
 
     def build(self, config: SecondConfig) -> Second:
-        """Return a fresh network."""
+        """Return a new SECOND network; torch's global generator draws its weights."""
         return second(config)
 
     def samples(self, data: Dataset, config: SecondConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
-        """Return each frame's sweep with its ground truth as labels, read when asked for."""
+        """Return the sweeps of frames (None: all) with ground truth as labels, each read on access.
+
+        Raises `InputError` where one of the frames has no LiDAR.
+        """
         return RecordedSweeps(data, config, data.numbers(frames))
 
     def fitting(self, data: Dataset, config: SecondConfig) -> Sequence[int]:
-        """Return the frames whose LiDAR is about as high as the network expects, see `fitting_frames`."""
+        """Return the frames whose LiDAR is mounted at about the height that the network expects.
+
+        See `flcav.perception.objects.samples`. Raises `InputError` where there are LiDARs but none fits.
+        """
         return fitting_frames(data, config)
 
     def draw(self, samples: Sequence[Sample], index: int, config: SecondConfig, rng: np.random.Generator) -> Sample:
-        """Return the sample with objects of all pasted into it, then changed as `config.augmentation` says.
+        """Return sample `index` augmented as `config.augmentation` says, ground-truth sampling first.
 
-        What can be pasted is cut out of all samples when one of them is drawn first.
+        The ground-truth database is made of all samples when one of them is drawn first.
         """
         how = config.augmentation
         sample = samples[index]
@@ -79,7 +85,7 @@ class ObjectsTask(ObjectsOutcomes):
         return self._cut[1]
 
     def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
-        """Return SECOND's loss of a batch."""
+        """Return the loss of SECOND on a batch, differentiable in the network's parameters."""
         return batch_loss(network, samples)
 
     def evaluate(
@@ -91,9 +97,10 @@ class ObjectsTask(ObjectsOutcomes):
         asked: SecondConfig | None = None,
         progress: Report = silent,
     ) -> ObjectsEvaluation:
-        """Return AP per class, kind of overlap and IoU, with intervals over scenes; its slices; what to trust.
+        """Return AP and AOS per class, kind of overlap and IoU, with intervals over scenes; breakdown; calibration.
 
-        `asked`: the network's configuration with a smaller range, see `flcav.perception.objects.area`.
+        frames: their numbers (None: all). asked: the network's configuration with a smaller range, see
+        `flcav.perception.objects.area`. Raises `InputError` where there are no frames, or one has no LiDAR.
         """
         numbers, classes = data.numbers(frames), network.config.classes
         found, truths = detections_and_truths(
@@ -109,17 +116,21 @@ class ObjectsTask(ObjectsOutcomes):
         )
 
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
-        """Set the calibration of the network's scores, see `flcav.perception.objects.calibrate`."""
+        """Set the Platt scaling of the network's scores, fitted on frames (None: all) it was not trained on."""
         calibrate(network, map(data.frame, data.numbers(frames)))
 
     def sample_bytes(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> list[int]:
-        """Return the bytes of each sweep with its annotation rows."""
+        """Return the size of each frame's sweep with its annotation rows [bytes]."""
         return [data.payload_bytes(i) for i in frames]
 
     def infer(
         self, network: Second, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the objects in each point cloud of `path`, see `infer.point_clouds`."""
+        """Yield the objects of score `threshold` or more in each point cloud of `path`.
+
+        path: a KITTI .bin file, a folder of them, or a dataset folder, of which `frames` (None: all). Raises
+        `InputError` for anything else, see `flcav.perception.objects.infer`.
+        """
         for cloud in point_clouds(path, frames):
             found = detect(network, cloud.points, score_threshold=threshold)
             yield Finding(cloud.path, cloud.points, ObjectsFound(box_rows(found)), (CloudBoxes(found),), cloud.view)
@@ -132,7 +143,10 @@ class ObjectsTask(ObjectsOutcomes):
         threshold: float = THRESHOLD,
         progress: Report = silent,
     ) -> Registry:
-        """Return the objects that are missed and invented, see `errors.register_errors`."""
+        """Return the registry of the network's misses and false positives on frames (None: all).
+
+        threshold: lowest score of a detection. See `flcav.perception.objects.errors`.
+        """
         numbers = data.numbers(frames)
 
         def found() -> Iterator[Boxes]:

@@ -1,7 +1,8 @@
-"""Which objects of a frame count for a detector: the one rule of training, evaluation, error registry and tracking.
+"""Ground truth of object detection: targets, faint, hidden and lookalike objects of a frame.
 
-An object of a class the network knows, its centre in the network's range, is a *target* with five LiDAR returns or
-more, *faint* with one to four, *hidden* with none. What each user makes of them is in docs/tasks.md.
+An object of a class the network knows, with its centre in the network's range, is a *target* with five LiDAR returns or
+more, *faint* with one to four, *hidden* with none. Training, evaluation, error registry and tracking share this
+definition; how each treats the kinds is in docs/tasks.md.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ DETECTION_CLASS = {
     "bicycle": "Cyclist",
     "motorcycle": "Cyclist",
 }
-LOOKALIKE = {"truck": "Car", "bus": "Car"}  # neutral: neither to be found nor to be kept apart
+LOOKALIKE = {"truck": "Car", "bus": "Car"}  # neutral: a detection on one is neither true nor false
 MIN_RETURNS = 5  # LiDAR returns that make an object a target
 
 Mask = NDArray[np.bool_]
@@ -30,47 +31,47 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Truth:
-    """The M annotated actors of a frame, as a network of some classes and range is asked for them.
+    """Ground truth of one frame: its M annotated actors, for a network of some classes and range.
 
-    Rows are those of the frame's annotations. Beside targets, faint and hidden objects there are those out of range,
-    `lookalike` ones, and actors of no class the network knows.
+    Rows are those of the frame's annotations. Besides targets, faint and hidden objects there are objects out of range,
+    lookalikes, and actors of no class the network knows.
     """
 
-    boxes: Boxes  # (M,) LiDAR frame; label = detection class, of a lookalike the one it looks like, else ""
+    boxes: Boxes  # (M,) LiDAR frame; label = detection class, of a lookalike the one it resembles, else ""
     returns: NDArray[np.int64]  # (M,) of all LiDARs
-    inside: Mask  # (M,) centre within the range, seen from above
-    lookalike: Mask  # (M,) trucks and buses beside cars
+    inside: Mask  # (M,) centre within the range in bird's-eye view
+    lookalike: Mask  # (M,) trucks and buses, for a network that knows cars
 
     @cached_property
     def known(self) -> Mask:
-        """Return which objects are of a class of the network, wherever they are."""
+        """Return (M,) whether the object is of a class of the network, in range or not."""
         return (self.boxes.label != "") & ~self.lookalike
 
     @cached_property
     def enough(self) -> Mask:
-        """Return which known objects have returns enough to be targets, wherever they are."""
+        """Return (M,) whether the object is of a known class with enough returns for a target, in range or not."""
         return self.known & (self.returns >= MIN_RETURNS)
 
     @cached_property
     def target(self) -> Mask:
-        """Return which objects are to be found."""
+        """Return (M,) whether the object is a target: of a known class, in range, with enough returns."""
         return self.enough & self.inside
 
     @cached_property
     def faint(self) -> Mask:
-        """Return which objects in range have some returns, but too few for a target."""
+        """Return (M,) whether the object is faint: of a known class, in range, with some returns but too few."""
         return self.known & self.inside & (self.returns > 0) & ~self.enough
 
     @cached_property
     def hidden(self) -> Mask:
-        """Return which objects in range have no return."""
+        """Return (M,) whether the object is hidden: of a known class, in range, without a return."""
         return self.known & self.inside & (self.returns == 0)
 
 
 def ground_truth(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Truth:
-    """Return the actors of `frame` as a network of `config` is asked for them, in the frame of the LiDAR.
+    """Return the ground truth of `frame` for a network of `config`, in the frame of the LiDAR.
 
-    `lidar`: None where the frame has one. Raises `InputError` where the frame has none of that name.
+    lidar: its name; None: the frame's first. Raises `InputError` where the frame has none of that name.
     """
     annotations = frame.annotations
     boxes = annotations.boxes.transformed(inverse(frame.world_from_sensor(only_lidar(frame, lidar))))
@@ -81,25 +82,28 @@ def ground_truth(frame: Frame, config: SecondConfig, lidar: str | None = None) -
 
 
 def in_range(boxes: Boxes, config: SecondConfig) -> Mask:
-    """Return (N,) whether a box's centre lies within the range, seen from above."""
+    """Return (N,) whether the centre of each box (LiDAR frame) lies in the range of `config` in bird's-eye view."""
     x, y = boxes.center[:, 0], boxes.center[:, 1]
     x0, y0, _, x1, y1, _ = config.range_m
     return (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
 
 
 def detection_labels(category: NDArray[np.str_], classes: tuple[str, ...]) -> NDArray[np.str_]:
-    """Return the detection class of every actor category, "" where the network knows none."""
+    """Return the detection class (N,) of each actor category (N,), "" where it is none of `classes`."""
     mapped = [DETECTION_CLASS.get(str(name), "") for name in category]
     return np.array([name if name in classes else "" for name in mapped], dtype=np.str_)
 
 
 def is_lookalike(category: NDArray[np.str_], classes: tuple[str, ...]) -> Mask:
-    """Return which actors look so much like one of `classes` that finding them is no mistake (trucks, buses)."""
+    """Return (N,) whether an actor category (N,) resembles one of `classes` so that a detection is no error.
+
+    Trucks and buses resemble cars.
+    """
     return np.array([LOOKALIKE.get(str(name)) in classes for name in category], dtype=bool)
 
 
 def only_lidar(frame: Frame, name: str | None = None) -> str:
-    """Return `name`, or the frame's first LiDAR; raises `InputError` where it has none."""
+    """Return the LiDAR `name` of the frame, None: its first; raises `InputError` where it has no such LiDAR."""
     if name is None and frame.lidar:
         return next(iter(frame.lidar))
     if name is None or name not in frame.lidar:

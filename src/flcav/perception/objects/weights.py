@@ -1,4 +1,4 @@
-"""Files of the detector's weights."""
+"""Saving and loading of SECOND's weights (safetensors)."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from flcav.perception.objects.task import OBJECTS
 
 
 def save_network(network: Second, path: Path) -> None:
-    """Write configuration and weights as safetensors, see `flcav.perception.weights`."""
+    """Save configuration and weights to `path` as safetensors, see `flcav.perception.weights`."""
     weights.save_network(OBJECTS, network, path)
 
 
@@ -18,5 +18,5 @@ def load_network(path: Path) -> Second:
 
 
 def load_weights(network: Second, path: Path) -> None:
-    """Load the weights at `path` into `network`; raises `InputError` where they are of another one."""
+    """Load the weights at `path` into `network`; raises `InputError` where they are of another network."""
     weights.load_weights(OBJECTS, network, path)

@@ -1,1 +1,1 @@
-"""Network operations in plain PyTorch."""
+"""Operations of networks: sparse convolution, voxelisation, batch normalisation, IoU and non-maximum suppression."""

@@ -1,7 +1,8 @@
-"""Sparse convolution on a CPU, compiled: gather, multiply and add for a block of pairs at a time, within the cache.
+"""Blocked gather-multiply-scatter kernels of sparse convolution on a CPU, compiled: forward pass and gradients.
 
-Products of all pairs at once would go through main memory; a block's never leave the cache. Matrices stay below the
-size from which BLAS would wake its other threads.
+The pairs of a rulebook are worked through in blocks. The products of a block stay in the processor's cache; those of
+all pairs at once would go through main memory. Each matrix product is smaller than those that BLAS spreads over
+threads.
 """
 
 import numpy as np
@@ -13,15 +14,17 @@ Array = NDArray[np.floating]
 Int32s = NDArray[np.int32]
 Int64s = NDArray[np.int64]
 
-BLOCK = 1 << 18  # multiplications in a matrix product, at most
-LONGEST = 1024  # pairs
+BLOCK = 1 << 18  # most multiplications in the matrix product of a block
+LONGEST = 1024  # most pairs in a block
 
 
 @compiled
 def convolve(features: Array, weight: Array, source: Int32s, target: Int32s, begins: Int64s, out: Array) -> None:
-    """Add features[s] @ weight[k] to out[t] for the pairs (s, t) of every offset k, begins[k] to begins[k + 1].
+    """Sparse convolution, forward pass: add features[s] @ weight[k] to out[t] for every pair (s, t) of kernel offset k.
 
-    features (N, C), weight (K, C, C'), out (M, C'); targets differ within an offset.
+    features (N, C), weight (K, C, C'), out (M, C'), changed in place. source and target (P,) are the rows s and t of
+    the pairs; those of offset k are numbers begins[k] to begins[k + 1], begins (K + 1,). No target occurs twice in an
+    offset.
     """
     block = min(LONGEST, max(1, BLOCK // (weight.shape[1] * weight.shape[2])))
     sent = np.empty((block, weight.shape[1]), dtype=features.dtype)
@@ -38,7 +41,10 @@ def convolve(features: Array, weight: Array, source: Int32s, target: Int32s, beg
 def weight_gradient(
     features: Array, gradient: Array, source: Int32s, target: Int32s, begins: Int64s, out: Array
 ) -> None:
-    """Add features[s]^T gradient[t] to out[k] (K, C, C') for the pairs (s, t) of every offset k."""
+    """Gradient of the weights: add features[s]^T gradient[t] to out[k] for every pair (s, t) of kernel offset k.
+
+    features (N, C), gradient of the output (M, C'), out (K, C, C'), changed in place; pairs as in `convolve`.
+    """
     block = min(LONGEST, max(1, BLOCK // (out.shape[1] * out.shape[2])))
     sent = np.empty((block, out.shape[1]), dtype=features.dtype)
     arrived = np.empty((block, out.shape[2]), dtype=features.dtype)
@@ -63,9 +69,11 @@ def gradients(
     to_features: Array,
     to_weight: Array,
 ) -> None:
-    """Do as `weight_gradient` into `to_weight`, and add gradient[t] @ turned[k] to to_features[s] for the same pairs.
+    """Gradients of weights and input features, in one pass over the pairs.
 
-    turned (K, C', C): each offset's weight, transposed.
+    For every pair (s, t) of kernel offset k, features[s]^T gradient[t] is added to to_weight[k] (K, C, C'), and
+    gradient[t] @ turned[k] to to_features[s] (N, C), both in place. turned (K, C', C): the weight of each offset,
+    transposed. The rest is as in `convolve`.
     """
     block = min(LONGEST, max(1, BLOCK // (turned.shape[1] * turned.shape[2])))
     sent = np.empty((block, turned.shape[2]), dtype=features.dtype)

@@ -1,7 +1,7 @@
-"""Batch normalisation followed by ReLU, of maps and of rows of features.
+"""Batch normalisation followed by ReLU, of (B, C, H, W) maps and of (N, C) rows of features.
 
-Written out for rows on a CPU in one differentiable step, because the framework's own kernel is several times slower on
-tall, narrow matrices there. Equations of Ioffe and Szegedy, "Batch Normalization", ICML 2015, alg. 1, and their
+Rows on a CPU have an implementation of their own, one differentiable step, because PyTorch's kernel is several times
+slower there on tall, narrow matrices. Equations: Ioffe and Szegedy, "Batch Normalization", ICML 2015, alg. 1, and their
 gradient; as there, the running variance is the unbiased one.
 """
 
@@ -13,7 +13,10 @@ from torch import Tensor, nn
 
 
 class NormReLU(nn.Module):
-    """Batch normalisation and ReLU of (N, C) rows or (B, C, H, W) maps; maps are best in channels-last memory."""
+    """Batch normalisation and ReLU of (N, C) rows or (B, C, H, W) maps; channels-last memory is fastest for maps.
+
+    Running mean and variance follow the batches with weight `momentum`; `epsilon` is added to variances.
+    """
 
     running_mean: Tensor
     running_variance: Tensor
@@ -27,7 +30,10 @@ class NormReLU(nn.Module):
         self.register_buffer("running_variance", torch.ones(channels))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return max(0, weight * (x - mean) / deviation + bias), by the batch's own statistics in training mode."""
+        """Return max(0, weight * (x - mean) / deviation + bias), in the shape of x.
+
+        Mean and deviation are those of the batch in training mode, the running ones otherwise.
+        """
         if x.dim() == 4 or not _written_out(x):
             known = self.running_mean, self.running_variance, self.weight, self.bias
             return F.batch_norm(x, *known, self.training, self.momentum, self.epsilon).relu_()

@@ -1,11 +1,11 @@
-"""Overlap of upright rectangles, rows x1 y1 x2 y2, and suppression of those that say the same."""
+"""IoU, complete IoU and non-maximum suppression of axis-aligned rectangles, rows x1, y1, x2, y2."""
 
 import math
 
 import torch
 from torch import Tensor
 
-TINY = 1e-7
+TINY = 1e-7  # added to denominators
 
 
 def iou(one: Tensor, other: Tensor) -> Tensor:
@@ -14,11 +14,11 @@ def iou(one: Tensor, other: Tensor) -> Tensor:
 
 
 def complete_iou(one: Tensor, other: Tensor) -> Tensor:
-    """Return (N,) complete IoU of rectangles (N, 4) with their partners (N, 4), in (-1.5, 1].
+    """Return (N,) complete IoU (CIoU) of rectangles (N, 4) with the rectangles of the same rows (N, 4), in (-1.5, 1].
 
-    IoU less the distance of the centres as a share of the common hull's diagonal, squared, less how much the shapes
-    differ (Zheng et al., "Distance-IoU Loss", AAAI 2020, eq. 7-11). The weight of the last is held constant in
-    derivatives.
+    CIoU = IoU - d^2 / c^2 - a v: d the distance of the centres, c the diagonal of the smallest rectangle around both,
+    v the difference of the aspect ratios, a its weight, a constant for derivatives (Zheng et al., "Distance-IoU Loss",
+    AAAI 2020, eq. 7-11).
     """
     overlap = _iou(one, other)
     hull = torch.maximum(one[:, 2:], other[:, 2:]) - torch.minimum(one[:, :2], other[:, :2])
@@ -31,7 +31,10 @@ def complete_iou(one: Tensor, other: Tensor) -> Tensor:
 
 
 def nms(boxes: Tensor, scores: Tensor, most: float) -> Tensor:
-    """Return the numbers of the rectangles kept, best first: none overlaps a better one by an IoU above `most`."""
+    """Return the indices of the rectangles (N, 4) that non-maximum suppression keeps, highest of the scores (N,) first.
+
+    A rectangle is dropped where its IoU with a kept one of higher score exceeds `most`.
+    """
     order = scores.argsort(descending=True, stable=True)
     overlaps = iou(boxes[order], boxes[order]) > most
     kept = torch.ones(len(order), dtype=torch.bool)

@@ -1,8 +1,8 @@
-"""Intersection over union of turned boxes, and non-maximum suppression by it. Float64 throughout.
+"""IoU of rotated boxes, in 3D and in bird's-eye view, and non-maximum suppression by it. Float64 throughout.
 
-Boxes are rows x, y, z, length, width, height, yaw. Two rectangles meet in the convex hull of the corners of each that
-lie in the other and of their edges' crossings. Coordinates are taken about the pair's midpoint, so that precision does
-not depend on where in the world they are.
+Boxes are rows x, y, z of the centre, length, width, height [m], yaw [rad], in any one frame with z up. The intersection
+of two rectangles is the convex hull of the corners of each that lie in the other and of the crossings of their edges.
+Coordinates are relative to the midpoint of the pair, so that precision does not depend on the distance from the origin.
 """
 
 from typing import Literal
@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-Kind = Literal["3d", "bev"]
-PAIRS_AT_ONCE = 100_000
+Kind = Literal["3d", "bev"]  # IoU of volumes, or of footprints in bird's-eye view
+PAIRS_AT_ONCE = 100_000  # bounds the memory of `iou`
 
 
 def iou(a: Tensor, b: Tensor, kind: Kind = "3d") -> Tensor:
-    """Return (A, B) float64 IoU of boxes a (A, 7) and b (B, 7): of volumes, or of footprints (`bev`)."""
+    """Return (A, B) float64 IoU of each of the boxes a (A, 7) with each of b (B, 7), of volumes or of footprints."""
     a, b = a.double(), b.double()
     out = a.new_zeros(len(a), len(b))
     reach_a, reach_b = a[:, 3:5].norm(dim=1) / 2, b[:, 3:5].norm(dim=1) / 2
@@ -40,7 +40,7 @@ def paired_iou(a: Tensor, b: Tensor, kind: Kind = "3d") -> Tensor:
 
 
 def intersection_area(a: Tensor, b: Tensor) -> Tensor:
-    """Return (P,) area [m^2] that the footprints of paired boxes (P, 7) share."""
+    """Return (P,) intersection area [m^2] of the footprints of each box of a (P, 7) and the same row of b (P, 7)."""
     middle = (a[:, :2] + b[:, :2]) / 2
     a = torch.cat((a[:, :2] - middle, a[:, 2:]), 1)
     b = torch.cat((b[:, :2] - middle, b[:, 2:]), 1)
@@ -54,14 +54,15 @@ def intersection_area(a: Tensor, b: Tensor) -> Tensor:
     order = angle.argsort(1)
     spokes = spokes.gather(1, order[..., None].expand(-1, -1, 2))
     valid = valid.gather(1, order)
-    spokes = torch.where(valid[..., None], spokes, spokes[:, :1])  # unused ones fall on the first: no area
+    spokes = torch.where(valid[..., None], spokes, spokes[:, :1])  # invalid points repeat the first and add no area
     return _cross(spokes, spokes.roll(-1, 1)).sum(1).abs() / 2
 
 
 def nms(boxes: Tensor, scores: Tensor, *, overlap: float = 0.01, consider: int = 256, keep: int = 100) -> Tensor:
-    """Return the indices of boxes (N, 7) that survive, best score first.
+    """Return the indices of the boxes (N, 7) that non-maximum suppression keeps, highest of the scores (N,) first.
 
-    A box falls where its bird's-eye IoU with a better survivor exceeds `overlap`; the `consider` best are looked at.
+    A box is dropped where its bird's-eye IoU with a kept one of higher score exceeds `overlap`. The `consider` boxes of
+    highest score are candidates, and at most `keep` are kept.
     """
     order = scores.argsort(descending=True, stable=True)[:consider]
     clash = (iou(boxes[order], boxes[order], "bev") > overlap).cpu().numpy()
@@ -83,6 +84,7 @@ def _corners(boxes: Tensor) -> Tensor:
 
 
 def _inside(points: Tensor, boxes: Tensor) -> Tensor:
+    # (P, K) whether points (P, K, 2) lie in the footprints of boxes (P, 7)
     delta = points - boxes[:, None, :2]
     cos, sin = boxes[:, 6].cos()[:, None], boxes[:, 6].sin()[:, None]
     along = delta[..., 0] * cos + delta[..., 1] * sin
@@ -91,7 +93,10 @@ def _inside(points: Tensor, boxes: Tensor) -> Tensor:
 
 
 def _crossings(corners_a: Tensor, corners_b: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (P, 16, 2) points where edges of the two rectangles cross, and (P, 16) whether they do."""
+    """Return (P, 16, 2) crossings of each edge of one rectangle with each of the other, and (P, 16) whether they exist.
+
+    corners_a, corners_b: (P, 4, 2).
+    """
     edge_a = (corners_a.roll(-1, 1) - corners_a)[:, :, None]
     edge_b = (corners_b.roll(-1, 1) - corners_b)[:, None]
     gap = corners_b[:, None] - corners_a[:, :, None]

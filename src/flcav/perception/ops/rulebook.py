@@ -1,4 +1,14 @@
-"""Rulebooks of sparse 3D convolutions: which input voxel meets which output voxel, by kernel offset."""
+"""Rulebooks of submanifold and strided sparse 3D convolutions: pairs of input and output voxels per kernel offset.
+
+A voxel of sample b at grid cell (z, y, x) has the integer key ((b D + z + 1) H + y + 1) W + x + 1, where D, H, W are
+the extents of the grid plus two. The padding of one cell on every side keeps a neighbour's key from wrapping to another
+row, so a kernel offset is one difference of keys. Keys are sorted (ascending), so a neighbour is found by binary
+search. Source: Graham et al., "3D Semantic Segmentation with Submanifold Sparse Convolutional Networks", CVPR 2018.
+
+There are two implementations with the same result. On a CPU a compiled one merges the sorted keys with themselves,
+shifted, in one pass per offset, about ten times faster than tensor operations. On a GPU tensor operations do it; the
+host waits once per rulebook, for the number of pairs of every offset and of outputs together.
+"""
 
 from dataclasses import dataclass
 from itertools import product
@@ -16,9 +26,10 @@ Int64s = NDArray[np.int64]
 
 @compiled
 def submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int64s]:
-    """Return source, target and pairs per offset of a 3x3x3 convolution.
+    """Return the pairs of a 3x3x3 submanifold convolution: source (P,), target (P,), number of pairs per offset (27,).
 
-    keys (N,) ascending; steps (13,) key differences of the later half of the offsets.
+    keys (N,) ascending; steps (13,) key differences of the offsets after the centre, z-major. Pairs are grouped by
+    offset; within one, targets ascend.
     """
     count, half = len(keys), len(steps)
     later = np.empty((half, count), dtype=np.int32)  # the neighbour at each later offset, -1 for none
@@ -59,9 +70,10 @@ def submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int6
 def strided_pairs(
     keys: Int64s, samples: int, shape: Int64s, kernel: Int64s, stride: Int64s, padding: Int64s, out_shape: Int64s
 ) -> tuple[Int32s, Int32s, Int64s, Int64s]:
-    """Return source, target, pairs per offset, and the ascending output keys of a strided convolution.
+    """Return the pairs of a strided convolution: source (P,), target (P,), number per offset (K,), output keys (M,).
 
-    shape, kernel, stride, padding, out_shape: (3,) along z, y, x.
+    keys (N,) and output keys ascend. shape, kernel, stride, padding, out_shape: (3,) along z, y, x. Pairs are grouped
+    by offset, z-major; within one, targets ascend.
     """
     height, width = shape[1] + 2, shape[2] + 2
     layers = shape[0] + 2
@@ -114,22 +126,25 @@ Triple = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Groups:
-    """The pairs of each of some rows, one row's after another's."""
+    """Pairs of a rulebook grouped by a row of input or output, as offsets into one list (compressed sparse rows)."""
 
-    order: Tensor  # (P,) int32 pair numbers
-    begins: Tensor  # (rows,) int32 where each row's pairs begin
+    order: Tensor  # (P,) int32 numbers of the pairs, those of row 0 first
+    begins: Tensor  # (rows,) int32 place in `order` where the pairs of each row begin
 
 
 @dataclass(frozen=True)
 class Rules:
-    """P pairs (source voxel, target voxel), grouped by kernel offset; within an offset, targets ascend."""
+    """Rulebook of a sparse convolution: P pairs (input voxel, output voxel), grouped by kernel offset.
+
+    Within an offset, targets ascend.
+    """
 
     source: Tensor  # (P,) int32 row of the input
     target: Tensor  # (P,) int32 row of the output
     counts: tuple[int, ...]  # pairs per kernel offset, z-major
     targets: int  # rows of the output
-    by_target: Groups | None = None  # None on a CPU, which adds pair by pair
-    by_source: Groups | None = None  # None too where the pairs of offset k are those of offset K-1-k, roles exchanged
+    by_target: Groups | None = None  # None on a CPU, where products are added pair by pair
+    by_source: Groups | None = None  # None too where offset k has the pairs of offset K-1-k with exchanged roles
 
 
 def _compiled(keys: Tensor) -> bool:
@@ -137,29 +152,30 @@ def _compiled(keys: Tensor) -> bool:
 
 
 def _grouped(row: Tensor, offset: Tensor, offsets: int, rows: int) -> Groups:
+    # row (P,): of each pair, in [0, rows); offset (P,): its kernel offset, in [0, offsets)
     number = torch.arange(len(row), device=row.device, dtype=torch.int32)
     table = torch.full((rows * offsets,), -1, device=row.device, dtype=torch.int32)
-    table[row.long() * offsets + offset] = number  # a row meets each offset once at most
+    table[row.long() * offsets + offset] = number  # a row has at most one pair per offset
     used = table >= 0
     per_row = used.view(rows, offsets).sum(1, dtype=torch.int32)
     return Groups(table[_places(used, len(row))], per_row.cumsum(0, dtype=torch.int32) - per_row)
 
 
 def _places(mask: Tensor, count: int) -> Tensor:
-    """Return the (count,) ascending places where a flat mask is True: `nonzero` without waiting for their number."""
+    """Return the (count,) ascending indices where a flat mask is True: `nonzero` without waiting for the GPU."""
     rank = mask.cumsum(0, dtype=torch.int32)
     return torch.searchsorted(rank, torch.arange(1, count + 1, device=mask.device, dtype=torch.int32))
 
 
 def keys_of(cells: Tensor, shape: Triple) -> Tensor:
-    """Return (N,) keys of (N, 4) cells (sample, z, y, x) of a grid of extents `shape` (z, y, x)."""
+    """Return the (N,) integer keys of cells (N, 4), rows sample, z, y, x, of a grid of extents `shape` (z, y, x)."""
     depth, height, width = (extent + 2 for extent in shape)
     sample, z, y, x = cells.unbind(1)
     return ((sample * depth + z + 1) * height + y + 1) * width + x + 1
 
 
 def cells_of(keys: Tensor, shape: Triple) -> Tensor:
-    """Return (N, 4) cells (sample, z, y, x) of (N,) keys."""
+    """Return the cells (N, 4), rows sample, z, y, x, of keys (N,): the inverse of `keys_of`."""
     depth, height, width = (extent + 2 for extent in shape)
     row = keys.div(width, rounding_mode="floor")
     layer = row.div(height, rounding_mode="floor")
@@ -168,10 +184,11 @@ def cells_of(keys: Tensor, shape: Triple) -> Tensor:
 
 
 def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
-    """Return the rules of a 3x3x3 convolution whose outputs are the input voxels `keys` (N,), sorted.
+    """Return the rulebook of a 3x3x3 submanifold convolution, whose output voxels are its input voxels.
 
-    Half of the offsets suffice: the pairs of the others are the same with the roles exchanged. Three offsets that
-    differ in x only share one search, because their keys are consecutive.
+    keys (N,): ascending; shape: extents z, y, x of the grid. Only the 13 offsets after the centre are searched: the
+    others have the same pairs with exchanged roles. On a GPU three offsets that differ in x alone share one search,
+    because their keys are consecutive.
     """
     _, height, width = (extent + 2 for extent in shape)
     if _compiled(keys):
@@ -183,7 +200,7 @@ def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
 
 def _submanifold_rules(keys: Tensor, height: int, width: int) -> Rules:
     count = len(keys)
-    later = torch.cat((keys, keys.new_full((3,), -1)))  # so that looking up to 3 rows past the end finds no key
+    later = torch.cat((keys, keys.new_full((3,), -1)))  # padded: a look-up of up to 3 rows past the end finds no key
     lines = (width, (height - 1) * width, height * width, (height + 1) * width)
     wanted = torch.stack([keys + (line - 1) for line in lines])  # (4, N): the first of three consecutive keys
     place = torch.searchsorted(keys, wanted)
@@ -213,10 +230,11 @@ def _submanifold_rules(keys: Tensor, height: int, width: int) -> Rules:
 def strided_rules(
     keys: Tensor, shape: Triple, kernel: Triple, stride: Triple, padding: Triple, samples: int
 ) -> tuple[Rules, Tensor, Triple]:
-    """Return the rules of a strided convolution, its output keys (M,) sorted, and its output grid (z, y, x).
+    """Return the rulebook of a strided sparse convolution, its output keys (M,), sorted, and its output grid (z, y, x).
 
-    The outputs are the cells whose window holds an input voxel. Axes are independent: an input cell c reaches output
-    (c + padding - k) / stride through kernel index k, where that is whole and inside.
+    keys (N,) of `samples` grids of extents `shape`; shape, kernel, stride, padding: z, y, x. Output voxels are the
+    cells with an input voxel in their window. Axes are independent: input cell c contributes to output cell
+    (c + padding - k) / stride by kernel index k, where that is a whole number inside the grid.
     """
     depth, height, width = ((n + 2 * p - k) // s + 1 for n, k, s, p in zip(shape, kernel, stride, padding, strict=True))
     out_shape = (depth, height, width)
@@ -234,8 +252,8 @@ def _strided_rules(
 ) -> tuple[Rules, Tensor]:
     depth, height, width = (extent + 2 for extent in out_shape)
     cells = cells_of(keys, shape)
-    reached = cells[:, 0] * (depth * height * width)  # grows to (kz, ky, kx, N): the output's key
-    valid = torch.ones_like(reached, dtype=torch.bool)  # and whether there is one
+    reached = cells[:, 0] * (depth * height * width)  # becomes (kz, ky, kx, N): key of the output voxel
+    valid = torch.ones_like(reached, dtype=torch.bool)  # whether there is such a voxel
     for axis, key_step in zip((2, 1, 0), (1, width, height * width), strict=True):
         shifted = cells[:, axis + 1] + padding[axis]
         place = [(shifted - k).div(stride[axis], rounding_mode="floor") for k in range(kernel[axis])]
@@ -248,7 +266,7 @@ def _strided_rules(
     reached, valid = reached.flatten(), valid.flatten()
     size = samples * depth * height * width
     occupied = torch.zeros(size + 1, dtype=torch.bool, device=keys.device)
-    occupied = occupied.index_fill_(0, torch.where(valid, reached, size), True)[:size]  # the last takes what is invalid
+    occupied = occupied.index_fill_(0, torch.where(valid, reached, size), True)[:size]  # entry `size`: invalid ones
     number = occupied.cumsum(0, dtype=torch.int32)
     per_offset = valid.view(offsets, -1).sum(1)
     *counts, targets = torch.cat((per_offset, number[-1:])).tolist()

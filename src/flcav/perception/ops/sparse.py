@@ -1,8 +1,9 @@
-"""Sparse 3D convolution: gather, one matrix product per kernel offset, sum by target voxel.
+"""Submanifold and strided sparse 3D convolution: gather, one matrix product per kernel offset, sum by output voxel.
 
-On a CPU that is compiled, block by block (`blocks`); elsewhere the sum by target is an `embedding_bag`, which reads
-each product once in target order. Both directions are written out, and only the input features are kept for the
-backward pass.
+On a CPU compiled kernels do it block by block (`blocks`). Elsewhere the sum by output voxel is an `embedding_bag`,
+which reads each product once, in the order of the outputs. The backward pass is written by hand and keeps the input
+features and the weight alone. Convolutions: Graham et al., "3D Semantic Segmentation with Submanifold Sparse
+Convolutional Networks", CVPR 2018.
 """
 
 import math
@@ -21,20 +22,20 @@ from flcav.perception.ops.rulebook import Groups, Rules, Triple, cells_of, strid
 
 @dataclass(frozen=True)
 class SparseTensor:
-    """Features of the occupied cells of `samples` grids."""
+    """Sparse tensor: features of the occupied voxels of a batch of grids."""
 
     features: Tensor  # (N, C)
-    keys: Tensor  # (N,) int64 cell keys (see `rules`), ascending
+    keys: Tensor  # (N,) int64 keys of the cells, ascending; see `flcav.perception.ops.rulebook`
     shape: Triple  # grid extents z, y, x
-    samples: int
-    rules: dict[str, Rules] = field(default_factory=dict)  # submanifold rules of this set of cells, once made
+    samples: int  # grids in the batch, B
+    rules: dict[str, Rules] = field(default_factory=dict)  # cache of the submanifold rulebook of these voxels
 
     def with_features(self, features: Tensor) -> "SparseTensor":
-        """Return the same cells with other features (N, C')."""
+        """Return the same voxels with other features (N, C')."""
         return replace(self, features=features)
 
     def dense(self) -> Tensor:
-        """Return (B, C, D, H, W) with zeros where no voxel is."""
+        """Return the dense tensor (B, C, D, H, W), zero where no voxel is occupied."""
         depth, height, width = self.shape
         sample, z, y, x = cells_of(self.keys, self.shape).unbind(1)
         flat = ((sample * depth + z) * height + y) * width + x
@@ -43,7 +44,7 @@ class SparseTensor:
         return rows.view(self.samples, depth, height, width, -1).permute(0, 4, 1, 2, 3)
 
     def birds_eye(self) -> Tensor:
-        """Return (B, D*C, H, W), the layers stacked as channels, in channels-last memory."""
+        """Return the bird's-eye-view map (B, D*C, H, W), height layers stacked as channels, in channels-last memory."""
         depth, height, width = self.shape
         sample, z, y, x = cells_of(self.keys, self.shape).unbind(1)
         flat = ((sample * height + y) * width + x) * depth + z
@@ -53,10 +54,10 @@ class SparseTensor:
 
 
 def sparse_convolution(features: Tensor, weight: Tensor, rules: Rules) -> Tensor:
-    """Return (targets, C_out): target t gets the sum over its pairs (s, t, k) of features[s] @ weight[k].
+    """Return the sparse convolution (M, C'): row t is the sum of features[s] @ weight[k] over the pairs (s, t, k).
 
-    features: (sources, C_in); weight: (K, C_in, C_out). Differentiable in both. On a CPU in the features' precision,
-    elsewhere in autocast's where that is on.
+    features (N, C), weight (K, C, C'); differentiable in both. Computed in the precision of the features; elsewhere
+    than on a CPU in that of autocast, where autocast is on.
     """
     kind = features.device.type
     if rules.by_target is not None and torch.is_autocast_enabled(kind):
@@ -96,7 +97,7 @@ class _SparseConvolution(torch.autograd.Function):
 
 
 def _pairs(rules: Rules) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-    """Return source and target, and where the pairs of each offset begin; the last entry is where they end."""
+    """Return source (P,), target (P,), and (K + 1,) where the pairs of each offset begin and the last ones end."""
     return rules.source.numpy(), rules.target.numpy(), np.cumsum((0, *rules.counts), dtype=np.int64)
 
 
@@ -120,7 +121,7 @@ def _grouped_gradients(
             products.append(arrived @ weight[k].t())
     if not wants_features:
         return None, grad_weight
-    if rules.by_source is None:  # grouped by the mirrored pairs' targets, which are these pairs' sources
+    if rules.by_source is None:  # submanifold: the mirrored offsets' pairs have these sources as their targets
         return _sum(torch.cat(products[::-1]), cast(Groups, rules.by_target)), grad_weight
     return _sum(torch.cat(products), rules.by_source), grad_weight
 
@@ -132,21 +133,24 @@ def _sum(rows: Tensor, groups: Groups) -> Tensor:
 
 
 class SubmanifoldConv3d(nn.Module):
-    """3x3x3 convolution whose output lives on the input's voxels."""
+    """Submanifold 3x3x3 convolution: the output voxels are the input voxels."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
         self.weight = nn.Parameter(_initial(27, in_channels, out_channels))
 
     def forward(self, x: SparseTensor) -> SparseTensor:
-        """Return the convolution on the same cells; the rules are made once per set of cells."""
+        """Return the convolution on the same voxels; their rulebook is built once and cached."""
         if "submanifold" not in x.rules:
             x.rules["submanifold"] = submanifold_rules(x.keys, x.shape)
         return x.with_features(sparse_convolution(x.features, self.weight, x.rules["submanifold"]))
 
 
 class StridedConv3d(nn.Module):
-    """Convolution onto a coarser grid: an output wherever a window holds an input voxel. Triples are z, y, x."""
+    """Strided sparse convolution onto a coarser grid: an output voxel for every window with an input voxel.
+
+    kernel, stride, padding: along z, y, x.
+    """
 
     def __init__(self, in_channels: int, out_channels: int, kernel: Triple, stride: Triple, padding: Triple) -> None:
         super().__init__()
@@ -154,11 +158,11 @@ class StridedConv3d(nn.Module):
         self.weight = nn.Parameter(_initial(math.prod(kernel), in_channels, out_channels))
 
     def forward(self, x: SparseTensor) -> SparseTensor:
-        """Return the convolution on the coarser grid."""
+        """Return the convolution as a sparse tensor of the coarser grid."""
         rules, keys, shape = strided_rules(x.keys, x.shape, self.kernel, self.stride, self.padding, x.samples)
         return SparseTensor(sparse_convolution(x.features, self.weight, rules), keys, shape, x.samples)
 
 
 def _initial(offsets: int, in_channels: int, out_channels: int) -> Tensor:
-    active = offsets / 3  # about a third of a LiDAR voxel's neighbours are occupied
+    active = offsets / 3  # He initialisation: about a third of the neighbours of a LiDAR voxel are occupied
     return torch.randn(offsets, in_channels, out_channels) * math.sqrt(2 / (in_channels * active))

@@ -1,4 +1,4 @@
-"""Point clouds to voxels: the mean of the points in each cell (the mean VFE of SECOND's published configuration)."""
+"""Voxelisation of point clouds: the mean of the points in each voxel (mean VFE of SECOND's published configuration)."""
 
 from collections.abc import Sequence
 
@@ -9,9 +9,10 @@ from flcav.perception.ops.rulebook import Triple, keys_of
 
 
 def grid_shape(range_m: Sequence[float], voxel_m: Sequence[float]) -> Triple:
-    """Return the extents z, y, x of a range (x, y, z minima, then maxima) cut into voxels (x, y, z sizes) [m].
+    """Return the extents z, y, x of a voxel grid.
 
-    One empty layer is added on top, as the published network does, so that its strides come out even.
+    range_m: minima x, y, z, then maxima [m], LiDAR frame; voxel_m: sizes along x, y, z [m]. One empty layer is added on
+    top, as in the published network, so that its strides divide the height.
     """
     nx, ny, nz = (round((range_m[i + 3] - range_m[i]) / voxel_m[i]) for i in range(3))
     return nz + 1, ny, nx
@@ -20,9 +21,10 @@ def grid_shape(range_m: Sequence[float], voxel_m: Sequence[float]) -> Triple:
 def voxelize(
     points: Tensor, sample: Tensor, range_m: Sequence[float], voxel_m: Sequence[float], shape: Triple
 ) -> tuple[Tensor, Tensor]:
-    """Return (V, C) voxel means and (V,) ascending keys of points (N, C), x, y, z first [m], of samples (N,).
+    """Return the mean features (V, C) and the ascending keys (V,) of the occupied voxels of a batch of point clouds.
 
-    Points outside `range_m` are left out.
+    points (N, C), x, y, z first [m]; sample (N,) number of each point's cloud; range_m, voxel_m and shape: see
+    `grid_shape`. Points outside the range are left out.
     """
     low, size = points.new_tensor(range_m[:3]), points.new_tensor(voxel_m)
     cell = torch.floor((points[:, :3] - low) / size)

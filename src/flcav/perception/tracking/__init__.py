@@ -1,4 +1,4 @@
-"""Detections over time: tracks with velocities."""
+"""Multi-object tracking of detections: tracks with velocities, and their evaluation."""
 
 from flcav.perception.tracking.evaluate import evaluate_tracks
 from flcav.perception.tracking.tracker import Tracked, Tracker

@@ -1,4 +1,4 @@
-"""Tracks of a detector against the recorded ones."""
+"""Evaluation of multi-object tracking on recorded sequences: MOTA, AMOTA, identity switches, velocity error."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -23,34 +23,34 @@ from flcav.records import Class
 from flcav.sensors.frame import Frame
 
 LONGEST_GAP_S = 1.0  # between two frames of a sequence
-SCORE = 0.3  # lowest of a detection that is followed
+SCORE = 0.3  # lowest score of a detection that is tracked
 
 
 @dataclass(frozen=True)
 class TrackScore:
-    """How well the objects of one class were followed; numbers are None where there were none."""
+    """Tracking metrics of one class; None where there are no objects, pairs or velocities to compute one from."""
 
     label: Class
-    objects: int
+    objects: int  # to be tracked, summed over frames
     mota: float | None
     amota: float | None
-    motp_m: float | None
+    motp_m: float | None  # mean distance of an object from its track [m]
     misses: int
     false_positives: int
     id_switches: int
-    velocity_error_mps: float | None
+    velocity_error_mps: float | None  # mean over tracks within 1 m of an object, in the plane [m/s]
 
 
 @dataclass(frozen=True)
 class TracksEvaluation(Result):
-    """How well objects were followed through sequences of frames."""
+    """Evaluation of tracking on sequences of frames."""
 
-    sequences: int
+    sequences: int  # one per scene and agent
     frames: int
-    scores: tuple[TrackScore, ...]
+    scores: tuple[TrackScore, ...]  # one per class
 
     def lines(self) -> list[str]:
-        """Return a line per class."""
+        """Return the evaluation in words: frames and sequences, then a line per class."""
         lines = [f"tracks in {self.frames} frames of {self.sequences} sequences"]
         for row in self.scores:
             if row.mota is None:
@@ -70,12 +70,12 @@ def evaluate_tracks(
     asked: SecondConfig | None = None,
     progress: Report = silent,
 ) -> TracksEvaluation:
-    """Return MOTA, AMOTA, switches of identity and errors of velocity per class.
+    """Return MOTA, AMOTA, identity switches and velocity error per class.
 
-    A sequence is the frames (None: all) of one agent in one scene. Objects to follow are those that detection asks for,
+    A sequence is the frames (None: all) of one agent in one scene. Objects to be tracked are the targets of detection,
     by the network's configuration or by `asked`, one of smaller range.
 
-    Raises `InputError` where frames are further apart than a tracker can bridge.
+    Raises `InputError` where consecutive frames of a sequence are more than `LONGEST_GAP_S` apart.
     """
     numbers, config = sequences(data, frames), asked or network.config
     total = sum(map(len, numbers.values()))
@@ -117,9 +117,9 @@ def evaluate_tracks(
 
 
 def sequences(data: Dataset, frames: Sequence[int] | None = None) -> dict[tuple[str, str], list[int]]:
-    """Return the frames (None: all) by scene and agent, in time order.
+    """Return the numbers of the frames (None: all) by (scene, agent), in time order.
 
-    Raises `InputError` where they are too far apart.
+    Raises `InputError` where consecutive frames of a sequence are more than `LONGEST_GAP_S` apart.
     """
     found: dict[tuple[str, str], list[int]] = defaultdict(list)
     for number in sorted(data.numbers(frames), key=lambda i: data.keys[i].time_s):
@@ -133,7 +133,7 @@ def sequences(data: Dataset, frames: Sequence[int] | None = None) -> dict[tuple[
 
 
 def _final_scores(story: Sequence[Tracked]) -> dict[int, float]:
-    """Return each track's score at its end."""
+    """Return the score of each track in the last frame it is reported in, by its number."""
     final: dict[int, float] = {}
     for tracked in story:
         score = tracked.boxes.score if tracked.boxes.score is not None else np.ones(len(tracked.boxes))
@@ -144,7 +144,11 @@ def _final_scores(story: Sequence[Tracked]) -> dict[int, float]:
 def _moment(
     frame: Frame, tracked: Tracked, final: Mapping[int, float], config: SecondConfig, name: str
 ) -> tuple[Moment, list[float]]:
-    """Return one class's moment, and by how much the velocity of each pair of an object and its track differ [m/s]."""
+    """Return ground truth and tracks of class `name` in a frame, and velocity errors [m/s].
+
+    There is one error for each track within 1 m of an object: that of the velocity in the plane, against the nearest
+    object.
+    """
     truth, annotations = ground_truth(frame, config), frame.annotations
     of_class = truth.boxes.label == name
     wanted = of_class & truth.target

@@ -1,4 +1,15 @@
-"""Multi-object tracking: a Kalman filter per object, and assignment by likelihood."""
+"""Multi-object tracking (AB3DMOT): a Kalman filter per object, and Hungarian assignment by likelihood.
+
+The state is x, y, z, length, width, height, yaw, then the velocity along x and y: that of Weng et al., "3D Multi-Object
+Tracking: A Baseline and New Evaluation Metrics", IROS 2020, sec. III-B, without a vertical velocity. The motion model
+is constant velocity in the plane; height, size and yaw are random walks. The process noise is that of white
+acceleration, so that the time between frames may vary (Bar-Shalom et al., "Estimation with Applications to Tracking and
+Navigation", 2001, eq. 6.3.2-4).
+
+The cost of a pair of a track and a detection is the negative log-likelihood of the detection under the prediction, and
+pairs outside a gate are excluded (Chiu et al., "Probabilistic 3D Multi-Object Tracking for Autonomous Driving", 2020),
+so that the variances a detector predicts count.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,29 +22,29 @@ from flcav.geometry import Boxes, wrap_angle
 
 Array = NDArray[np.float64]
 
-MEASURED, STATES = 7, 9
-YAW = 6
-ACCELERATION = 3.0  # standard deviation [m/s^2]
-DRIFT = np.array((0, 0, 0.2, 0.05, 0.05, 0.05, 0.3))  # of z, size and yaw [per root second]
-FIRST_SPEED = 8.0  # standard deviation of a velocity of which nothing is known [m/s]
-LEAST_VARIANCE = np.array((0.1, 0.1, 0.1, 0.2, 0.1, 0.1, 0.15)) ** 2  # of a detection's x, y, z, size, yaw
+MEASURED, STATES = 7, 9  # lengths of a measurement and of a state
+YAW = 6  # index in both
+ACCELERATION = 3.0  # standard deviation of the white acceleration [m/s^2]
+DRIFT = np.array((0, 0, 0.2, 0.05, 0.05, 0.05, 0.3))  # of the random walks of z, size [m/sqrt(s)] and yaw [rad/sqrt(s)]
+FIRST_SPEED = 8.0  # standard deviation of the velocity of a new track [m/s]
+LEAST_VARIANCE = np.array((0.1, 0.1, 0.1, 0.2, 0.1, 0.1, 0.15)) ** 2  # of a detection: x, y, z, size [m^2], yaw [rad^2]
 
 
 class State(NamedTuple):
-    """What is known of one object."""
+    """Gaussian state estimate of one object: x, y, z, length, width, height [m], yaw [rad], velocity x, y [m/s]."""
 
     mean: Array  # (9,)
     covariance: Array  # (9, 9)
 
 
 def first_state(box: Array, variance: Array) -> State:
-    """Return the state of an object seen once, as box (7,) with `variance` (7,); nothing is known of its velocity."""
+    """Return the state of a new track from its first detection: box (7,) with `variance` (7,), mean velocity zero."""
     spread = np.concatenate((np.maximum(variance, LEAST_VARIANCE), np.full(2, FIRST_SPEED**2)))
     return State(np.concatenate((box, np.zeros(2))), np.diag(spread))
 
 
 def predicted(state: State, after_s: float) -> State:
-    """Return the state `after_s` later."""
+    """Return the Kalman prediction of the state `after_s` [s] later, at constant velocity."""
     step = np.eye(STATES)
     step[0, 7] = step[1, 8] = after_s
     noise = np.zeros((STATES, STATES))
@@ -48,9 +59,10 @@ def predicted(state: State, after_s: float) -> State:
 
 
 def innovation(state: State, box: Array, variance: Array) -> tuple[Array, Array]:
-    """Return how far box (7,) is from what `state` expects (7,), and the covariance of that (7, 7).
+    """Return the innovation (7,) of box (7,) with `variance` (7,), and its covariance (7, 7).
 
-    A heading that is opposite to the expected one is taken for a mistake of the detector and turned.
+    The innovation is detection less prediction. A heading more than 90 degrees off the predicted one is taken for
+    reversed by the detector, and turned by 180 degrees.
     """
     off = box - state.mean[:MEASURED]
     turn = float(wrap_angle(off[YAW]))
@@ -59,7 +71,7 @@ def innovation(state: State, box: Array, variance: Array) -> tuple[Array, Array]
 
 
 def updated(state: State, box: Array, variance: Array) -> State:
-    """Return the state after it was seen as box (7,) with `variance` (7,)."""
+    """Return the Kalman update of the state by the detection box (7,) with `variance` (7,)."""
     off, spread = innovation(state, box, variance)
     gain = np.linalg.solve(spread, state.covariance[:MEASURED]).T
     mean = state.mean + gain @ off
@@ -67,21 +79,21 @@ def updated(state: State, box: Array, variance: Array) -> State:
     rest = np.eye(STATES)
     rest[:, :MEASURED] -= gain
     noise = np.diag(np.maximum(variance, LEAST_VARIANCE))
-    return State(mean, rest @ state.covariance @ rest.T + gain @ noise @ gain.T)  # Joseph's form: stays symmetric
+    return State(mean, rest @ state.covariance @ rest.T + gain @ noise @ gain.T)  # Joseph form: stays symmetric
 
 
-GATE = 9.21  # squared Mahalanobis distance in x, y that 99 % of true pairs stay below
-FASTEST = 40.0  # [m/s] no pair is further apart than this allows
+GATE = 9.21  # largest squared Mahalanobis distance in x, y of a pair: 99 % quantile of chi-squared with 2 dof
+FASTEST = 40.0  # [m/s] a pair is at most this speed times the elapsed time, plus `SLACK_M`, apart
 SLACK_M = 2.0
-UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of detections that come without
+UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of detections without a predicted one
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """The objects of one moment."""
+    """The N tracks seen in one frame."""
 
-    boxes: Boxes  # world frame; score: the mean of the track's detections so far; variance: the filter's
-    track: NDArray[np.int64]  # (N,) each object's number, the same as long as it is followed
+    boxes: Boxes  # world frame; score: mean over the track's detections so far; variance: of the Kalman filter
+    track: NDArray[np.int64]  # (N,) number of each track, constant over its life
     velocity: Array  # (N, 2) along x and y of the world [m/s]
 
 
@@ -90,15 +102,15 @@ class _Track:
     number: int
     label: str
     state: State
-    scores: list[float]
-    missed: int = 0  # frames since it was last seen
+    scores: list[float]  # of its detections
+    missed: int = 0  # frames since its last detection
 
 
 class Tracker:
-    """Follows objects of all classes through one sequence of frames.
+    """Multi-object tracker of all classes through one sequence of frames.
 
-    A track is told of from its `confirm`-th detection on, whenever it is seen, and ends after `patience` frames in
-    which it was not.
+    A track is reported in each frame with a detection of it, from its `confirm`-th detection on; in the first frame
+    every track is. It ends when it has had no detection for more than `patience` frames in a row.
     """
 
     def __init__(self, *, confirm: int = 2, patience: int = 3) -> None:
@@ -108,7 +120,11 @@ class Tracker:
         self._time_s: float | None = None
 
     def step(self, detections: Boxes, time_s: float) -> Tracked:
-        """Return the objects followed after `detections` (world frame) at `time_s`, which must not run backwards."""
+        """Return the tracks seen at `time_s`: predict, assign `detections` (world frame), update, begin and end tracks.
+
+        Detections without scores count as of score 1, those without variances as of `UNKNOWN_VARIANCE`. Raises
+        ValueError where `time_s` is before that of the last step.
+        """
         after_s = 0.0 if self._time_s is None else time_s - self._time_s
         if after_s < 0:
             raise ValueError(f"frames must come in time order: {time_s} s after {self._time_s} s")
@@ -153,7 +169,11 @@ class Tracker:
 
 
 def assigned(states: list[State], boxes: Array, variance: Array, after_s: float) -> list[tuple[int, int]]:
-    """Return pairs (state, box) of least total cost, among those that the gate lets through; variance (D, 7)."""
+    """Return the pairs (index of a state, index of a box) of least total cost: the Hungarian method within the gate.
+
+    The cost is twice the negative log-likelihood of the detection's x, y under the prediction, up to a constant.
+    boxes (D, 7), variance (D, 7), after_s: time since the last step [s].
+    """
     if not len(boxes) or not states:
         return []
     cost = np.full((len(states), len(boxes)), np.inf)
