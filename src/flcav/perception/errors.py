@@ -1,4 +1,4 @@
-"""The error registry: a network's mistakes with their positions in a town, each registered once per scene.
+"""The error registry: a network's mistakes with their positions in a town, each registered once.
 
 Sensors are placed by it. The `errors.py` of each task defines what a mistake is; this module holds the records, removes
 duplicates, and reads and writes files.

@@ -25,8 +25,8 @@ ANCHORS_PX: tuple[Level, Level, Level] = (
 class SignsConfig:
     """Configuration of a sign detector, which takes images of any size; lengths are in pixels of the image."""
 
-    width: Annotated[float, Field(gt=0, le=4)]  # factor of the numbers of channels `flcav.perception.signs.model.CHANNELS`
-    depth: Annotated[float, Field(gt=0, le=4)]  # factor of the numbers of bottlenecks
+    width: Annotated[float, Field(gt=0, le=4)]  # factor of the numbers of channels, see `signs.model.CHANNELS`
+    depth: Annotated[float, Field(gt=0, le=4)]  # factor of the numbers of bottlenecks, see `signs.model.DEPTHS`
     classes: Annotated[tuple[str, ...], Field(min_length=1)] = SIGNS  # in the order of the scores
     anchors_px: tuple[Level, Level, Level] = ANCHORS_PX  # width, height of the anchors at each of STRIDES
     window_px: tuple[Window, Window] = (320, 192)  # width, height of a training sample
