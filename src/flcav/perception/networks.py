@@ -184,7 +184,7 @@ def register_errors(
     device: str = "auto",
     progress: Report = silent,
 ) -> Registry:
-    """Return the mistakes of a network on recorded frames with their positions in the town, each once per scene.
+    """Return the mistakes of a network on recorded frames with their positions in the town, each once.
 
     Detections that score below `threshold` are ignored (None: the task's default). Raises `InputError` for a task whose
     mistakes have no position, and if data, weights, device or agents are unusable.
