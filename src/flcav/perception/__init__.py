@@ -1,4 +1,4 @@
-"""Tasks, their networks, metrics and errors."""
+"""Perception tasks: training, evaluation and inference of their networks, metrics, and the error registry."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Whose frames of a dataset a network learns from, is tested on, or looks at: vehicles', poles', or some by name."""
+"""Selection of a dataset's frames by agent: all, vehicles, poles (roadside units), or agents by name."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -9,17 +9,17 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.perception.task import RigBound, Task
 
-POLE = "pole"  # begins the names of roadside agents; all others are vehicles
+POLE = "pole"  # prefix of the names of roadside agents; all other agents are vehicles
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """Frames of a dataset, and what is left out."""
+    """The selected frames of a dataset, and counts of the selected and of the other frames."""
 
-    frames: tuple[int, ...]  # numbers, in order
-    agents: tuple[str, ...]  # whose they are, in the dataset's order
-    used: Mapping[str, int]  # kind of agent, vehicle or pole -> frames
-    left_out: Mapping[str, int]
+    frames: tuple[int, ...]  # frame numbers
+    agents: tuple[str, ...]  # names of their agents, in the order of the frames
+    used: Mapping[str, int]  # kind of agent, vehicle or pole -> number of selected frames
+    left_out: Mapping[str, int]  # the same of the frames that are not selected
 
     @property
     def sentence(self) -> str:
@@ -28,15 +28,16 @@ class Chosen:
         return _frames(self.used) + left
 
     def summary(self) -> dict[str, Any]:
-        """Return agents and counts as JSON knows them."""
+        """Return the agents and the counts of selected frames as JSON values."""
         return {"agents": list(self.agents), "used": dict(self.used), "left_out": dict(self.left_out)}
 
 
 def choose_frames(task: Task, config: Any, data: Dataset, wanted: str | None = None) -> Chosen:
-    """Return the frames of the agents `wanted`: "all", "vehicles", "poles" or names, with commas between several.
+    """Select the frames of the agents `wanted`: "all", "vehicles", "poles" or names, separated by commas.
 
-    None stands for the frames whose sensors stand as a network of `config` expects them, all where the task does not
-    mind. Raises `InputError` for an agent that the dataset lacks, and where no frame is left.
+    None selects the frames whose sensors are mounted as a network of `config` expects them (`RigBound.fitting`), and
+    all frames if the task is not bound to a rig. Raises `InputError` for an agent that the dataset lacks, and what
+    `RigBound.fitting` raises.
     """
     if wanted is not None:
         frames = data.select(agents=_agents(data, wanted))
@@ -48,7 +49,7 @@ def choose_frames(task: Task, config: Any, data: Dataset, wanted: str | None = N
 
 
 def kind_of(agent: str) -> str:
-    """Return "vehicle" or "pole"."""
+    """Return the kind of an agent by its name: "vehicle" or "pole"."""
     return POLE if agent.startswith(POLE) else "vehicle"
 
 

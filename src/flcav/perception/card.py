@@ -1,4 +1,4 @@
-"""What one should know of a network before using it: a model card, after Mitchell et al. (FAT* 2019)."""
+"""Model cards: how a network was trained and evaluated (Mitchell et al., "Model Cards for Model Reporting", 2019)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from flcav.perception.agents import Chosen
 from flcav.records import LEFT_OUT, Record
 from flcav.sensors.rig import RIGS
 
-CARD_KEY = "flcav.card"  # metadata entry of a file of weights
+CARD_KEY = "flcav.card"  # key of the card in the metadata of a safetensors file
 LICENCE = "Apache-2.0"
 RECIPE_FIELDS = (
     "town",
@@ -35,49 +35,49 @@ RIG_FIELDS = ("vehicle_rig", "pole_rig")
 
 @dataclass(frozen=True)
 class Learning(Record):
-    """How a training went."""
+    """Steps, final loss and validation scores of a training."""
 
     steps: int
-    loss: float  # mean of the last epoch
-    scores: tuple[float, ...] = ()  # on the validation data, after each epoch
+    loss: float  # mean over the last epoch
+    scores: tuple[float, ...] = ()  # on the validation data, after each epoch; empty without validation
 
 
 @dataclass(frozen=True, kw_only=True)
 class DataEntry:
-    """What of a dataset was used."""
+    """Provenance of one dataset: name, frames and agents used, hash of the manifest, recipe."""
 
-    name: str
-    frames: int
-    agents: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose; None in older cards
-    manifest: str  # its SHA-256
-    recipe: Mapping[str, Json]  # what makes two datasets differ most, and the rigs that have a name
+    name: str  # the last two parts of the folder's path
+    frames: int  # number of frames used
+    agents: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose frames; None in older cards
+    manifest: str  # SHA-256 of the manifest
+    recipe: Mapping[str, Json]  # `RECIPE_FIELDS` of the recording's recipe, and the rigs that have a name
 
 
 class Card(Config):
-    """How a file of weights came about; kept in its metadata as JSON and beside it as text."""
+    """Model card of a file of weights, stored as JSON in the file's metadata and as Markdown beside the file."""
 
     task: str
     network: str  # name of the configuration
     parameters: int
     seed: int
     samples: int
-    training: Mapping[str, Json]  # settings, and what `Learning` says
-    data: tuple[DataEntry, ...]  # one per dataset
-    validation: DataEntry | None = None  # of the dataset that `metrics` are of
-    metrics: Mapping[str, Json]  # evaluation on the validation data; empty where there were none
+    training: Mapping[str, Json]  # settings such as epochs and batch, and the fields of `Learning`
+    data: tuple[DataEntry, ...]  # training data, one entry per dataset
+    validation: DataEntry | None = None  # validation data; None without
+    metrics: Mapping[str, Json]  # evaluation on the validation data; empty without
     licence: str = LICENCE
     flcav: str = version("flcav")
-    torch: str | None = None  # its version; this and the next are None in older cards
-    threads: int | None = None  # that a process computed on
-    processor: str | None = None  # kind of, see `flcav.perception.device`
+    torch: str | None = None  # version of torch; this and the next two are None in older cards
+    threads: int | None = None  # CPU threads of the training process
+    processor: str | None = None  # kind of processor, see `flcav.perception.device.processor_of`
 
     @property
     def learning(self) -> Learning:
-        """Return how the training went."""
+        """Return the record of the training; raises `InputError` if `training` lacks its fields."""
         return Learning.of_json(self.training, f"card of {self.task}, {self.network}")
 
     def markdown(self) -> str:
-        """Return the card as a page of text; its numbers are rounded, the file of weights has them whole."""
+        """Return the card as Markdown, numbers rounded to 4 decimals; the metadata keeps all digits."""
         facts = {name: value for name in FACTS if (value := getattr(self, name)) is not None}
         held = [] if self.validation is None else [bullets([_entry(self.validation)])]
         blocks = [
@@ -96,7 +96,7 @@ class Card(Config):
 
 
 def data_entry(data: Dataset, chosen: Chosen) -> DataEntry:
-    """Return what of a dataset was used."""
+    """Return the card's entry of a dataset and the frames selected from it."""
     recipe = data.manifest.recipe
     rigs = {name: _rig_name(recipe[name]) for name in RIG_FIELDS if name in recipe}
     return DataEntry(
@@ -125,7 +125,7 @@ def _entry(entry: DataEntry) -> str:
 
 
 def _blocks(values: Mapping[str, Any]) -> list[str]:
-    """Return a list of what fits a line each, and a table below its name of what does not."""
+    """Return Markdown blocks: one list of the values that fit on a line, then a titled table of each other value."""
     tables = {name: _table(value, values.get("classes")) for name, value in values.items()}
     plain = [f"{name}: {_text(value)}" for name, value in values.items() if tables[name] is None]
     named = [f"### {name}\n\n{text}" for name, text in tables.items() if text is not None]
@@ -133,7 +133,7 @@ def _blocks(values: Mapping[str, Any]) -> list[str]:
 
 
 def _table(value: Any, classes: Any) -> str | None:
-    """Return the table of a list or a mapping of records, or of a square over the classes; None of anything else."""
+    """Return a Markdown table of a list or mapping of records, or of a confusion matrix; None for any other value."""
     rows = value
     if isinstance(value, Mapping):
         rows = [{"": name} | dict(row) for name, row in value.items() if isinstance(row, Mapping)]
@@ -148,7 +148,7 @@ def _table(value: Any, classes: Any) -> str | None:
 
 
 def _text(value: Any) -> str:
-    """Return a value on one line; what is nested is in brackets, and left out where it is empty."""
+    """Return a value on one line: nested values in brackets, empty ones left out."""
     if isinstance(value, float):
         return f"{round(value, 4):g}"
     if isinstance(value, Mapping):

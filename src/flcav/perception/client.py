@@ -1,4 +1,4 @@
-"""A task as the client of a federation: what a sample costs to send, and local training."""
+"""Client of a federated task: recording settings, sources of labels, bytes of a sample, and local training."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,66 +13,73 @@ from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 from flcav.perception.training import train_steps
 from flcav.perception.weights import from_arrays, to_arrays
 
-ANNOTATED = "annotated"
+ANNOTATED = "annotated"  # kind of labels: the ground truth of the recording
 
 
 @runtime_checkable
 class Shared(Protocol):
-    """A task that vehicles train together."""
+    """A task with its own settings for federated training: recording, kinds of labels, bytes of a sample."""
 
     @property
     def recording(self) -> Mapping[str, Any]:
-        """Return the fields of a recording's recipe in which the task differs from its defaults."""
+        """Return the fields of the recording's recipe that differ from the recipe's defaults."""
         ...
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return the kinds of labels that vehicles can learn from, the default first: see `flcav.pipeline.labels`."""
+        """Return the kinds of labels that clients can train on, the default first: see `flcav.pipeline.labels`."""
         ...
 
     def sample_bytes(self, data: Dataset, config: Any, frames: Sequence[int]) -> list[int]:
-        """Return the bytes of each frame as a labelled sample that a vehicle uploads."""
+        """Return the uplink size [B] of each frame as a labelled sample."""
         ...
 
 
 class WholeFrames:
-    """A task of which no more is known: whole frames are uploaded, with the labels that they were recorded with."""
+    """Default settings of a task without its own: whole frames are uploaded, labelled with their ground truth."""
 
     recording: Mapping[str, Any] = {}
     labels = (ANNOTATED,)
 
     def sample_bytes(self, data: Dataset, config: Any, frames: Sequence[int]) -> list[int]:
-        """Return the bytes of point clouds, pictures and annotations."""
+        """Return the size [B] of each frame's point clouds, images and annotations."""
         return [data.payload_bytes(i) + picture_bytes(data, i) for i in frames]
 
 
 def shared(task: Task) -> Shared:
-    """Return how vehicles share the task."""
+    """Return the task's settings for federated training: its own, or `WholeFrames`."""
     return task if isinstance(task, Shared) else WholeFrames()
 
 
 def picture_bytes(data: Dataset, i: int) -> int:
-    """Return the bytes of a frame's pictures as they are recorded (PNG)."""
+    """Return the size [B] of a frame's images as recorded (PNG)."""
     return sum(data.plane_path(i, camera, "rgb").stat().st_size for camera in data.cameras(i))
 
 
 def camera_ahead(width: int, height: int, fov_deg: float) -> Mapping[str, Any]:
-    """Return a rig of one camera that looks ahead from behind the windscreen, as a recipe has it."""
+    """Return a rig of one forward-looking camera behind the windscreen, as the fields of a recipe.
+
+    `width` and `height` are in pixels, `fov_deg` is the horizontal field of view.
+    """
     mount, settings = {"x": 0.5, "z": 1.5}, {"width": width, "height": height, "fov_deg": fov_deg}
     return {"cameras": {"camera": {"mount": mount, "settings": settings}}}
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What local training produced."""
+    """Result of local training."""
 
-    weights: dict[str, NDArray[np.number]]
-    samples: int  # distinct samples trained on
-    loss: float  # mean over the steps
+    weights: dict[str, NDArray[np.number]]  # by name of parameter or buffer
+    samples: int  # number of distinct samples trained on
+    loss: float  # mean over the steps; 0 without steps
 
 
 class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
-    """A vehicle's copy of a task's network; shaped as federation's `Trainable`, which this layer does not import."""
+    """A federated client: local training of a task's network on the client's own samples.
+
+    It satisfies the protocol `Trainable` of `flcav.federation`, which this layer does not import. Raises `InputError`
+    without samples.
+    """
 
     def __init__(
         self,
@@ -90,7 +97,10 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
     def train(
         self, weights: Mapping[str, NDArray[np.number]], *, steps: int, learning_rate: float, seed: int
     ) -> Trained:
-        """Return the weights after `steps` local steps from `weights`; the same arguments give the same result."""
+        """Train for `steps` steps from `weights` at a constant learning rate; deterministic in its arguments.
+
+        Raises `InputError` if `weights` do not fit the network.
+        """
         network = self.task.build(self.config)
         from_arrays(network, weights)
         loss = train_steps(

@@ -1,4 +1,4 @@
-"""The device that networks run on, and the precision of their arithmetic there."""
+"""Choice of the compute device, and bfloat16 autocast where the hardware supports it."""
 
 import platform
 from contextlib import AbstractContextManager, nullcontext
@@ -11,10 +11,10 @@ CPU = torch.device("cpu")
 
 
 def device_named(name: str) -> torch.device:
-    """Return the device `name`, cpu or cuda; "auto" is the GPU where there is one.
+    """Return the torch device "cpu" or "cuda"; "auto" is the GPU if torch can use one, otherwise the CPU.
 
-    On a GPU its library is told to use algorithms that give the same result each time. Raises `InputError` for another
-    name, and for cuda where torch has no GPU to use.
+    For a GPU, cuDNN is set to deterministic algorithms. Raises `InputError` for another name, and for "cuda" if torch
+    can use no GPU.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise InputError(f"device '{name}': choose one of auto, cpu, cuda")
@@ -27,7 +27,10 @@ def device_named(name: str) -> torch.device:
 
 
 def processor_of(device: torch.device) -> str:
-    """Return the kind of processor, as far as the last bits of a training depend on it: "x86_64 AVX512 bfloat16"."""
+    """Return the kind of processor, such as "x86_64 AVX512 bfloat16", or the name of the GPU.
+
+    Results of a training are bitwise reproducible on one kind of processor only.
+    """
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     kind = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
@@ -35,9 +38,9 @@ def processor_of(device: torch.device) -> str:
 
 
 def bfloat16(device: torch.device, wanted: bool) -> AbstractContextManager[object]:
-    """Return a context whose convolutions and matrix products are in bfloat16 where `wanted` and in the hardware.
+    """Return a context of bfloat16 autocast, if `wanted` and if the hardware supports it.
 
-    Elsewhere it changes nothing.
+    Otherwise the context changes nothing.
     """
     if wanted and multiplies_bfloat16(device):
         return torch.autocast(device.type, torch.bfloat16)
@@ -45,7 +48,7 @@ def bfloat16(device: torch.device, wanted: bool) -> AbstractContextManager[objec
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:
-    """Return whether the device has instructions for products of bfloat16, which halve the time of a convolution."""
+    """Return whether the device has instructions for bfloat16 products, which halve the time of a convolution."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()

@@ -1,6 +1,7 @@
-"""The error registry: where a network was wrong in a town, each mistake once: sensors are placed by it.
+"""The error registry: a network's mistakes with their positions in a town, each registered once.
 
-What a mistake is, each task says in its own `errors.py`; here is how they are kept and handed on.
+Sensors are placed by it. The `errors.py` of each task defines what a mistake is; this module holds the records, removes
+duplicates, and reads and writes files.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,36 +23,36 @@ if TYPE_CHECKING:
 
     from flcav.perception.agents import Chosen
 
-SAME_PLACE_M = 2.0  # false positives of one scene within this of one another are one
+SAME_PLACE_M = 2.0  # false positives of one scene this near to one another are duplicates
 
-THRESHOLD = 0.3  # lowest score of a detection, unless one is told otherwise
+THRESHOLD = 0.3  # default score threshold of a detection
 MISS, FALSE_POSITIVE, FINAL_ERROR = "miss", "false_positive", "final_error"
-CLASS = "class"  # the column of `PerceptionError.label`
+CLASS = "class"  # name of the column of `PerceptionError.label` in files
 
 
 @dataclass(frozen=True)
 class PerceptionError:
-    """One registered mistake."""
+    """One registered mistake: a missed object, a false positive, or a forecast with a large final error."""
 
     x: float  # world [m]; of an object its geometric centre
     y: float
     z: float
-    weight: float  # what covering it is worth
+    weight: float  # gain of covering it with a sensor
     kind: str  # miss | false_positive | final_error
-    label: str  # class of what was missed or invented
-    returns: int  # LiDAR returns in it; 0 where no LiDAR is asked
-    occlusion: float  # of a missed object, [0, 1]; NaN where it is not known
+    label: str  # class of the missed object, or of the false positive
+    returns: int  # LiDAR returns inside the object; 0 for tasks without LiDAR
+    occlusion: float  # of a missed object, in [0, 1]; NaN if unknown
     scene: str
-    track: str  # the object's; false positives are numbered per scene
+    track: str  # track of the object; false positives are numbered per scene
 
 
 @dataclass(frozen=True)
 class Registry:
-    """All mistakes of a network on a dataset."""
+    """All registered mistakes of a network on a dataset."""
 
     errors: tuple[PerceptionError, ...]
-    dropped: int = 0  # false positives that point at no place of the town
-    chosen: "Chosen | None" = None  # whose frames, where that is known
+    dropped: int = 0  # number of false positives without a position in the town
+    chosen: "Chosen | None" = None  # the frames that were tested, if known
 
     def __len__(self) -> int:
         return len(self.errors)
@@ -61,23 +62,23 @@ class Registry:
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Return where the mistakes are, (N, 3) world [m]."""
+        """Return the positions of the mistakes, (N, 3) x, y, z in the world [m]."""
         return np.array([(error.x, error.y, error.z) for error in self.errors]).reshape(-1, 3)
 
     @property
     def weights(self) -> NDArray[np.float64]:
-        """Return what covering each is worth, (N,)."""
+        """Return the gain of covering each mistake, (N,)."""
         return np.array([error.weight for error in self.errors], np.float64)
 
     @property
     def kinds(self) -> NDArray[np.str_]:
-        """Return the kind of each, (N,): miss, false_positive or final_error."""
+        """Return the kind of each mistake, (N,): miss, false_positive or final_error."""
         return np.array([error.kind for error in self.errors], np.str_)
 
 
 @runtime_checkable
 class RegistersErrors(Protocol):
-    """A task whose mistakes have a place in the town."""
+    """A task whose mistakes have a position in the town."""
 
     def register_errors(
         self,
@@ -87,17 +88,18 @@ class RegistersErrors(Protocol):
         threshold: float,
         progress: Report = silent,
     ) -> Registry:
-        """Return what `network` misses and invents in the frames; detections below `threshold` are none.
+        """Return the mistakes of `network` in the frames (None: all); detections scoring below `threshold` are ignored.
 
-        Raises `InputError` where the dataset lacks what that takes.
+        Raises `InputError` if the dataset lacks the ground truth, the town or the sensors for that.
         """
         ...
 
 
 def keep_first(errors: Iterable[PerceptionError]) -> tuple[PerceptionError, ...]:
-    """Return each mistake where and as it was first made, false positives numbered per scene.
+    """Return the mistakes without duplicates: the first of each group, in order, false positives numbered per scene.
 
-    A missed object is one mistake per track and scene; so are false positives of a class within `SAME_PLACE_M`.
+    Duplicates are mistakes of the same track and scene, and false positives of one scene, of whatever class, within
+    `SAME_PLACE_M` of one that is kept.
     """
     kept: dict[tuple[str, str], PerceptionError] = {}
     for error in errors:
@@ -112,9 +114,9 @@ def keep_first(errors: Iterable[PerceptionError]) -> tuple[PerceptionError, ...]
 
 
 def save_errors(errors: Sequence[PerceptionError], path: Path) -> None:
-    """Write the registry as Parquet or CSV, by the ending of `path`; raises `InputError` for another one.
+    """Write mistakes as Parquet or CSV, by the suffix of `path`; raises `InputError` for any other suffix.
 
-    A column per field of `PerceptionError`, its `label` called "class": what `flcav place` reads.
+    The table has a column per field of `PerceptionError`, `label` under the name "class"; `flcav place` reads it.
     """
     kinds = {float: pa.float64(), int: pa.int64(), str: pa.string()}
     schema = pa.schema([(name, kinds[kind]) for name, kind in PerceptionError.__annotations__.items()])
@@ -124,7 +126,7 @@ def save_errors(errors: Sequence[PerceptionError], path: Path) -> None:
 
 
 def load_errors(path: Path) -> tuple[PerceptionError, ...]:
-    """Return the registry that `save_errors` wrote as Parquet."""
+    """Return the mistakes in a Parquet file that `save_errors` wrote."""
     rows = pq.read_table(path).to_pylist()
     return tuple(PerceptionError(**{("label" if name == CLASS else name): row[name] for name in row}) for row in rows)
 

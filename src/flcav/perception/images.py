@@ -1,4 +1,8 @@
-"""Camera images of datasets and folders, and the view of a camera beside a LiDAR."""
+"""Camera images: read from datasets and folders, checked, resized; and projection of points into them.
+
+A `CameraView` is the image of a camera beside a LiDAR, with the calibration that projects points of the LiDAR's sweep
+and corners of boxes into it.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,15 +23,13 @@ from flcav.sensors.frame import Frame
 Picture = NDArray[np.uint8]  # (H, W, 3) sRGB
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
-SMALLEST_PX, LARGEST_PX = 32, 8192  # side of a picture
+SMALLEST_PX, LARGEST_PX = 32, 8192  # bounds of an image's width and height
 
 
 def pictures(path: Path, frames: Sequence[int] | None = None) -> Iterator[tuple[Path, Picture]]:
-    """Yield the pictures of a PNG, JPEG or WebP file, a folder of them, or `frames` of a dataset folder (None: all).
+    """Yield path and image of a PNG, JPEG or WebP file, a folder of such files, or `frames` of a dataset (None: all).
 
-    Each comes with its own path.
-
-    Raises `InputError` for anything else, and for a picture that is damaged, not RGB or of a size out of bounds.
+    Raises `InputError` for any other path, and for an image that is damaged, not RGB or of a size out of bounds.
     """
     if (path / MANIFEST).is_file():
         data = Dataset.open(path)
@@ -43,7 +45,10 @@ def pictures(path: Path, frames: Sequence[int] | None = None) -> Iterator[tuple[
 
 
 def recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterator[tuple[Frame, str, Picture]]:
-    """Yield the pictures in frames of a dataset, with frame and camera; raises `InputError` where there is none."""
+    """Yield frame, camera name and image of a dataset's frames (None: all); raises `InputError` if there is no image.
+
+    Also raises `InputError` as `checked_picture` does.
+    """
     seen = False
     for number in data.numbers(frames):
         frame = data.frame(number)
@@ -56,7 +61,7 @@ def recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterator[tup
 
 
 def read_picture(path: Path) -> Picture:
-    """Return an RGB picture file; raises `InputError` for anything else."""
+    """Return the RGB or palette image of a PNG, JPEG or WebP file; raises `InputError` for any other file."""
     try:
         with Image.open(path, formats=("PNG", "JPEG", "WEBP")) as image:
             channels, mode = len(image.getbands()), image.mode
@@ -71,7 +76,7 @@ def read_picture(path: Path) -> Picture:
 
 
 def checked_picture(pixels: NDArray[np.uint8], origin: str | Path) -> Picture:
-    """Return the picture, or raise `InputError` where a network can do nothing with it."""
+    """Return the image as it is; raises `InputError` unless it is (H, W, 3) with sides of 32 to 8192 pixels."""
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise InputError(f"{origin}: a picture of shape {pixels.shape}; (H, W, 3) red, green, blue is wanted")
     height, width = pixels.shape[:2]
@@ -82,37 +87,37 @@ def checked_picture(pixels: NDArray[np.uint8], origin: str | Path) -> Picture:
 
 
 def resized(picture: Picture, width: int, height: int) -> Picture:
-    """Return the picture at another size; when it shrinks, each pixel is the weighted mean of those it covers."""
+    """Return the image resampled bilinearly to `width` x `height` pixels, with antialiasing when it shrinks."""
     return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR))
 
 
 def recoloured(picture: Picture, gain: float, saturation: float) -> Picture:
-    """Return the picture `gain` times as bright and its colours `saturation` times as far from grey."""
+    """Return the image with its brightness scaled by `gain` and its saturation by `saturation`."""
     coloured = ImageEnhance.Color(Image.fromarray(picture)).enhance(saturation)
     return np.asarray(ImageEnhance.Brightness(coloured).enhance(gain))
 
 
 Array = NDArray[np.float64]
 
-LEAST_AHEAD = 0.5  # cosine of the angle between the axes of a camera and of the LiDAR
-NEAREST_M = 0.1  # in front of the camera
-BESIDE = 0.5  # pixels are known as far beside the picture, in its widths and heights; further off, distortion folds
+LEAST_AHEAD = 0.5  # least cosine of the angle between the camera's optical axis and the LiDAR's x axis
+NEAREST_M = 0.1  # near plane: least depth in front of the camera
+BESIDE = 0.5  # margin around the image, in its widths and heights, in which the distortion polynomial is used
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """One picture and how the camera stands to the frame of the points: a LiDAR's, or the world's.
+    """A camera image with its calibration relative to the frame of the points: a LiDAR's, or the world's.
 
-    The camera's frame is optical: x right, y down, z ahead; the centre of the first pixel is at (0, 0).
+    The camera's frame is optical: x right, y down, z forward; the centre of the first pixel is at (0, 0).
     """
 
     picture: Picture  # (H, W, 3) sRGB
     camera_from_points: Array  # (4, 4)
     intrinsics: Array  # (3, 3) [px]
-    distortion: Array  # (5,) k1 k2 p1 p2 k3
+    distortion: Array  # (5,) Brown-Conrady k1 k2 p1 p2 k3, as `flcav.sensors.camera.lens`
 
     def project(self, points: NDArray) -> Array:
-        """Return the pixels (N, 2) u, v of points (N, 3); NaN behind the camera or far off its picture."""
+        """Return pixel coordinates (N, 2) u, v of points (N, 3) [m]; NaN behind the near plane or far off the image."""
         seen = transform_points(self.camera_from_points, np.asarray(points, np.float64))
         seen[seen[:, 2] < NEAREST_M] = np.nan
         straight = projected(self.intrinsics, np.zeros(5), seen)
@@ -121,15 +126,15 @@ class CameraView:
         return projected(self.intrinsics, self.distortion, np.where(near[:, None], seen, np.nan))
 
     def shows(self, points: NDArray) -> NDArray[np.bool_]:
-        """Return which of the points (N, 3) lie within the picture; some may be hidden by others."""
+        """Return (N,) whether each point (N, 3) [m] projects into the image; occlusion is not considered."""
         pixels = self.project(points) + 0.5
         return np.all((pixels >= 0) & (pixels < self.picture.shape[1::-1]), axis=1)
 
 
 def recorded_view(data: Dataset, number: int, lidar: str) -> CameraView | None:
-    """Return the view of the camera that looks most nearly where `lidar` does in a frame; None where none does.
+    """Return the view of the camera whose axis is closest to the x axis of `lidar` in frame `number`.
 
-    It stands as the agent believes it to.
+    Poses and intrinsics are the agent's assumed calibration. None if no camera's axis is within 60 degrees.
     """
     frame = data.frame(number)
     lidar_from_world = inverse(frame.assumed_world_from_sensor(lidar))
@@ -146,7 +151,10 @@ def recorded_view(data: Dataset, number: int, lidar: str) -> CameraView | None:
 
 
 def kitti_view(picture: Picture, calibration: Calibration) -> CameraView:
-    """Return the view of KITTI's left colour camera; what its projection shifts becomes part of where it stands."""
+    """Return the view of KITTI's left colour camera relative to the LiDAR.
+
+    The fourth column of its 3 x 4 projection matrix becomes a translation of the extrinsics.
+    """
     intrinsics = calibration.image_from_camera[:, :3]
     shifted = np.eye(4)
     shifted[:3, 3] = np.linalg.solve(intrinsics, calibration.image_from_camera[:, 3])
@@ -154,9 +162,9 @@ def kitti_view(picture: Picture, calibration: Calibration) -> CameraView:
 
 
 def view_beside(points: Path) -> CameraView | None:
-    """Return the view that lies beside a point cloud of a KITTI folder; None where there is none.
+    """Return the view of a point cloud in a KITTI folder, from `image_2` and `calib`; None if either file is missing.
 
-    Raises `InputError` where there is one that cannot be read.
+    Raises `InputError` if one of them cannot be read.
     """
     folder, name = points.absolute().parent.parent, points.stem
     picture, calibration = folder / "image_2" / f"{name}.png", folder / "calib" / f"{name}.txt"

@@ -1,6 +1,6 @@
-"""What a network found in one input, as marks on it: few kinds, the same for every task. `flcav.report` draws each.
+"""Marks: drawable results of an inference, of few kinds that all tasks share. `flcav.report` draws each kind.
 
-What is marked is a picture (H, W, 3), a point cloud (N, 4) or a map from above, see `flcav.perception.task.Finding`.
+They are drawn on an image (H, W, 3), a point cloud (N, 4) or a bird's-eye map, see `flcav.perception.task.Finding`.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Bars:
-    """A share for each of several names, drawn beside what was seen."""
+    """A bar chart of shares by name, such as class probabilities, drawn beside the input."""
 
     share: Mapping[str, float]  # name -> in [0, 1]
     title: str = "probability"
@@ -29,33 +29,33 @@ class Bars:
 
 @dataclass(frozen=True)
 class PictureBoxes:
-    """Upright rectangles on a picture."""
+    """Axis-aligned 2D boxes on an image."""
 
-    box: Array  # (N, 4) x1 y1 x2 y2 [px] from the upper left corner of the picture
+    box: Array  # (N, 4) x1 y1 x2 y2 [px] from the upper left corner of the image
     label: NDArray[np.str_]  # (N,) class names
     score: Array  # (N,) in [0, 1]
 
     @property
     def caption(self) -> str:
-        """Return how many there are."""
+        """Return the number of boxes in words."""
         return f"{len(self.box)} found"
 
 
 @dataclass(frozen=True)
 class CloudBoxes:
-    """Boxes in a point cloud, and on the picture of a camera beside it."""
+    """3D boxes in a point cloud, also drawn on the image of a camera beside the LiDAR."""
 
     boxes: Boxes  # in the frame of the cloud, with scores
 
     @property
     def caption(self) -> str:
-        """Return how many there are."""
+        """Return the number of boxes in words."""
         return f"{len(self.boxes)} found"
 
 
 @dataclass(frozen=True)
 class Mode:
-    """One of the futures that are thought possible."""
+    """One mode of a trajectory forecast."""
 
     probability: float
     path: Array  # (T, 2) world [m]
@@ -63,7 +63,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class RoadUser:
-    """Whose future is predicted."""
+    """A road user with its predicted modes, the constant-velocity baseline and the ground truth."""
 
     track: str
     label: str  # class
@@ -73,33 +73,33 @@ class RoadUser:
     speed: float  # [m/s]
     length: float  # [m]
     width: float
-    modes: tuple[Mode, ...]  # the first is the one for who wants a single one, the others come by probability
-    constant_velocity: Array | None = None  # (T, 2) world [m]: where it would be without turning or braking
-    truth: Array | None = None  # (T, 2) world [m]: where it went, as far as that was recorded
+    modes: tuple[Mode, ...]  # the first is the single path (the medoid), the others follow by falling probability
+    constant_velocity: Array | None = None  # (T, 2) world [m]: path at constant heading and speed
+    truth: Array | None = None  # (T, 2) world [m]: path that was driven; None if not recorded
 
 
 @dataclass(frozen=True)
 class Light:
-    """The signal of a lane."""
+    """A traffic light with its state."""
 
-    x: float  # world [m]
+    x: float  # world [m]: middle of its bars across the lanes' entries
     y: float
     open: bool  # green
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Predicted paths on a map from above, around who observes."""
+    """Trajectory forecasts on a bird's-eye map around the observing agent."""
 
     observer: tuple[float, float, float]  # x, y, yaw in the world [m, rad]
-    reach_m: float  # the map's, ahead of the observer, behind it and to both sides
-    times_s: tuple[float, ...]  # (T,) of the points of every path, from the present
+    reach_m: float  # half the side of the map, which is centred on the observer
+    times_s: tuple[float, ...]  # (T,) times of the points of every path, after the present
     users: tuple[RoadUser, ...]
     lights: tuple[Light, ...] = ()
 
     @property
     def caption(self) -> str:
-        """Return for how many there are paths."""
+        """Return the number of road users with a forecast, in words."""
         return f"{len(self.users)} predicted"
 
 

@@ -1,7 +1,7 @@
-"""What one does with a task's networks: train one, test it, look with it, register what it gets wrong.
+"""Training, evaluation and inference of a task's networks, and registration of their mistakes.
 
-A task is named as on the command line (`flcav.perception.tasks`) or handed over, data are datasets or their folders,
-and a network is one in memory, a file of weights, or, where none is given, the one that comes with the task.
+In all functions a task is a `Task` or its name on the command line (`flcav.perception.tasks`), data are a dataset or
+its folder, and a network is one in memory, a file of weights, or None for the task's own weights in the package.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,22 +36,22 @@ Weights = nn.Module | Path | str | None
 
 @dataclass(frozen=True)
 class TrainedNetwork:
-    """What a training left."""
+    """A trained network with its model card and its file of weights."""
 
     network: nn.Module  # in evaluation mode
-    card: Card  # data, settings, and the numbers on the validation data
-    weights: Path  # file of the network, with the card in its metadata
+    card: Card  # data, settings, and metrics on the validation data
+    weights: Path  # safetensors file of the network, with the card in its metadata
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How good a network is on a dataset."""
+    """Metrics of a network on a dataset."""
 
-    task: str
-    score: float  # the one number that training raises, in [0, 1]: accuracy, mAP, AP, by task
-    chosen: Chosen  # whose frames
-    numbers: Mapping[str, Json]  # all of the task's, as JSON knows them: docs/tasks.md
-    lines: tuple[str, ...]  # the numbers in words
+    task: str  # its name
+    score: float  # the metric that validation maximises, in [0, 1]: accuracy, mAP, AP or another, by task
+    chosen: Chosen  # the frames that were tested
+    numbers: Mapping[str, Json]  # all metrics of the task as JSON values: docs/tasks.md
+    lines: tuple[str, ...]  # the metrics in words
 
     def __str__(self) -> str:
         return "\n".join((self.chosen.sentence, *self.lines))
@@ -59,9 +59,9 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Inference:
-    """What a network finds, input by input, looked for when asked for; one goes through it once."""
+    """Findings of a network, computed lazily input by input; they can be iterated once."""
 
-    chosen: Mapping[Path, Chosen]  # of the inputs that are datasets: whose frames
+    chosen: Mapping[Path, Chosen]  # the selected frames of each input that is a dataset
     findings: Iterator[Finding]
 
     def __iter__(self) -> Iterator[Finding]:
@@ -82,12 +82,13 @@ def train(
     agents: str | None = None,
     progress: Report = silent,
 ) -> TrainedNetwork:
-    """Train a network on recorded frames with their ground truth; its weights, card and curves are kept in `out`.
+    """Train a network on recorded frames with their ground truth; weights, card and curves are written to `out`.
 
-    `network` names one of the task's configurations (None: its first). With `validation`, a dataset of other scenes,
-    the best epoch is kept, and training ends after `patience` epochs without a better one. A training that was
-    interrupted goes on; one that is finished is read. Raises `InputError` where task, network, data or agents cannot be
-    used, and where `out` holds weights of other settings.
+    `network` names one of the task's configurations (None: its first), `device` is "auto", "cpu" or "cuda", `agents`
+    selects frames as in `flcav.perception.agents.choose_frames`. With `validation`, a dataset of other scenes, the best
+    epoch is kept, and training stops early after `patience` epochs without a better one. An interrupted training is
+    resumed; the result of a finished one is loaded. Raises `InputError` if task, network, data, device or agents are
+    unusable, and if `out` holds weights of other settings; `OSError` if `out` cannot be written.
 
     >>> from flcav import train
     >>> trained = train("weather", "data", out="networks/weather", epochs=2, seed=1)
@@ -114,10 +115,10 @@ def evaluate(
     device: str = "auto",
     progress: Report = silent,
 ) -> Evaluation:
-    """Evaluate a network on recorded frames, by the measure of its task.
+    """Evaluate a network on recorded frames by the metrics of its task.
 
-    Of objects alone: `within`, "AHEAD,SIDE" in metres, asks only for those so near, and `tracks` adds MOTA and AMOTA.
-    Raises `InputError` where task, data, weights or agents cannot be used.
+    For the task `objects` alone, `within` ("AHEAD,SIDE" in metres) limits the range, and `tracks` adds the tracking
+    metrics MOTA and AMOTA. Raises `InputError` if task, data, weights, device, agents or range are unusable.
 
     >>> from flcav import evaluate
     >>> found = evaluate("objects", "data")  # the network of the package
@@ -151,10 +152,10 @@ def infer(
     agents: str | None = None,
     device: str = "auto",
 ) -> Inference:
-    """Return what a network finds in files, folders of them, or dataset folders: point clouds, pictures, by task.
+    """Run a network on files, folders of files, or dataset folders: point clouds or images, by task.
 
-    Findings that score below `threshold` are left out (None: the task's own). Raises `InputError` where task, weights,
-    inputs or agents cannot be used; of a file, when its turn comes.
+    Detections that score below `threshold` are left out (None: the task's default). Raises `InputError` if task,
+    weights, device or agents are unusable; for a bad file, when the iteration reaches it.
 
     >>> from flcav import infer
     >>> first = next(iter(infer("objects", "data", threshold=0.5)))
@@ -183,10 +184,10 @@ def register_errors(
     device: str = "auto",
     progress: Report = silent,
 ) -> Registry:
-    """Return what a network gets wrong on recorded frames and where in the town, each object once per scene.
+    """Return the mistakes of a network on recorded frames with their positions in the town, each once.
 
-    Detections that score below `threshold` are none (None: the task's own). Raises `InputError` for a task whose
-    mistakes have no place in a town, and where data, weights or agents cannot be used.
+    Detections that score below `threshold` are ignored (None: the task's default). Raises `InputError` for a task whose
+    mistakes have no position, and if data, weights, device or agents are unusable.
 
     >>> from flcav import register_errors
     >>> errors = register_errors("objects", "data")
@@ -206,35 +207,38 @@ def register_errors(
 
 
 def task_of(task: Named) -> Task:
-    """Return the task, by its name where that is what is given; raises `InputError` for an unknown one."""
+    """Return the task, looked up if a name is given; raises `InputError` for an unknown name."""
     return task_named(task) if isinstance(task, str) else task
 
 
 def opened(data: Data) -> Dataset:
-    """Return the dataset, opened where its folder is what is given; raises `InputError` as `Dataset.open` does."""
+    """Return the dataset, opened if a folder is given; raises `InputError` as `Dataset.open` does."""
     return data if isinstance(data, Dataset) else Dataset.open(data)
 
 
 def network_of(task: Task[ConfigT, NetworkT, SampleT], network: Weights, device: str = "cpu") -> NetworkT:
-    """Return the network: one in memory as it is, one in a file of weights on the device, None: the task's own."""
+    """Return a network in memory as it is; otherwise load the file of weights (None: the task's own) on `device`.
+
+    Raises `InputError` for a file that is not of the task, and for None if the task has no weights in the package.
+    """
     if isinstance(network, nn.Module):
-        return cast(NetworkT, network)  # whose it is, is for those to say who have it
+        return cast(NetworkT, network)  # the caller answers for its type
     return load_network(task, Path(network or shipped(task))).to(device_named(device))
 
 
 def threshold_of(task: Task, threshold: float | None) -> float:
-    """Return the lowest score of a finding: `threshold`, for None the task's own, 0 where its findings have none."""
+    """Return the score threshold: `threshold`, for None the task's default, or 0 for a task without scores."""
     own = task.threshold if isinstance(task, Scores) else 0.0
     return own if threshold is None else threshold
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Which network `network_of` loads."""
+    """Origin of a network: its configuration, the seed of its training, and its file of weights."""
 
-    network: str | None  # name of the configuration; None without a card, as the seed is
-    seed: int | None
-    weights: str  # the file
+    network: str | None  # name of the configuration; None without a card
+    seed: int | None  # None without a card
+    weights: str  # path of the file
 
     def __str__(self) -> str:
         card = "without a card" if self.network is None else f"{self.network}, seed {self.seed}"
@@ -242,7 +246,10 @@ class Origin:
 
 
 def origin_of(task: Task, weights: Path | None) -> Origin:
-    """Return which network `network_of` loads."""
+    """Return the origin of the network in a file of weights (None: the task's own), read from its card.
+
+    Raises `InputError` for None if the task has no weights in the package.
+    """
     path = weights or shipped(task)
     try:
         card = read_card(path)

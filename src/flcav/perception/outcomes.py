@@ -1,6 +1,8 @@
-"""What a network did on test frames, kept so that frames can be counted again: measures, intervals, paired differences.
+"""Outcomes of a test, from which the task's measure and its bootstrap over scenes follow without the network.
 
-A task says in its `outcomes.py` what is kept of a frame, a picture or a road user, and how its measure follows from it.
+The bootstrap gives 95 % percentile intervals of the measure and of paired differences between two networks, see
+`flcav.intervals`. The `outcomes.py` of each task defines what is kept per unit (a frame, an image or a road user) and
+how the measure is computed from it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,25 +23,25 @@ from flcav.progress import Report, silent
 from flcav.seeds import stream
 
 SCENE = "scene"
-Times = NDArray[np.int64]  # (n, N) how often each unit counts in each of n redrawings
-Values = NDArray[np.float64]  # (n,) NaN where nothing is to be measured
+Times = NDArray[np.int64]  # (n, N) how often each of N units is drawn in each of n bootstrap samples
+Values = NDArray[np.float64]  # (n,) measure of each bootstrap sample; NaN where it is undefined
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What a network did with N units, each one scene's: frames, pictures or road users, as the task has them."""
+    """Outcomes of a network on N units: frames, images or road users, by task."""
 
-    scene: NDArray[np.str_]  # (N,)
-    arrays: Mapping[str, NDArray]  # the task's own
+    scene: NDArray[np.str_]  # (N,) scene of each unit
+    arrays: Mapping[str, NDArray]  # arrays by name, as the task defines them
 
     def save(self, path: Path) -> None:
-        """Write them as NumPy's archive, atomically."""
+        """Write the outcomes as a compressed NumPy archive (.npz), atomically."""
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **{SCENE: self.scene}, **self.arrays)
 
     @classmethod
     def load(cls, path: Path) -> "Outcomes":
-        """Read what `save` wrote; raises `InputError` where `path` is no such file."""
+        """Return the outcomes that `save` wrote; raises `InputError` for any other file."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
@@ -50,33 +52,33 @@ class Outcomes:
 
 @runtime_checkable
 class Measurable(Protocol):
-    """A task whose measure follows from outcomes, so that it has intervals over scenes."""
+    """A task whose measure is computed from outcomes, so that it can be bootstrapped over scenes."""
 
     @property
     def measure_name(self) -> str:
-        """Return what the measure is, in the field's words; it lies in [0, 1], more is better."""
+        """Return the name of the measure, such as "mAP50"; a measure lies in [0, 1], and more is better."""
         ...
 
     @property
     def redraws(self) -> int:
-        """Return how many redrawings of the scenes there is time for."""
+        """Return the number of bootstrap samples."""
         ...
 
     def outcomes(self, network: nn.Module, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
-        """Return what `network` does in the frames; raises `InputError` where there is nothing to measure."""
+        """Return the outcomes of `network` on the frames; raises `InputError` if there is nothing to measure."""
         ...
 
     def measure(self, outcomes: Outcomes, times: Times) -> Values:
-        """Return the measure where each unit counts so many times."""
+        """Return the measure (n,) of each of n bootstrap samples, in which the units count `times` (n, N)."""
         ...
 
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
-        """Return more numbers, by name; None where one is not known."""
+        """Return further numbers by name; None where one is undefined."""
         ...
 
 
 class SceneScores:
-    """The measure of a task that keeps no outcomes: the mean over scenes of its score."""
+    """Default measure of a task without outcomes: the mean over scenes of `Evaluated.score`."""
 
     measure_name = "mean score of a scene"
     redraws = REDRAWS
@@ -85,7 +87,7 @@ class SceneScores:
         self._task = task
 
     def outcomes(self, network: nn.Module, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
-        """Return the score of each scene."""
+        """Return the score of each scene, under the name "score"."""
         scenes = list(dict.fromkeys(data.keys[i].scene for i in frames))
         scores = []
         for done, scene in enumerate(scenes, start=1):
@@ -95,32 +97,35 @@ class SceneScores:
         return Outcomes(np.array(scenes), {"score": np.array(scores, dtype=np.float64)})
 
     def measure(self, outcomes: Outcomes, times: Times) -> Values:
-        """Return the mean score."""
+        """Return the mean score of each bootstrap sample."""
         return weighted_mean(outcomes.arrays["score"], times)
 
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
-        """Return none."""
+        """Return no further numbers."""
         return {}
 
 
 def measurable(task: Task) -> Measurable:
-    """Return how the task is measured."""
+    """Return the task itself if it is `Measurable`, otherwise its `SceneScores`."""
     return task if isinstance(task, Measurable) else SceneScores(task)
 
 
 def measured(task: Task, outcomes: Outcomes) -> float:
-    """Return the task's measure, each unit counted once; NaN where there was nothing to find."""
+    """Return the task's measure, each unit counted once; NaN if it is undefined: nothing was to be found."""
     return float(measurable(task).measure(outcomes, np.ones((1, len(outcomes.scene)), dtype=np.int64))[0])
 
 
 def score_on(task: Task, network: nn.Module, data: Dataset, frames: Sequence[int] | None = None) -> float:
-    """Return the measure of `network` on frames (None: all); 0 where there was nothing to find."""
+    """Return the measure of `network` on frames (None: all); 0 if it is undefined: nothing was to be found."""
     found = measured(task, measurable(task).outcomes(network, data, data.numbers(frames)))
     return 0.0 if np.isnan(found) else found
 
 
 def interval(task: Task, outcomes: Outcomes, seed: int = 0) -> tuple[float | None, float | None]:
-    """Return the 95 % interval of the measure over scenes; None where fewer than two hold something to measure."""
+    """Return low and high of the measure's 95 % bootstrap interval over scenes.
+
+    Both are None if the measure is defined on fewer than two scenes.
+    """
     own = measurable(task)
     counted = [scene for scene in np.unique(outcomes.scene) if not np.isnan(_alone(own, outcomes, scene))]
     if len(counted) < 2:
@@ -132,9 +137,10 @@ def interval(task: Task, outcomes: Outcomes, seed: int = 0) -> tuple[float | Non
 def difference(
     task: Task, before: Outcomes, after: Outcomes, seed: int = 0
 ) -> tuple[float, float | None, float | None]:
-    """Return measure(after) - measure(before) and its 95 % interval, both on the same redrawn scenes.
+    """Return measure(after) - measure(before) and its paired 95 % bootstrap interval over scenes (low, high).
 
-    Raises `InputError` where they are not of the same units.
+    Both measures are taken on the same bootstrap samples. Low and high are None for a single scene. Raises `InputError`
+    if the outcomes are not of the same units.
     """
     if not np.array_equal(before.scene, after.scene):
         raise InputError("two tests are not of the same frames: there is no paired difference")
@@ -151,7 +157,7 @@ def difference(
 
 
 def weighted_mean(values: NDArray[np.float64], times: Times) -> Values:
-    """Return (n,) the means of values (N,) that count `times` (n, N); NaN where none does."""
+    """Return (n,) means of values (N,) weighted by `times` (n, N); NaN where all weights are 0."""
     with np.errstate(invalid="ignore"):
         return times @ values / times.sum(axis=1)
 

@@ -1,4 +1,4 @@
-"""The study of a task: what is recorded to learn from and to be tested on, and how long is trained."""
+"""Study recipe of a task: training, validation and test recordings, and the length of the training."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -8,25 +8,28 @@ from flcav.config import InputError, read_yaml
 from flcav.files import Json
 from flcav.sources.recipe import recipe_path
 
-RecipeFields = Mapping[str, Json]  # of a `Recipe`, as YAML has it
+RecipeFields = Mapping[str, Json]  # fields of a recording's `Recipe`, as in YAML
 SCALES = ("full", "quick")
 
 
 @dataclass(frozen=True)
 class StudyRecipe:
-    """Frames to learn from, to choose the epoch by, and to test once; no two of them may share town and seed."""
+    """Recordings to train on, to choose the epoch by, and to test on; no two of them may share town and seed."""
 
     network: str  # name of the configuration
     train: tuple[RecipeFields, ...]
     validation: RecipeFields
-    tests: Mapping[str, RecipeFields]  # by name
+    tests: Mapping[str, RecipeFields]  # by name of the test
     epochs: int
-    patience: int
-    quick_scenes: int = 2  # of every recipe at the quick scale
-    quick_epochs: int = 1
+    patience: int  # epochs without a better validation score after which training stops
+    quick_scenes: int = 2  # most scenes of each recording at the scale "quick"
+    quick_epochs: int = 1  # epochs at the scale "quick"
 
     def at_scale(self, scale: str) -> "StudyRecipe":
-        """Return it as it stands ("full") or to run in minutes ("quick"); raises `InputError` for another scale."""
+        """Return the recipe itself ("full") or one with few scenes and epochs that runs in minutes ("quick").
+
+        Raises `InputError` for another scale.
+        """
         if scale not in SCALES:
             raise InputError(f"scale '{scale}': a task's study knows {' and '.join(SCALES)}")
         if scale == "full":
@@ -48,15 +51,15 @@ class StudyRecipe:
 
 @runtime_checkable
 class Studied(Protocol):
-    """A task that says how it is studied: `flcav reproduce my_module:TASK` does so."""
+    """A task with a study, which `flcav reproduce my_module:TASK` performs."""
 
     def study(self) -> StudyRecipe:
-        """Return what is recorded, trained and tested."""
+        """Return the recordings and the training of the study."""
         ...
 
 
 def read_recipe(name: str) -> RecipeFields:
-    """Return the fields of a recipe that comes with flcav as YAML has them, without its split: a study has its own.
+    """Return the YAML fields of one of the package's recipes without its `split`, since a study sets its own.
 
     Raises `InputError` for an unknown name.
     """

@@ -1,7 +1,7 @@
-"""What a perception task is: its networks, its samples, its loss and its measure. All else is the same for every task.
+"""The interface of a perception task: its networks, samples, augmentation, loss, evaluation and inference.
 
-Training is `flcav.perception.training`, files of weights are `flcav.perception.weights`, a federation's client is
-`flcav.perception.client`: each works with any `Task`, and so do the command line and the federation.
+Everything else works with any `Task`: training (`flcav.perception.training`), files of weights
+(`flcav.perception.weights`), clients of a federation (`flcav.perception.client`), the federation, the command line.
 """
 
 from abc import ABC, abstractmethod
@@ -33,53 +33,53 @@ SampleT = TypeVar("SampleT", default=Any)
 
 @dataclass(frozen=True)
 class Practice:
-    """How a task is trained unless one is told otherwise."""
+    """Default hyperparameters of a task's training."""
 
-    batch: int
-    learning_rate: float  # of AdamW, at its peak
-    schedule: str = "one_cycle"
+    batch: int  # samples per step
+    learning_rate: float  # peak learning rate of AdamW
+    schedule: str = "one_cycle"  # of the learning rate, one of `flcav.perception.training.SCHEDULES`
 
 
 def no_view() -> None:
-    """Return no camera's view."""
+    """Return None: the view of an input without a camera beside it."""
 
 
 class Result(Record):
-    """What a network came to, as a frozen dataclass: in JSON and in words."""
+    """Base of results of a network: a frozen dataclass that converts itself to JSON and to lines of text."""
 
     def lines(self) -> list[str]:
-        """Return it in words: each field on a line, where a task has none of its own."""
+        """Return the result as lines of text: one per field, unless a subclass has its own."""
         return [f"{name}: {value}" for name, value in self.as_json().items()]
 
 
 class Evaluated(Result, ABC):
-    """The task's numbers on some frames."""
+    """Base of a task's evaluation: its metrics on some frames."""
 
     @property
     @abstractmethod
     def score(self) -> float:
-        """Return the one number that training is to raise."""
+        """Return the metric that validation maximises."""
 
     def numbers(self) -> Mapping[str, float]:
-        """Return the numbers whose means over seeds a study gives, by name: the score, where a task has no others."""
+        """Return the metrics, by name, whose means over seeds a study reports: the score, unless a task has others."""
         return {"score": self.score}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What a network found in one input."""
+    """Result of a network on one input, with what is needed to draw it."""
 
-    path: Path  # the input's own
-    seen: NDArray  # picture (H, W, 3) u8, point cloud (N, 4) f32, or map: (3, H, W) bool of road, lane, crossing
+    path: Path  # of the input
+    seen: NDArray  # image (H, W, 3) u8, point cloud (N, 4) f32, or map: (3, H, W) bool of road, lane, crossing
     result: Result
-    marks: tuple[Mark, ...] = ()  # the same, as it is drawn on what was seen
-    view: Callable[[], "CameraView | None"] = no_view  # of a camera beside the LiDAR, read when asked for
+    marks: tuple[Mark, ...] = ()  # the result as it is drawn on `seen`
+    view: Callable[[], "CameraView | None"] = no_view  # reads the image of a camera beside the LiDAR
 
 
 class Task(Protocol[ConfigT, NetworkT, SampleT]):
-    """One thing to learn from recorded frames; without parameters, whatever its configurations, networks and samples.
+    """A perception task, generic in the types of its configurations, networks and samples (default: any).
 
-    A network carries its configuration as `config`, a pydantic dataclass from which `build` makes it again.
+    Each network has its configuration as attribute `config`, a pydantic dataclass from which `build` rebuilds it.
     """
 
     @property
@@ -89,32 +89,32 @@ class Task(Protocol[ConfigT, NetworkT, SampleT]):
 
     @property
     def family(self) -> str:
-        """Return the name of the networks' architecture: files of weights are marked with it."""
+        """Return the name of the networks' architecture, which is part of a metadata key of files of weights."""
         ...
 
     @property
     def configurations(self) -> Mapping[str, ConfigT]:
-        """Return the networks one can ask for by name, the default first."""
+        """Return the configurations of networks by name, the default first."""
         ...
 
     @property
     def practice(self) -> Practice:
-        """Return how the task is trained by default."""
+        """Return the default hyperparameters of training."""
         ...
 
     def build(self, config: ConfigT) -> NetworkT:
-        """Return a fresh network; torch's global generator draws its weights."""
+        """Return a network with random initial weights, drawn from torch's global generator."""
         ...
 
     def samples(self, data: Dataset, config: ConfigT, frames: Sequence[int] | None = None) -> Sequence[SampleT]:
-        """Return what a network of `config` learns from the frames of these numbers (None: all).
+        """Return the labelled samples of the frames of these numbers (None: all) for a network of `config`.
 
-        Raises `InputError` where the dataset lacks what the task needs.
+        Raises `InputError` if the dataset lacks what the task needs.
         """
         ...
 
     def draw(self, samples: Sequence[SampleT], index: int, config: ConfigT, rng: np.random.Generator) -> SampleT:
-        """Return sample `index` as one training step sees it: augmented by what `rng` draws."""
+        """Return sample `index`, augmented at random by `rng`, for one training step."""
         ...
 
     def loss(self, network: NetworkT, samples: Sequence[SampleT]) -> Tensor:
@@ -124,49 +124,49 @@ class Task(Protocol[ConfigT, NetworkT, SampleT]):
     def evaluate(
         self, network: NetworkT, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
     ) -> Evaluated:
-        """Return the task's numbers on frames of a dataset (None: all)."""
+        """Return the task's metrics on frames of a dataset (None: all)."""
         ...
 
     def infer(
         self, network: NetworkT, path: Path, threshold: float, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield what is found in each input that `path` names, of a dataset in these frames (None: all).
+        """Yield the finding of each input at `path`: a file, a folder of files, or `frames` of a dataset (None: all).
 
-        Raises `InputError` for a bad one.
+        Detections that score below `threshold` are left out. Raises `InputError` for a bad input.
         """
         ...
 
 
 @runtime_checkable
 class Calibrates(Protocol):
-    """A task whose trained networks are told, by frames they did not learn from, how far to trust their scores."""
+    """A task whose trained networks have their confidence scores calibrated on frames held out from training."""
 
     def calibrate(self, network: Any, data: Dataset, frames: Sequence[int] | None = None) -> None:
-        """Set the calibration in the network's configuration from frames of `data` (None: all)."""
+        """Fit the calibration of scores on frames of `data` (None: all); set it in the network's configuration."""
         ...
 
 
 @runtime_checkable
 class Scores(Protocol):
-    """A task whose findings have a score each, in [0, 1]."""
+    """A task whose findings have confidence scores in [0, 1]."""
 
     @property
     def threshold(self) -> float:
-        """Return the lowest score of what is shown and registered, unless one is told otherwise."""
+        """Return the default score threshold of inference and of the error registry."""
         ...
 
 
 @runtime_checkable
 class RigBound(Protocol):
-    """A task whose networks expect sensors to stand where not every agent carries them."""
+    """A task whose networks expect a sensor rig that not every agent has."""
 
     def fitting(self, data: Dataset, config: Any) -> Sequence[int]:
-        """Return the frames whose sensors stand as a network of `config` expects; raises `InputError` for none."""
+        """Return the numbers of the frames whose rig suits a network of `config`; may raise `InputError` for none."""
         ...
 
 
 def configuration(task: Task[ConfigT, NetworkT, SampleT], name: str | None) -> ConfigT:
-    """Return the configuration of that name, the default for None; raises `InputError` for an unknown one."""
+    """Return the configuration of that name (None: the default); raises `InputError` for an unknown name."""
     known = task.configurations
     if name is None:
         return next(iter(known.values()))
@@ -176,7 +176,7 @@ def configuration(task: Task[ConfigT, NetworkT, SampleT], name: str | None) -> C
 
 
 def fresh(task: Task[ConfigT, NetworkT, SampleT], config: ConfigT, seed: int) -> NetworkT:
-    """Return a new network, its weights drawn from `seed`."""
+    """Return a network with random initial weights drawn from `seed`; torch's global generator is left as it was."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(child_seed(seed, "weights"))
         return task.build(config)

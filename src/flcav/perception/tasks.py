@@ -1,4 +1,4 @@
-"""The perception tasks by name: `TASKS`, the one list of those of the package, and a user's own.
+"""Registry of the perception tasks: `TASKS` lists those of the package, a user's own is `module:NAME`.
 
 >>> from flcav import TASKS
 >>> list(TASKS)
@@ -14,7 +14,7 @@ from flcav.plugins import load_own
 if TYPE_CHECKING:
     from flcav.perception.task import Task
 
-TASKS: Mapping[str, str] = {  # name -> module:NAME, so that listing them loads none
+TASKS: Mapping[str, str] = {  # name -> module:NAME, so that listing the tasks imports none
     "weather": "flcav.perception.weather.task:WEATHER",
     "signs": "flcav.perception.signs.task:SIGNS",
     "objects": "flcav.perception.objects.task:OBJECTS",
@@ -23,9 +23,9 @@ TASKS: Mapping[str, str] = {  # name -> module:NAME, so that listing them loads 
 
 
 def task_named(name: str) -> "Task":
-    """Return the task of that name, one of `TASKS`, or a user's own as `module:NAME`.
+    """Return the task of that name: one of `TASKS`, or a user's own as `module:NAME`.
 
-    Raises `InputError` for an unknown name, and where the user's module is not there or holds no task of that name.
+    Raises `InputError` for an unknown name, and if the user's module is missing or has no task of that name.
 
     >>> from flcav import task_named
     >>> list(task_named("objects").configurations)  # networks, the default first

@@ -1,4 +1,4 @@
-"""Weights on disk and as arrays: safetensors files that say which network they are of, and how it came about."""
+"""Weights of networks as safetensors files, with configuration and model card as metadata, and as NumPy arrays."""
 
 import json
 import sys
@@ -20,13 +20,13 @@ from flcav.perception.card import CARD_KEY, Card
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 
 PREFIX = "flcav."
-LARGEST = 1e9  # of a weight: larger ones overflow in a few layers
-SHIPPED = "shipped/weights.safetensors"  # beside a task's module; its card lies beside it
-COUNTER = "num_batches_tracked"  # of batch normalisation with a fixed momentum, which does not use it
+LARGEST = 1e9  # largest absolute value of a weight; larger ones overflow in a few layers
+SHIPPED = "shipped/weights.safetensors"  # relative to the folder of a task's module
+COUNTER = "num_batches_tracked"  # buffer of batch normalisation, unused with a fixed momentum
 
 
 def shipped(task: Task) -> Path:
-    """Return the file of weights that comes with a task; raises `InputError` where it has none."""
+    """Return the path of the task's weights in the package; raises `InputError` if there are none."""
     module = sys.modules.get(type(task).__module__)
     path = Path(getattr(module, "__file__", None) or "").parent / SHIPPED
     if not path.is_file():
@@ -35,14 +35,17 @@ def shipped(task: Task) -> Path:
 
 
 def config_key(task: Task) -> str:
-    """Return the metadata entry that holds the network's configuration as JSON."""
+    """Return the metadata key of the network's configuration."""
     return PREFIX + task.family
 
 
 def save_network(
     task: Task[ConfigT, NetworkT, SampleT], network: NetworkT, path: Path, card: Card | None = None
 ) -> None:
-    """Write the network's configuration, weights and card to a safetensors file, atomically."""
+    """Write weights, configuration (JSON) and card (JSON) of a network to a safetensors file, atomically.
+
+    The same network gives the same bytes.
+    """
     tensors = {name: tensor.contiguous().cpu() for name, tensor in network.state_dict().items()}
     metadata = {config_key(task): _adapter(task).dump_json(network.config).decode()}
     if card is not None:
@@ -51,7 +54,10 @@ def save_network(
 
 
 def load_network(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> NetworkT:
-    """Return the network that `save_network` wrote, in evaluation mode; raises `InputError` for any other file."""
+    """Return the network that `save_network` wrote, in evaluation mode on the CPU.
+
+    Raises `InputError` for any other file, and for weights that are not finite.
+    """
     config, tensors = _read(task, path)
     try:
         with torch.random.fork_rng(devices=[]):
@@ -63,7 +69,7 @@ def load_network(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> NetworkT
 
 
 def read_card(path: Path) -> Card:
-    """Return the card in a file of weights; raises `InputError` where there is none."""
+    """Return the card in a file of weights; raises `InputError` if there is none."""
     metadata, _ = _opened(path)
     if CARD_KEY not in metadata:
         raise InputError(f"{path}: weights without a card")
@@ -71,7 +77,7 @@ def read_card(path: Path) -> Card:
 
 
 def load_weights(task: Task[ConfigT, NetworkT, SampleT], network: NetworkT, path: Path) -> None:
-    """Load the weights at `path` into `network`; raises `InputError` where they are of another one."""
+    """Load the weights at `path` into `network`, in place; raises `InputError` if their configuration differs."""
     config, tensors = _read(task, path)
     if config != network.config:
         raise InputError(f"{path}: weights of another network ({_difference(config, network.config)})")
@@ -79,12 +85,15 @@ def load_weights(task: Task[ConfigT, NetworkT, SampleT], network: NetworkT, path
 
 
 def to_arrays(network: nn.Module) -> dict[str, NDArray[np.number]]:
-    """Return copies of parameters and buffers by name, without the counters of batch normalisation."""
+    """Return copies of parameters and buffers by name, except batch normalisation's `num_batches_tracked`."""
     return {name: tensor.detach().cpu().numpy().copy() for name, tensor in _learned(network).items()}
 
 
 def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[np.number]]) -> None:
-    """Set parameters and buffers from what `to_arrays` returned; raises `InputError` where they do not fit."""
+    """Set parameters and buffers of `network` to the arrays of `to_arrays`.
+
+    Raises `InputError` if names or shapes differ.
+    """
     state = _learned(network)
     if set(arrays) != set(state):
         odd = sorted(set(arrays) ^ set(state))
@@ -98,7 +107,7 @@ def from_arrays(network: nn.Module, arrays: Mapping[str, NDArray[np.number]]) ->
 
 
 def _in_order(data: bytes) -> bytes:
-    """Return the bytes of a safetensors file with its metadata sorted; the library's order is another each time."""
+    """Return the bytes of a safetensors file with its metadata sorted by key, since the library's order varies."""
     size = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + size])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))

@@ -1,1 +1,1 @@
-"""Signs and traffic lights in camera pictures (a YOLOv5-style detector)."""
+"""2D detection of traffic signs and traffic lights in camera images, by a YOLOv5-style detector."""

@@ -1,9 +1,9 @@
-"""Windows of pictures at random places and scales, several of them as a mosaic, in random colours. Never mirrored.
+"""Augmentation of images of signs: random crops and scales, mosaics, brightness and saturation; no mirroring.
 
-The mosaic is that of Bochkovskiy et al., "YOLOv4", 2020, sec. 3.3, of windows at their own scale: signs are few and
-small, so that windows are drawn around them, and pictures are not made smaller. Small windows around signs show a
-network many digits for little calculation. All but the first look for a sign of a class drawn at random, so that rare
-ones (amber lasts seconds of a minute) are seen as often as any.
+The mosaic is that of Bochkovskiy et al., "YOLOv4", 2020, sec. 3.3, of crops ("windows") instead of whole images made
+smaller: signs are few and small, so most windows are drawn around a sign. Small windows around signs show the network
+many digits at a low cost. Each window but the first looks for a sign of a class drawn at random, so that rare classes
+(amber lasts seconds of a minute) are seen as often as others.
 """
 
 from collections.abc import Sequence
@@ -17,19 +17,19 @@ from flcav.perception.images import recoloured, resized
 from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.samples import Sample, size_px
 
-GREY = 114  # what lies beyond a picture
-SHARES = (0.15, 0.25, 0.3, 0.3)  # of the samples that are one window, a mosaic of 2 x 2, of 3 x 3, of 4 x 4
-PART_PX = 32  # a mosaic's parts are about so high at least
-UNEVEN = 0.3  # how far a border within a mosaic may lie off, as a share of a part
-AROUND_A_SIGN = 0.8  # share of the windows drawn so that they hold one, where the picture has any
-SCALE = (0.6, 2.0)
-WHOLE = 0.8  # share of a box that must lie in the window for it to be found: a lamp may be in what is cut off
-LOOKS = 12  # pictures that are looked through for a sign of a class
-GAIN, SATURATION = (0.7, 1.3), (0.6, 1.4)
+GREY = 114  # padding value outside an image
+SHARES = (0.15, 0.25, 0.3, 0.3)  # probabilities of a single window and of a mosaic of 2 x 2, 3 x 3, 4 x 4 windows
+PART_PX = 32  # approximate least height of a mosaic's windows
+UNEVEN = 0.3  # largest offset of a border within a mosaic, as a share of a window's side
+AROUND_A_SIGN = 0.8  # probability that a window is placed around a sign, if the image has any
+SCALE = (0.6, 2.0)  # range of the scale of a window
+WHOLE = 0.8  # least share of a box inside the window for a target; otherwise the lamp may be cut off
+LOOKS = 12  # number of images searched for a sign of a class
+GAIN, SATURATION = (0.7, 1.3), (0.6, 1.4)  # ranges of the factors of brightness and of saturation
 
 
 def draw(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
-    """Return sample `index` as a training step sees it: a window of it, or a mosaic with windows of others."""
+    """Return an augmented sample of size `config.window_px`: a window of sample `index`, or a mosaic with others."""
     width, height = config.window_px
     across = max(min(int(rng.choice(len(SHARES), p=SHARES)) + 1, height // PART_PX), 1)
     columns, rows = _borders(width, across, rng), _borders(height, across, rng)
@@ -44,13 +44,13 @@ def draw(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.ran
 
 
 def _borders(length: int, parts: int, rng: np.random.Generator) -> list[int]:
-    """Return where each of so many parts of about the same length begins, and the end."""
+    """Return the borders [px] of `parts` parts of a length with randomly shifted inner borders: parts + 1 values."""
     inner = (np.arange(1, parts) + rng.uniform(-UNEVEN, UNEVEN, parts - 1)) * length / parts
     return [0, *inner.astype(int).tolist(), length]
 
 
 def _one_with(label: int, samples: Sequence[Sample], rng: np.random.Generator) -> Sample:
-    """Return a sample drawn at random, if possible one in which there is a sign of class `label`."""
+    """Return a random sample, with a sign of class `label` if one is among `LOOKS` samples."""
     looked = (samples[int(number)] for number in rng.integers(0, len(samples), LOOKS))
     sample = next(looked)
     while label not in sample.label and (other := next(looked, None)):
@@ -59,7 +59,7 @@ def _one_with(label: int, samples: Sequence[Sample], rng: np.random.Generator) -
 
 
 def joined(parts: Sequence[tuple[Sample, int, int]], width: int, height: int) -> Sample:
-    """Return one sample of parts that lie at (x, y) [px] in it."""
+    """Return the mosaic of parts at (x, y) [px] of their upper left corners; the rest is grey."""
     picture = np.full((height, width, 3), GREY, np.uint8)
     for part, x, y in parts:
         picture[y : y + part.picture.shape[0], x : x + part.picture.shape[1]] = part.picture
@@ -77,9 +77,9 @@ def window(
     rng: np.random.Generator,
     wanted: int | None = None,
 ) -> Sample:
-    """Return a window of `width` x `height` of the sample, scaled and placed at random, often around a sign.
+    """Return a window of `width` x `height` pixels of the sample at a random scale and place, mostly around a sign.
 
-    Which sign is random too; one of class `wanted`, if there is any.
+    The sign is drawn at random, among those of class `wanted` if there are any.
     """
     scale = rng.uniform(*SCALE)
     size = np.array([width, height]) / scale
@@ -97,9 +97,10 @@ def window(
 
 
 def cut(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], config: SignsConfig) -> Sample:
-    """Return the part x, y, width, height [px] of a sample at another size; what lies outside is grey.
+    """Return the crop `part` (x, y, width, height) [px] of a sample, resized to `size` (width, height) [px].
 
-    Boxes of which less than `WHOLE` remains, or that become too small, are ignored.
+    Padding outside the image is grey. Boxes of which less than the share `WHOLE` remains, or that become smaller than
+    `config.smallest_px`, become ignored.
     """
     x, y, across, down = part
     canvas = np.full((down, across, 3), GREY, np.uint8)
@@ -121,6 +122,6 @@ def cut(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], 
 
 
 def _in_other_colours(sample: Sample, rng: np.random.Generator) -> Sample:
-    """Return the sample brighter or darker, and more or less colourful; hues stay, since they tell lights apart."""
+    """Return the sample with random brightness and saturation; hues are kept, since they distinguish lights."""
     gain, saturation = rng.uniform(*GAIN), rng.uniform(*SATURATION)
     return replace(sample, picture=recoloured(sample.picture, gain, saturation))

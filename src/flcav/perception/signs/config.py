@@ -1,4 +1,4 @@
-"""Which network finds signs, and of what it is trained to find."""
+"""Configurations of the sign detector: width, depth, classes, anchors, size of training windows."""
 
 from typing import Annotated
 
@@ -7,7 +7,7 @@ from pydantic.dataclasses import dataclass
 
 from flcav.dataset.rectangles import SIGNS
 
-STRIDES = (8, 16, 32)  # pixels between the cells of each level
+STRIDES = (8, 16, 32)  # [px] of the three levels' feature maps
 Side = Annotated[float, Field(gt=0, le=8192)]
 Size = tuple[Side, Side]  # width, height [px]
 Window = Annotated[int, Field(ge=32, le=8192)]
@@ -23,14 +23,14 @@ ANCHORS_PX: tuple[Level, Level, Level] = (
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
 class SignsConfig:
-    """A detector on pictures of any size; sizes are in the pixels of the picture."""
+    """Configuration of a sign detector, which takes images of any size; lengths are in pixels of the image."""
 
-    width: Annotated[float, Field(gt=0, le=4)]  # times the channels of the largest published network
-    depth: Annotated[float, Field(gt=0, le=4)]  # times its bottlenecks
+    width: Annotated[float, Field(gt=0, le=4)]  # factor of the numbers of channels, see `signs.model.CHANNELS`
+    depth: Annotated[float, Field(gt=0, le=4)]  # factor of the numbers of bottlenecks, see `signs.model.DEPTHS`
     classes: Annotated[tuple[str, ...], Field(min_length=1)] = SIGNS  # in the order of the scores
-    anchors_px: tuple[Level, Level, Level] = ANCHORS_PX  # the shapes boxes are regressed from, at each of STRIDES
-    window_px: tuple[Window, Window] = (320, 192)  # width, height of what one training step sees of a picture
-    smallest_px: Annotated[float, Field(ge=0, le=8192)] = 6.0  # root of a box's area from which on it is to be found
+    anchors_px: tuple[Level, Level, Level] = ANCHORS_PX  # width, height of the anchors at each of STRIDES
+    window_px: tuple[Window, Window] = (320, 192)  # width, height of a training sample
+    smallest_px: Annotated[float, Field(ge=0, le=8192)] = 6.0  # least size, root of the area, of a target box
 
 
 CONFIGURATIONS = {

@@ -1,4 +1,4 @@
-"""Boxes from pictures."""
+"""Inference of the sign detector: decoding, score threshold and class-agnostic non-maximum suppression."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ from flcav.perception.signs.model import SignDetector, decode
 from flcav.perception.task import Result
 from flcav.records import Class
 
-CANDIDATES = 512  # best-scoring places that suppression looks at
-MOST_OVERLAP = 0.5  # IoU above which two boxes are the same sign, whatever class they say
-MOST_FOUND = 100
+CANDIDATES = 512  # number of best-scoring anchors before non-maximum suppression
+MOST_OVERLAP = 0.5  # IoU above which the lower-scoring of two boxes is suppressed, whatever their classes
+MOST_FOUND = 100  # largest number of detections of an image
 
 
 @dataclass(frozen=True)
 class Detections:
-    """What was found in one picture, best first."""
+    """Detections in one image as arrays, by falling score."""
 
     box: NDArray[np.float64]  # (N, 4) x1 y1 x2 y2 [px] from the upper left corner
-    label: NDArray[np.int64]  # (N,) number of the class
+    label: NDArray[np.int64]  # (N,) index of the class
     score: NDArray[np.float64]  # (N,) in [0, 1]
 
     def __len__(self) -> int:
@@ -35,7 +35,7 @@ class Detections:
 
 @dataclass(frozen=True)
 class BoxFound:
-    """A box around a sign or light, from the upper left corner of the picture."""
+    """A detected sign or traffic light; coordinates are from the upper left corner of the image."""
 
     label: Class
     score: float  # [0, 1]
@@ -47,12 +47,12 @@ class BoxFound:
 
 @dataclass(frozen=True)
 class BoxesFound(Result):
-    """The signs and lights of a picture, best first."""
+    """The detected signs and traffic lights of an image, by falling score."""
 
     boxes: tuple[BoxFound, ...]
 
     def lines(self) -> list[str]:
-        """Return one line per box."""
+        """Return the number of boxes, then one line per box."""
         lines = [f"{len(self.boxes)} signs and lights"]
         for box in self.boxes:
             corners = f"({box.x1:.1f}, {box.y1:.1f}) to ({box.x2:.1f}, {box.y2:.1f}) px"
@@ -61,15 +61,15 @@ class BoxesFound(Result):
 
 
 def boxes_found(found: Detections, classes: Sequence[str]) -> BoxesFound:
-    """Return detections with the names of their classes."""
+    """Return detections as a record with the names of their classes."""
     rows = zip(found.box.tolist(), map(int, found.label), map(float, found.score), strict=True)
     return BoxesFound(tuple(BoxFound(classes[label], score, *box) for box, label, score in rows))
 
 
 def detect(network: SignDetector, picture: Picture, *, threshold: float) -> Detections:
-    """Return the boxes found in a picture of any size with a score of `threshold` or more.
+    """Return the detections in an image of any size with a score of at least `threshold`.
 
-    The network's mode is left as it was.
+    The network's training mode is left as it was.
     """
     training = network.training
     network.eval()
@@ -85,15 +85,16 @@ def detect(network: SignDetector, picture: Picture, *, threshold: float) -> Dete
 
 
 def padded(picture: Picture) -> Picture:
-    """Return the picture with grey to its right and below, so that its sides are multiples of the largest stride."""
+    """Return the image padded with grey on the right and below, to sides that are multiples of the largest stride."""
     down, across = (-side % STRIDES[-1] for side in picture.shape[:2])
     return np.pad(picture, ((0, down), (0, across), (0, 0)), constant_values=GREY)
 
 
 def predict(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Tensor]:
-    """Return the network's raw predictions on pictures of one size, both sides multiples of the largest stride.
+    """Return the network's raw predictions on images of one size, whose sides are multiples of the largest stride.
 
-    Channels lie innermost in memory and convolutions are in bfloat16 where the processor multiplies it: half the time.
+    One tensor per level as `SignDetector.forward`, in float32. Channels are last in memory and convolutions are in
+    bfloat16 where the hardware supports it, which halves the time.
     """
     device = next(network.parameters()).device
     stacked = torch.from_numpy(np.stack(pictures)).to(device)

@@ -1,4 +1,4 @@
-"""Which signs and traffic lights a detector misses, and where it sees some that are none."""
+"""Error registry of the sign detector: missed signs and lights, and false positives, with positions in the town."""
 
 from collections.abc import Iterator, Sequence
 
@@ -22,8 +22,8 @@ from flcav.sensors.frame import Frame
 from flcav.world.rays.embree import Embree, Solid
 from flcav.world.static import Things, static_world, town_things
 
-OVERLAP = 0.5  # IoU that counts as found
-WITHIN = 0.5  # share of a detection that lies on something too small or cut off, which is then no mistake
+OVERLAP = 0.5  # least IoU of a true positive
+WITHIN = 0.5  # least share of a detection on a neutral (too small or cut off) box for it to be no mistake
 
 
 def register_errors(
@@ -33,11 +33,11 @@ def register_errors(
     threshold: float,
     progress: Report = silent,
 ) -> Registry:
-    """Return each sign or light of the town that was missed, once, and false positives by scene.
+    """Return the missed signs and lights of the town, each once, and the false positives of each scene.
 
-    A miss stands at the sign's place in the town, a false positive where the ray through its middle meets what stands
-    still in the town; where it meets nothing it is dropped, and counted. Raises `InputError` where the dataset's town
-    is not known, or none of the frames has a camera.
+    Detections scoring below `threshold` are ignored. A miss has the position of the sign in the town; a false positive
+    that of the first hit of the ray through its centre with the static mesh of the town, and is dropped, and counted,
+    without a hit. Raises `InputError` if the dataset's town is unknown, or none of the frames has a camera.
     """
     town = data.town()
     if town is None:
@@ -68,7 +68,7 @@ def register_errors(
 def _mistakes(
     frame: Frame, camera: str, found: Detections, size: tuple[int, int], config: SignsConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of the picture's signs that were missed, and the numbers of the detections of nothing."""
+    """Return the annotation rows of the missed signs of an image, and the indices of the false positives."""
     shown = rectangles(frame, camera, "signs", min_pixels=1)
     names = [CLASSES["signs"][number] for number in shown.label]
     wanted = wanted_boxes(shown.box, size, config) & np.array([name in config.classes for name in names], dtype=bool)
@@ -87,7 +87,7 @@ def _mistakes(
 
 
 def _on(box: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
-    """Return whether at least `WITHIN` of a box (4,) lies on one of the others (K, 4)."""
+    """Return whether at least the share `WITHIN` of a box (4,) lies inside one of the others (K, 4)."""
     low, high = np.maximum(box[:2], others[:, :2]), np.minimum(box[2:], others[:, 2:])
     return bool(((high - low).clip(min=0).prod(1) >= WITHIN * (box[2:] - box[:2]).prod()).any())
 
@@ -105,7 +105,7 @@ def _misses(frame: Frame, camera: str, rows: NDArray[np.int64], things: Things) 
 def _meets(
     frame: Frame, camera: str, found: Detections, numbers: NDArray[np.int64], solid: Solid, config: SignsConfig
 ) -> Iterator[PerceptionError | None]:
-    """Yield a false positive where its ray meets the town, None where it meets nothing."""
+    """Yield each false positive at the hit of its ray with the town, None for a ray without a hit."""
     if not len(numbers):
         return
     calibration = frame.calibration

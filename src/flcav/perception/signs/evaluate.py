@@ -1,4 +1,4 @@
-"""How well boxes agree with the truth: COCO's mean average precision, by class and by size."""
+"""COCO's mean average precision of the sign detector, also by class and by size of the box."""
 
 import contextlib
 import io
@@ -15,23 +15,23 @@ from flcav.perception.signs.samples import size_px
 from flcav.perception.task import Evaluated
 from flcav.records import Class
 
-EDGES_PX = (12.0, 24.0)  # between small, medium and large: roots of a box's area
+EDGES_PX = (12.0, 24.0)  # borders between small, medium and large, as roots of a box's area
 LARGEST_PX = 1e5
-ALL, FIFTY = 0, 0  # area range that holds all sizes; IoU threshold 0.5
+ALL, FIFTY = 0, 0  # index of the area range of all sizes; index of the IoU threshold 0.5
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What one picture holds."""
+    """Ground truth of one image."""
 
-    box: NDArray[np.float64]  # (N, 4) x1 y1 x2 y2 [px]
-    label: NDArray[np.int64]  # (N,)
-    neutral: NDArray[np.float64]  # (K, 4) to find them, as whatever, is neither right nor wrong
+    box: NDArray[np.float64]  # (N, 4) x1 y1 x2 y2 [px] of the targets
+    label: NDArray[np.int64]  # (N,) index of the class
+    neutral: NDArray[np.float64]  # (K, 4) boxes whose detection, as any class, is neither right nor wrong
 
 
 @dataclass(frozen=True)
 class ClassPrecision:
-    """Average precision of a class; None where there was nothing to find."""
+    """Average precision of a class; None without targets."""
 
     label: Class
     ap50: float | None
@@ -46,38 +46,38 @@ class ClassPrecision:
 
 @dataclass(frozen=True)
 class SizePrecision:
-    """Mean average precision of targets of one size, roots of a box's area; None where there was nothing to find."""
+    """Mean average precision of targets of one size, the root of a box's area; None without targets."""
 
     from_px: float
-    to_px: float | None  # None: no limit
+    to_px: float | None  # None: no upper limit
     map50: float | None
     targets: int
 
     @property
     def name(self) -> str:
-        """Return the span of sizes in words."""
+        """Return the range of sizes in words."""
         return f"{self.from_px:g} px on" if self.to_px is None else f"{self.from_px:g} to {self.to_px:g} px"
 
 
 @dataclass(frozen=True)
 class SignsEvaluation(Evaluated):
-    """COCO's mean average precision, by class and by size; None where there was nothing to find."""
+    """COCO's mean average precision, as a whole, by class and by size; None without targets."""
 
-    map50: float | None
-    map50_95: float | None
+    map50: float | None  # at IoU 0.5
+    map50_95: float | None  # averaged over IoU 0.5 to 0.95
     classes: tuple[ClassPrecision, ...]
     sizes: tuple[SizePrecision, ...]
-    neutral: int  # boxes that are neither asked for nor counted as false
-    pictures: int
-    scenes: int = 1  # of the pictures
+    neutral: int  # number of neutral boxes, whose detection is neither right nor wrong
+    pictures: int  # number of images
+    scenes: int = 1  # number of scenes of the images
 
     @property
     def score(self) -> float:
-        """Return mAP at IoU 0.5; 0 where there was nothing to find."""
+        """Return mAP at IoU 0.5; 0 without targets."""
         return self.map50 or 0.0
 
     def numbers(self) -> Mapping[str, float]:
-        """Return mAP, and AP50 by class and by size, of what there was to find."""
+        """Return mAP, and AP50 by class and by size, as far as there are targets."""
         means = {"mAP50": self.map50, "mAP50-95": self.map50_95}
         classes = {row.name: row.ap50 for row in self.classes}
         sizes = {row.name: row.map50 for row in self.sizes}
@@ -98,10 +98,10 @@ class SignsEvaluation(Evaluated):
 def mean_average_precision(
     found: Sequence[Detections], truths: Sequence[Truth], classes: Sequence[str], smallest_px: float
 ) -> SignsEvaluation:
-    """Return mAP at IoU 0.5 and averaged over 0.5 to 0.95, by class and by size of the true box.
+    """Return mAP at IoU 0.5 and averaged over IoU 0.5 to 0.95, by class and by size of the true box.
 
-    Boxes found that are smaller than `smallest_px`, or mostly within a neutral one (a "crowd" in COCO's words), are
-    neither right nor wrong.
+    `found` and `truths` have an entry per image. Detections that are smaller than `smallest_px`, or match only a
+    neutral box (COCO's "crowd": the intersection over the detection's area counts), are neither right nor wrong.
     """
     edges = (smallest_px, *EDGES_PX, LARGEST_PX)
     ranges = [(smallest_px, LARGEST_PX), *pairwise(edges)]

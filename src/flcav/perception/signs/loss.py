@@ -1,4 +1,7 @@
-"""The loss of the sign detector, and which cells answer for which sign."""
+"""Loss of the sign detector: assignment of boxes to anchors and cells, complete IoU, and binary cross entropies.
+
+Terms: complete IoU of the boxes, cross entropy of the objectness, cross entropy of the classes.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,27 +16,27 @@ from flcav.perception.signs.config import STRIDES, SignsConfig
 from flcav.perception.signs.model import boxes_of
 from flcav.perception.signs.samples import Sample
 
-MOST_TIMES = 4.0  # by which a box's width and height may differ from its anchor's: what `decode` can reach
+MOST_TIMES = 4.0  # largest ratio of a box's width or height to its anchor's, either way; `decode` reaches no more
 
 
 @dataclass(frozen=True)
 class Targets:
-    """What one level of a batch is to predict at P places."""
+    """Training targets of a batch at one level: P pairs of a box with an anchor of a cell."""
 
-    image: Tensor  # (P,)
-    anchor: Tensor  # (P,)
-    row: Tensor  # (P,)
-    column: Tensor  # (P,)
+    image: Tensor  # (P,) index in the batch
+    anchor: Tensor  # (P,) index of the anchor
+    row: Tensor  # (P,) of the cell
+    column: Tensor  # (P,) of the cell
     box: Tensor  # (P, 4) x1 y1 x2 y2 [px]
-    label: Tensor  # (P,)
-    counted: Tensor  # (B, rows, columns) whether a cell's objectness is asked for
+    label: Tensor  # (P,) index of the class
+    counted: Tensor  # (B, rows, columns) whether a cell enters the objectness loss
 
 
 def assign(samples: Sequence[Sample], config: SignsConfig) -> list[Targets]:
-    """Return the targets at each of `STRIDES` for pictures of one size.
+    """Return the training targets at each of `STRIDES` for images of one size.
 
     A box is assigned to every anchor whose width and height are within a factor of four of its own, in the cell of its
-    centre and in the nearer neighbour to the side and above or below. Cells within ignored boxes are not counted.
+    centre and in the nearer horizontal and the nearer vertical neighbour. Cells within ignored boxes do not count.
     """
     height, width = samples[0].picture.shape[:2]
     image = np.repeat(np.arange(len(samples)), [len(sample.boxes) for sample in samples])
@@ -53,7 +56,7 @@ def assign(samples: Sequence[Sample], config: SignsConfig) -> list[Targets]:
 
 
 def _places(box: Tensor, anchors: Tensor, stride: int, grid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (P,) box, (P,) anchor, (P, 2) column and row of every assignment."""
+    """Return box (P,), anchor (P,), and cell (P, 2) as column, row, of every assignment."""
     ratio = (box[:, 2:] - box[:, :2])[:, None] / anchors  # (N, A, 2)
     number, anchor = (torch.maximum(ratio, 1 / ratio).amax(2) < MOST_TIMES).nonzero(as_tuple=True)
     center = ((box[:, :2] + box[:, 2:]) / 2 / stride)[number]
@@ -72,16 +75,16 @@ def _counted(sample: Sample, stride: int, grid: Tensor) -> Tensor:
     return counted
 
 
-BOX, OBJECT, CLASS = 1.0, 10.0, 8.0  # weights of the parts
-LEVELS = (4.0, 1.0, 0.4)  # of objectness: finer levels have more cells, of which fewer hold an object
+BOX, OBJECT, CLASS = 1.0, 10.0, 8.0  # weights of the terms
+LEVELS = (4.0, 1.0, 0.4)  # weights of the levels' objectness: on finer levels a smaller share of cells has an object
 
 
 def detection_loss(raw: Sequence[Tensor], targets: Sequence[Targets], config: SignsConfig) -> Tensor:
-    """Return the loss of raw predictions at each stride.
+    """Return the loss of raw predictions, one tensor per level as `SignDetector.forward`: the weighted sum of terms.
 
-    Boxes: mean of 1 - complete IoU over assigned places. Objectness: its target is that IoU where a place is assigned
-    (the best, where several boxes share one) and 0 elsewhere; mean over counted cells. Classes: mean over assigned
-    places, each class by itself.
+    Boxes: mean of 1 - complete IoU over the assigned anchors. Objectness: mean binary cross entropy over counted
+    cells; the target is that complete IoU at assigned anchors (the largest, if several boxes share one) and 0
+    elsewhere. Classes: mean binary cross entropy over assigned anchors and classes.
     """
     total = raw[0].new_zeros(())
     for level, (cells, asked) in enumerate(zip(raw, targets, strict=True)):
@@ -105,7 +108,7 @@ def detection_loss(raw: Sequence[Tensor], targets: Sequence[Targets], config: Si
 
 
 def _largest_at(maps: Tensor, place: tuple[Tensor, ...], values: Tensor) -> Tensor:
-    """Return `maps` with, at each place, the largest of the values given for it."""
+    """Return `maps` with each entry raised to the largest of the values at its index in `place`."""
     flat = torch.zeros_like(place[0])
     for index, size in zip(place, maps.shape, strict=True):
         flat = flat * size + index

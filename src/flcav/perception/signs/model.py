@@ -1,10 +1,10 @@
-"""A one-stage detector of the YOLOv5 kind, in the parts it is described by in the literature.
+"""A YOLOv5-style one-stage detector.
 
 A backbone of cross-stage partial stages (Wang et al., "CSPNet", CVPRW 2020), spatial pyramid pooling by repeated
-maxima (He et al., "Spatial Pyramid Pooling in Deep Convolutional Networks", ECCV 2014), a path-aggregation neck (Liu et
-al., "Path Aggregation Network for Instance Segmentation", CVPR 2018), and three levels of anchors; how these are put
-together, and the widths and depths, is surveyed by Terven et al., "A Comprehensive Review of YOLO Architectures", 2023.
-With 80 classes the widths `n` and `s` have the published 1.87 M and 7.23 M parameters.
+max pooling (He et al., "Spatial Pyramid Pooling in Deep Convolutional Networks", ECCV 2014), a path-aggregation neck
+(Liu et al., "Path Aggregation Network for Instance Segmentation", CVPR 2018), and anchors on three levels. Terven et
+al., "A Comprehensive Review of YOLO Architectures", 2023, describe how the parts are combined, their widths and depths.
+With 80 classes the configurations `n` and `s` have the published 1.87 M and 7.23 M parameters.
 """
 
 import math
@@ -14,21 +14,21 @@ from torch import Tensor, nn
 
 from flcav.perception.signs.config import STRIDES, SignsConfig
 
-CHANNELS = (64, 128, 256, 512, 1024)  # after each halving, at width 1
+CHANNELS = (64, 128, 256, 512, 1024)  # after each downsampling, at width 1
 DEPTHS = (3, 6, 9, 3)  # bottlenecks of the backbone's stages, at depth 1
-NECK_DEPTH = 3
-EXPECTED_OBJECTS = 1e-3  # share of cells that hold one, which a fresh network starts from
+NECK_DEPTH = 3  # bottlenecks of the neck's stages, at depth 1
+EXPECTED_OBJECTS = 1e-3  # initial odds of the objectness
 
 
 def unit(into: int, out: int, kernel: int = 1, stride: int = 1, padding: int | None = None) -> nn.Sequential:
-    """Return a convolution, its normalisation and a SiLU."""
+    """Return a convolution with batch normalisation and SiLU; `padding` None keeps the size at stride 1."""
     padding = kernel // 2 if padding is None else padding
     convolution = nn.Conv2d(into, out, kernel, stride, padding, bias=False)
     return nn.Sequential(convolution, nn.BatchNorm2d(out, eps=1e-3), nn.SiLU())
 
 
 class Bottleneck(nn.Module):
-    """Two convolutions, around which the input may go unchanged."""
+    """A bottleneck: a 1 x 1 and a 3 x 3 convolution, with a residual connection if `shortcut`."""
 
     def __init__(self, channels: int, shortcut: bool) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class Bottleneck(nn.Module):
 
 
 class Partial(nn.Module):
-    """A cross-stage partial stage: half of the channels go through the bottlenecks, half go past them."""
+    """A cross-stage partial (CSP) stage: one half of the channels passes the bottlenecks, the other half skips them."""
 
     def __init__(self, into: int, out: int, depth: int, shortcut: bool = True) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ class Partial(nn.Module):
 
 
 class Pyramid(nn.Module):
-    """Maxima over 5, 9 and 13 pixels beside the input, each by another pooling over 5."""
+    """Spatial pyramid pooling: the input with its maxima over 5, 9 and 13 pixels, by repeated max pooling over 5."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ class Pyramid(nn.Module):
 
 
 class SignDetector(nn.Module):
-    """Raw predictions for every anchor of every cell at three strides."""
+    """The detector: raw predictions for every anchor of every cell at three strides."""
 
     def __init__(self, config: SignsConfig) -> None:
         super().__init__()
@@ -96,9 +96,10 @@ class SignDetector(nn.Module):
         self._start_with_few_objects()
 
     def forward(self, pictures: Tensor) -> list[Tensor]:
-        """Return, for each of `STRIDES`, (B, anchors, H / stride, W / stride, fields) of pictures (B, 3, H, W) in 0..1.
+        """Return raw predictions (B, anchors, H / stride, W / stride, fields) at each of `STRIDES`.
 
-        H and W are multiples of 32.
+        `pictures` (B, 3, H, W) are RGB in [0, 1]; H and W are multiples of 32. The fields are x, y, width, height,
+        objectness, and one per class, all before the sigmoid.
         """
         at_8 = self.to_8(pictures)
         at_16 = self.to_16(at_8)
@@ -119,9 +120,9 @@ class SignDetector(nn.Module):
 
 
 def decode(raw: Tensor, level: int, config: SignsConfig) -> Tensor:
-    """Return boxes (B, anchors, rows, columns, 4) x1 y1 x2 y2 [px] of one level's raw predictions.
+    """Return the boxes (B, anchors, rows, columns, 4) x1 y1 x2 y2 [px] of one level's raw predictions.
 
-    A centre lies within half a cell around its own, a size is at most four times the anchor's.
+    A centre lies in its cell or up to half a cell outside, a width or height is at most four times the anchor's.
     """
     stride, (rows, columns) = STRIDES[level], raw.shape[2:4]
     across = torch.arange(columns, device=raw.device)
@@ -131,7 +132,10 @@ def decode(raw: Tensor, level: int, config: SignsConfig) -> Tensor:
 
 
 def boxes_of(raw: Tensor, cell: Tensor, anchor: Tensor, stride: int) -> Tensor:
-    """Return boxes (..., 4) [px] from raw (..., 4), cells (..., 2) column, row, and anchors (..., 2) [px]."""
+    """Return boxes (..., 4) x1 y1 x2 y2 [px] of raw predictions t (..., 4), cells (..., 2) and anchors (..., 2) [px].
+
+    With s = sigmoid(t) and the cell's column and row c: centre = (2 s_xy - 0.5 + c) stride, size = (2 s_wh)^2 anchor.
+    """
     share = raw.sigmoid()
     center = (2 * share[..., :2] - 0.5 + cell) * stride
     half = (2 * share[..., 2:]).square() * anchor / 2

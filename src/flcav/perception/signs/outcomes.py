@@ -1,4 +1,4 @@
-"""Which boxes were found in each picture, and COCO's mean average precision from them."""
+"""Outcomes of the sign task: detections and ground truth of each image, and COCO's mAP of bootstrap samples."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -14,21 +14,21 @@ from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.samples import RecordedPictures
 from flcav.progress import Report, silent
 
-LOWEST_SCORE = 0.01  # detections below hardly change the average precision
+LOWEST_SCORE = 0.01  # score threshold; detections below it hardly change the average precision
 FOUND, WANTED, NEUTRAL = "found", "wanted", "neutral"
 CLASSES, SMALLEST = "classes", "smallest_px"
 
 
 class SignsOutcomes:
-    """COCO's mAP at IoU 0.5."""
+    """Measure of the sign task: COCO's mAP at IoU 0.5."""
 
     measure_name = "mAP50"
-    redraws = 200  # each matches all pictures anew
+    redraws = 200  # few, since each bootstrap sample matches all images anew
 
     def outcomes(
         self, network: SignDetector, data: Dataset, frames: Sequence[int], progress: Report = silent
     ) -> Outcomes:
-        """Return what each picture holds and what was found in it."""
+        """Return detections and ground truth of each image, flattened, with the counts per image."""
         recorded = _last_asked_for(data, network.config, tuple(frames))
         found, truths = [], []
         for done, sample in enumerate(recorded, start=1):
@@ -51,7 +51,7 @@ class SignsOutcomes:
         return Outcomes(np.array([recorded.scene(number) for number in range(len(recorded))]), arrays)
 
     def measure(self, outcomes: Outcomes, times: Times) -> Values:
-        """Return mAP at IoU 0.5 of each redrawing."""
+        """Return mAP at IoU 0.5 of each bootstrap sample; NaN without targets."""
         found, truths = by_picture(outcomes)
         classes, smallest = outcomes.arrays[CLASSES].tolist(), float(outcomes.arrays[SMALLEST])
         values = []
@@ -62,7 +62,7 @@ class SignsOutcomes:
         return np.array(values, dtype=np.float64)
 
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
-        """Return mAP averaged over IoU 0.5 to 0.95, and the boxes to find."""
+        """Return mAP averaged over IoU 0.5 to 0.95, and the number of targets."""
         found, truths = by_picture(outcomes)
         classes, smallest = outcomes.arrays[CLASSES].tolist(), float(outcomes.arrays[SMALLEST])
         result = mean_average_precision(found, truths, classes, smallest)
@@ -70,7 +70,7 @@ class SignsOutcomes:
 
 
 def by_picture(outcomes: Outcomes) -> tuple[list[Detections], list[Truth]]:
-    """Return what was found in each picture, and what it holds."""
+    """Return the detections and the ground truth of each image."""
 
     def parts(name: str, field: str) -> list[np.ndarray]:
         ends = np.cumsum(outcomes.arrays[f"{name}/count"])[:-1]
@@ -87,5 +87,5 @@ def _joined(boxes: Sequence[np.ndarray], width: int) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _last_asked_for(data: Dataset, config: SignsConfig, frames: tuple[int, ...]) -> RecordedPictures:
-    """Return the pictures; training asks for those of its validation again and again."""
+    """Return the images with their labels, cached: each validation of a training asks for the same ones."""
     return RecordedPictures(data, config, frames)

@@ -1,4 +1,4 @@
-"""What the detector learns from: pictures, the boxes to find, the places to leave out of the loss."""
+"""Samples of the sign task: images with target boxes, and ignored boxes that are left out of the loss."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,24 +14,23 @@ from flcav.perception.images import Picture, checked_picture
 from flcav.perception.signs.config import SignsConfig
 from flcav.sensors.frame import Frame
 
-KEPT_BYTES = 3_000_000_000  # of pictures that stay in memory once they are read
+KEPT_BYTES = 3_000_000_000  # [B] of images cached in memory
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One labelled picture; boxes are x1 y1 x2 y2 [px] from its upper left corner."""
+    """One labelled image; boxes are x1 y1 x2 y2 [px] from its upper left corner."""
 
     picture: Picture
-    boxes: NDArray[np.float64]  # (N, 4) to be found
-    label: NDArray[np.int64]  # (N,) number of the class
-    ignore: NDArray[np.float64]  # (K, 4) neither to be found nor to be kept apart
+    boxes: NDArray[np.float64]  # (N, 4) targets
+    label: NDArray[np.int64]  # (N,) index of the class
+    ignore: NDArray[np.float64]  # (K, 4) neither targets nor background
 
 
 class RecordedPictures(Sequence[Sample]):
-    """Every camera's pictures in frames of a dataset with their ground truth.
+    """The labelled images of all cameras in frames of a dataset (None: all).
 
-    They are read when asked for, and stay in memory as long as they take no more than `KEPT_BYTES` together.
-    Raises `InputError` where no frame has a camera.
+    Images are read on access and cached up to `KEPT_BYTES`. Raises `InputError` if no frame has a camera.
     """
 
     def __init__(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> None:
@@ -58,15 +57,14 @@ class RecordedPictures(Sequence[Sample]):
         return sample
 
     def scene(self, index: int) -> str:
-        """Return the scene of a picture."""
+        """Return the scene of image `index`."""
         return self._data.keys[self._of[index][0]].scene
 
 
 def sample_of(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
-    """Return a camera's picture with its signs and lights.
+    """Return a camera's image with the boxes of its signs and lights.
 
-    Those smaller than `config.smallest_px` are ignored, and so are those that the picture's edge cuts off: what a lamp
-    shows may lie outside.
+    Boxes smaller than `config.smallest_px`, and boxes cut off by the image's edge, are ignored: a lamp may lie outside.
     """
     shown = rectangles(frame, camera, "signs", min_pixels=1)
     names = [CLASSES["signs"][number] for number in shown.label]
@@ -79,11 +77,11 @@ def sample_of(frame: Frame, camera: str, picture: Picture, config: SignsConfig) 
 
 
 def wanted_boxes(box: NDArray[np.float64], size: tuple[int, int], config: SignsConfig) -> NDArray[np.bool_]:
-    """Return which boxes (N, 4) are to be found in a picture of `size` (width, height) [px]: whole and large enough."""
+    """Return (N,) which boxes (N, 4) are targets in an image of `size` (width, height) [px]: whole and large enough."""
     whole = (box[:, :2] > 0).all(1) & (box[:, 2:] < size).all(1)
     return whole & (size_px(box) >= config.smallest_px)
 
 
 def size_px(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N,) the root of each box's area."""
+    """Return the size (N,) of boxes (N, 4): the square root of the area [px]."""
     return np.sqrt((boxes[:, 2:] - boxes[:, :2]).clip(min=0).prod(1))

@@ -1,7 +1,7 @@
-"""The study of the sign task: three towns to learn from; held-out scenes and a held-out town to test.
+"""Study recipe of the sign task: training in three towns, tests on held-out scenes and on a held-out town.
 
-It learns from recipes/signs.yaml, signs_suburb.yaml and signs_grid.yaml.
-The held-out scenes have all eight classes; the held-out town has speed limits of 30, yield signs and lights alone.
+Training recordings are by recipes/signs.yaml, signs_suburb.yaml and signs_grid.yaml. The held-out scenes have all eight
+classes; the held-out town has only speed limits of 30, yield signs and lights.
 """
 
 from flcav.perception.study import StudyRecipe, read_recipe

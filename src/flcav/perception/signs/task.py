@@ -1,4 +1,4 @@
-"""Detection of signs and traffic lights as a `Task`."""
+"""The sign task: detection of traffic signs and traffic lights as a `Task`."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -26,11 +26,11 @@ from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.progress import Report, silent
 
-BOX_BYTES = 4 * 4 + 1  # of a label: a box in float32, and its class
+BOX_BYTES = 4 * 4 + 1  # [B] of a label: a box in float32, and its class
 
 
 class SignsTask(SignsOutcomes):
-    """Boxes of signs and signal heads in a camera picture, and what they show."""
+    """2D detection of signs and signal heads in camera images, classified by what they show."""
 
     name = "signs"
     family = "yolo"
@@ -44,39 +44,39 @@ class SignsTask(SignsOutcomes):
     threshold = THRESHOLD
 
     def study(self) -> StudyRecipe:
-        """Return how it is studied, see `flcav.perception.signs.study`."""
+        """Return the study recipe, see `flcav.perception.signs.study`."""
         from flcav.perception.signs.study import STUDY
 
         return STUDY
 
     def build(self, config: SignsConfig) -> SignDetector:
-        """Return a fresh network."""
+        """Return a network with random initial weights."""
         return SignDetector(config)
 
     def samples(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
-        """Return every camera's pictures with their signs and lights, read when asked for."""
+        """Return the labelled images of all cameras, read on access; raises `InputError` if no frame has a camera."""
         return RecordedPictures(data, config, frames)
 
     def draw(self, samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
-        """Return a window of the sample, or a mosaic with others, in changed colours."""
+        """Return an augmented sample, see `flcav.perception.signs.augment.draw`."""
         return draw(samples, index, config, rng)
 
     def loss(self, network: SignDetector, samples: Sequence[Sample]) -> Tensor:
-        """Return the loss of a batch of pictures of one size, both sides multiples of 32."""
+        """Return the loss of a batch of images of one size, whose sides are multiples of 32; see `detection_loss`."""
         raw = predict(network, [sample.picture for sample in samples])
         return detection_loss(raw, assign(samples, network.config), network.config)
 
     def evaluate(
         self, network: SignDetector, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
     ) -> SignsEvaluation:
-        """Return COCO's mAP, by class and by size, see `mean_average_precision`."""
+        """Return COCO's mAP, as a whole, by class and by size; see `mean_average_precision`."""
         kept = self.outcomes(network, data, data.numbers(frames), progress)
         found, truths = by_picture(kept)
         result = mean_average_precision(found, truths, network.config.classes, network.config.smallest_px)
         return replace(result, scenes=len(set(kept.scene.tolist())))
 
     def sample_bytes(self, data: Dataset, config: SignsConfig, frames: Sequence[int]) -> list[int]:
-        """Return the bytes of each frame's pictures with their boxes: four float32 and a class."""
+        """Return the size [B] of each frame's images with their boxes: four float32 and a class."""
         return [
             picture_bytes(data, i) + BOX_BYTES * sum(map(len, data.frame(i).annotations.signs.values())) for i in frames
         ]
@@ -84,7 +84,7 @@ class SignsTask(SignsOutcomes):
     def infer(
         self, network: SignDetector, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the boxes in each picture of `path`, best first."""
+        """Yield the detections of each image at `path`, by falling score."""
         for origin, rgb in pictures(path, frames):
             found = detect(network, rgb, threshold=threshold)
             names = np.array(network.config.classes)[found.label]
@@ -99,7 +99,7 @@ class SignsTask(SignsOutcomes):
         threshold: float = THRESHOLD,
         progress: Report = silent,
     ) -> Registry:
-        """Return the signs that are missed and invented, see `errors.register_errors`."""
+        """Return the missed signs and the false positives, see `flcav.perception.signs.errors.register_errors`."""
         return register_errors(network, data, data.numbers(frames), threshold, progress)
 
 

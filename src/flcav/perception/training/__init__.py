@@ -1,4 +1,4 @@
-"""Training, the same for every task: batches, learning rates, checkpoints, early stopping."""
+"""Training of any task's networks: mini-batches, learning-rate schedules, checkpoints, early stopping."""
 
 from flcav.perception.training.loop import (
     SCHEDULES,

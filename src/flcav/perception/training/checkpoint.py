@@ -1,4 +1,7 @@
-"""Checkpoints of a training, and the settings that make it another one."""
+"""Checkpoints of a training run, and the settings that identify it.
+
+The settings are all that decides the weights, except the kind of processor and the versions of libraries.
+"""
 
 import io
 import pickle
@@ -13,18 +16,18 @@ from flcav.files import write_bytes
 from flcav.perception.card import Card, DataEntry
 from flcav.perception.weights import read_card
 
-TRAINED = ("device", "epochs", "patience", "batch", "learning_rate", "schedule")  # told in a card's training
-Part = tuple[str, tuple[str, ...] | None]  # of data: a manifest's fingerprint, the agents; None where not recorded
+TRAINED = ("device", "epochs", "patience", "batch", "learning_rate", "schedule")  # settings in `Card.training`
+Part = tuple[str, tuple[str, ...] | None]  # a dataset: SHA-256 of its manifest, agents used (None in older cards)
 NAMED = {"data": "other data or agents", "validation": "other validation data or agents"}
 
 
 class Settings(Config):
-    """Fields are None where an older card does not say."""
+    """Settings of a training, which decide its weights; None where an older card lacks them."""
 
     task: str
-    network: str
+    network: str  # name of the configuration
     seed: int
-    threads: int | None
+    threads: int | None  # CPU threads
     device: str | None  # cpu | cuda
     data: tuple[Part, ...]
     validation: Part | None
@@ -35,7 +38,7 @@ class Settings(Config):
     schedule: str
 
     def differences(self, other: "Settings") -> str:
-        """Return in words what is otherwise in `other`; "" where nothing is."""
+        """Return the differences of `other` in words; an empty string if there are none."""
         pairs = [(name, getattr(self, name), getattr(other, name)) for name in type(self).model_fields]
         return ", ".join(
             NAMED.get(name, f"{name} {theirs} instead of {own}") for name, own, theirs in pairs if own != theirs
@@ -43,7 +46,7 @@ class Settings(Config):
 
 
 def settings_of(card: Card) -> Settings:
-    """Return the settings of the training that a card is of."""
+    """Return the settings of the training that a card describes."""
     return Settings.model_validate(
         {
             "task": card.task,
@@ -58,14 +61,14 @@ def settings_of(card: Card) -> Settings:
 
 
 def part_of(entry: DataEntry) -> Part:
-    """Return what a card's entry of a dataset says of which data they are."""
+    """Return the identity of a dataset in a card: its manifest's SHA-256 and the agents used."""
     return entry.manifest, entry.agents
 
 
 def finished_card(path: Path, asked: Settings) -> Card | None:
-    """Return the card of the weights at `path` if they are what is asked for; None where there are none.
+    """Return the card of the weights at `path`; None if there is no such file.
 
-    Raises `InputError` where they are others, so that nothing is lost.
+    Raises `InputError` if they were trained with other settings than `asked`, so that they are not overwritten.
     """
     if not path.exists():
         return None
@@ -77,17 +80,17 @@ def finished_card(path: Path, asked: Settings) -> Card | None:
 
 @dataclass
 class Progress:
-    """What a run has behind it."""
+    """State of a training run: losses, validation scores and best weights so far."""
 
-    losses: list[float] = field(default_factory=list)  # of each step taken
+    losses: list[float] = field(default_factory=list)  # of each step
     scores: list[float] = field(default_factory=list)  # of each validation
-    best: dict[str, Tensor] | None = None  # the weights of the best validation
+    best: dict[str, Tensor] | None = None  # weights of the best validation; None before the first
 
 
 def save_checkpoint(
     path: Path, identity: str, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer
 ) -> None:
-    """Write the state of the run that `identity` describes, atomically."""
+    """Write a checkpoint of the run `identity`, atomically: progress, network and optimiser."""
     state = {
         "identity": identity,
         "losses": torch.tensor(progress.losses, dtype=torch.float64),
@@ -102,9 +105,9 @@ def save_checkpoint(
 
 
 def load_checkpoint(path: Path, identity: str, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
-    """Restore network and optimiser in place and return what was done; nothing where there is no file.
+    """Restore network and optimiser in place and return the progress; without a file, an empty progress.
 
-    Raises `InputError` where the file is not a checkpoint or one of another run. Nothing in it is executed.
+    Raises `InputError` if the file is not a checkpoint, or one of another run. No code in the file is executed.
     """
     if not path.exists():
         return Progress()

@@ -1,4 +1,7 @@
-"""The training loop: batches, learning rates, the loss, the score after each epoch."""
+"""The training loop: AdamW on augmented mini-batches, a learning-rate schedule, validation with early stopping.
+
+Training is deterministic in its seed, and a run resumed from a checkpoint ends with the same weights.
+"""
 
 import json
 import math
@@ -20,14 +23,15 @@ from flcav.seeds import stream
 
 
 def constant(done: float) -> float:
-    """Return 1: the learning rate stays."""
+    """Return 1, the constant schedule."""
     return 1.0
 
 
 def one_cycle(done: float) -> float:
-    """Return the share of the peak learning rate when a share `done` in [0, 1] of the steps is over.
+    """Return the one-cycle schedule: the share of the peak learning rate after a share `done` in [0, 1] of the steps.
 
-    From 1/25 up to 1 over the first 30 %, then down to 1/10000, both along a cosine (Smith and Topin, 2018).
+    It rises from 1/25 to 1 over the first 30 % and falls to 1/10000, both along a cosine (Smith and Topin,
+    "Super-Convergence", 2018).
     """
     warm, low, floor = 0.3, 1 / 25, 1e-4
     if done < warm:
@@ -38,9 +42,9 @@ def one_cycle(done: float) -> float:
 SCHEDULES: dict[str, Callable[[float], float]] = {"constant": constant, "one_cycle": one_cycle}
 
 
-CLIP_NORM = 10.0
+CLIP_NORM = 10.0  # largest norm of the gradient
 
-Watch = Callable[[int, Mapping[str, float]], None]  # steps taken, numbers by name
+Watch = Callable[[int, Mapping[str, float]], None]  # called with the number of steps taken and scalars by name
 
 
 def _unwatched(step: int, values: Mapping[str, float]) -> None:
@@ -49,31 +53,31 @@ def _unwatched(step: int, values: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class Checkpointing:
-    """Where a run leaves off, and how often it says so."""
+    """File and interval of the checkpoints of a run."""
 
     path: Path
-    every: int = 50  # steps
-    of: str = ""  # what else tells one run from another, beside what `train` is given
+    every: int = 50  # steps between checkpoints
+    of: str = ""  # part of the run's identity beside the arguments of `train`, such as its data
 
 
 @dataclass(frozen=True)
 class Validation:
-    """When to look how good the network is, and when to give up hope of a better one."""
+    """Validation during a training, and the rule of early stopping."""
 
-    score: Callable[[Any], float]  # of a network; the higher, the better
-    every: int  # steps
-    patience: int  # validations without a new best after which training ends
+    score: Callable[[Any], float]  # validation score of a network; more is better
+    every: int  # steps between validations
+    patience: int  # validations without a new best after which training stops
 
     def over(self, scores: Sequence[float]) -> bool:
-        """Return whether the last `patience` of `scores` brought nothing above those before."""
+        """Return whether training stops: none of the last `patience` of `scores` is above all scores before them."""
         return len(scores) > self.patience and max(scores[-self.patience :]) <= max(scores[: -self.patience])
 
 
 @dataclass(frozen=True)
 class History:
-    """How a training went."""
+    """Losses and validation scores of a training."""
 
-    losses: NDArray[np.float64]  # (steps,) of each batch; fewer than asked for where validation ended it
+    losses: NDArray[np.float64]  # (steps,) loss of each batch; fewer steps than asked for after early stopping
     scores: NDArray[np.float64]  # (validations,)
 
 
@@ -92,12 +96,12 @@ def train(
     watch: Watch = _unwatched,
     progress: Report = silent,
 ) -> History:
-    """Train `network` in place for `steps` batches; what is not given is the task's practice.
+    """Train `network` in place for `steps` optimiser steps; hyperparameters default to `task.practice`.
 
-    Batches go through the samples in a random order, drawn anew each time round. With `validation`, training may end
-    early, and the network is left with the weights that scored best. With `checkpointing`, a run that was cut off goes
-    on from its file to the very same weights. Raises `InputError` without samples, for an unknown schedule, and where
-    the checkpoint is of another run.
+    Each epoch goes through the samples in a new random order. With `validation`, training may stop early, and the
+    network gets the weights of the best validation. With `checkpointing`, an interrupted run is resumed from its file
+    and ends with the same weights. `watch` receives loss, learning rate and validation score. Raises `InputError`
+    without samples, for an unknown schedule, and if the checkpoint is of another run.
     """
     batch = task.practice.batch if batch is None else batch
     learning_rate = task.practice.learning_rate if learning_rate is None else learning_rate
@@ -113,7 +117,7 @@ def train(
     identity = f"{json.dumps(settings)} on {len(samples)} samples {checkpointing.of if checkpointing else ''}"
     done = load_checkpoint(checkpointing.path, identity, network, optimizer) if checkpointing else Progress()
     order = batches(len(samples), batch, steps, seed)
-    config: Any = network.config  # which every network of a task carries
+    config: Any = network.config  # an attribute of every network of a task
     for number in range(len(done.losses), steps):
         if validation and validation.over(done.scores):
             break
@@ -147,7 +151,10 @@ def train_steps(
     learning_rate: float,
     seed: int,
 ) -> float:
-    """Train `network` in place at a constant learning rate, as a federation's client does; return the mean loss."""
+    """Train `network` in place at a constant learning rate, as a federated client does.
+
+    Returns the mean loss, 0 for 0 steps; raises as `train` does.
+    """
     history = train(
         task,
         network,
@@ -162,7 +169,7 @@ def train_steps(
 
 
 def adamw(network: nn.Module, learning_rate: float) -> torch.optim.AdamW:
-    """Return the optimiser that every task is trained with."""
+    """Return the AdamW optimiser that all tasks are trained with."""
     return torch.optim.AdamW(network.parameters(), learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True)
 
 
@@ -172,7 +179,7 @@ def step(
     optimizer: torch.optim.Optimizer,
     samples: Sequence[SampleT],
 ) -> float:
-    """Take one optimiser step on a batch and return its loss."""
+    """Take one optimiser step on a batch, with the gradient's norm clipped to `CLIP_NORM`, and return the loss."""
     loss = task.loss(network, samples)
     optimizer.zero_grad()
     loss.backward()
@@ -182,7 +189,10 @@ def step(
 
 
 def batches(samples: int, batch: int, steps: int, seed: int) -> NDArray[np.int64]:
-    """Return (steps, batch) sample indices: one shuffled pass after another, cut into batches."""
+    """Return the sample indices of each batch, (steps, batch): shuffled epochs one after another, cut into batches.
+
+    A batch has at most as many samples as there are.
+    """
     batch = min(batch, samples)
     passes = [stream(seed, "order", i).permutation(samples) for i in range(-(-steps * batch // samples))]
     order = np.concatenate([np.zeros(0, dtype=np.int64), *passes])

@@ -1,4 +1,4 @@
-"""A training from datasets to a file of weights, its card and TensorBoard's events."""
+"""A complete training of any task: from datasets to a file of weights, its model card and TensorBoard event files."""
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,9 +26,9 @@ from flcav.progress import Report, silent
 
 @contextlib.contextmanager
 def event_files(folder: Path) -> Iterator[Watch]:
-    """Yield a `Watch` that writes scalars below `folder`, which is made with the first one.
+    """Yield a `Watch` that writes TensorBoard event files to `folder`, which is created with the first scalar.
 
-    A run that goes on from a checkpoint hides what an interrupted one wrote after it.
+    A run that is resumed hides the events that the interrupted run wrote after the checkpoint.
     """
     writer: Any = None
 
@@ -53,70 +53,70 @@ WEIGHTS, CARD, CHECKPOINT, EVENTS = "weights.safetensors", "card.md", "checkpoin
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be trained on what."""
+    """Arguments of a training."""
 
     data: Sequence[Dataset]
     validation: Dataset | None = None  # of other scenes
     network: str | None = None  # name of the configuration; None: the task's default
     epochs: int = 10
-    patience: int = 5  # epochs without a better validation after which training ends
+    patience: int = 5  # epochs without a better validation score after which training stops
     seed: int = 0
     device: torch.device = CPU
-    agents: str | None = None  # whose frames, of validation too: see `flcav.perception.agents`
+    agents: str | None = None  # selection of frames, of validation too: see `flcav.perception.agents.choose_frames`
 
 
 @dataclass(frozen=True)
 class Part:
-    """A dataset and the frames of it that are used."""
+    """A dataset with the frames selected from it."""
 
     data: Dataset
     chosen: Chosen
-    entry: DataEntry  # in the card
+    entry: DataEntry  # its entry in the card
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A training that can begin, or has been finished before."""
+    """A training whose arguments are checked and whose samples are listed."""
 
     task: Task
     request: Request
     out: Path
-    config: Any  # the network's
+    config: Any  # configuration of the network
     settings: Settings
-    parts: tuple[Part, ...]
-    held: Part | None  # for validation
-    finished: Card | None  # of the weights that lie in `out` already
-    samples: Sequence[Any]  # none where it is finished
+    parts: tuple[Part, ...]  # training data
+    held: Part | None  # validation data
+    finished: Card | None  # card of the weights in `out`, if the training was finished before
+    samples: Sequence[Any]  # training samples; empty if finished before
 
     def lines(self) -> list[str]:
-        """Return what is learned from, and what is validated on, in words."""
+        """Return the training and validation data in words, one line per dataset."""
         named = [*((part, "") for part in self.parts), *([(self.held, ", for validation")] if self.held else [])]
         return [f"{part.data.folder}: {part.chosen.sentence}{what}" for part, what in named]
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training came to."""
+    """Result of a training: model card and evaluation."""
 
     card: Card  # of the weights
-    evaluation: Evaluated | None = None  # on the validation data; None where there are none, or it was trained before
+    evaluation: Evaluated | None = None  # on the validation data; None without, or if finished before
 
 
 def train_network(task: Task, request: Request, out: Path, progress: Report = silent) -> Card:
-    """Train, going on from where an interrupted run left off in `out`; write weights, card and curves there.
+    """Train a network and write weights, card and curves to `out`; resume an interrupted run there. Return the card.
 
-    One learning-rate cycle over all epochs. With validation data, the network of the best epoch is kept, its scores are
-    calibrated where the task does so, and its evaluation is in the card. Where `out` holds the weights of these very
-    settings, nothing is done. Raises as `prepare` does.
+    The learning rate follows one schedule over all epochs. With validation data, the network of the best epoch is kept,
+    its scores are calibrated if the task is `Calibrates`, and its evaluation goes into the card. If `out` holds weights
+    of the same settings, nothing is trained. Raises as `prepare` does.
     """
     return train_prepared(prepare(task, request, out), progress).card
 
 
 def prepare(task: Task, request: Request, out: Path) -> Prepared:
-    """Return the training that is asked for, its samples found.
+    """Check the arguments of a training and list its samples.
 
-    Raises `InputError` for an unknown network, for data or agents that the task cannot use and where `out` holds the
-    weights of other settings; `OSError` before anything is read where `out` cannot be written.
+    Raises `InputError` for an unknown network, for data or agents that the task cannot use, and if `out` holds weights
+    of other settings; `OSError`, before any data are read, if `out` cannot be written.
     """
     check_writable(out)
     config = configuration(task, request.network)
@@ -140,12 +140,12 @@ def prepare(task: Task, request: Request, out: Path) -> Prepared:
         found = [task.samples(part.data, config, part.chosen.frames) for part in parts]
         samples = ConcatDataset(found)  # pyright: ignore[reportArgumentType]
         if held is not None:
-            task.samples(held.data, config, held.chosen.frames)  # what is wrong is said before the long work
+            task.samples(held.data, config, held.chosen.frames)  # raises for bad validation data before the long work
     return Prepared(task, request, out, config, settings, parts, held, finished, samples)
 
 
 def train_prepared(prepared: Prepared, progress: Report = silent) -> Trained:
-    """Train what `prepare` returned, see `train_network`."""
+    """Perform the training that `prepare` returned, see `train_network`; return its card and evaluation."""
     if prepared.finished is not None:
         return Trained(prepared.finished)
     task, request, out, held = prepared.task, prepared.request, prepared.out, prepared.held

@@ -1,1 +1,1 @@
-"""Where road users will be: an LSTM over tracks and a bird's-eye view of the surroundings (rasters, or cameras)."""
+"""Trajectory prediction of vehicles: an LSTM over past tracks and a bird's-eye view, of map rasters or of cameras."""

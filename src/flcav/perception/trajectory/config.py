@@ -1,4 +1,4 @@
-"""Which network predicts trajectories."""
+"""Configurations of the trajectory network: modes, sizes, patch of ground, cameras; and the instants of a track."""
 
 from typing import Annotated
 
@@ -6,19 +6,19 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-STEP_S = 0.25  # between two points of a track
+STEP_S = 0.25  # time between two points of a track
 PAST, FUTURE = 8, 12  # steps before and after the present: 2 s and 3 s
-Maps = Annotated[int, Field(ge=1, le=4096)]
+Maps = Annotated[int, Field(ge=1, le=4096)]  # number of feature maps
 HORIZON_S = FUTURE * STEP_S
 
 
 @dataclass(frozen=True, config=STRICT)
 class Patch:
-    """The square of ground that is looked at, in the frame of the predicted road user: x ahead, y to the left."""
+    """The square of ground that the network sees, in the frame of the predicted road user: x ahead, y to the left."""
 
     cells: Annotated[int, Field(ge=16, le=1024, multiple_of=8)] = 64  # along each side
-    cell_m: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
-    ahead: Annotated[float, Field(gt=0, lt=1)] = 0.75  # share of it that lies ahead
+    cell_m: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0  # side of a cell
+    ahead: Annotated[float, Field(gt=0, lt=1)] = 0.75  # share of the patch that lies ahead of the road user
 
     @property
     def side_m(self) -> float:
@@ -27,30 +27,30 @@ class Patch:
 
     @property
     def middle_x_m(self) -> float:
-        """Return how far ahead of the road user the patch's middle is [m]."""
+        """Return the x coordinate of the patch's centre [m]."""
         return (self.ahead - 0.5) * self.side_m
 
 
 @dataclass(frozen=True, config=STRICT)
 class CrossView:
-    """A cross-view transformer: pictures of several cameras to features on the ground."""
+    """Configuration of the cross-view transformer, from images of several cameras to features on the ground."""
 
-    width_px: Annotated[int, Field(ge=32, le=8192, multiple_of=16)] = 96  # pictures are resized to this
+    width_px: Annotated[int, Field(ge=32, le=8192, multiple_of=16)] = 96  # images are resized to this
     height_px: Annotated[int, Field(ge=32, le=8192, multiple_of=16)] = 48
-    features: Annotated[int, Field(ge=8, le=4096, multiple_of=8)] = 32
-    heads: Annotated[int, Field(ge=1, le=64)] = 2
-    layers: Annotated[int, Field(ge=1, le=64)] = 1  # of attention, one after another
+    features: Annotated[int, Field(ge=8, le=4096, multiple_of=8)] = 32  # width of the embeddings
+    heads: Annotated[int, Field(ge=1, le=64)] = 2  # attention heads
+    layers: Annotated[int, Field(ge=1, le=64)] = 1  # attention layers
     queries: Annotated[int, Field(ge=4, le=256)] = 16  # along each side of the patch
-    map_weight: Annotated[float, Field(ge=0, le=1e6)] = 8.0  # of the map's segmentation in the loss
+    map_weight: Annotated[float, Field(ge=0, le=1e6)] = 8.0  # weight of the map segmentation in the loss
 
 
 @dataclass(frozen=True, config=STRICT)
 class TrajectoryConfig:
-    """An LSTM encoder-decoder that sees the surroundings as rasters of map and tracks, or through cameras."""
+    """Configuration of the LSTM encoder-decoder; its bird's-eye view is of rasters, or of cameras."""
 
-    modes: Annotated[int, Field(ge=1, le=256)] = 6
-    hidden: Annotated[int, Field(ge=8, le=4096)] = 64  # of both LSTMs
-    maps: tuple[Maps, Maps, Maps] = (16, 32, 32)  # of the convolutions over the raster
+    modes: Annotated[int, Field(ge=1, le=256)] = 6  # of a forecast, K
+    hidden: Annotated[int, Field(ge=8, le=4096)] = 64  # size of the hidden state of both LSTMs
+    maps: tuple[Maps, Maps, Maps] = (16, 32, 32)  # feature maps of the convolutions of the bird's-eye view
     patch: Patch = Patch()
     cameras: CrossView | None = None  # None: rasters
 

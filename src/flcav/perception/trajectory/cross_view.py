@@ -1,4 +1,14 @@
-"""Cross-view attention from surround cameras to a bird's-eye map."""
+"""Encoders of the surroundings as bird's-eye features: convolutions over rasters, and a cross-view transformer.
+
+The cross-view transformer maps images of several cameras to features and a map of the ground (Zhou and Kraehenbuehl,
+"Cross-view Transformers for Real-time Map-view Semantic Segmentation", CVPR 2022, sec. 3): places on the ground attend
+to all places of all images at once, by cosine similarity (eq. 3); a place in an image is embedded by its features, the
+position of the camera and the direction of its ray (eq. 2). In addition, each ray is intersected with a flat ground,
+and attention is biased to near places by a Gaussian of the distance, whose width each head learns, after Chen et al.,
+"Efficient and Robust 2D-to-BEV Representation Learning via Geometry-guided Kernel Transformer", 2022. Differences from
+the paper: small convolutions instead of EfficientNet, one or two attention layers at one resolution, and ground around
+the predicted road user instead of the vehicle with the cameras.
+"""
 
 from typing import NamedTuple
 
@@ -9,29 +19,29 @@ from torch.nn import functional
 from flcav.perception.trajectory.config import CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.rasters import LAYERS, OTHERS
 
-COARSE = 8  # cells along each side of the map that is summed up
+COARSE = 8  # cells along each side of the pooled map
 
 
 class Inputs(NamedTuple):
-    """A batch as the network takes it."""
+    """Input tensors of a batch of B samples: `raster`, or the last three of n cameras."""
 
-    past: Tensor  # (B, PAST + 1, 4) x, y, yaw, speed
+    past: Tensor  # (B, PAST + 1, 4) x, y, yaw, speed [m, rad, m/s]
     raster: Tensor | None = None  # (B, LAYERS, cells, cells) of zeros and ones
     pictures: Tensor | None = None  # (B, n, 3, height, width) in [-1, 1]
-    intrinsics: Tensor | None = None  # (B, n, 3, 3)
-    camera_from_frame: Tensor | None = None  # (B, n, 4, 4)
+    intrinsics: Tensor | None = None  # (B, n, 3, 3) [px]
+    camera_from_frame: Tensor | None = None  # (B, n, 4, 4) from the road user's frame to the optical one
 
 
 class Seen(NamedTuple):
-    """The surroundings as features."""
+    """Bird's-eye features of the surroundings."""
 
-    summary: Tensor  # (B, summary) of all of them
-    ground: Tensor  # (B, maps[1], h, w) of each place in the patch, row 0 ahead and column 0 on the left
-    map_logits: Tensor | None = None  # of the map, where it had to be learned
+    summary: Tensor  # (B, summary) of the whole patch
+    ground: Tensor  # (B, maps[1], h, w) of each place in the patch, row 0 farthest ahead and column 0 farthest left
+    map_logits: Tensor | None = None  # (B, LEARNED, h, w) of the map's segmentation; None with rasters
 
 
 class Summary(nn.Module):
-    """From maps of the patch to one vector that still knows what is where."""
+    """Pooling of the patch's feature maps to one vector, over a coarse grid so that places stay distinguishable."""
 
     def __init__(self, maps: int, out: int, size: int) -> None:
         super().__init__()
@@ -40,12 +50,12 @@ class Summary(nn.Module):
         )
 
     def forward(self, ground: Tensor) -> Tensor:
-        """Return (B, size) of (B, maps, h, w)."""
+        """Return the vector (B, size) of feature maps (B, maps, h, w)."""
         return self.layers(ground)
 
 
 class RasterEncoder(nn.Module):
-    """Convolutions over rasters of the map and the tracks."""
+    """Convolutional encoder of rasters of the map and the tracks."""
 
     def __init__(self, config: TrajectoryConfig) -> None:
         super().__init__()
@@ -55,28 +65,28 @@ class RasterEncoder(nn.Module):
         self.sum_up = Summary(ground, coarse, self.summary)
 
     def forward(self, inputs: Inputs) -> Seen:
-        """Return what is seen on (B, LAYERS, cells, cells) rasters; places are 4 x 4 cells."""
+        """Return the features of rasters (B, LAYERS, cells, cells); a place of `ground` is 4 x 4 cells."""
         assert inputs.raster is not None
         ground = self.layers(inputs.raster)
         return Seen(self.sum_up(ground), ground)
 
 
 def conv(maps: int, out: int, stride: int | tuple[int, int] = 1) -> nn.Sequential:
-    """Return a 3 x 3 convolution with its normalisation over groups of maps, and a rectifier."""
+    """Return a 3 x 3 convolution with group normalisation and ReLU."""
     return nn.Sequential(nn.Conv2d(maps, out, 3, stride, 1, bias=False), nn.GroupNorm(out // 8, out), nn.ReLU())
 
 
 LEARNED = {"road": 1.0, "lane": 1.0, "crossing": 5.0, "way": 3.0, "red": 10.0, "green": 10.0, OTHERS[0]: 8.0}
 """Layers of the raster that cameras are taught to see, and how much more a cell in one weighs: some are rare."""
-SCALE_M = 10.0  # places on the ground are divided by this
-STRIDES = (4, 8)  # pixels of a picture, down and to the right, to a place of its features: ground is seen flat
-FAR_M = 100.0  # rays that meet the ground beyond this, or never, end there
-SHARPNESS = 3.0  # the first inverse temperature of the cosines; it is learned
-NEAR = 3  # features of a place by which the attention knows how near two are
+SCALE_M = 10.0  # unit of positions on the ground
+STRIDES = (4, 8)  # [px] of the image features, down and to the right; finer down, since the ground is foreshortened
+FAR_M = 100.0  # largest distance of a ray's intersection with the ground, also of rays without one
+SHARPNESS = 3.0  # initial inverse temperature of the cosine similarities; it is learned
+NEAR = 3  # channels of query and key that hold the distance on the ground
 
 
 class CrossViewEncoder(nn.Module):
-    """Pictures to what is seen of the ground, by attention."""
+    """Cross-view transformer: images of several cameras to bird's-eye features, by attention."""
 
     def __init__(self, config: TrajectoryConfig) -> None:
         super().__init__()
@@ -97,11 +107,11 @@ class CrossViewEncoder(nn.Module):
         self.map = nn.Conv2d(config.maps[1], len(LEARNED), 1)
         self.sum_up = Summary(config.maps[1], config.maps[2], self.summary)
 
-    pixels: Tensor  # (P, 3) homogeneous
-    places: Tensor  # (Q, 2) x, y [SCALE_M]
+    pixels: Tensor  # (P, 3) homogeneous coordinates of the image features
+    places: Tensor  # (Q, 2) x, y of the queries [SCALE_M]
 
     def forward(self, inputs: Inputs) -> Seen:
-        """Return what is seen in (B, n, 3, height, width) pictures; places are half as far apart as the queries."""
+        """Return the features of images (B, n, 3, height, width); `ground` has twice the resolution of the queries."""
         assert inputs.pictures is not None
         assert inputs.intrinsics is not None
         assert inputs.camera_from_frame is not None
@@ -120,7 +130,7 @@ class CrossViewEncoder(nn.Module):
 
 
 class CrossAttention(nn.Module):
-    """The ground attends to all places of all pictures at once, then a perceptron."""
+    """A transformer layer: places on the ground attend to all places of all images at once, then an MLP."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -134,13 +144,14 @@ class CrossAttention(nn.Module):
             nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
         )
         self.sharpness = nn.Parameter(torch.full((heads, 1, 1), SHARPNESS))
-        self.nearness = nn.Parameter(torch.logspace(1, -1, heads)[:, None, None])  # the first looks most narrowly
+        self.nearness = nn.Parameter(torch.logspace(1, -1, heads)[:, None, None])  # the first head is the narrowest
 
     def forward(self, ground: Tensor, places: Tensor, seen: Tensor, met: Tensor) -> Tensor:
-        """Return the ground (B, Q, width) after a look at what is `seen` (B, P, width).
+        """Return the ground's features (B, Q, width) after attention to the images' features `seen` (B, P, width).
 
-        `places` (Q, 2) are those of the ground, `met` (B, P, 2) where rays meet it. Softmax is over P of
-        sharpness * cosine - nearness * |place - met|^2, in which |place|^2 makes no difference.
+        `places` (Q, 2) are the positions of the ground's features and `met` (B, P, 2) the rays' intersections with the
+        ground [SCALE_M]. The softmax over P is of sharpness * cosine - nearness * |place - met|^2; the term |place|^2
+        is omitted, since it cancels in the softmax.
         """
         query = self.sharpness * functional.normalize(self._split(self.query(ground)), dim=-1)
         key = functional.normalize(self._split(self.key(seen)), dim=-1)
@@ -157,9 +168,10 @@ class CrossAttention(nn.Module):
 
 
 def rays(intrinsics: Tensor, camera_from_frame: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Return unit directions (B, n, P, 3) of the homogeneous `pixels` (P, 3), and where the cameras stand (B, n, 3).
+    """Return unit directions (B, n, P, 3) of the rays through homogeneous `pixels` (P, 3), and their origins (B, n, 3).
 
-    Both are in the frame of the road user; the standpoint is divided by SCALE_M.
+    Both are in the frame of the road user; the origins, the cameras' positions, are in units of SCALE_M. `intrinsics`
+    are (B, n, 3, 3) [px], `camera_from_frame` (B, n, 4, 4) [m].
     """
     frame_from_camera = camera_from_frame[..., :3, :3].transpose(-1, -2)
     back = frame_from_camera @ torch.linalg.inv(intrinsics)
@@ -169,7 +181,10 @@ def rays(intrinsics: Tensor, camera_from_frame: Tensor, pixels: Tensor) -> tuple
 
 
 def met_ground(looks: Tensor, stands: Tensor) -> Tensor:
-    """Return (B, n, P, 2) where rays along `looks` from `stands`, as of `rays`, meet the ground at z = 0 [SCALE_M]."""
+    """Return the intersections (B, n, P, 2) x, y of the rays with the ground z = 0 [SCALE_M], at most `FAR_M` away.
+
+    `looks` and `stands` are the directions and origins of `rays`.
+    """
     level = torch.linalg.vector_norm(looks[..., :2], dim=-1, keepdim=True).clamp(min=1e-6)
     fall = (-looks[..., 2:] / level).clamp(min=1e-6)
     reach = (stands[:, :, None, 2:] / fall).clamp(max=FAR_M / SCALE_M)
@@ -177,7 +192,7 @@ def met_ground(looks: Tensor, stands: Tensor) -> Tensor:
 
 
 def pixel_grid(settings: CrossView) -> Tensor:
-    """Return (P, 3) the homogeneous middles of the features' places in a picture, row by row [px]."""
+    """Return the homogeneous pixel coordinates (P, 3) of the centres of the image features, row by row."""
     down, right = (
         torch.arange(size // stride) * stride + (stride - 1) / 2
         for size, stride in zip((settings.height_px, settings.width_px), STRIDES)
@@ -187,7 +202,7 @@ def pixel_grid(settings: CrossView) -> Tensor:
 
 
 def place_grid(settings: CrossView, patch: Patch) -> Tensor:
-    """Return (Q, 2) x, y of the places on the ground that ask, row by row, divided by SCALE_M."""
+    """Return the positions (Q, 2) x, y of the queries on the ground, row by row [SCALE_M]."""
     step = patch.side_m / settings.queries
     fore = patch.middle_x_m + patch.side_m / 2 - (torch.arange(settings.queries) + 0.5) * step
     left = patch.side_m / 2 - (torch.arange(settings.queries) + 0.5) * step

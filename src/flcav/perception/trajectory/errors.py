@@ -1,4 +1,4 @@
-"""Where road users went elsewhere than a predictor said: final errors above `MISS_M`, at the vehicle's present."""
+"""Error registry of the trajectory task: forecasts whose single path has a final error above `MISS_M`."""
 
 from typing import Any
 
@@ -15,9 +15,9 @@ from flcav.world.trace import Trace
 
 
 def register_errors(network: TrajectoryNetwork, data: Dataset, samples: Samples, progress: Report = silent) -> Registry:
-    """Return a mistake per road user and scene whose single path ends more than `MISS_M` from where it went: the first.
+    """Return the first miss of each road user and scene: a single path with a final error above `MISS_M`.
 
-    It stands at the road user's present, on the ground.
+    Its position is that of the road user at the present, on the ground (z = 0).
     """
     columns: dict[str, Any] = samples.columns
     paths, probabilities = predict(network, samples, progress)

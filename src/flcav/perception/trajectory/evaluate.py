@@ -1,4 +1,4 @@
-"""How near predictions come to where road users went, beside keeping heading and speed."""
+"""Displacement errors of forecasts: ADE, FDE and miss rate of modes, single path and constant velocity, by slice."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,20 +14,21 @@ from flcav.records import LEFT_OUT
 
 Array = NDArray[np.float64]
 
-MISS_M = 2.0  # a last position farther off than this is a miss
-TURN = np.radians(20.0)  # between heading at present and from the last second's displacement
+MISS_M = 2.0  # a larger final error is a miss
+TURN = np.radians(20.0)  # least angle of a turn between the present heading and the last second's displacement
 ALL = "all"  # the slice of all samples
 
 
-Newer = Annotated[float | None, LEFT_OUT]  # always there, but in results of before
+Newer = Annotated[float | None, LEFT_OUT]  # None only in older results
 
 
 @dataclass(frozen=True, kw_only=True)
 class PathErrors:
-    """Mean errors of some samples' predictions [m]: ADE over a path, FDE at its end.
+    """Mean displacement errors [m] and miss rates of a slice of samples.
 
-    Of the likeliest mode (1), the best of all modes (K), the single path, and constant velocity, which the others'
-    final errors are divided by: a ratio is None where it makes none.
+    ADE is the average displacement error over a path, FDE the final displacement error at its end. They are given for
+    the likeliest mode (1), the best of all K modes (K), the single path and constant velocity. A ratio is an FDE
+    divided by that of constant velocity, None where the latter is 0.
     """
 
     samples: int
@@ -50,23 +51,23 @@ class PathErrors:
 
 @dataclass(frozen=True)
 class TrajectoryEvaluation(Evaluated):
-    """Errors of predicted paths, by slice."""
+    """Displacement errors of forecasts, by slice of the samples."""
 
-    modes: int
-    miss_m: float
-    scenes: int
-    slices: Mapping[str, PathErrors | None]  # of all samples, at junctions, turning there; None without samples
+    modes: int  # K
+    miss_m: float  # final error above which a path is a miss
+    scenes: int  # number of scenes
+    slices: Mapping[str, PathErrors | None]  # all samples, at junctions, turning at junctions; None without samples
 
     @property
     def score(self) -> float:
-        """Return 1 / (1 + the mean of the likeliest and the best mode's final error in metres)."""
+        """Return 1 / (1 + (minFDE_1 + minFDE_K) / 2), errors in metres, of all samples; 0 without samples."""
         every = self.slices[ALL]
         if every is None:
             return 0.0
         return 1 / (1 + (every.minFDE_1 + every.minFDE_K) / 2)
 
     def numbers(self) -> Mapping[str, float]:
-        """Return errors, misses and ratios to constant velocity of each slice that has samples."""
+        """Return the fields of `PathErrors` as "slice, field", of each slice that has samples."""
         return {
             f"{name}, {key}": value
             for name, errors in self.slices.items()
@@ -76,7 +77,7 @@ class TrajectoryEvaluation(Evaluated):
         }
 
     def lines(self) -> list[str]:
-        """Return a line per slice, and of each one per predictor."""
+        """Return a line per slice, each followed by a line per predictor."""
         lines = [f"{self.modes} modes, {self.scenes} scenes; errors in m: average / final / missed"]
         for name, e in self.slices.items():
             if e is None:
@@ -98,9 +99,10 @@ class TrajectoryEvaluation(Evaluated):
 
 
 def metrics(paths: Array, probabilities: Array, columns: Mapping[str, NDArray[Any]]) -> TrajectoryEvaluation:
-    """Return the errors of all samples, of those at junctions, and of those that turn there.
+    """Return the displacement errors of all samples, of those at junctions, and of those turning at junctions.
 
-    `paths` (N, K, FUTURE, 2) and `probabilities` (N, K) belong to the samples whose `columns` are given.
+    `paths` (N, K, FUTURE, 2) [m] and `probabilities` (N, K) are the forecasts of N samples, `columns` the arrays of
+    `Samples.columns`.
     """
     future, past = columns["future"].astype(np.float64), columns["past"]
     at_junction = columns["at_junction"].astype(np.bool_)
@@ -119,13 +121,19 @@ def metrics(paths: Array, probabilities: Array, columns: Mapping[str, NDArray[An
 
 
 def turning(future: Array) -> NDArray[np.bool_]:
-    """Return (N,) whether the displacement of the last second points more than 20 degrees away from x."""
+    """Return (N,) whether a future (N, FUTURE, 2) [m] turns.
+
+    It turns if the displacement in its last second is above 1 m and more than 20 degrees off the x axis.
+    """
     last = future[:, -1] - future[:, -5]
     return (np.abs(np.arctan2(last[:, 1], last[:, 0])) > TURN) & (np.linalg.norm(last, axis=1) > 1.0)
 
 
 def errors_of(paths: Array, probabilities: Array, future: Array, baseline: Array) -> dict[str, Array]:
-    """Return (N,) errors [m] by name: average and final, of the likeliest and the best mode, `single`, the baseline."""
+    """Return ADE and FDE (N,) [m] of each sample by name: of likeliest mode, best mode, single path, and baseline.
+
+    `paths` are (N, K, FUTURE, 2), `probabilities` (N, K), `future` and `baseline` (N, FUTURE, 2), in one frame.
+    """
     off = np.linalg.norm(paths - future[:, None], axis=3)  # (N, K, FUTURE)
     everyone = np.arange(len(off))
     likeliest, only = off[everyone, probabilities.argmax(axis=1)], off[everyone, single(paths, probabilities)]

@@ -1,4 +1,4 @@
-"""Predictions for the frames of a dataset, as JSON knows them, on the map around who observes."""
+"""Forecasts for the frames of a dataset, as records and as marks on the map around the observing agent."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,14 +26,14 @@ from flcav.world.trace import Trace
 Array = NDArray[np.float64]
 Point = tuple[float, float]  # x, y in the world [m]
 
-AROUND_M = 50.0  # of the observing agent, ahead, behind and to both sides: shown, and predicted with rasters
-PIXEL_M = 0.2  # of the map that is shown
-TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())
+AROUND_M = 50.0  # half side of the map around the observer, and of the square whose vehicles are predicted with rasters
+PIXEL_M = 0.2  # resolution of the map
+TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())  # of the path points, after the present
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where someone is."""
+    """A 2D pose in the world."""
 
     x: float  # world [m]
     y: float
@@ -42,15 +42,15 @@ class Place:
 
 @dataclass(frozen=True)
 class ForecastMode:
-    """One way that a road user may take."""
+    """One mode of a forecast."""
 
     probability: float
-    path: tuple[Point, ...]  # at `Forecasts.time_s`
+    path: tuple[Point, ...]  # positions at `Forecasts.time_s`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Forecast:
-    """The predicted paths of a road user, as `RoadUser` has them."""
+    """The forecast of one road user: the JSON record of a `RoadUser`."""
 
     track: str
     label: Class
@@ -60,22 +60,22 @@ class Forecast:
     speed: float  # [m/s]
     length: float  # [m]
     width: float
-    modes: tuple[ForecastMode, ...]  # the first is the one for who wants a single one, the others come by probability
-    constant_velocity: tuple[Point, ...] | None
-    truth: tuple[Point, ...] | None  # where it went; None where that was not recorded
+    modes: tuple[ForecastMode, ...]  # the first is the single path (the medoid), the others follow by probability
+    constant_velocity: tuple[Point, ...] | None  # path at constant heading and speed
+    truth: tuple[Point, ...] | None  # path that was driven; None if not recorded
 
 
 @dataclass(frozen=True)
 class Forecasts(Result):
-    """What is predicted in a frame."""
+    """The forecasts of a frame."""
 
-    time_s: tuple[float, ...]  # of the points of every path, from the present
+    time_s: tuple[float, ...]  # times of the points of every path, after the present
     observer: Place
     lights: tuple[Light, ...]
     agents: tuple[Forecast, ...]
 
     def lines(self) -> list[str]:
-        """Return where each road user will be, by one mode."""
+        """Return one line per road user: its position now and at the end of its single path."""
         lines = []
         for agent in self.agents:
             x, y = agent.modes[0].path[-1]
@@ -85,10 +85,11 @@ class Forecasts(Result):
 
 
 def findings(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | None = None) -> Iterator[Finding]:
-    """Yield what is predicted in `frames` of the dataset `path` (None: all); raises `InputError` for anything else.
+    """Yield the forecasts of `frames` of the dataset `path` (None: all).
 
-    The `Forecasts` are shown on the map around the observer, (len(STATIC), H, W), row 0 ahead of it and column 0 to its
-    left. Frames whose vehicles have no past of 2 s yet have no agents.
+    `Finding.seen` is the map around the observer, (len(STATIC), H, W), row 0 farthest ahead and column 0 farthest left.
+    Only vehicles with a recorded past of 2 s are predicted. Raises `InputError` if `path` is no dataset, or one
+    without traffic or map.
     """
     read_manifest(path)
     data = Dataset.open(path)
@@ -105,7 +106,7 @@ def findings(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | Non
 
 
 def forecasts(paths: Paths) -> Forecasts:
-    """Return predicted paths as a record."""
+    """Return the JSON record of the forecasts of a frame."""
     x, y, yaw = paths.observer
     return Forecasts(paths.times_s, Place(x, y, yaw), paths.lights, tuple(map(_forecast, paths.users)))
 
@@ -131,7 +132,7 @@ def _points(path: Array) -> tuple[Point, ...]:
 
 
 def map_around(roads: RoadMap, observer: Array) -> NDArray[np.bool_]:
-    """Return (len(STATIC), H, W) the map within `AROUND_M` of x, y, yaw."""
+    """Return the raster (len(STATIC), H, W) of the map in the square of half side `AROUND_M` around x, y, yaw."""
     middle = pose(float(observer[0]), float(observer[1]), yaw=float(observer[2]))
     return rasterise(roads.layers, middle, (2 * AROUND_M, 2 * AROUND_M), PIXEL_M)[list(STATIC_ROWS)]
 

@@ -1,4 +1,4 @@
-"""The loss of K modes: the mode that comes nearest learns to come nearer, and that it is the one."""
+"""Loss of the trajectory network: winner-takes-all regression, mode classification, and map segmentation."""
 
 import torch
 from torch import Tensor
@@ -8,14 +8,15 @@ from flcav.perception.trajectory.cross_view import LEARNED
 from flcav.perception.trajectory.model import Forecast
 from flcav.perception.trajectory.rasters import LAYERS
 
-SHARED = 0.05  # of the loss goes to all modes, so that none is lost: Rupprecht et al., ICCV 2017, eq. 5
-MODE_WEIGHT = 1.0
+SHARED = 0.05  # share of the regression over all modes, against unused modes: Rupprecht et al., ICCV 2017, eq. 5
+MODE_WEIGHT = 1.0  # weight of the mode classification
 
 
 def forecast_loss(forecast: Forecast, future: Tensor) -> Tensor:
-    """Return winner-takes-all regression and classification of the modes against `future` (B, FUTURE, 2).
+    """Return the winner-takes-all regression and the mode classification against `future` (B, FUTURE, 2) [m].
 
-    Metres enter by Huber's loss with a bend at 1 m, so that few paths that are far off do not decide.
+    The winner is the mode with the smallest average displacement error. Regression is Huber's loss with threshold 1 m,
+    which limits the influence of outliers; classification is the cross entropy of the modes' logits.
     """
     apart = functional.smooth_l1_loss(forecast.paths, future[:, None].expand_as(forecast.paths), reduction="none")
     off = apart.sum(dim=3).mean(dim=2)  # (B, K)
@@ -27,7 +28,10 @@ def forecast_loss(forecast: Forecast, future: Tensor) -> Tensor:
 
 
 def map_loss(map_logits: Tensor, raster: Tensor) -> Tensor:
-    """Return the cross entropy of the learned map (B, LEARNED, h, w) against the raster's layers at its resolution."""
+    """Return the weighted binary cross entropy of map logits (B, LEARNED, h, w) against the raster's layers.
+
+    `raster` (B, LAYERS, cells, cells) is averaged to the resolution of the logits.
+    """
     wanted = raster[:, [LAYERS.index(name) for name in LEARNED]]
     wanted = functional.adaptive_avg_pool2d(wanted, map_logits.shape[-1])
     weight = map_logits.new_tensor(list(LEARNED.values()))[:, None, None]

@@ -1,8 +1,8 @@
-"""An LSTM encoder-decoder over tracks that looks at its surroundings: where it is, and again wherever it goes.
+"""A multi-modal LSTM encoder-decoder over tracks with bird's-eye features of the surroundings.
 
-Encoder: an LSTM over the past, and a bird's-eye view (`flcav.perception.trajectory.cross_view`). Decoder: one LSTM per
-mode, all with the same weights, begun differently; at each step it sees the features of the ground at the position that
-it has reached, and changes its last displacement. Without any change a path keeps heading and speed.
+Encoder: an LSTM over the past, and a bird's-eye view (`flcav.perception.trajectory.cross_view`). Decoder: one LSTM with
+a different initial state per mode; at each step its inputs are position, last displacement and the ground's features at
+the position, and its output is a change of the displacement. With zero output a path keeps heading and speed.
 """
 
 from typing import NamedTuple
@@ -14,20 +14,20 @@ from torch.nn import functional
 from flcav.perception.trajectory.config import FUTURE, STEP_S, TrajectoryConfig
 from flcav.perception.trajectory.cross_view import CrossViewEncoder, Inputs, RasterEncoder, Seen
 
-SCALE_M = 10.0  # positions and speeds are divided by this
-TRACK = 6  # features of a point of the past
+SCALE_M = 10.0  # unit of positions and speeds inside the network
+TRACK = 6  # number of features of a point of the past
 
 
 class Forecast(NamedTuple):
-    """What the network says."""
+    """Output tensors of the network: K modes per sample."""
 
     paths: Tensor  # (B, K, FUTURE, 2) x, y [m] in the frame of the present
     logits: Tensor  # (B, K) of the modes' probabilities
-    map_logits: Tensor | None  # (B, LAYERS seen, h, w) of the map learned through cameras
+    map_logits: Tensor | None  # (B, LEARNED, h, w) of the map's segmentation; None with rasters
 
 
 class TrajectoryNetwork(nn.Module):
-    """K ways a road user may go, each with its probability."""
+    """The trajectory network: K paths of a road user with their probabilities."""
 
     def __init__(self, config: TrajectoryConfig) -> None:
         super().__init__()
@@ -67,7 +67,10 @@ class TrajectoryNetwork(nn.Module):
         return torch.stack(path, dim=2)
 
     def _ground_at(self, ground: Tensor, position: Tensor) -> Tensor:
-        """Return (B, K, features) of the maps (B, features, h, w) of the patch at positions (B, K, 2); 0 beyond it."""
+        """Return the features (B, K, features) of `ground` (B, features, h, w), bilinear, at positions (B, K, 2) [m].
+
+        They are 0 outside the patch.
+        """
         patch = self.config.patch
         half = patch.side_m / 2
         right_down = torch.stack((-position[..., 1] / half, (patch.middle_x_m - position[..., 0]) / half), dim=-1)

@@ -1,4 +1,4 @@
-"""How far predicted paths ended from where each road user went, and a score from it."""
+"""Outcomes of the trajectory task: displacement errors of each road user, and the score of bootstrap samples."""
 
 from collections.abc import Mapping, Sequence
 
@@ -22,7 +22,7 @@ NUMBERS = {
 
 
 class TrajectoryOutcomes:
-    """1 / (1 + the mean of the likeliest and the best mode's final error in metres)."""
+    """Measure of the trajectory task: 1 / (1 + (minFDE_1 + minFDE_K) / 2), errors in metres."""
 
     measure_name = "1 / (1 + FDE in m)"
     redraws = REDRAWS
@@ -30,7 +30,7 @@ class TrajectoryOutcomes:
     def outcomes(
         self, network: TrajectoryNetwork, data: Dataset, frames: Sequence[int], progress: Report = silent
     ) -> Outcomes:
-        """Return the errors of each road user's prediction [m]."""
+        """Return the displacement errors of each sample [m], see `errors_of`."""
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
         columns = samples.columns
@@ -39,12 +39,12 @@ class TrajectoryOutcomes:
         return Outcomes(np.asarray(columns["scene"], dtype=np.str_), dict(errors))
 
     def measure(self, outcomes: Outcomes, times: Times) -> Values:
-        """Return the score."""
+        """Return the score of each bootstrap sample."""
         likeliest, best = (weighted_mean(outcomes.arrays[name], times) for name in ("minFDE_1", "minFDE_K"))
         return 1 / (1 + (likeliest + best) / 2)
 
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
-        """Return final errors [m], the share of misses, and how many road users there are."""
+        """Return mean final errors [m], the miss rate of the single path, and the number of samples."""
         errors = outcomes.arrays
         means = {name: float(errors[column].mean()) for name, column in NUMBERS.items()}
         return {

@@ -1,4 +1,4 @@
-"""Predicted paths of samples, batch by batch."""
+"""Inference of the trajectory network on samples: input and target tensors, batches, and the single path."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from flcav.progress import Report, silent
 
 
 def inputs_of(samples: Sequence[Sample], network: nn.Module) -> Inputs:
-    """Return a batch of inputs on the network's device."""
+    """Return the input tensors of samples on the network's device; with rasters if the samples have no images."""
     device = next(network.parameters()).device
     past = torch.from_numpy(np.stack([sample.past for sample in samples])).to(device)
     seen = [sample.surround for sample in samples if sample.surround is not None]
@@ -30,13 +30,13 @@ def inputs_of(samples: Sequence[Sample], network: nn.Module) -> Inputs:
 
 
 def rasters_of(samples: Sequence[Sample], device: torch.device) -> Tensor:
-    """Return (B, LAYERS, cells, cells) rasters of zeros and ones."""
+    """Return the rasters (B, LAYERS, cells, cells) of samples, of zeros and ones in float32."""
     bits = np.unpackbits(np.stack([sample.raster for sample in samples]), axis=-1)
     return torch.from_numpy(bits).to(device).float()
 
 
 def futures_of(samples: Sequence[Sample], device: torch.device) -> Tensor:
-    """Return (B, FUTURE, 2) where the road users went."""
+    """Return the ground-truth futures (B, FUTURE, 2) [m] of samples."""
     return torch.from_numpy(np.stack([sample.future for sample in samples])).to(device)
 
 
@@ -46,11 +46,14 @@ def _floats(arrays: list[NDArray[np.float64]], device: torch.device) -> Tensor:
 
 Array = NDArray[np.float64]
 
-RASTERS, VIEWS = 256, 16  # samples at once, of one kind and the other
+RASTERS, VIEWS = 256, 16  # batch sizes of inference with rasters and with cameras
 
 
 def predict(network: TrajectoryNetwork, samples: Sequence[Sample], progress: Report = silent) -> tuple[Array, Array]:
-    """Return paths (N, K, FUTURE, 2) [m] in the samples' frames and probabilities (N, K)."""
+    """Return the forecasts of N samples: paths (N, K, FUTURE, 2) [m] in the samples' frames and probabilities (N, K).
+
+    The network's training mode is left as it was.
+    """
     training = network.training
     network.eval()
     paths, probabilities = [], []
@@ -67,10 +70,11 @@ def predict(network: TrajectoryNetwork, samples: Sequence[Sample], progress: Rep
 
 
 def single(paths: Array, probabilities: Array) -> NDArray[np.int64]:
-    """Return (N,) which of the modes is given where only one is asked for: the medoid of the forecast.
+    """Return the index (N,) of the mode that is given as the single path: the medoid of the forecast.
 
-    Of all modes it has the least expected distance, over all steps, to the way that is taken, as far as the forecast
-    itself knows; several that go much the same way count together, which the likeliest alone would not.
+    The medoid is the mode with the least expected average distance to the other modes under the predicted
+    probabilities. Unlike the likeliest mode it takes similar modes together. `paths` are (N, K, FUTURE, 2) [m],
+    `probabilities` (N, K).
     """
     apart = np.linalg.norm(paths[:, :, None] - paths[:, None], axis=4).mean(axis=3)  # (N, K, K)
     return (apart * probabilities[:, None]).sum(axis=2).argmin(axis=1)

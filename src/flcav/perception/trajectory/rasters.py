@@ -1,4 +1,4 @@
-"""Bird's-eye rasters around road users: the map, where their lane leads, lights, and everybody else's tracks."""
+"""Bird's-eye rasters around road users: the map, reachable lanes, traffic lights, and other road users' tracks."""
 
 from collections.abc import Sequence
 
@@ -12,12 +12,12 @@ from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
 
-AGO = (0, 4, 8)  # steps before the present at which others are shown: 0, 1 and 2 s
+AGO = (0, 4, 8)  # steps before the present at which other road users are drawn: 0, 1 and 2 s
 OTHERS = {steps: f"others {steps * STEP_S:g} s ago" for steps in AGO}
 LAYERS = (
     *STATIC,
-    "way",  # the lanes that one gets to from where the road user is
-    "red",  # bars across the lanes that a light closes, amber too
+    "way",  # lanes that are reachable from the road user's lanes
+    "red",  # bars across the lanes whose light is not green
     "green",
     "self",
     *OTHERS.values(),
@@ -25,15 +25,15 @@ LAYERS = (
 )
 OPEN = ("G", "g")  # SUMO's letters of a green light
 _LONG, _WIDE = np.meshgrid(np.linspace(-0.5, 0.5, 17), np.linspace(-0.5, 0.5, 5), indexing="ij")
-BODY = np.stack((_LONG, _WIDE), axis=-1).reshape(-1, 2)  # points of a box, as shares of its length and width
+BODY = np.stack((_LONG, _WIDE), axis=-1).reshape(-1, 2)  # points inside a box, as shares of its length and width
 
 
 def rasters(
     trace: Trace, tracks: Tracks, lit: NDArray[np.str_], predicted: NDArray[np.int64], roads: RoadMap, patch: Patch
 ) -> NDArray[np.bool_]:
-    """Return (N, len(LAYERS), cells, cells) views of the surroundings of the `predicted` (N,) actors of `trace`.
+    """Return the rasters (N, len(LAYERS), cells, cells) around the actors `predicted` (N,), as indices into `trace`.
 
-    `tracks` hold the past, the present at `PAST`; `lit` (L,) are the letters of the lights at present. Row 0 is
+    `tracks` have the present at index `PAST`; `lit` (L,) are SUMO's letters of the lights at the present. Row 0 is
     farthest ahead and column 0 farthest left, as in `flcav.world.map.lanes`.
     """
     frame = np.concatenate((tracks.position[PAST, predicted], tracks.yaw[PAST, predicted, None]), axis=1)
@@ -50,15 +50,15 @@ def rasters(
 
 
 class Sheets:
-    """The rasters of N road users while they are being made."""
+    """The rasters of N road users while they are drawn; `cells` (N, len(LAYERS), cells * cells) is changed in place."""
 
     def __init__(self, frame: Array, patch: Patch) -> None:
-        """Begin with nothing marked; `frame` (N, 3) is where the road users are, x, y, yaw."""
+        """Create empty rasters; `frame` (N, 3) are the road users' poses x, y, yaw in the world."""
         self.frame, self.patch = frame, patch
         self.cells = np.zeros((len(frame), len(LAYERS), patch.cells**2), np.bool_)
 
     def mark(self, layer: str, rows: NDArray[np.int64], world: Array) -> None:
-        """Mark the cells of the points `world` (R, D, 2) on the sheets `rows` (R,)."""
+        """Set the cells of world points (R, D, 2) [m] in a layer of the rasters `rows` (R,)."""
         at, inside = cell_of(into_frame(world, self.frame[rows]), self.patch)
         sheet = np.broadcast_to(rows[:, None], at.shape)
         self.cells[sheet[inside], LAYERS.index(layer), at[inside]] = True
@@ -90,16 +90,16 @@ def _mark_others(
     instant: int,
     kind: NDArray[np.bool_],
 ) -> None:
-    """Mark who was near at an instant and is of the `kind` (A,), but for the road user himself."""
+    """Draw the bodies of the near actors of a `kind` (A,) at an instant, without the predicted road user itself."""
     apart = tracks.position[instant][None] - sheets.frame[:, None, :2]
-    near = (np.abs(apart) < sheets.patch.side_m).all(axis=2) & kind  # NaN is not near
+    near = (np.abs(apart) < sheets.patch.side_m).all(axis=2) & kind  # False for NaN, the absent ones
     near[np.arange(len(predicted)), predicted] = False
     row, other = np.nonzero(near)
     sheets.mark(layer, row, _bodies(trace, tracks, instant, other))
 
 
 def centres(patch: Patch) -> Array:
-    """Return (cells * cells, 2) the middle of each cell in the road user's frame, row by row."""
+    """Return the centres (cells * cells, 2) of a patch's cells in the road user's frame [m], row by row."""
     low = patch.middle_x_m - patch.side_m / 2
     steps = (np.arange(patch.cells, dtype=np.float64) + 0.5) * patch.cell_m
     along, across = low + steps[::-1], patch.side_m / 2 - steps
@@ -107,7 +107,7 @@ def centres(patch: Patch) -> Array:
 
 
 def cell_of(points: Array, patch: Patch) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the cell that each point (..., 2) of the road user's frame lies in, and whether it lies in any."""
+    """Return the cell index (...) of points (..., 2) in the road user's frame [m], and whether each is in the patch."""
     ahead, left = patch.middle_x_m + patch.side_m / 2, patch.side_m / 2
     row = np.floor((ahead - points[..., 0]) / patch.cell_m).astype(np.int64)
     column = np.floor((left - points[..., 1]) / patch.cell_m).astype(np.int64)
@@ -125,6 +125,6 @@ def _bars(roads: RoadMap, lights: NDArray[np.str_], lit: NDArray[np.str_], wante
 
 
 def _bodies(trace: Trace, tracks: Tracks, instant: int, actors: NDArray[np.int64]) -> Array:
-    """Return (N, len(BODY), 2) points of the actors' boxes in the world."""
+    """Return points (N, len(BODY), 2) inside the actors' boxes, in the world [m]."""
     pose = np.concatenate((tracks.position[instant, actors], tracks.yaw[instant, actors, None]), axis=1)
     return out_of_frame(BODY * trace.size[actors, None, :2], pose)

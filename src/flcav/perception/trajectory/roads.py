@@ -1,4 +1,4 @@
-"""A town's map as the task uses it: a raster of all of it, its lanes as points, where each lane leads, its lights."""
+"""Lane-level map of a town for trajectory prediction: raster, lane centre lines, reachable lanes, traffic lights."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -19,43 +19,43 @@ from flcav.world.map.town import Town
 
 Array = NDArray[np.float64]
 
-STATIC = ("road", "lane", "crossing")  # layers of the map that are looked at
+STATIC = ("road", "lane", "crossing")  # layers of the map that are used
 STATIC_ROWS = tuple(RASTER_LAYERS.index(name) for name in STATIC)
 RESOLUTION_M = 0.5  # of the town's raster
-DOT_M = 0.7  # between two points of a lane's surface: each cell of a metre gets one
-REACH_M = 70.0  # how far along the lanes it matters where one leads
-ASIDE_M, TURNED = 1.5, np.radians(40.0)  # a road user is on a lane whose line is so near and so much in his direction
-BEFORE_M = 20.0  # a road user so near before a junction is at it
-BAR_M = 2.0  # length of the bar that shows a light's state, across its lane's entry
+DOT_M = 0.7  # spacing of the points of a lane's surface, so that each cell of 1 m has a point
+REACH_M = 70.0  # distance along the lanes up to which lanes are reachable
+ASIDE_M, TURNED = 1.5, np.radians(40.0)  # largest distance and angle between a road user and its lane's centre line
+BEFORE_M = 20.0  # distance before a junction from which on a road user is at the junction
+BAR_M = 2.0  # length along the lane of the bar of a traffic light, which spans the lane at its start
 
 
 @dataclass(frozen=True)
 class RoadMap:
-    """A town's map; all in the world's frame."""
+    """Map of a town with its lanes, all in the world's frame [m, rad]."""
 
     layers: MapLayers
     raster: NDArray[np.bool_]  # (len(STATIC), H, W) cells of RESOLUTION_M; row 0 at the lowest x, column 0 the lowest y
-    corner: Array  # (2,) x, y of the raster's first corner
-    line: KDTree  # of the (P, 2) points of the lanes' middle lines
+    corner: Array  # (2,) x, y of the corner of the raster's first cell
+    line: KDTree  # of the (P, 2) points of the lanes' centre lines
     line_lane: NDArray[np.int64]  # (P,) index of the lane
     line_yaw: Array  # (P,) driving direction
-    line_to_junction_m: Array  # (P,) along the lane to a junction; 0 inside one, inf where none follows
-    reach: tuple[Array, ...]  # of each lane: (D, 2) points of the surfaces of all lanes it leads to, its own too
-    lights: Mapping[str, Array]  # entry of `Trace.light` -> (D, 2) points of the bars it rules
+    line_to_junction_m: Array  # (P,) distance along the lane to a junction; 0 inside one, inf without
+    reach: tuple[Array, ...]  # of each lane: (D, 2) points of the surfaces of the lane and of all reachable lanes
+    lights: Mapping[str, Array]  # entry of `Trace.light` -> (D, 2) points of the bars of its lanes
 
     def static(self, world: Array) -> NDArray[np.bool_]:
-        """Return (..., len(STATIC)) whether the points (..., 2) lie in each layer; beyond the town in none."""
+        """Return (..., len(STATIC)) whether world points (..., 2) lie in each layer; False outside the town."""
         cell = np.floor((world - self.corner) / RESOLUTION_M).astype(np.int64)
         inside = np.all((cell >= 0) & (cell < self.raster.shape[1:]), axis=-1)
         row, column = np.moveaxis(np.where(inside[..., None], cell, 0), -1, 0)
         return np.moveaxis(self.raster[:, row, column] & inside, 0, -1)
 
     def lanes_at(self, position: Array, yaw: Array) -> tuple[list[list[int]], Array]:
-        """Return of each road user the lanes he is on, and how far a junction is ahead of him (N,) [m].
+        """Return the lanes of each of N road users, lists of indices, and the distance to the next junction (N,) [m].
 
-        Lanes overlap inside junctions and where they begin, so that there may be several; of those within `ASIDE_M`
-        all count that are no farther aside than the nearest by half a metre. The distance is `inf` where no junction
-        follows the lane, and for somebody on none.
+        `position` is (N, 2), `yaw` (N,). Lanes overlap inside junctions and at their start, so a road user may have
+        several: the nearest within `ASIDE_M` and `TURNED`, and those up to 0.5 m farther. The distance is `inf` if no
+        junction follows, and for a road user on no lane.
         """
         lanes, distance = [], np.full(len(position), np.inf)
         for i, near in enumerate(self.line.query_ball_point(position, ASIDE_M)):
@@ -73,7 +73,7 @@ class RoadMap:
 
 @lru_cache(maxsize=8)
 def roads_of(data: Dataset) -> RoadMap:
-    """Return the map of a dataset's town; raises `InputError` where it is not known."""
+    """Return the map of a dataset's town, cached; raises `InputError` if the town is unknown."""
     town = data.town()
     if town is None:
         raise InputError(f"{data.folder}: the map of its town is not known, which 'trajectory' needs")
@@ -81,7 +81,7 @@ def roads_of(data: Dataset) -> RoadMap:
 
 
 def road_map(town: Town) -> RoadMap:
-    """Return the map of a town."""
+    """Return the map of a town, of its driving and bicycle lanes."""
     layers = map_layers(town)
     lanes = [lane for lane in layers.lanes if lane.kind in ("driving", "bicycle") and len(lane.centre_line) > 1]
     number = {lane.id: i for i, lane in enumerate(lanes)}
@@ -119,7 +119,7 @@ def _raster(layers: MapLayers, bounds: tuple[float, float, float, float]) -> NDA
 
 
 def _where_streets_meet(lanes: Iterable[MapLane]) -> set[str]:
-    """Return the junctions where one has a choice or meets others; bends and dead ends are none."""
+    """Return the ids of the junctions with a choice of exits or with merging streets; bends and dead ends are none."""
     known = {lane.id: lane for lane in lanes}
     ways: dict[str, set[tuple[str, str]]] = {}
     for lane in known.values():
@@ -141,7 +141,7 @@ def _edge(lane: str) -> str:
 
 
 def _reach(lanes: list[MapLane], number: Mapping[str, int]) -> Iterable[Array]:
-    """Yield of each lane the points of the lanes that one gets to from it within `REACH_M` of its end."""
+    """Yield, for each lane, the surface points of the lane and of the lanes reachable within `REACH_M` of its end."""
     surface = [_surface(lane) for lane in lanes]
     length = [LineString(lane.centre_line).length for lane in lanes]
     for start in range(len(lanes)):

@@ -1,4 +1,8 @@
-"""Samples of the trajectory task: a vehicle's past, its surroundings, and its future."""
+"""Samples of the trajectory task: a vehicle's past and future in the frame of its present, and its surroundings.
+
+The surroundings are a raster of map and tracks, or resized images of the cameras near the vehicle with the calibration
+that projects the vehicle's frame into them.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -22,22 +26,25 @@ from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
 
-CAMERAS = 6  # around a vehicle, as a rule
-KEPT_BYTES = 2**30  # of pictures at hand
+CAMERAS = 6  # typical number of cameras of a vehicle
+KEPT_BYTES = 2**30  # [B] of images cached in memory
 
-Pictured = tuple[NDArray[np.uint8], Array, Array]  # pictures, intrinsics and views, without the road user
+Pictured = tuple[NDArray[np.uint8], Array, Array]  # images, intrinsics and camera_from_world of a frame's cameras
 
 
 class Surround(NamedTuple):
-    """The pictures of n cameras around a road user at one instant."""
+    """The images of n cameras at one instant, with their calibration relative to a road user."""
 
     pictures: NDArray[np.uint8]  # (n, height, width, 3)
-    intrinsics: Array  # (n, 3, 3) of the pictures as they are here [px]
+    intrinsics: Array  # (n, 3, 3) of the resized images [px]
     camera_from_frame: Array  # (n, 4, 4) from the road user's frame to the optical one: x right, y down, z forward
 
 
 def surround(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
-    """Return what the cameras of frame `number` see, as the agent believes them to be, around `present` x, y, yaw."""
+    """Return the resized images of frame `number` with their calibration relative to a road user at `present`.
+
+    `present` is x, y, yaw in the world; poses and intrinsics of the cameras are the agent's assumed calibration.
+    """
     pictures, intrinsics, camera_from_world = _kept(settings)(data, number)
     world_from_frame = pose(float(present[0]), float(present[1]), yaw=float(present[2]))
     return Surround(pictures, intrinsics, camera_from_world @ world_from_frame)
@@ -45,7 +52,7 @@ def surround(data: Dataset, number: int, present: Array, settings: CrossView) ->
 
 @lru_cache(maxsize=2)
 def _kept(settings: CrossView) -> Callable[[Dataset, int], Pictured]:
-    """Return `_read` that keeps the frames read last, as many as fit into `KEPT_BYTES`."""
+    """Return `_read` with a cache of the most recently used frames that fit into `KEPT_BYTES`."""
     frame_bytes = CAMERAS * settings.height_px * settings.width_px * 3
     return lru_cache(maxsize=KEPT_BYTES // frame_bytes)(partial(_read, settings))
 
@@ -62,7 +69,7 @@ def _read(settings: CrossView, data: Dataset, number: int) -> Pictured:
 
 
 def rescaled(intrinsics: Array, rgb: Picture, settings: CrossView) -> Array:
-    """Return the (3, 3) intrinsics of the picture resized; the centre of a picture's first pixel is at (0, 0)."""
+    """Return the intrinsics (3, 3) of an image after resizing; the centre of the first pixel is at (0, 0)."""
     scale = np.array((settings.width_px / rgb.shape[1], settings.height_px / rgb.shape[0]))
     out = intrinsics.copy()
     out[:2] *= scale[:, None]
@@ -70,33 +77,33 @@ def rescaled(intrinsics: Array, rgb: Picture, settings: CrossView) -> Array:
     return out
 
 
-SEEN_M = 25.0  # from the cameras to a road user whose way is predicted through them
-LOOKED_AT_AGAIN = 4  # so many sets of samples are kept, so that validation does not extract its own anew
+SEEN_M = 25.0  # largest distance from the observing vehicle to a road user that is predicted with cameras
+LOOKED_AT_AGAIN = 4  # number of cached sets of samples, so that validation does not extract its samples again
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One road user at one instant, its present the origin and x its heading; metres, radians, seconds.
+    """One road user at one instant, in the frame of its present pose: x along its heading; metres, radians, seconds.
 
-    The fields before `surround` are also those of `Tables`, with a row for each of N samples.
+    The fields before `surround` are also the keys of `Samples.columns`, there with a row for each of N samples.
     """
 
     past: NDArray[np.float32]  # (PAST + 1, 4) x, y, yaw, speed; the last is the present
-    future: NDArray[np.float32]  # (FUTURE, 2) x, y; NaN where it is not known
-    raster: NDArray[np.uint8]  # (LAYERS, cells, cells / 8) bits of `flcav.perception.trajectory.rasters`
+    future: NDArray[np.float32]  # (FUTURE, 2) x, y; NaN if unknown
+    raster: NDArray[np.uint8]  # (LAYERS, cells, cells / 8) packed bits of `flcav.perception.trajectory.rasters`
     pose: NDArray[np.float64]  # (3,) x, y, yaw of the present in the world
     actor: NDArray[np.int64]  # () index in its trace
-    at_junction: NDArray[np.bool_]  # () inside one, or its lane leads into one within BEFORE_M
+    at_junction: NDArray[np.bool_]  # () whether it is inside a junction or at most BEFORE_M before one
     scene: NDArray[np.str_]  # ()
     frame: NDArray[np.int64]  # () number of the dataset's frame
-    surround: Surround | None = None  # what the cameras see, where they are looked through
+    surround: Surround | None = None  # images and calibration of the cameras; None with rasters
 
 
 COLUMNS = tuple(field.name for field in fields(Sample) if field.name != "surround")
 
 
 class Samples(Sequence[Sample]):
-    """Samples as arrays, a row each; pictures are read when a sample is asked for."""
+    """Samples as arrays with a row per sample, `columns`; images are read when a sample is accessed."""
 
     def __init__(self, data: Dataset, columns: dict[str, NDArray], cameras: CrossView | None) -> None:
         self.columns = columns
@@ -118,11 +125,11 @@ class Samples(Sequence[Sample]):
 
 
 def samples_of(data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | None = None) -> Samples:
-    """Return the samples of frames of a dataset whose past and future are known.
+    """Return the samples of a dataset's frames (None: all) with a complete past and future; cached.
 
-    With rasters those are all vehicles on the road at the frames' instants, whoever observes; with cameras those near
-    each frame's own vehicle, itself too. Raises `InputError` where the dataset lacks traffic, its map or pictures, or
-    holds no such sample.
+    With rasters these are all vehicles on the road at the frames' instants, whichever agent observes; with cameras, the
+    vehicles within `SEEN_M` of each frame's own vehicle, which is included. Raises `InputError` if the dataset lacks
+    traffic, map or images, or has no such sample.
     """
     return _samples(data, config.patch, config.cameras, tuple(data.numbers(frames)))
 
@@ -161,16 +168,16 @@ def _parts(
 
 
 def watching_frames(data: Dataset, cameras: bool) -> Sequence[int]:
-    """Return the frames that samples can be of: all, or with `cameras` those of vehicles, if there are any.
+    """Return the numbers of the frames that can have samples: all; with `cameras` those of vehicles, if any.
 
-    Through cameras the ways of those around the observing vehicle are predicted; a pole is none.
+    With cameras only road users around an observing vehicle are predicted, none around a pole.
     """
     driving = [number for number, key in enumerate(data.keys) if kind_of(key.agent) != POLE]
     return driving if cameras and driving else range(len(data))
 
 
 def traffic(data: Dataset, scene: str) -> Trace:
-    """Return a scene's traffic; raises `InputError` where it is not there, or too coarse."""
+    """Return the traffic of a scene; raises `InputError` if it was not recorded, or at too coarse instants."""
     trace = data.trace(scene)
     if trace is None:
         raise InputError(f"{data.folder}: no traffic of scene '{scene}' was recorded, which 'trajectory' needs")
@@ -179,21 +186,21 @@ def traffic(data: Dataset, scene: str) -> Trace:
 
 
 def seen_from(trace: Trace, key: FrameKey) -> NDArray[np.bool_]:
-    """Return (A,) who is within `SEEN_M` of the observing vehicle, itself too; nobody where a pole observes."""
+    """Return (A,) which actors are within `SEEN_M` of the observing vehicle, itself included; none for a pole."""
     instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
     own = trace.actor == key.agent
     if not own.any():
         return own
     apart = trace.position[instant, :, :2] - trace.position[instant, own, :2]
-    return np.linalg.norm(apart, axis=1) <= SEEN_M  # not those who are absent
+    return np.linalg.norm(apart, axis=1) <= SEEN_M  # False for absent actors
 
 
 def present_at(
     trace: Trace, time_s: float, roads: RoadMap, patch: Patch, wanted: NDArray[np.bool_], complete: bool = True
 ) -> dict[str, NDArray]:
-    """Return the columns of `Sample` that a trace tells, of the vehicles on the road at `time_s` and `wanted` (A,).
+    """Return the columns of `Sample` except scene and frame, of the `wanted` (A,) vehicles on the road at `time_s`.
 
-    Theirs is a past in full, and where `complete` a future.
+    Only vehicles with a complete past are included, and only with a complete future if `complete`.
     """
     tracks = tracks_around(trace, time_s)
     known = np.isfinite(tracks.yaw)

@@ -1,8 +1,8 @@
-"""The studies of the trajectory task: on rasters, and through cameras.
+"""Study recipes of the trajectory task: with rasters, and with cameras.
 
-On rasters two towns are learned from, and held-out scenes and a held-out town tested; the recipes are those of
-recipes/trajectory.yaml, trajectory_suburb.yaml and trajectory_ring.yaml. Through cameras it is one town and its
-held-out scenes, by recipes/trajectory_cameras.yaml.
+With rasters: training in two towns, tests on held-out scenes and on a held-out town, by recipes/trajectory.yaml,
+trajectory_suburb.yaml and trajectory_ring.yaml. With cameras: training in one town, tests on held-out scenes of the
+same town, by recipes/trajectory_cameras.yaml.
 """
 
 from flcav.perception.study import StudyRecipe, read_recipe

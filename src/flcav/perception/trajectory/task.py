@@ -1,4 +1,4 @@
-"""Trajectory prediction as a `Task`."""
+"""The trajectory task: trajectory prediction of vehicles as a `Task`."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 
 class TrajectoryTask(TrajectoryOutcomes):
-    """Where road users will be in the next three seconds."""
+    """Trajectory prediction: K paths of a vehicle over the next three seconds."""
 
     name = "trajectory"
     family = "trajectory-lstm"
@@ -41,29 +41,29 @@ class TrajectoryTask(TrajectoryOutcomes):
     labels = ("future",)
 
     def study(self) -> StudyRecipe:
-        """Return how it is studied, see `flcav.perception.trajectory.study`."""
+        """Return the study recipe, see `flcav.perception.trajectory.study`."""
         from flcav.perception.trajectory.study import STUDY
 
         return STUDY
 
     def build(self, config: TrajectoryConfig) -> TrajectoryNetwork:
-        """Return a fresh network."""
+        """Return a network with random initial weights."""
         return TrajectoryNetwork(config)
 
     def samples(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
-        """Return the road users of the frames with a past and a future, see `samples_of`."""
+        """Return the vehicles of the frames with a complete past and future, see `samples_of`."""
         return samples_of(data, config, frames)
 
     def fitting(self, data: Dataset, config: TrajectoryConfig) -> Sequence[int]:
-        """Return the frames that can hold samples, see `watching_frames`."""
+        """Return the numbers of the frames that can have samples, see `watching_frames`."""
         return watching_frames(data, config.cameras is not None)
 
     def draw(self, samples: Sequence[Sample], index: int, config: TrajectoryConfig, rng: np.random.Generator) -> Sample:
-        """Return the sample as it is: the frame of the present leaves nothing to turn or to move."""
+        """Return the sample without augmentation: its frame already removes rotation and translation."""
         return samples[index]
 
     def loss(self, network: TrajectoryNetwork, samples: Sequence[Sample]) -> Tensor:
-        """Return the loss of the modes, with cameras also that of the map."""
+        """Return the loss of the forecast, with cameras plus the weighted loss of the map's segmentation."""
         inputs = inputs_of(samples, network)
         forecast = network(inputs)
         loss = forecast_loss(forecast, futures_of(samples, inputs.past.device))
@@ -80,15 +80,15 @@ class TrajectoryTask(TrajectoryOutcomes):
         *,
         progress: Report = silent,
     ) -> TrajectoryEvaluation:
-        """Return errors of a single path, of K modes and of constant velocity by slice, see `metrics`."""
+        """Return displacement errors of single path, K modes and constant velocity by slice, see `metrics`."""
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
         return metrics(paths, probabilities, samples.columns)
 
     def sample_bytes(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> list[int]:
-        """Return the bytes of each frame's tracks, past and future in float32; the map is known to everybody.
+        """Return the size [B] of each frame's samples: past and future in float32; the map is not sent.
 
-        With rasters, those who observe the same instant each send all of it.
+        With rasters, each agent that observes an instant sends all samples of the instant.
         """
         columns = samples_of(data, config, frames).columns
         each = 4 * int(np.prod(columns["past"].shape[1:]) + np.prod(columns["future"].shape[1:]))
@@ -99,7 +99,7 @@ class TrajectoryTask(TrajectoryOutcomes):
     def infer(
         self, network: TrajectoryNetwork, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the predicted paths of each frame of a dataset, see `findings`; all modes, however unlikely."""
+        """Yield the forecasts of each frame of a dataset, see `findings`; all modes, whatever the threshold."""
         yield from findings(network, path, frames)
 
     def register_errors(
@@ -110,7 +110,7 @@ class TrajectoryTask(TrajectoryOutcomes):
         threshold: float = 0.0,
         progress: Report = silent,
     ) -> Registry:
-        """Return who went elsewhere than predicted, see `errors.register_errors`; a path has no score."""
+        """Return the misses, see `flcav.perception.trajectory.errors.register_errors`; `threshold` has no effect."""
         return register_errors(network, data, samples_of(data, network.config, frames), progress)
 
 

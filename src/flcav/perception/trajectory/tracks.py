@@ -1,4 +1,7 @@
-"""Tracks at the task's own instants, from traffic that was recorded at others, and in the frame of their end."""
+"""Tracks of a traffic trace, interpolated at the task's instants and transformed into the frame of a pose.
+
+Interpolation is by cubic Hermite curves with Catmull-Rom tangents.
+"""
 
 from typing import NamedTuple
 
@@ -12,12 +15,12 @@ from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
 
-GAP_S = 0.5  # between two instants of a trace, at most
-OFFSETS_S: Array = np.arange(-PAST, FUTURE + 1, dtype=np.float64) * STEP_S
+GAP_S = 0.5  # largest time between two instants of a trace
+OFFSETS_S: Array = np.arange(-PAST, FUTURE + 1, dtype=np.float64) * STEP_S  # of a track's points from the present
 
 
 class Tracks(NamedTuple):
-    """All A road users of a trace at S instants; NaN where they are not there."""
+    """Tracks of all A actors of a trace at S instants; NaN where an actor is absent."""
 
     position: Array  # (S, A, 2) world [m]
     yaw: Array  # (S, A) [rad]
@@ -25,7 +28,7 @@ class Tracks(NamedTuple):
 
 
 def check_instants(trace: Trace, origin: str) -> None:
-    """Raise `InputError` where tracks cannot be told from the instants of `trace`."""
+    """Raise `InputError` if the instants of `trace` are more than `GAP_S` apart, or fewer than two."""
     gaps = np.diff(trace.time_s)
     if len(gaps) == 0 or gaps.max() > GAP_S + 1e-6:
         said = f"spins up to {gaps.max():g} s apart" if len(gaps) else "a single spin"
@@ -33,7 +36,7 @@ def check_instants(trace: Trace, origin: str) -> None:
 
 
 def tracks_around(trace: Trace, time_s: float) -> Tracks:
-    """Return the tracks at `time_s + OFFSETS_S`; nothing up to `time_s` depends on what the trace says of later."""
+    """Return the tracks at `time_s + OFFSETS_S`; points up to `time_s` depend on no later instant of the trace."""
     times_s = time_s + OFFSETS_S
     known = int(np.searchsorted(trace.time_s, time_s + 1e-6, side="right"))
     past, future = tracks_at(trace, times_s[: PAST + 1], known), tracks_at(trace, times_s[PAST + 1 :])
@@ -41,10 +44,10 @@ def tracks_around(trace: Trace, time_s: float) -> Tracks:
 
 
 def tracks_at(trace: Trace, times_s: Array, known: int | None = None) -> Tracks:
-    """Return the tracks at `times_s` (S,), from the trace's first `known` instants or from all of it.
+    """Return the tracks at `times_s` (S,), interpolated from the first `known` instants of the trace (None: all).
 
-    They are cubic Hermite curves through its positions, with Catmull-Rom's tangents. Somebody is there at an instant
-    where the trace has him at both instants around it.
+    Positions are on cubic Hermite curves with Catmull-Rom tangents, yaw and speed are linear. An actor is present at a
+    time if it is present at both instants around it.
     """
     knots, position = trace.time_s[:known], trace.position[:known, :, :2]
     if not len(knots):
@@ -75,7 +78,7 @@ def tracks_at(trace: Trace, times_s: Array, known: int | None = None) -> Tracks:
 
 
 def _tangents(knots: Array, position: Array) -> Array:
-    """Return (T, A, 2) velocities from the positions an instant before and after, one-sided where one is missing."""
+    """Return the tangents (T, A, 2) [m/s]: the mean of the slopes before and after, one-sided if one is missing."""
     slope = np.diff(position, axis=0) / np.diff(knots)[:, None, None]
     none = np.full_like(position[:1], np.nan)
     sides = np.stack((np.concatenate((none, slope)), np.concatenate((slope, none))))
@@ -84,7 +87,7 @@ def _tangents(knots: Array, position: Array) -> Array:
 
 
 def into_frame(points: Array, pose: Array) -> Array:
-    """Return points (N, ..., 2) of the world in the frames of `pose` (N, 3) x, y, yaw: x ahead, y to the left."""
+    """Transform world points (N, ..., 2) into the frames of poses (N, 3) x, y, yaw: x ahead, y to the left [m]."""
     spread = (slice(None), *(None,) * (points.ndim - 2))
     cos, sin = np.cos(pose[:, 2])[spread], np.sin(pose[:, 2])[spread]
     x, y = points[..., 0] - pose[:, 0][spread], points[..., 1] - pose[:, 1][spread]
@@ -92,7 +95,7 @@ def into_frame(points: Array, pose: Array) -> Array:
 
 
 def out_of_frame(points: Array, pose: Array) -> Array:
-    """Return the points (N, ..., 2) that `into_frame` was given."""
+    """Transform points (N, ..., 2) from the frames of poses (N, 3) x, y, yaw to the world: `into_frame` inverted."""
     spread = (slice(None), *(None,) * (points.ndim - 2))
     cos, sin = np.cos(pose[:, 2])[spread], np.sin(pose[:, 2])[spread]
     x, y = points[..., 0], points[..., 1]
@@ -100,6 +103,9 @@ def out_of_frame(points: Array, pose: Array) -> Array:
 
 
 def constant_velocity(past: NDArray[np.floating]) -> Array:
-    """Return (N, FUTURE, 2) where the road users go if they keep heading and speed; `past` as of `Samples`."""
+    """Return the constant-velocity paths (N, FUTURE, 2) [m], at the present heading and speed.
+
+    `past` (N, PAST + 1, 4) is the column of `Samples`; the paths are in the same frames.
+    """
     ahead = past[:, -1, 3, None] * STEP_S * np.arange(1, FUTURE + 1)
     return np.stack((ahead, np.zeros_like(ahead)), axis=-1).astype(np.float64)

@@ -1,1 +1,1 @@
-"""Weather from a camera picture (LeNet-5)."""
+"""Weather classification of camera images, by LeNet-5."""

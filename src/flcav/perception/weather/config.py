@@ -1,4 +1,4 @@
-"""Which network classifies the weather."""
+"""Configurations of the weather classifier: classes, and LeNet-5 as published or modernised."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -20,10 +20,10 @@ Classes = Annotated[tuple[str, ...], Field(min_length=2), AfterValidator(_classe
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class LeNetConfig:
-    """A LeNet-5 on RGB pictures of 32 x 32 pixels."""
+    """Configuration of a LeNet-5 on RGB images of 32 x 32 pixels."""
 
     classes: Classes = tuple(WEATHER_CLASSES)  # in the order of the scores
-    original: bool = False  # as published in 1998; otherwise rectifiers and maxima where it had tanh and means
+    original: bool = False  # tanh and subsampling as published in 1998; otherwise ReLU and max pooling
 
 
 CONFIGURATIONS = {"tiny": LeNetConfig(), "paper": LeNetConfig(original=True)}

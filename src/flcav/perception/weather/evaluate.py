@@ -1,4 +1,4 @@
-"""How often the weather is named rightly."""
+"""Classification metrics of the weather task: accuracy, recall per class, and the confusion matrix."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ from flcav.seeds import stream
 
 @dataclass(frozen=True, kw_only=True)
 class Classification(Evaluated):
-    """How often each class was named rightly, and what it was taken for."""
+    """Accuracy, recall per class and confusion matrix on some images."""
 
     accuracy: float
-    low: float | None  # 95 % interval over scenes; None of a single one
+    low: float | None  # bounds of the 95 % bootstrap interval over scenes; None for a single scene
     high: float | None
     confidence: float = CONFIDENCE
-    recall: Mapping[str, float | None]  # by class; None of one without pictures
+    recall: Mapping[str, float | None]  # by class; None for a class without images
     classes: tuple[str, ...]
-    confusion: tuple[tuple[int, ...], ...]  # pictures: rows are the truth, columns what was found
-    pictures: int
-    scenes: int
-    nearest: Annotated["Classification | None", LEFT_OUT] = None  # the same of all pictures, see `over_the_whole_space`
+    confusion: tuple[tuple[int, ...], ...]  # numbers of images: rows are the true class, columns the predicted one
+    pictures: int  # number of images
+    scenes: int  # number of scenes
+    nearest: Annotated["Classification | None", LEFT_OUT] = None  # on all images, see `over_the_whole_space`
 
     @property
     def score(self) -> float:
@@ -35,12 +35,12 @@ class Classification(Evaluated):
         return self.accuracy
 
     def numbers(self) -> Mapping[str, float]:
-        """Return the accuracy on pictures within the classes' regions, and on all where they were asked for."""
+        """Return the accuracy on images within the classes' regions, and on all images if `nearest` is there."""
         nearest = {} if self.nearest is None else {"nearest class": self.nearest.accuracy}
         return {"accuracy": self.accuracy, **nearest}
 
     def lines(self) -> list[str]:
-        """Return accuracy, then recall and confusions class by class."""
+        """Return a line with the accuracy, then a line per class with its recall and confusions."""
         interval = interval_words(self.low, self.high)
         if self.low is not None:
             interval += f" ({100 * self.confidence:g} %, over scenes)"
@@ -57,9 +57,10 @@ class Classification(Evaluated):
 def classification(
     truth: NDArray[np.int64], found: NDArray[np.int64], scenes: Sequence[str], classes: Sequence[str], seed: int = 0
 ) -> Classification:
-    """Return accuracy with its 95 % interval over scenes, recall per class, and the confusion matrix.
+    """Return accuracy with its 95 % bootstrap interval over scenes, recall per class, and the confusion matrix.
 
-    `truth` and `found` are (N,) class numbers. Scenes are redrawn whole, since their pictures are alike.
+    `truth` and `found` (N,) are the true and the predicted class indices, `scenes` names the scene of each image.
+    Whole scenes are redrawn, since the images of a scene are correlated.
     """
     confusion = np.zeros((len(classes), len(classes)), np.int64)
     np.add.at(confusion, (truth, found), 1)

@@ -1,7 +1,7 @@
 """LeNet-5: LeCun et al., "Gradient-Based Learning Applied to Document Recognition", Proc. IEEE 1998, sec. II-B.
 
-Two things differ from the paper in both configurations: pictures have three channels, and the output layer is linear
-with a softmax, where digits had radial basis functions towards drawn prototypes.
+Two things differ from the paper in both configurations: images have three channels, and the output layer is linear with
+a softmax instead of radial basis functions around drawn prototypes of digits.
 """
 
 import torch
@@ -10,8 +10,8 @@ from torch.nn import functional
 
 from flcav.perception.weather.config import LeNetConfig
 
-SIDE = 32  # pixels
-# Table I: which of the six maps of S2 each of the sixteen maps of C3 sees
+SIDE = 32  # [px] of the input image
+# Table I: which of the six maps of S2 are inputs of each of the sixteen maps of C3
 _RUNS = [[i % 6, (i + 1) % 6, (i + 2) % 6] for i in range(6)]
 _LONGER_RUNS = [[(i + k) % 6 for k in range(4)] for i in range(6)]
 _PAIRS = [[i, i + 1, (i + 3) % 6, (i + 4) % 6] for i in range(3)]
@@ -19,7 +19,7 @@ SEEN_MAPS = tuple(tuple(sorted(maps)) for maps in (*_RUNS, *_LONGER_RUNS, *_PAIR
 
 
 class PartlyConnected(nn.Module):
-    """Layer C3: a 5 x 5 convolution whose maps see only some of the maps before, `SEEN_MAPS`."""
+    """Layer C3: a 5 x 5 convolution in which each output map is connected to some of the input maps, `SEEN_MAPS`."""
 
     place: Tensor  # (60,) index of each kernel among the (16 x 6) of a full convolution
 
@@ -38,7 +38,7 @@ class PartlyConnected(nn.Module):
 
 
 class Subsampling(nn.Module):
-    """Layers S2 and S4: means over 2 x 2 pixels, times a trained factor, plus a trained bias, per map."""
+    """Layers S2 and S4: average pooling over 2 x 2 pixels, with a trainable factor and bias per map."""
 
     def __init__(self, maps: int) -> None:
         super().__init__()
@@ -46,20 +46,20 @@ class Subsampling(nn.Module):
         self.bias = nn.Parameter(torch.zeros(maps, 1, 1))
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Return maps of half the size."""
+        """Return (B, maps, H / 2, W / 2) from (B, maps, H, W)."""
         return functional.avg_pool2d(maps, 2) * self.factor + self.bias
 
 
 class ScaledTanh(nn.Module):
-    """The paper's squashing function, 1.7159 tanh(2/3 a)."""
+    """The activation function of the paper, 1.7159 tanh(2/3 a)."""
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Return the maps squashed."""
+        """Return the activations, of the same shape."""
         return 1.7159 * torch.tanh(maps * (2 / 3))
 
 
 class Classifier(nn.Module):
-    """Any network that returns (B, classes) logits of (B, 3, 32, 32) pictures in [-1, 1]."""
+    """Base of classifiers: networks that return logits (B, classes) of images (B, 3, 32, 32) in [-1, 1]."""
 
     def __init__(self, config: LeNetConfig) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ class Classifier(nn.Module):
 
 
 class LeNet(Classifier):
-    """Class scores of RGB pictures of 32 x 32 pixels."""
+    """LeNet-5 on RGB images of 32 x 32 pixels."""
 
     def __init__(self, config: LeNetConfig) -> None:
         super().__init__(config)
@@ -86,12 +86,15 @@ class LeNet(Classifier):
         )
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Return (B, classes) logits of (B, 3, 32, 32) pictures in [-1, 1]."""
+        """Return the logits (B, classes) of images (B, 3, 32, 32) in [-1, 1]."""
         return self.layers(pictures)
 
 
 def uniform_over(inputs: Tensor) -> Tensor:
-    """Return weights drawn evenly from -/+ 2.4 / inputs, the paper's initialisation (appendix A)."""
+    """Return weights drawn uniformly from [-2.4 / F, 2.4 / F], the paper's initialisation (appendix A).
+
+    F is the fan-in of each weight, given by the tensor `inputs`, whose shape the weights get.
+    """
     return (2 * torch.rand(inputs.shape) - 1) * 2.4 / inputs
 
 

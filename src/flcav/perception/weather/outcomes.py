@@ -1,4 +1,4 @@
-"""Which pictures' weather was named rightly, and accuracy from it."""
+"""Outcomes of the weather task: true and predicted class of each image, and the accuracy of bootstrap samples."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,7 +14,7 @@ from flcav.progress import Report, silent
 
 
 class WeatherOutcomes:
-    """Accuracy: the share of pictures whose class of weather was named."""
+    """Measure of the weather task: accuracy, the share of images whose class is predicted correctly."""
 
     measure_name = "accuracy"
     redraws = REDRAWS
@@ -22,18 +22,18 @@ class WeatherOutcomes:
     def outcomes(
         self, network: Classifier, data: Dataset, frames: Sequence[int], progress: Report = silent
     ) -> Outcomes:
-        """Return each picture's class and the one that was named."""
+        """Return the true class ("truth") and the predicted class ("named") of each image, as indices."""
         samples = labelled(data, network.config.classes, frames)
         named = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
         truth = np.array([sample.label for sample in samples])
         return Outcomes(np.array([sample.scene for sample in samples]), {"truth": truth, "named": named})
 
     def measure(self, outcomes: Outcomes, times: Times) -> Values:
-        """Return the accuracy."""
+        """Return the accuracy of each bootstrap sample."""
         return weighted_mean((outcomes.arrays["truth"] == outcomes.arrays["named"]).astype(np.float64), times)
 
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
-        """Return the least recall of a class, and how many pictures there are."""
+        """Return the lowest recall of a class, and the number of images."""
         truth, named = outcomes.arrays["truth"], outcomes.arrays["named"]
         recalls = [float((named[truth == label] == label).mean()) for label in np.unique(truth)]
         return {"least recall": min(recalls), "pictures": float(len(truth))}

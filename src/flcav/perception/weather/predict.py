@@ -1,4 +1,4 @@
-"""The classifier's probabilities of pictures, many at once."""
+"""Inference of the weather classifier: class probabilities of images, in batches."""
 
 from collections.abc import Sequence
 
@@ -11,11 +11,14 @@ from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.samples import batched
 from flcav.progress import Report, silent
 
-BATCH = 256  # pictures at once where nothing is learned
+BATCH = 256  # images of a batch of inference
 
 
 def probabilities(network: Classifier, small_pictures: Sequence[Picture], progress: Report = silent) -> np.ndarray:
-    """Return (N, classes) probabilities of pictures of 32 x 32 pixels; the network's mode is left as it was."""
+    """Return the class probabilities (N, classes) of images of 32 x 32 pixels.
+
+    The network's training mode is left as it was.
+    """
     training = network.training
     network.eval()
     parts = []
@@ -29,5 +32,5 @@ def probabilities(network: Classifier, small_pictures: Sequence[Picture], progre
 
 
 def tensor_of(network: Classifier, small_pictures: list[Picture]) -> Tensor:
-    """Return (N, 3, 32, 32) the pictures as the network takes them, on its device."""
+    """Return images as the network's input tensor (N, 3, 32, 32) in [-1, 1], on its device."""
     return torch.from_numpy(batched(small_pictures)).to(next(network.parameters()).device)

@@ -1,4 +1,4 @@
-"""What the classifier learns from: small pictures and their weather."""
+"""Samples of the weather task: images of 32 x 32 pixels with their class of weather, and their augmentation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ from flcav.perception.images import Picture, recorded, resized
 from flcav.perception.weather.model import SIDE
 from flcav.world.weather import Weather, weather_class
 
-SHIFT_PX = 3  # the most that augmentation moves a picture
-GAIN, GAMMA, SATURATION = 0.05, 0.2, 0.25  # and how much more it makes of its light, tones and colours: exp(+-)
+SHIFT_PX = 3  # largest shift of augmentation
+GAIN, GAMMA, SATURATION = 0.05, 0.2, 0.25  # largest absolute logarithms of augmentation's random factors
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One labelled picture."""
+    """One labelled image."""
 
     picture: Picture  # (32, 32, 3)
     label: int  # index of the class
-    scene: str = ""
+    scene: str = ""  # name of its scene
 
 
 def labelled(
@@ -33,10 +33,10 @@ def labelled(
     *,
     named: Callable[[Weather], str | None] = weather_class,
 ) -> list[Sample]:
-    """Return every camera's pictures, small enough to be kept, with the class that `named` finds in their weather.
+    """Return the images of all cameras in frames of a dataset (None: all), reduced to 32 x 32 pixels, with their class.
 
-    Those of no class are left out. Raises `InputError` where there are no pictures, no record of the weather, or none
-    of `classes`.
+    `named` maps a frame's weather to the name of its class; images of no class, or of one not in `classes`, are left
+    out. Raises `InputError` if there are no images, if no weather was recorded, or if no image is in `classes`.
     """
     seen = _reduced(data, None if frames is None else tuple(frames))
     if all(weather is None for _, weather, _ in seen):
@@ -50,21 +50,20 @@ def labelled(
     return found
 
 
-@lru_cache(maxsize=4)  # a validation looks at the same pictures after every epoch
+@lru_cache(maxsize=4)  # since a validation reads the same images after every epoch
 def _reduced(data: Dataset, frames: tuple[int, ...] | None) -> list[tuple[Picture, Weather | None, str]]:
     return [(small(rgb), frame.weather, frame.scene) for frame, _, rgb in recorded(data, frames)]
 
 
 def small(picture: Picture) -> Picture:
-    """Return a picture as the network sees it: all of it, squeezed to 32 x 32 pixels."""
+    """Return the whole image resized to 32 x 32 pixels, whatever its aspect ratio."""
     return resized(picture, SIDE, SIDE)
 
 
 def augment(sample: Sample, rng: np.random.Generator) -> Sample:
-    """Return the sample mirrored in half of the cases, moved by up to 3 pixels, as another camera would show it.
+    """Return the sample with random mirroring, a random shift of up to 3 pixels, and random gain, gamma and saturation.
 
-    Cameras differ in gain, tone curve and colours. All three are varied little, since the light itself tells the
-    weather.
+    The last three imitate differences between cameras; they are small, since the light itself shows the weather.
     """
     picture = sample.picture[:, ::-1] if rng.random() < 0.5 else sample.picture
     padded = np.pad(picture, ((SHIFT_PX, SHIFT_PX), (SHIFT_PX, SHIFT_PX), (0, 0)), mode="edge")
@@ -77,5 +76,5 @@ def augment(sample: Sample, rng: np.random.Generator) -> Sample:
 
 
 def batched(pictures: list[Picture]) -> NDArray[np.float32]:
-    """Return (B, 3, 32, 32) pictures in [-1, 1]."""
+    """Return images (32, 32, 3) uint8 as one array (B, 3, 32, 32) in [-1, 1]."""
     return np.stack(pictures).transpose(0, 3, 1, 2).astype(np.float32) / 127.5 - 1

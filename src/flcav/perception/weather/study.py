@@ -1,6 +1,7 @@
-"""The study of the weather task: three towns to learn from; other scenes, another town and the whole space to test.
+"""Study recipe of the weather task: training in three towns, tests on held-out scenes, a held-out town, any weather.
 
-The recipe is that of recipes/weather.yaml: each scene goes once through all eight classes, so that they are balanced.
+Recordings are by recipes/weather.yaml: each scene goes once through all eight classes, so that they are balanced. The
+test "whole space" draws weathers from the whole space of parameters, also between the classes' regions.
 """
 
 from flcav.perception.study import StudyRecipe, read_recipe

@@ -1,4 +1,4 @@
-"""Weather classification as a `Task`."""
+"""The weather task: classification of the weather in camera images as a `Task`."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,18 +29,18 @@ from flcav.world.weather import WEATHER_CLASSES, nearest_class
 
 @dataclass(frozen=True)
 class Named(Result):
-    """The likeliest class of a picture, and the probability of each."""
+    """Classification of one image: the likeliest class, and the probability of each class."""
 
     label: Class
     probabilities: Mapping[str, float]  # by class
 
     def lines(self) -> list[str]:
-        """Return the class and its probability."""
+        """Return one line with the class and its probability."""
         return [f"{self.label} ({self.probabilities[self.label]:.2f})"]
 
 
 class WeatherTask(WeatherOutcomes):
-    """Which of the classes of weather a picture shows."""
+    """Classification of the weather in a camera image."""
 
     name = "weather"
     family = "lenet"
@@ -53,25 +53,25 @@ class WeatherTask(WeatherOutcomes):
     labels = (ANNOTATED,)
 
     def study(self) -> StudyRecipe:
-        """Return how it is studied, see `flcav.perception.weather.study`."""
+        """Return the study recipe, see `flcav.perception.weather.study`."""
         from flcav.perception.weather.study import STUDY
 
         return STUDY
 
     def build(self, config: LeNetConfig) -> Classifier:
-        """Return a fresh network."""
+        """Return a network with random initial weights."""
         return LeNet(config)
 
     def samples(self, data: Dataset, config: LeNetConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
-        """Return the pictures whose weather lies in one of the classes' regions, see `labelled`."""
+        """Return the images whose weather is in the region of one of the classes, see `labelled`."""
         return labelled(data, config.classes, frames)
 
     def draw(self, samples: Sequence[Sample], index: int, config: LeNetConfig, rng: np.random.Generator) -> Sample:
-        """Return the sample mirrored, moved and lit at random."""
+        """Return an augmented sample, see `flcav.perception.weather.samples.augment`."""
         return augment(samples[index], rng)
 
     def loss(self, network: Classifier, samples: Sequence[Sample]) -> Tensor:
-        """Return the cross entropy of a batch."""
+        """Return the mean cross entropy of a batch."""
         logits = network(tensor_of(network, [sample.picture for sample in samples]))
         return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
 
@@ -82,13 +82,13 @@ class WeatherTask(WeatherOutcomes):
         return classified(network, self.samples(data, network.config, frames), progress)
 
     def sample_bytes(self, data: Dataset, config: LeNetConfig, frames: Sequence[int]) -> list[int]:
-        """Return the bytes of each frame's pictures, with one for the class."""
+        """Return the size [B] of each frame's images, plus one byte for the class."""
         return [picture_bytes(data, i) + 1 for i in frames]
 
     def infer(
         self, network: Classifier, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the probabilities of each picture's classes; the likeliest class is named, however unlikely."""
+        """Yield the class probabilities and the likeliest class of each image at `path`; `threshold` has no effect."""
         classes = network.config.classes
         for origin, rgb in pictures(path, frames):
             shares = probabilities(network, [small(rgb)])[0]
@@ -100,13 +100,16 @@ WEATHER = WeatherTask()
 
 
 def classified(network: Classifier, samples: Sequence[Sample], progress: Report = silent) -> Classification:
-    """Return how the network does on labelled pictures, see `classification`."""
+    """Return the classification metrics of a network on labelled images, see `classification`."""
     found = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
     truth = np.array([sample.label for sample in samples])
     return classification(truth, found, [sample.scene for sample in samples], network.config.classes)
 
 
 def over_the_whole_space(network: Classifier, data: Dataset) -> Classification:
-    """Return as `classified`, where pictures between and beyond the regions count as of the nearest."""
+    """Return the classification metrics on all images: weathers outside the regions get the nearest class.
+
+    Raises `InputError` as `labelled` does.
+    """
     samples = labelled(data, network.config.classes, named=nearest_class)
     return classified(network, samples)
