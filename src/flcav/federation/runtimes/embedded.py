@@ -34,7 +34,7 @@ def update_bytes(weights: Weights) -> int:
 
 @contextlib.contextmanager
 def _server_identity() -> Iterator[None]:
-    """Give messages created inside the server's identity; at the end restore the previous one, of an outer federation."""
+    """Give messages created inside the server's identity; then restore the previous one, of an outer federation."""
     names = ("_run_id", "_node_id", "_task_id")
     before = {name: getattr(TaskIdentity, name) for name in names}
     TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SERVER_NODE, 1
