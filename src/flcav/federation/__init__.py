@@ -1,4 +1,4 @@
-"""The three training stages over a vehicle-edge-cloud network."""
+"""Federated learning over a vehicle-edge-cloud network: rounds, aggregation strategies, metered messages."""
 
 from typing import TYPE_CHECKING
 

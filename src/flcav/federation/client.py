@@ -1,4 +1,4 @@
-"""The one client app of every federation: a vehicle's, and an edge server's towards the cloud."""
+"""The Flower client app of both federated stages: vehicles with their edge server, edge servers with the cloud."""
 
 from collections.abc import Mapping
 
@@ -13,7 +13,10 @@ CLIENT = "client"  # node config key: the client's registered name
 
 
 def client_app(trainables: Mapping[str, Trainable]) -> ClientApp:
-    """Return a Flower app that trains whichever of `trainables` its node is registered as."""
+    """Return a Flower client app that trains the one of `trainables` (by client name) that its node stands for.
+
+    A node's name is the entry `CLIENT` of its node config. Its seed is derived from the round's seed and its name.
+    """
     app = ClientApp()
 
     @app.train()

@@ -1,4 +1,4 @@
-"""Between the weights a task knows and the records Flower sends."""
+"""Conversion between weights and updates (NumPy) and the records of Flower's messages."""
 
 from dataclasses import dataclass
 
@@ -7,47 +7,47 @@ from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, Re
 
 from flcav.federation.trainable import LocalUpdate, Update, Weights
 
-ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"
-SAMPLES, LOSS = "num-examples", "loss"
+ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"  # records of a message, by key
+SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
 
 
 @dataclass(frozen=True)
 class LocalWork:
-    """What every client of a round is asked to do."""
+    """The local training that every client does in one round."""
 
     round: int  # 1-based within its federation
-    steps: int
+    steps: int  # local optimiser steps
     learning_rate: float
-    seed: int  # of the round; a client adds its own name
+    seed: int  # of the round; each client derives its own from it and its name
 
     def record(self) -> ConfigRecord:
-        """Return the work as the config of a Flower message."""
+        """Return the work as the config record of a Flower message."""
         return ConfigRecord(dict(vars(self)))
 
     @classmethod
     def from_record(cls, config: ConfigRecord) -> "LocalWork":
-        """Read what `record` wrote."""
+        """Return the work in a config record: the inverse of `record`. Raises KeyError where a field is missing."""
         return cls(**{name: config[name] for name in cls.__dataclass_fields__})  # type: ignore[arg-type]
 
 
 def to_arrays(weights: Weights) -> ArrayRecord:
-    """Return weights as a Flower record, in the order they come in."""
+    """Return weights as a Flower array record, in the same order."""
     return ArrayRecord({name: Array(np.ascontiguousarray(value)) for name, value in weights.items()})
 
 
 def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
-    """Return a Flower record as weights."""
+    """Return the arrays of a Flower record as weights, in the same order."""
     return {name: array.numpy() for name, array in arrays.items()}
 
 
 def reply(message: Message, update: Update) -> Message:
-    """Return the answer to a training message."""
+    """Return the reply to a training message: the weights, and the number of samples and the loss as metrics."""
     metrics = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
     return Message(RecordDict({ARRAYS: to_arrays(update.weights), METRICS: metrics}), reply_to=message)
 
 
 def to_update(answer: Message) -> LocalUpdate:
-    """Read what `reply` wrote."""
+    """Return the update in a client's reply: the inverse of `reply`. Raises KeyError where a record is missing."""
     metrics = answer.content.metric_records[METRICS]
     weights = to_weights(answer.content.array_records[ARRAYS])
     return LocalUpdate(weights, int(metrics[SAMPLES]), float(metrics[LOSS]))  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
-"""The rounds of a federation as a Flower strategy: everybody trains, then what `Strategy.combine` makes of it.
+"""Synchronous federated rounds with full participation, as a Flower strategy.
 
-Flower's own strategies pick nodes by the global random state and multiply integer buffers by floats; this one asks
-every node, and hands their updates on in node order.
+In each round every client trains, and `Strategy.combine` aggregates the updates in the order of the nodes. Flower's own
+strategies sample nodes from the global random state and multiply integer buffers by floats.
 """
 
 from collections.abc import Callable, Iterable
@@ -15,27 +15,31 @@ from flcav.federation.records import ARRAYS, CONFIG, LOSS, SAMPLES, LocalWork, t
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Weights
 
-OnRound = Callable[[int, Weights, float], None]  # round just aggregated, its weights, mean training loss
+OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
 
 
 class ClientFailed(RuntimeError):
-    """A client answered a round with an error."""
+    """A client replied to a round with an error."""
 
 
 class Rounds(FlowerStrategy):
-    """Every node trains every round, as `work` of the round says; rounds are numbered on from the `done` ones."""
+    """Flower strategy in which every node trains in every round; `strategy` aggregates their updates.
+
+    `work` gives the local training of a round by its number; numbers continue after the `done` rounds. `on_round` is
+    called after each aggregation.
+    """
 
     def __init__(self, strategy: Strategy, work: Callable[[int], LocalWork], done: int, on_round: OnRound) -> None:
         self._strategy, self._work, self._done, self._on_round = strategy, work, done, on_round
         self._start: Weights = {}
 
     def summary(self) -> None:
-        """Log nothing: the stage's own records say what was run."""
+        """Log nothing: the stage's own records hold the settings."""
 
     def configure_train(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
-        """Return one training message per node."""
+        """Return one training message per node: the round's weights and its local work."""
         self._start = to_weights(arrays)
         content = RecordDict({ARRAYS: arrays, CONFIG: self._work(self._done + server_round).record()})
         return [
@@ -45,7 +49,7 @@ class Rounds(FlowerStrategy):
     def aggregate_train(
         self, server_round: int, replies: Iterable[Message]
     ) -> tuple[ArrayRecord | None, MetricRecord | None]:
-        """Return what the strategy makes of all replies, and their mean loss by samples.
+        """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
 
         Raises `ClientFailed` where a reply is an error, ValueError where the strategy returns arrays of other names,
         shapes or types.
@@ -67,11 +71,11 @@ class Rounds(FlowerStrategy):
     def configure_evaluate(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
-        """Return no messages: vehicles have no ground truth to evaluate on."""
+        """Return no messages: vehicles have no ground truth for an evaluation."""
         return []
 
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
-        """Return nothing."""
+        """Return None: clients do not evaluate."""
         return None
 
 

@@ -1,7 +1,7 @@
-"""The federated stages: II, vehicles with their edge server; III, edge servers with the cloud.
+"""Hierarchical federated learning: stage II, vehicles with their edge server; stage III, edge servers with the cloud.
 
-Both are one loop (`federate`): stage III's clients are edge servers, and an edge server's local training is k rounds of
-its own region's federation.
+Both stages run the same loop, `federate`. The clients of stage III are edge servers, and the local training of an edge
+server is k rounds of federation with the vehicles of its region (Wang et al., IEEE Network 37(3), 2023).
 """
 
 import logging
@@ -25,16 +25,16 @@ logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each round; a s
 
 @dataclass(frozen=True)
 class Schedule:
-    """What the clients of a federation do in its rounds."""
+    """Number of rounds, local steps per round, and a learning rate that decays geometrically over the rounds."""
 
-    rounds: int
-    steps: int  # local steps per round
+    rounds: int  # in all, those already done included
+    steps: int  # local optimiser steps per round
     learning_rate: float  # in the first round
-    final_learning_rate: float  # in the last; geometric between
-    seed: int
+    final_learning_rate: float  # in the last round, where there are several
+    seed: int  # of the federation; each round derives its own
 
     def work(self, round_: int) -> LocalWork:
-        """Return the local work of a 1-based round."""
+        """Return the local work of round `round_`, counted from 1."""
         progress = (round_ - 1) / max(self.rounds - 1, 1)
         rate = self.learning_rate * (self.final_learning_rate / self.learning_rate) ** progress
         return LocalWork(round_, self.steps, rate, child_seed(self.seed, "round", round_))
@@ -54,12 +54,17 @@ def federate(
     done: int = 0,
     on_round: OnRound = _ignore,
 ) -> LocalUpdate:
-    """Run rounds `done + 1 .. schedule.rounds` of one federation from `weights` and return what it ends with.
+    """Run rounds `done + 1 .. schedule.rounds` of a federation, starting from `weights`.
 
-    `strategy` makes each round's weights of its clients' updates. Every message is booked on `account`; raises
-    `BudgetExceeded` where one cannot be paid, `ClientFailed` where a client raised, `InputError` without clients. To
-    resume, pass the same strategy, and the weights and the number of the last round that `on_round` was given. With the
-    default it is federated averaging (McMahan et al., AISTATS 2017, algorithm 1).
+    Returns the weights after the last round, and of that round the number of samples of all clients and their mean
+    training loss, weighted by samples; without a round to run, `weights`, 0 samples and a loss of 0. In each round
+    every client trains, and `strategy` combines their updates: by default federated averaging (McMahan et al., AISTATS
+    2017, algorithm 1). `on_round` is called after each round with its number, weights and mean loss. Every message is
+    entered in the ledger of `account`. To resume, pass the same strategy, and the weights and the number of the last
+    round that `on_round` was given.
+
+    Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where a client raised, `InputError`
+    where there are no clients, ValueError where `strategy` changes names, shapes or types of the arrays.
 
     >>> import numpy as np
     >>> from flcav import Ledger, federate
@@ -94,18 +99,18 @@ def federate(
 class EdgeServer:
     """A region's edge server as a client of the cloud: its local training is k edge rounds with its vehicles."""
 
-    vehicles: Mapping[str, Trainable]
-    edge_rounds: int  # k >= 1
-    account: Account  # wireless
-    own: Weights  # its stage II model
+    vehicles: Mapping[str, Trainable]  # of the region, by name
+    edge_rounds: int  # k >= 1, per cloud round
+    account: Account  # of the wireless link
+    own: Weights  # the region's model at the end of stage II
     cloud_rounds_done: int = 0
-    strategy: Strategy = FEDAVG  # of its region
+    strategy: Strategy = FEDAVG  # of aggregation in the region
 
     def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
-        """Return the region's model after k edge rounds from the cloud's model.
+        """Return the update of the region after k edge rounds from the cloud's `weights`; raises as `federate` does.
 
-        The first cloud round starts from the server's own stage II model: the cloud has not averaged yet, and what it
-        holds is older. Edge rounds are numbered on through the cloud rounds.
+        The first cloud round starts from the server's own stage II model instead: the cloud has not averaged yet, and
+        its model is older. Edge rounds are numbered consecutively over the cloud rounds.
         """
         start = weights if self.cloud_rounds_done else self.own
         done = self.cloud_rounds_done * self.edge_rounds

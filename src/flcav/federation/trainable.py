@@ -1,4 +1,7 @@
-"""What a federation asks of whatever it trains. It knows weights and numbers, never a task."""
+"""The interface of a federation's client: weights in, update out.
+
+A federation knows weights and numbers alone; whatever satisfies `Trainable` can be federated, of any task.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,36 +14,39 @@ Weights = Mapping[str, NDArray[np.number]]  # name -> array, parameters and buff
 
 
 class Update(Protocol):
-    """What one client's local training produced."""
+    """The result of one client's local training in one round."""
 
     @property
     def weights(self) -> Weights:
-        """Return the weights it ended with."""
+        """The weights after local training."""
         ...
 
     @property
     def samples(self) -> int:
-        """Return how many distinct samples it trained on: its weight in the average."""
+        """Number of distinct samples trained on: the client's weight in federated averaging."""
         ...
 
     @property
     def loss(self) -> float:
-        """Return the mean training loss over the local steps."""
+        """Mean training loss over the local steps."""
         ...
 
 
 @dataclass(frozen=True)
 class LocalUpdate:
-    """A plain `Update`."""
+    """An `Update` as a plain record."""
 
-    weights: Weights
-    samples: int
-    loss: float
+    weights: Weights  # after local training
+    samples: int  # distinct samples trained on
+    loss: float  # mean over the local steps
 
 
 class Trainable(Protocol):
-    """One client's copy of a task: its own data and a network to train. The network that drives is another one."""
+    """A client: its own data and a network to train on them. The network that the vehicle drives with is another."""
 
     def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> Update:
-        """Return the update of `steps` local steps from `weights`; the same arguments give the same update."""
+        """Return the update after `steps` local optimiser steps from `weights`, at `learning_rate`.
+
+        `seed` determines the batches and the augmentation: the same arguments give the same update.
+        """
         ...

@@ -1,1 +1,1 @@
-"""Combining what several agents saw."""
+"""Fusion of vehicle and roadside perception into training labels without ground truth."""

@@ -1,10 +1,12 @@
-"""Labels for a vehicle that has no ground truth: its frozen network's own detections, and what the road tells it.
+"""Pseudo-labels of a vehicle's LiDAR sweep: detections of its own frozen network, fused with roadside labels.
 
-A box of the road sensor wins over the vehicle's own; what the road looked at and did not label is no object. Where
-neither saw free ground nor the road anything at all, nothing is known and an anchor there is ignored. Beside a road
-sensor a vehicle's own detection says that there is an object, not how large: its box is what the network would answer
-anyway, and to learn it would hold the network back from what the road's boxes teach. Without a road sensor it is all
-there is, and keeps the boxes from drifting.
+- A roadside box replaces the vehicle's own detection of the same object.
+- A detection where the roadside sensor saw the ground or other returns and labelled no object is dropped.
+- An anchor is a negative only where the vehicle saw free ground, or the roadside sensor free ground or returns;
+  elsewhere it is ignored.
+- Beside a roadside sensor, the vehicle's own detections teach classification alone, not size and pose: the network
+  would only learn its own output again, against the roadside boxes. Without one they teach both, which keeps boxes
+  from drifting.
 """
 
 from collections.abc import Sequence
@@ -19,18 +21,20 @@ from flcav.perception.objects.samples import Sample, near_range
 from flcav.perception.objects.truth import detection_labels, is_lookalike
 from flcav.sensors.frame import Frame
 
-CONTRADICTED = 0.5  # a detection is dropped where the road looked at more than this share of its footprint
-SAME_OBJECT_M = 1.0  # boxes of two road sensors with centres nearer than this are of one object
+CONTRADICTED = 0.5  # a detection is dropped where the roadside sensors observed more than this share of its footprint
+SAME_OBJECT_M = 1.0  # boxes of roadside sensors with centres at most this far apart are of one object
 
 
 def label_sample(
     frame: Frame, detections: Boxes, views: Sequence[RoadView], config: SecondConfig, lidar: str = "lidar"
 ) -> Sample:
-    """Return a training sample of a vehicle's `frame`, labelled without ground truth.
+    """Return a training sample of a vehicle's `frame`, labelled without ground truth; LiDAR frame.
 
-    `detections`: the frozen network's own, LiDAR frame, already cut at its threshold. `views`: the road sensors' at the
-    same spin (none: own labels only). A road label of an object that the vehicle has no return from is ignored in the
-    loss, and so are trucks and buses.
+    `detections`: those of the frozen network above its score threshold, LiDAR frame. `views`: of the roadside sensors
+    at the same spin, world frame; without any, the detections are the only labels. Boxes to find are the roadside boxes
+    of the network's classes from which the vehicle has returns, then the detections that the road does not contradict.
+    Roadside boxes without a return, and of lookalike classes (trucks, buses), are ignored in the loss. `free` holds the
+    cell centres that the vehicle saw as free ground or a roadside sensor observed; `exact` marks the roadside boxes.
     """
     world_from_lidar = frame.world_from_sensor(lidar)
     points = near_range(frame.lidar[lidar], config)
@@ -55,7 +59,7 @@ def label_sample(
 
 
 def _distinct(boxes: Boxes) -> NDArray[np.int64]:
-    """Return the indices of boxes that are not an earlier one again: two poles may label one car."""
+    """Return the indices of boxes that are no duplicates of an earlier one: two poles may label the same car."""
     kept: list[int] = []
     for i, center in enumerate(boxes.center):
         if all(np.hypot(*(center - boxes.center[j])[:2]) > SAME_OBJECT_M for j in kept):
@@ -64,14 +68,18 @@ def _distinct(boxes: Boxes) -> NDArray[np.int64]:
 
 
 def _cell_centers(config: SecondConfig) -> NDArray[np.float64]:
-    """Return (K, 2) centres of the known-free grid over the detector's range, LiDAR frame."""
+    """Return the centres (K, 2) of the cells of `CELL_M` over the detector's range, x first, LiDAR frame [m]."""
     x0, y0, _, x1, y1, _ = config.range_m
     x, y = np.arange(x0 + CELL_M / 2, x1, CELL_M), np.arange(y0 + CELL_M / 2, y1, CELL_M)
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _contradicted(detections: Boxes, told: Boxes, cells: NDArray, looked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (N,): the road labelled the same place itself, or looked there and labelled nothing."""
+    """Return (N,): whether the road labelled an object at a detection's place, or observed the place.
+
+    `told` are the roadside boxes, `cells` (K, 2) cell centres, both in the LiDAR frame; `looked` (K,) says which cells
+    the roadside sensors observed.
+    """
     flat = [1.0, 1.0, 0.0]
     footprints = Boxes(detections.center * flat, detections.size * flat + [0, 0, 1], detections.yaw, detections.label)
     inside = points_in_boxes(np.c_[cells, np.zeros(len(cells))], footprints)
@@ -81,9 +89,9 @@ def _contradicted(detections: Boxes, told: Boxes, cells: NDArray, looked: NDArra
 
 
 def _free_ground(points: NDArray[np.float32], height: float, cells: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (K,): the vehicle saw ground in the cell or beside it, and nothing that stands there or beside it.
+    """Return (K,): whether the vehicle saw the ground within two cells of each cell, and nothing standing within two.
 
-    `height` of the LiDAR above the ground [m].
+    `points` (N, 4) and the centres `cells` (K, 2) are in the LiDAR frame; `height` is the LiDAR's above ground [m].
     """
     origin = cells[0] - CELL_M / 2
     shape = np.round((cells[-1] - cells[0]) / CELL_M).astype(int) + 1

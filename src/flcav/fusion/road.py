@@ -1,7 +1,7 @@
-"""What a roadside LiDAR tells the vehicles of its region about one spin: boxes, and where it saw what.
+"""Roadside perception of one LiDAR spin: object boxes, and grids of free and occupied cells, sent to the vehicles.
 
-The detector at the pole is *ideal* here: it labels exactly the objects its own LiDAR has enough returns from. Every
-figure that rests on it is an upper bound of what a trained roadside detector would give.
+The roadside detector is *ideal*: it labels exactly the objects from which its own LiDAR has at least `MIN_RETURNS`
+returns. Every figure that uses it is an upper bound for a trained roadside detector.
 """
 
 from dataclasses import dataclass
@@ -15,23 +15,26 @@ from flcav.geometry import Boxes, transform_points
 from flcav.sensors.frame import Frame
 
 MIN_RETURNS = 10  # an object with fewer returns from the roadside LiDAR is not labelled
-CELL_M = 0.4  # of the grids that say where something was seen
-REACH = np.ones((5, 5), dtype=bool)  # what a return says of the cells around it: up to two cells away
+CELL_M = 0.4  # edge of a cell of the free and occupied grids
+REACH = np.ones((5, 5), dtype=bool)  # structuring element: a return counts for the cells up to two away
 GROUND_M = (-0.3, 0.3)  # a return between these heights above the road is ground (kerbs are 0.12)
-TOP_M = 3.0  # what is higher (crowns, signs, walls) says nothing about the road below
+TOP_M = 3.0  # higher returns (crowns, signs, walls) are ignored: they say nothing about the road below
 
 
 @dataclass(frozen=True)
 class RoadView:
-    """One spin of one roadside sensor, world frame."""
+    """Roadside perception of one LiDAR spin, world frame: labelled boxes, free cells and occupied cells."""
 
     boxes: Boxes  # labelled objects; label = actor category
     origin: NDArray[np.float64]  # (2,) world x, y of the corner of cell (0, 0) [m]
-    ground: NDArray[np.bool_]  # (X, Y) cells of CELL_M that are seen to be free
+    ground: NDArray[np.bool_]  # (X, Y) cells of CELL_M that were seen to be free ground
     occupied: NDArray[np.bool_]  # (X, Y) cells with returns above the ground
 
     def at(self, cells: NDArray[np.bool_], xy: NDArray) -> NDArray[np.bool_]:
-        """Return (K,): `cells` (`ground` or `occupied`) at world positions (K, 2); False outside the grid."""
+        """Return (K,): the value of the grid `cells` (`ground` or `occupied`) at each world position `xy` (K, 2) [m].
+
+        It is False outside the grid.
+        """
         index = np.floor((xy - self.origin) / CELL_M).astype(np.int64)
         inside = ((index >= 0) & (index < cells.shape)).all(axis=1)
         out = np.zeros(len(xy), dtype=bool)
@@ -39,7 +42,7 @@ class RoadView:
         return out
 
     def message(self) -> bytes:
-        """Return the view as it crosses the radio: float32 boxes and one bit per cell."""
+        """Return the view serialised for the radio link (safetensors): boxes as float32, grids as one bit per cell."""
         arrays = {
             "boxes": self.boxes.array().astype(np.float32),
             "category": np.frombuffer("\n".join(self.boxes.label).encode() or b"\n", dtype=np.uint8),
@@ -51,7 +54,10 @@ class RoadView:
 
 
 def road_view(frame: Frame, lidar: str = "lidar") -> RoadView:
-    """Return what an ideal detector at a roadside sensor tells of its `frame`."""
+    """Return the view of an ideal detector at the roadside sensor that recorded `frame`, from its LiDAR `lidar`.
+
+    The grids cover the returns of the sweep.
+    """
     labelled = frame.annotations.returns >= MIN_RETURNS
     points = transform_points(frame.world_from_sensor(lidar), frame.lidar[lidar][:, :3].astype(np.float64))
     origin = np.floor(points[:, :2].min(axis=0) / CELL_M) * CELL_M
@@ -66,5 +72,5 @@ def road_view(frame: Frame, lidar: str = "lidar") -> RoadView:
 
 
 def free_cells(ground: NDArray[np.bool_], standing: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the cells at or beside a ground return with nothing standing at or beside them."""
+    """Return the cells (X, Y) within two cells of one in `ground` and not within two cells of one in `standing`."""
     return np.asarray(binary_dilation(ground, REACH)) & ~np.asarray(binary_dilation(standing, REACH), dtype=bool)

@@ -1,4 +1,4 @@
-"""What to move and where to look: learning curves, allocation, placement."""
+"""Learning curves, allocation of communication budgets (MLGRA), and placement of roadside sensors (VRCSP)."""
 
 from typing import TYPE_CHECKING
 

@@ -1,14 +1,15 @@
-"""A plan that the vehicles can carry: within both budgets, what each vehicle holds, and each vehicle's own link.
+"""Allocation under the fleet budgets and the limits of each vehicle: samples held, and link capacity within a horizon.
 
-The budgets know the fleet as a whole, and the optimum within them may ask more of slow links than `horizon_s` allows.
-Then two relaxations are solved, each with one number made smaller until the plan can be split over the vehicles:
+The budgets constrain the fleet as a whole, and the optimum within them may ask more of slow links than `horizon_s`
+allows. Then two relaxations are solved, each with one budget reduced by bisection until the plan can be split over the
+vehicles (`vehicle_shares`):
 
-- *all join*: every vehicle joins every round, as the budgets are priced, and the wireless budget shrinks;
-- *one joins*: one vehicle per edge group joins a round, the least that a split needs, and what all links together can
-  carry within the horizon, which takes the wireless budget's place, shrinks.
+- *all join*: every vehicle joins every round, as the budgets are priced; the wireless budget is reduced.
+- *one joins*: one vehicle per edge group joins each round, the least that a split needs; the wireless budget is
+  replaced by what all links together carry within the horizon, and that is reduced.
 
-Unshrunk, each errs no more than any plan that can be carried, so the larger of their bounds is proven; the better of
-the two plans is taken, and its gap says how far that may be from the best.
+At full size each relaxation is a lower bound of the error of any feasible plan; the larger of the two bounds is kept.
+The better of the two plans is returned, with its gap to that bound.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,19 +31,20 @@ from flcav.optimization.allocation.allocate import (
 from flcav.optimization.allocation.problem import Problem, Task
 from flcav.optimization.vehicles import BITS_PER_BYTE, Shares, TooSlow, vehicle_shares
 
-HALVINGS = 9  # of the interval in which what is made smaller is sought
-ROUNDING = 1e-9  # relative
-OPTIMAL = 1e-4  # gap
+HALVINGS = 9  # steps of the bisection over the share of a budget
+ROUNDING = 1e-9  # relative tolerance of budgets and objectives
+OPTIMAL = 1e-4  # largest gap of a plan that is called optimal
 CARRIED = "the vehicles' own links, within horizon_s, limit this plan"
 
-Carried = tuple[Allocation, Shares]
-Relaxed = Callable[[float], Problem]  # by the share that is left of what is made smaller
+Carried = tuple[Allocation, Shares]  # a plan and its split over the vehicles
+Relaxed = Callable[[float], Problem]  # the relaxation by the share of its budget, 0 to 1
 
 
 def allocate_fleet(problem: Problem) -> Carried:
-    """Return the plan and what each vehicle does for it.
+    """Return the best plan that the vehicles can carry out, and each vehicle's share of it, by task.
 
-    Raises `Infeasible` where the limits ask for more than the budgets, the held samples or the links carry.
+    Tasks that do not name their vehicles are planned under the budgets alone and have no shares. Raises `Infeasible`
+    where the limits ask for more than the budgets or the samples held, and `TooSlow` where no plan fits the links.
     """
     asked = problem.model_copy(update={"tasks": tuple(_within_held(task) for task in problem.tasks)})
     plan = allocate(asked)
@@ -66,7 +68,10 @@ def allocate_fleet(problem: Problem) -> Carried:
 
 
 def _within_held(task: Task) -> Task:
-    """Return the task with no more samples than its vehicles hold; raises `Infeasible` if its limits ask for more."""
+    """Return the task with its upper limit of samples at most what its vehicles hold.
+
+    Raises `Infeasible` if its lower limit is more.
+    """
     vehicles = task.uplink_mbps or {}
     if not vehicles or any(vehicle not in task.samples_held for vehicle in vehicles):
         return task
@@ -98,7 +103,7 @@ def _with_wireless(asked: Problem, wireless_mb: float, tasks: tuple[Task, ...]) 
 
 
 def _largest(asked: Problem, relaxed: Relaxed) -> Carried | None:
-    """Return the plan of the largest share that can be carried, as far as halving finds it."""
+    """Return the plan of the largest share of the budget that can be carried, by bisection; None if none was found."""
     low, high, share, found = 0.0, 1.0, 1.0, None
     for _ in range(HALVINGS + 1):
         try:
@@ -114,7 +119,7 @@ def _largest(asked: Problem, relaxed: Relaxed) -> Carried | None:
 
 
 def _carried(asked: Problem, plan: Allocation) -> Carried:
-    """Return the plan at its price in `asked`, split; raises `TooSlow` if the links or the budgets do not carry it."""
+    """Return the plan priced in `asked` and split over the vehicles; raises `TooSlow` beyond the links or budgets."""
     counts = [count for row in plan.tasks for count in (row.samples, row.edge_rounds, row.cloud_rounds)]
     tasks = described(asked, np.array(counts, dtype=np.float64))
     spent = used(tasks)
@@ -132,7 +137,7 @@ def _bound(relaxed: Relaxed) -> float | None:
 
 
 def _certified(asked: Problem, found: Sequence[Carried], bound: float | None) -> Carried:
-    """Return the best plan with what is proven of it; its derivative by the wireless budget is not known: 0."""
+    """Return the best plan with its certificate; its derivative by the wireless budget is not known and set to 0."""
     larger = asked.objective == "area"
     plan, shares = (max if larger else min)(found, key=lambda carried: carried[0].objective)
     lower = None if bound is None else min(bound, plan.objective)

@@ -1,10 +1,14 @@
-"""The three-layer graph: tasks - networks - modalities - vehicles (Wang et al., IEEE Network 37(3), 2023, Fig. 3a).
+"""The multi-layer graph of MLGRA: tasks, networks, modalities, vehicles (Wang et al., IEEE Network 37(3), 2023).
 
-Layer 1 joins each task to the network that it shares with others: they are a cluster, one resource serves them all, and
-its loss is the sum of theirs by weight; a task may have a curve of its own. Layer 2 joins a network to the modalities
-that it reads, at the size of one sample. Layer 3 joins a modality to the vehicles that record it, with the samples they
-hold and how good these are. The graph is a plain `networkx.Graph` whose nodes (kind, name) and edges carry these
-numbers; it is saved as node-link JSON, and it holds all that an allocation problem needs.
+It is the graph of the article's Fig. 3a, in three layers of edges:
+
+- Layer 1 joins each task to its network. Tasks with the same network are a cluster: one resource serves them all, and
+  the cluster's loss is the weighted sum of theirs. A task may have its own learning curve.
+- Layer 2 joins a network to the modalities that it reads, with the size of one sample [MB].
+- Layer 3 joins a modality to the vehicles that record it, with the number and the quality of the samples they hold.
+
+The graph is a `networkx.Graph` with nodes (kind, name); nodes and edges have these numbers as attributes. It contains
+all data of an allocation problem, and it is saved as node-link JSON.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,11 +24,11 @@ from flcav.optimization.allocation.problem import Budgets, Count, Limits, Proble
 from flcav.optimization.curves.curves import Additive, Effective, Positive
 
 OwnCurve = Annotated[Additive | Effective, Field(discriminator="model")]
-KINDS = ("task", "network", "modality", "vehicle")  # a layer joins neighbours
+KINDS = ("task", "network", "modality", "vehicle")  # of nodes; each layer joins two neighbours of this list
 
 
 class TaskNode(Quantities):
-    """A task, and the network it shares."""
+    """A perception task: its network, its weight and, where it differs from the network's, its learning curve."""
 
     network: str
     weight: Positive = 1.0
@@ -32,29 +36,29 @@ class TaskNode(Quantities):
 
 
 class NetworkNode(Quantities):
-    """A network: its size, what it reads, and the curve of its tasks that have none of their own."""
+    """A network: its size, its modalities, limits, and the learning curve of tasks that have none of their own."""
 
-    model_mb: Positive
+    model_mb: Positive  # one model update
     modalities: Annotated[tuple[str, ...], Field(min_length=1)]
     limits: Limits
     curve: OwnCurve | None = None
 
 
 class ModalityNode(Quantities):
-    """A kind of sensor data."""
+    """A modality: a kind of sensor data, and the size of one sample."""
 
-    sample_mb: Positive
+    sample_mb: Positive  # one labelled sample
 
 
 class Held(Quantities):
-    """What a vehicle holds of a modality."""
+    """Number and quality of the samples that a vehicle holds of a modality."""
 
-    samples: Count | None = None  # None: as many as are asked for
-    quality: Positive = 1.0
+    samples: Count | None = None  # None: not limited
+    quality: Positive = 1.0  # worth of one sample
 
 
 class VehicleNode(Quantities):
-    """A vehicle: its edge server, its own link, and what it holds."""
+    """A vehicle: its edge server, its uplink, and its samples by modality."""
 
     edge: str
     uplink_mbps: Uplink | None = None  # None: not known
@@ -62,7 +66,11 @@ class VehicleNode(Quantities):
 
 
 class Layers(Quantities):
-    """The graph as one writes it, in YAML or code, by name."""
+    """The graph as a configuration, in YAML or code: nodes by name, edges as references.
+
+    Construction raises pydantic's ValidationError where a reference names no node, a task has no learning curve, or a
+    network has no task or no vehicle with all its modalities.
+    """
 
     budgets_mb: Budgets
     edge_rounds_per_cloud_round: Count = 1
@@ -97,7 +105,11 @@ def _known(field: str, name: str, among: Mapping[str, Any]) -> None:
 
 
 def build(layers: Layers) -> nx.Graph:
-    """Return the graph: nodes (kind, name), edges with `layer` 1, 2 or 3, both with the numbers of `layers`."""
+    """Return the graph of `layers`: nodes (kind, name), edges with attribute `layer` 1, 2 or 3.
+
+    Node attributes are `kind` and the node's own numbers; edge attributes `weight` (layer 1), `sample_mb` (layer 2),
+    `samples` and `quality` (layer 3). Budgets, k and the horizon are attributes of the graph.
+    """
     graph = nx.Graph(
         budgets_mb=layers.budgets_mb.model_dump(),
         edge_rounds_per_cloud_round=layers.edge_rounds_per_cloud_round,
@@ -122,7 +134,7 @@ def build(layers: Layers) -> nx.Graph:
 
 
 def describe(graph: nx.Graph) -> Layers:
-    """Return the graph as one writes it: the inverse of `build`; raises `InputError` for any other graph."""
+    """Return the configuration of a graph: the inverse of `build`; raises `InputError` for any other graph."""
     nodes = {kind: [key for key, found in graph.nodes(data="kind") if found == kind] for kind in KINDS}
     for key in nodes["task"]:
         if graph.degree[key] != 1:
@@ -164,7 +176,7 @@ def save(graph: nx.Graph, path: Path) -> None:
 
 
 def load(path: Path) -> nx.Graph:
-    """Read a graph: one that `save` wrote, or its layers as one writes them; raises `InputError`."""
+    """Return the graph in the file at `path`: node-link JSON or `Layers` in YAML; raises `InputError` for another."""
     values = read_yaml(path)
     if not (isinstance(values, dict) and "nodes" in values):
         return build(parse_config(Layers, values, str(path)))
@@ -177,7 +189,7 @@ def load(path: Path) -> nx.Graph:
 
 
 def load_problem(path: Path | str) -> Problem:
-    """Return the problem in the YAML or JSON file at `path`: written as tasks, or as a graph in either form.
+    """Return the allocation problem in the YAML or JSON file at `path`: a list of tasks, or a graph in either form.
 
     Raises `InputError` naming file, field, value and rule where it is none. See docs/allocation.md.
 
@@ -191,13 +203,13 @@ def load_problem(path: Path | str) -> Problem:
 
 
 def read_graph(path: Path) -> nx.Graph | None:
-    """Return the graph in the file at `path`, None where it holds a problem written as tasks."""
+    """Return the graph in the file at `path`, None where it holds a list of tasks; raises `InputError`."""
     values = read_yaml(path)
     return load(path) if isinstance(values, dict) and ("networks" in values or "nodes" in values) else None
 
 
 def clusters(graph: nx.Graph) -> dict[str, dict[str, float]]:
-    """Return the tasks of every network with their weights: one resource serves all of a cluster."""
+    """Return the clusters: for each network the weights of its tasks, by name."""
     found: dict[str, dict[str, float]] = {}
     for task, network, weight in (
         (a, b, weight) if a[0] == "task" else (b, a, weight)
@@ -209,11 +221,12 @@ def clusters(graph: nx.Graph) -> dict[str, dict[str, float]]:
 
 
 def to_problem(graph: nx.Graph) -> Problem:
-    """Return the allocation problem: a task per cluster, named after its tasks and weighing what they weigh together.
+    """Return the allocation problem of a graph, with one entry in `tasks` per cluster.
 
-    Its groups are the vehicles, by edge server, that hold every modality of its network: a vehicle's samples are those
-    it has of all of them, their quality the least among them. A sample is one of each modality. Vehicles are named
-    where all their links are known.
+    A cluster's name joins those of its tasks, and its weight is the sum of theirs. A sample is one of each modality of
+    its network. Its edge groups are the vehicles, by edge server, that hold all these modalities; a vehicle's number of
+    samples, and their quality, is the least over them. Vehicles are named only where all their links are known. Raises
+    `InputError` where `graph` is none that `build` returns.
     """
     layers = describe(graph)
     tasks = []
@@ -240,7 +253,7 @@ def to_problem(graph: nx.Graph) -> Problem:
 
 
 def _cluster_curve(layers: Layers, network: str, tasks: Mapping[str, float]) -> dict[str, Any]:
-    """Return the curve of a cluster's mean error by weight: the network's alone where no task has one of its own."""
+    """Return the learning curve of a cluster's weighted mean error; a plain curve where all its tasks have the same."""
     shared = layers.networks[network].curve
     own = {name: layers.tasks[name].curve or shared for name in tasks}
     members = [
@@ -254,7 +267,7 @@ def _cluster_curve(layers: Layers, network: str, tasks: Mapping[str, float]) -> 
 
 
 def _named(fleet: Mapping[str, VehicleNode], held: Mapping[str, Sequence[Held]]) -> dict[str, Any]:
-    """Return what a task says of its vehicles; nothing where a link is not known."""
+    """Return the fields of a cluster that name its vehicles; none where a link is not known."""
     links = {key: each.uplink_mbps.model_dump() for key, each in fleet.items() if each.uplink_mbps is not None}
     if len(links) < len(fleet):
         return {}

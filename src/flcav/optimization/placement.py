@@ -1,8 +1,8 @@
-"""VRCSP: which poles get a roadside sensor, so that the sensors cover most of the registered errors.
+"""VRCSP, placement of roadside sensors on poles, as weighted maximum coverage of the registered perception errors.
 
-An error at e is covered by a sensor at x where ||e - x|| <= range in three dimensions. Choosing `count` poles is the
-maximum coverage problem: greedy is within 1 - 1/e of the optimum (Nemhauser, Wolsey and Fisher 1978); exact is a
-mixed-integer program for HiGHS, with a proven bound.
+A sensor at x covers an error at e where ||e - x|| <= range, in three dimensions. The greedy algorithm reaches at least
+1 - 1/e (here Euler's number) of the optimum (Nemhauser, Wolsey and Fisher 1978); the exact method is a mixed-integer
+program solved by HiGHS, with a proven upper bound. VRCSP: Wang et al., IEEE Network 37(3), 2023.
 """
 
 from dataclasses import dataclass
@@ -18,23 +18,26 @@ from flcav.config import InputError
 Array = NDArray[np.float64]
 Method = Literal["exact", "greedy"]
 
-FARTHEST_M = 1e9
-TIE = 1e-9  # relative: covered weights closer than this are equal
+FARTHEST_M = 1e9  # largest coordinate and range
+TIE = 1e-9  # relative difference below which covered weights are equal
 
 
 @dataclass(frozen=True)
 class Placement:
-    """The chosen poles and what they cover."""
+    """The chosen poles, the errors they cover, and a certificate of optimality."""
 
     chosen: tuple[int, ...]  # indices into the poles, ascending
     covered: int  # errors within range of a chosen pole
     covered_weight: float
-    upper_bound: float  # proven: no choice covers more weight
-    optimal: bool  # the bound is reached
+    upper_bound: float  # proven: no choice of as many poles covers more weight
+    optimal: bool  # whether `covered_weight` equals the bound
 
 
 def coverage(errors: ArrayLike, poles: ArrayLike, range_m: float) -> NDArray[np.bool_]:
-    """Return (P, E): whether pole p (P, 3) is within `range_m` of error e (E, 3), both in the world frame [m]."""
+    """Return the coverage matrix (P, E): whether each of the `poles` (P, 3) is within `range_m` of each error (E, 3).
+
+    Positions are in the world frame [m].
+    """
     sites, places = np.asarray(poles, dtype=np.float64), np.asarray(errors, dtype=np.float64)
     return np.stack([((places - site) ** 2).sum(axis=1) <= range_m**2 for site in sites])
 
@@ -48,10 +51,10 @@ def place(
     weight: ArrayLike | None = None,
     method: Method = "exact",
 ) -> Placement:
-    """Return which `count` of the poles (P, 3) cover most of the weight (E,) of the errors (E, 3), all in metres.
+    """Return the `count` of the poles (P, 3) that cover most of the weight (E,) of the errors (E, 3).
 
-    Without `weight` each error weighs 1. Among equal choices earlier poles are preferred. Raises `InputError` for rows
-    that are no places, and for a range, a count or a method that cannot be.
+    Positions are in the world frame [m]. Without `weight` each error weighs 1. Among equal choices earlier poles are
+    preferred. Raises `InputError` where positions, weights, range, count or method are invalid.
 
     >>> from flcav import place
     >>> placed = place([[0, 0, 1], [5, 0, 1], [90, 0, 1]], poles=[[0, 9, 3], [90, 9, 3]], range_m=40, count=1)
@@ -97,7 +100,10 @@ def _points(values: ArrayLike, name: str) -> Array:
 
 
 def _patterns(within: NDArray[np.bool_], weights: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Return (P, K) distinct sets of poles that see an error, and the weight (K,) of the errors each set sees."""
+    """Return the K distinct sets of poles that cover an error, as columns (P, K), and the weight (K,) of their errors.
+
+    Errors with the same set of poles are merged: the problem's size is K, not E.
+    """
     seen = within.any(axis=0)
     if not seen.any():
         return np.zeros((len(within), 0), dtype=bool), np.zeros(0)
@@ -107,7 +113,7 @@ def _patterns(within: NDArray[np.bool_], weights: Array) -> tuple[NDArray[np.boo
 
 
 def _greedy(patterns: NDArray[np.bool_], weight: Array, count: int) -> list[int]:
-    """Return `count` poles, each the one that adds most weight; the earliest among equals."""
+    """Return `count` poles by the greedy algorithm: each adds most weight; the earliest among equals."""
     left = weight.copy()
     chosen: list[int] = []
     for _ in range(count):
@@ -119,7 +125,10 @@ def _greedy(patterns: NDArray[np.bool_], weight: Array, count: int) -> list[int]
 
 
 def _program(patterns: NDArray[np.bool_], weight: Array, count: int) -> tuple[Array, csr_array, Array]:
-    """Return the objective, rows and limits over (poles, patterns): a pattern counts where one of its poles does."""
+    """Return objective, constraint rows and upper limits of the program over the variables (poles, patterns).
+
+    A pattern is covered only where one of its poles is chosen, and at most `count` poles are chosen.
+    """
     poles, kinds = patterns.shape
     cover = hstack((csr_array(-patterns.T.astype(np.float64)), eye_array(kinds)))
     choose = csr_array(np.r_[np.ones(poles), np.zeros(kinds)][None])
@@ -127,7 +136,7 @@ def _program(patterns: NDArray[np.bool_], weight: Array, count: int) -> tuple[Ar
 
 
 def _bound(patterns: NDArray[np.bool_], weight: Array, count: int) -> float:
-    """Return the linear programming bound on the covered weight."""
+    """Return the bound of the linear programming relaxation on the covered weight."""
     if count == 1 or not patterns.shape[1]:
         return float((patterns @ weight).max())
     objective, rows, limits = _program(patterns, weight, count)
@@ -135,7 +144,7 @@ def _bound(patterns: NDArray[np.bool_], weight: Array, count: int) -> float:
 
 
 def _exact(patterns: NDArray[np.bool_], weight: Array, count: int) -> tuple[list[int], float]:
-    """Return an optimal choice of `count` poles and the proven bound."""
+    """Return an optimal choice of `count` poles and the proven upper bound, by mixed-integer programming."""
     objective, rows, limits = _program(patterns, weight, count)
     whole = np.r_[np.ones(len(patterns)), np.zeros(patterns.shape[1])]
     result = milp(
@@ -151,7 +160,7 @@ def _exact(patterns: NDArray[np.bool_], weight: Array, count: int) -> tuple[list
 
 
 def _earliest(patterns: NDArray[np.bool_], weight: Array, chosen: list[int]) -> list[int]:
-    """Return the choice with poles swapped for earlier ones as long as that loses no weight."""
+    """Return the choice with each pole replaced by the earliest one that loses no covered weight."""
     best = float(weight[patterns[chosen].any(axis=0)].sum())
     for pole in sorted(chosen):
         others = [other for other in chosen if other != pole]

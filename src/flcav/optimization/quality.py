@@ -1,6 +1,7 @@
-"""How good a vehicle's data are where they are not IID; where they are, every quality is equal and throughput decides.
+"""Data quality of vehicles under non-IID data: label distribution distance, visible objects, gradient diversity.
 
-Three measures from the literature, each over a fleet of V vehicles, and one number made of them.
+Each measure is over a fleet of V vehicles; `data_quality` combines them into one weight per vehicle. For IID data all
+weights are equal.
 """
 
 import numpy as np
@@ -8,14 +9,16 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-LEAST = 0.01  # of a share: the poorest data are still worth something
+LEAST = 0.01  # least factor of a quality, relative to the fleet's best: no data are worth nothing
 
 
 def label_distribution_distance(counts: ArrayLike, reference: ArrayLike | None = None) -> Array:
-    """Return each vehicle's total variation distance (V,) in [0, 1] of its labels (V, C) to a reference (C,).
+    """Return the total variation distance (V,) in [0, 1] of each vehicle's label distribution to the reference's.
 
-    Half the L1 distance that Zhao et al. (2018, "Federated learning with non-IID data") relate the loss of accuracy to.
-    The reference defaults to the fleet's labels together. A vehicle without labels is at distance 1.
+    `counts` (V, C) are the vehicles' labels by class, `reference` (C,) those of the reference: by default the whole
+    fleet's. The distance is half the L1 distance to which Zhao et al. (2018, "Federated learning with non-IID data")
+    relate the loss of accuracy. A vehicle without labels has distance 1. Raises ValueError for negative counts and for
+    a reference without labels.
     """
     numbers = np.asarray(counts, dtype=np.float64)
     whole = numbers.sum(axis=0) if reference is None else np.asarray(reference, dtype=np.float64)
@@ -27,16 +30,19 @@ def label_distribution_distance(counts: ArrayLike, reference: ArrayLike | None =
 
 
 def visible_objects(objects: ArrayLike, samples: ArrayLike) -> Array:
-    """Return each vehicle's mean number of visible objects per sample (V,); 0 for one without samples."""
+    """Return each vehicle's mean number of visible objects per sample (V,): `objects` (V,) over `samples` (V,).
+
+    It is 0 for a vehicle without samples.
+    """
     seen, held = np.asarray(objects, dtype=np.float64), np.asarray(samples, dtype=np.float64)
     return np.divide(seen, held, out=np.zeros_like(seen), where=held > 0)
 
 
 def gradient_diversity(gradients: ArrayLike) -> float:
-    """Return the sum of the squared norms of gradients (V, P) over the squared norm of their sum.
+    """Return the gradient diversity sum_v ||g_v||^2 / ||sum_v g_v||^2 of gradients (V, P).
 
-    Yin et al. (2018, "Gradient diversity"): 1/V where all are equal, 1 where they are orthogonal, infinite where they
-    cancel.
+    It is 1/V where all gradients are equal, 1 where they are orthogonal, infinite where they cancel (Yin et al. 2018,
+    "Gradient diversity: a key ingredient for scalable distributed learning").
     """
     rows = np.asarray(gradients, dtype=np.float64)
     together = float((rows.sum(axis=0) ** 2).sum())
@@ -45,9 +51,10 @@ def gradient_diversity(gradients: ArrayLike) -> float:
 
 
 def gradient_novelty(gradients: ArrayLike) -> Array:
-    """Return how far each vehicle's gradient (V, P) points from the others' mean: (1 - cosine) / 2 (V,) in [0, 1].
+    """Return the cosine distance (V,) in [0, 1] of each vehicle's gradient (V, P) to the mean of the others'.
 
-    0: it says what the others say; 1/2: what none of them says. 0 for a gradient of 0 and for a single vehicle.
+    The distance is (1 - cosine) / 2: 0 for parallel, 1/2 for orthogonal, 1 for opposite gradients. It is 0 for a
+    gradient of 0 and for a single vehicle.
     """
     rows = np.asarray(gradients, dtype=np.float64)
     others = rows.sum(axis=0) - rows
@@ -59,10 +66,10 @@ def gradient_novelty(gradients: ArrayLike) -> Array:
 def data_quality(
     label_distance: ArrayLike, objects_per_sample: ArrayLike | None = None, novelty: ArrayLike | None = None
 ) -> Array:
-    """Return each vehicle's quality (V,) in (0, 1], the fleet's best 1: what one of its samples is worth.
+    """Return the quality (V,) in (0, 1] of each vehicle's data, the worth of one sample relative to the fleet's best.
 
-    The product of its label overlap with the reference (1 - distance), its visible objects and (1 + novelty), each
-    relative to the fleet's best. Equal vehicles are all worth 1.
+    It is the product of (1 - label distance), visible objects per sample and (1 + gradient novelty), each (V,) relative
+    to the fleet's best and at least `LEAST`; a measure that is None is left out. Equal vehicles all have quality 1.
     """
     parts = [1 - np.asarray(label_distance, dtype=np.float64)]
     if objects_per_sample is not None:

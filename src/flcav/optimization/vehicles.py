@@ -1,12 +1,17 @@
-"""Which vehicle uploads how many samples and joins which rounds, so that each stays within its own link.
+"""Split of a plan over the vehicles of a fleet: a lexicographic mixed-integer program under each vehicle's own link.
 
-A plan charges the links of a whole fleet. Here it is split: x samples and y rounds for every task and vehicle, whole
-numbers with sum(x) = the planned samples, at most the held ones, and in every round at least one vehicle of each edge
-group. All that a vehicle sends, over all its tasks, must be through within the horizon. Among such splits the first is
-taken by: most rounds joined (stragglers drop out of rounds only where their links cannot carry them), then samples of
-most worth, both weighted by data quality, then the earliest end of stage I, when all samples are through. For IID data,
-where every sample is worth the same, throughput alone decides. Three mixed-integer programs for HiGHS: solved to their
-end for small fleets; for large ones the best split in `NODES` nodes of the search, whatever the machine's speed.
+A plan gives the number of samples and rounds of each task for the whole fleet. The split has whole x samples and y
+rounds for every task and vehicle, with
+
+- sum(x) = the planned samples of the task, and x at most the samples that the vehicle holds;
+- at least one vehicle of each edge group in every round;
+- on each link of a vehicle, all its uplink messages over all tasks sent within the horizon.
+
+The objectives, in this order: most rounds joined (a straggler drops out of rounds only where its link cannot carry
+them); samples of most worth; both weighted by data quality; then the earliest end of stage I, when all samples have
+arrived. For IID data all samples have the same worth and throughput decides. Each objective is a program for HiGHS,
+solved to optimality for small fleets; for large ones the search ends after `NODES` nodes, so that the result does not
+depend on the machine's speed.
 """
 
 from collections.abc import Sequence
@@ -23,24 +28,24 @@ from flcav.optimization.allocation.problem import Problem, Task, Uplink
 Array = NDArray[np.float64]
 
 BITS_PER_BYTE = 8
-TIE = 1e-7  # relative: what an earlier aim may lose to a later one, against rounding
-GAP = 1e-6  # relative, of rounds and samples
-END_GAP = 1e-4  # relative, of times
-NODES = 100
+TIE = 1e-7  # relative: how much an earlier objective may lose to a later one, against rounding
+GAP = 1e-6  # relative optimality gap for rounds and samples
+END_GAP = 1e-4  # relative optimality gap for times
+NODES = 100  # most nodes of a branch-and-bound search
 
 
 class TooSlow(Infeasible):
-    """The vehicles' own links need longer than the horizon."""
+    """The vehicles' own links cannot carry the plan within the horizon."""
 
 
 @dataclass(frozen=True)
 class VehicleShare:
-    """What one vehicle does for one task."""
+    """One vehicle's share of a task's plan: samples to upload, rounds to join, and their size."""
 
     vehicle: str
-    samples: int  # uploads in stage I
-    rounds: tuple[int, ...]  # joins, of 1 ... edge_rounds + k * cloud_rounds, in the order of the run
-    wireless_mb: float
+    samples: int  # uploaded in stage I
+    rounds: tuple[int, ...]  # joined, of 1 ... edge_rounds + k * cloud_rounds, in the order of the run
+    wireless_mb: float  # uplink
 
 
 Shares = dict[str, tuple[VehicleShare, ...]]  # by task
@@ -48,22 +53,22 @@ Shares = dict[str, tuple[VehicleShare, ...]]  # by task
 
 @dataclass(frozen=True)
 class _Part:
-    """One task on one vehicle: two neighbouring variables, samples and rounds."""
+    """One task on one vehicle: two consecutive variables of the program, samples and rounds."""
 
     task: Task
-    group: int
+    group: int  # index of its edge group
     vehicle: str
     link: Uplink
-    held: int
-    rounds: int
+    held: int  # most samples
+    rounds: int  # most rounds
     quality: float
 
 
 def vehicle_shares(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
-    """Return the shares of every task that names its vehicles, by task, for `plans` in the order of the tasks.
+    """Return the split of `plans` (one per task, in their order) over the vehicles: by task, a share per vehicle.
 
-    Raises `Infeasible` where the vehicles hold too few samples, `TooSlow` where their links need longer than
-    `horizon_s`.
+    Tasks that do not name their vehicles are left out. Raises `Infeasible` where the vehicles hold too few samples,
+    `TooSlow` where their links need longer than `horizon_s`.
     """
     planned = [(task, plan) for task, plan in zip(problem.tasks, plans, strict=True) if task.uplink_mbps]
     if not planned:
@@ -104,8 +109,8 @@ def _parts(problem: Problem, task: Task, plan: TaskPlan) -> list[_Part]:
 
 
 def _split(parts: Sequence[_Part], plans: Sequence[TaskPlan], horizon_s: float | None) -> Array:
-    """Return the samples and rounds (P, 2) of every part."""
-    size = 2 * len(parts) + 1  # the last variable is a time [s]
+    """Return the samples and rounds (P, 2) of every part; raises `TooSlow` where no split fits the horizon."""
+    size = 2 * len(parts) + 1  # the last variable is a time [s]: the end of stage I, or of the plan
     needs, least = _needs(parts, plans)
     joined_by_all = LinearConstraint(needs, least[:, 0], least[:, 1])  # pyright: ignore[reportArgumentType]
     high = np.array([count for part in parts for count in (part.held, part.rounds)] + [np.inf])
@@ -131,7 +136,10 @@ def _split(parts: Sequence[_Part], plans: Sequence[TaskPlan], horizon_s: float |
 
 
 def _needs(parts: Sequence[_Part], plans: Sequence[TaskPlan]) -> tuple[csr_array, Array]:
-    """Return rows and (rows, 2) bounds: all samples are uploaded, and someone of each group joins each round."""
+    """Return constraint rows and their bounds (rows, 2) for the samples of each task and the rounds of each group.
+
+    All planned samples are uploaded; the rounds that the vehicles of a group join are together at least the task's.
+    """
     wanted = {plan.name: plan.samples for plan in plans}
     names: dict[tuple[str, int], int] = {}
     rows, columns, bounds = [], [], []
@@ -150,7 +158,7 @@ def _needs(parts: Sequence[_Part], plans: Sequence[TaskPlan]) -> tuple[csr_array
 
 
 def _busy(parts: Sequence[_Part], *, with_rounds: bool, less_last: bool = False) -> csr_array:
-    """Return a row per vehicle and link: the seconds that it is busy, if asked `less_last`, the last variable."""
+    """Return a row per vehicle and link: the time it is busy [s]; with `less_last`, minus the last variable."""
     lines: dict[tuple[str, str], Array] = {}
     for number, part in enumerate(parts):
         for link, mbps in (("wireless", part.link.wireless), ("wireline", part.link.wireline)):
@@ -164,7 +172,7 @@ def _busy(parts: Sequence[_Part], *, with_rounds: bool, less_last: bool = False)
 
 
 def _least(aim: Array, constraints: Sequence[LinearConstraint], high: Array, gap: float) -> Array | None:
-    """Return the variables of the least `aim`, None where there are none."""
+    """Return the variables that minimise `aim`, None where none satisfy the constraints or none were found."""
     whole = np.r_[np.ones(len(high) - 1), 0.0]
     result = milp(
         aim,
@@ -186,9 +194,10 @@ def _too_slow(soonest: Array | None, horizon_s: float | None) -> TooSlow:
 
 
 def _rounds(groups: Sequence[int], counts: Sequence[int], rounds: int) -> list[tuple[int, ...]]:
-    """Return which of `rounds` rounds each vehicle joins: within a group one goes on where the last one ended.
+    """Return the rounds that each vehicle joins, round robin: a vehicle starts where the one before in its group ended.
 
-    So every round is joined, and by numbers of vehicles that differ by at most one.
+    `counts` are the numbers of rounds per vehicle. So every round of a group is joined, and the numbers of vehicles in
+    its rounds differ by at most one.
     """
     ends = np.cumsum(counts, dtype=np.int64) - np.array(
         [sum(c for c, h in zip(counts, groups) if h < g) for g in groups]

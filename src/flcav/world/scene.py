@@ -145,6 +145,7 @@ class Scene:
             self._place()
 
     def _place(self) -> None:
+        """Place the instances of actors that have moved since the last time, and remove absent and hidden ones."""
         wanted = np.where(self.trace.present[self.index, :, None], self.poses(), np.nan)
         if self._hidden is not None:
             wanted[self._hidden] = np.nan
@@ -167,6 +168,8 @@ def _turned(yaw: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class _Model(NamedTuple):
+    """A mesh with its normals and its acceleration structure."""
+
     mesh: Mesh
     normal: NDArray[np.float32]
     solid: Solid
@@ -177,6 +180,7 @@ def _model(mesh: Mesh) -> _Model:
 
 
 def _surfaces(models: list[_Model], names: list[str]) -> Surfaces:
+    """Return the faces of all distinct models; an actor's paint is drawn by a hash of its name."""
     distinct = {id(model): model for model in models}
     starts = np.cumsum([0, *(len(model.mesh.faces) for model in distinct.values())])
     first = dict(zip(distinct, starts))

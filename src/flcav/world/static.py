@@ -112,6 +112,7 @@ Owned = tuple[Part, int, Mesh]  # kind of object, its row, its mesh in the world
 
 
 def _parts(town: Town) -> Iterator[Owned]:
+    """Yield the meshes of all static objects of a town."""
     yield Part.GROUND, 0, _ground(town)
     yield from chain(_roads(town), _sidewalks(town), _buildings(town), _plants(town), _furniture(town))
 
@@ -129,6 +130,7 @@ def _roads(town: Town) -> Iterator[Owned]:
 
 
 def _sidewalks(town: Town) -> Iterator[Owned]:
+    """Yield the sidewalks, each as its surface and its kerb face."""
     for row, polygon in enumerate(town.sidewalks):
         yield Part.SIDEWALK, row, _plate(polygon, KERB_M, Material.SIDEWALK)
         ring = np.concatenate((polygon, polygon[:1]))
@@ -159,6 +161,7 @@ def _plants(town: Town) -> Iterator[Owned]:
 
 
 def _furniture(town: Town) -> Iterator[Owned]:
+    """Yield clutter, lamps, signs with their posts, sensor masts and signals."""
     pieces = [(kind, *values) for kind, rows in town.clutter for values in rows]
     for row, (kind, x, y, yaw, length, width, height) in enumerate(pieces):
         yield Part.CLUTTER, row, moved(clutter(kind, length, width, height), x, y, 0.0, yaw)
@@ -173,6 +176,7 @@ def _furniture(town: Town) -> Iterator[Owned]:
 
 
 def _signals(town: Town) -> Iterator[Owned]:
+    """Yield the signal heads with their masts."""
     signals = town.signals
     for row, ((x, y, z), yaw, foot) in enumerate(zip(signals.position, signals.yaw, signals.foot)):
         left = np.array((-np.sin(yaw), np.cos(yaw)))

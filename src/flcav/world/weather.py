@@ -135,6 +135,7 @@ def _named(value: Any) -> Any:
 
 
 def _preset(name: Any) -> dict[str, Any]:
+    """Return the fields of a preset; raises `ValueError` for an unknown one."""
     if not isinstance(name, str) or name not in WEATHERS:
         raise ValueError(f"unknown weather; known weathers: {', '.join(WEATHERS)}")
     return WEATHERS[name].model_dump()
@@ -223,12 +224,14 @@ class WeatherSchedule(Config):
 
 
 def _draw(parameter: str, low: float, high: float, rng: np.random.Generator) -> float:
+    """Return a value between the limits: log-uniform for rain and visibility, else uniform."""
     if parameter in ("rain_mm_h", "visibility_m") and low > 0:
         return float(np.clip(np.exp(rng.uniform(np.log(low), np.log(high))), low, high))
     return float(rng.uniform(low, high))
 
 
 def _distance(weather: Weather, region: Region) -> float:
+    """Return the distance of a weather from a region in units of `SEPARATION`; 0 inside."""
     gaps = []
     for parameter, unit in SEPARATION.items():
         low, high = (_scaled(parameter, limit) for limit in region.get(parameter, (-np.inf, np.inf)))
@@ -238,6 +241,7 @@ def _distance(weather: Weather, region: Region) -> float:
 
 
 def _scaled(parameter: str, value: float) -> float:
+    """Return a parameter on the scale of `SEPARATION`: decades of rain and visibility, others as they are."""
     if not np.isfinite(value) or parameter not in ("rain_mm_h", "visibility_m"):
         return value
     return float(np.log10(value + DRIZZLE_MM_H if parameter == "rain_mm_h" else value))

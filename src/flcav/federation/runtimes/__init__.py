@@ -1,1 +1,1 @@
-"""Where a federation runs."""
+"""Flower grids: message passing in this process, and metering of messages."""

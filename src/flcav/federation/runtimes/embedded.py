@@ -1,7 +1,7 @@
-"""Flower in this process: messages are handed to the client app by a call; no sockets, no daemons.
+"""A Flower grid within one process: a message reaches the client app by a function call, without sockets or daemons.
 
-The only module that touches what Flower does not promise (pinned to 1.41): the process-global task identity, the empty
-run record, a message's id, and the wire form of a record.
+The only module that uses private parts of Flower (pinned to 1.41): the process-wide task identity, the empty run
+record, the id of a message, and the serialised form of a record.
 """
 
 import contextlib
@@ -18,23 +18,23 @@ from flcav.federation.records import ARRAYS, LOSS, METRICS, SAMPLES, to_arrays
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import BudgetExceeded
 
-RUN_ID, SERVER_NODE, CLIENT_APP_RAISED = 1, 1, 2
-FIRST_NODE = 2
+RUN_ID, SERVER_NODE, CLIENT_APP_RAISED = 1, 1, 2  # the last is Flower's error code of an exception in a client app
+FIRST_NODE = 2  # id of the first client
 
 
 def wire_bytes(content: RecordDict) -> int:
-    """Return the size of a message's content as Flower serialises it [bytes]."""
+    """Return the size of a message's content in Flower's serialisation [bytes]."""
     return recorddict_to_proto(content).ByteSize()
 
 
 def update_bytes(weights: Weights) -> int:
-    """Return the size of a client's update with such weights as Flower serialises it [bytes]."""
+    """Return the size of a client's update with these weights in Flower's serialisation [bytes]."""
     return wire_bytes(RecordDict({ARRAYS: to_arrays(weights), METRICS: MetricRecord({SAMPLES: 0, LOSS: 0.0})}))
 
 
 @contextlib.contextmanager
 def _server_identity() -> Iterator[None]:
-    """Messages made inside carry the server's identity; what stood there before (a nested federation's) comes back."""
+    """Give messages created inside the server's identity; then restore the previous one, of an outer federation."""
     names = ("_run_id", "_node_id", "_task_id")
     before = {name: getattr(TaskIdentity, name) for name in names}
     TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SERVER_NODE, 1
@@ -46,10 +46,10 @@ def _server_identity() -> Iterator[None]:
 
 
 class EmbeddedGrid(Grid):
-    """A Flower grid whose nodes live in this process; use it as a context manager."""
+    """Flower grid whose nodes are in this process; a context manager."""
 
     def __init__(self, app: ClientApp, nodes: Mapping[str, Mapping[str, str]]) -> None:
-        """Register one node per name in `nodes`, in their order, with its node config."""
+        """Register a node for each name in `nodes`, in their order; the values are the node configs."""
         self._app = app
         self.names = dict(enumerate(nodes, FIRST_NODE))
         self._contexts = {
@@ -68,7 +68,7 @@ class EmbeddedGrid(Grid):
         self._identity.__exit__(None, None, None)
 
     def set_run(self, run: Run) -> None:
-        """Take Flower's record of the run."""
+        """Set Flower's record of the run."""
         self._run = run
 
     @property
@@ -87,13 +87,16 @@ class EmbeddedGrid(Grid):
         return list(self._contexts)
 
     def push_messages(self, messages: Iterable[Message]) -> list[str]:
-        """Deliver each message to its node and keep the reply; an exception in the app becomes an error reply."""
+        """Deliver each message to its node, keep the reply, and return the message ids.
+
+        An exception in the client app becomes an error reply; `BudgetExceeded` is raised.
+        """
         ids = []
         for message in messages:
             self._sent += 1
             identifier = f"{RUN_ID}-{self._sent}"
             message.metadata.__dict__["_message_id"] = identifier
-            # Strategies share one RecordDict between nodes: what one app changes must not reach the next.
+            # Nodes share one RecordDict: a change by one client app must not reach the next.
             message.content = RecordDict({key: _copied(record) for key, record in message.content.items()})
             try:
                 answer = self._app(message, self._contexts[message.metadata.dst_node_id])
@@ -106,7 +109,7 @@ class EmbeddedGrid(Grid):
         return ids
 
     def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
-        """Return the replies that are there, each once."""
+        """Return the available replies to these messages and forget them."""
         return [self._replies.pop(identifier) for identifier in message_ids if identifier in self._replies]
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:

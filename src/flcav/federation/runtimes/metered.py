@@ -1,4 +1,4 @@
-"""A grid that enters every message in the ledger; refuses what a budget cannot pay. Wraps any Flower grid."""
+"""A Flower grid that enters every message in a ledger and enforces the budgets; it wraps any other grid."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link
 
 @dataclass(frozen=True)
 class Account:
-    """What a grid's messages are booked under."""
+    """The ledger, stage, task and link that messages are entered under."""
 
     ledger: Ledger
-    stage: str
-    task: str
-    link: Link
+    stage: str  # of training, as in the ledger's entries
+    task: str  # its name
+    link: Link  # wireless or wireline
 
 
 class MeteredGrid(Grid):
-    """Books what crosses another grid: down when the server sends, up when a node replies."""
+    """Grid that meters another one: a downlink entry for each message to a node, an uplink entry for each reply."""
 
     def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:
-        """Meter `grid` on `account`; `names` are the registered names of its nodes."""
+        """Meter `grid` on `account`; `names` are the clients' names by node id."""
         self._grid, self._account, self._names = grid, account, names
         self._round = 0
 
@@ -44,7 +44,7 @@ class MeteredGrid(Grid):
         )
 
     def push_messages(self, messages: Iterable[Message]) -> list[str]:
-        """Send messages, each booked downlink."""
+        """Send messages, entering each as downlink first; return their ids."""
         messages = list(messages)
         for message in messages:
             self._round = int(message.content.config_records[CONFIG]["round"])  # type: ignore[arg-type]
@@ -52,7 +52,7 @@ class MeteredGrid(Grid):
         return list(self._grid.push_messages(messages))
 
     def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
-        """Return replies, each booked uplink first; raises `BudgetExceeded` before one that cannot be paid."""
+        """Return replies, entering each as uplink first; raises `BudgetExceeded` where one would exceed a budget."""
         replies = list(self._grid.pull_messages(message_ids))
         for message in replies:
             if message.has_content():
@@ -60,11 +60,11 @@ class MeteredGrid(Grid):
         return replies
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
-        """Send messages one after another, so that a refused reply stops the round there."""
+        """Send messages one after another and return the replies: the first one over a budget ends the round."""
         return [reply for message in messages for reply in self.pull_messages(self.push_messages([message]))]
 
     def get_node_ids(self) -> list[int]:
-        """Return the metered grid's nodes."""
+        """Return the node ids of the metered grid."""
         return list(self._grid.get_node_ids())
 
     def create_message(
@@ -74,7 +74,7 @@ class MeteredGrid(Grid):
         return self._grid.create_message(content, message_type, dst_node_id, group_id, ttl)
 
     def set_run(self, run) -> None:
-        """Pass Flower's record of the run on."""
+        """Set Flower's record of the run, in the metered grid."""
         self._grid.set_run(run)
 
     @property

@@ -1,4 +1,4 @@
-"""How an aggregator combines updates."""
+"""Aggregation strategies by name: federated averaging, or a user's own."""
 
 from dataclasses import is_dataclass
 
@@ -12,9 +12,10 @@ FEDAVG = FedAvg()  # the default everywhere
 
 
 def strategy_named(name: str) -> Strategy:
-    """Return the strategy of that name with its default settings: one of `STRATEGIES`, or your own as `module:NAME`.
+    """Return the strategy of that name with its default settings: one of `STRATEGIES`, or a user's own, `module:NAME`.
 
-    Raises `InputError` for an unknown name, and where the user's module is not there or holds no strategy of that name.
+    Raises `InputError` for an unknown name, where the user's module cannot be imported or has no strategy of that name,
+    and where the strategy is no dataclass.
     """
     if name in STRATEGIES:
         return STRATEGIES[name]()

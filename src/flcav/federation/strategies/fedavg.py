@@ -9,10 +9,11 @@ from flcav.federation.trainable import Update, Weights
 
 
 def average(weights: Sequence[Weights], shares: Sequence[float]) -> dict[str, np.ndarray]:
-    """Return the mean of floating arrays (summed in float64), weighted by `shares`; of others, the first client's.
+    """Return the weighted mean of the clients' arrays by name: sum_i share_i w_i / sum_i share_i, in their own type.
 
-    Shares need not add up to 1. Raises ValueError where one is negative or not finite, or all are 0, and where the
-    clients' arrays differ in name, order or shape.
+    `shares` has one entry per client. Floating arrays are summed in float64; of any other array the first client's is
+    returned. Raises ValueError where a share is negative or not finite, or all are 0, and where the clients' arrays
+    differ in name, order or shape.
     """
     first = weights[0]
     for other in weights[1:]:
@@ -35,8 +36,8 @@ def average(weights: Sequence[Weights], shares: Sequence[float]) -> dict[str, np
 
 @dataclass(frozen=True)
 class FedAvg:
-    """The mean of the clients' weights, each by its number of samples."""
+    """Federated averaging: the mean of the clients' weights, weighted by their numbers of samples."""
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
-        """Return the mean; raises ValueError as `average` does."""
+        """Return the mean of the updates' weights, weighted by samples; raises ValueError as `average` does."""
         return average([update.weights for update in updates], [update.samples for update in updates])

@@ -1,4 +1,4 @@
-"""What every strategy is."""
+"""The interface of an aggregation strategy."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -7,15 +7,15 @@ from flcav.federation.trainable import Update, Weights
 
 
 class Strategy(Protocol):
-    """How an aggregator makes one network of its clients' updates, round by round.
+    """Aggregation of the clients' updates into the weights of the next round.
 
-    A strategy is a frozen dataclass: its fields are its settings, JSON values with defaults. It keeps nothing between
-    rounds, so that a resumed federation ends where an uninterrupted one does, and draws no random numbers.
+    A strategy is a frozen dataclass: its fields are its settings, JSON values with defaults. It has no state between
+    rounds, so that a resumed federation ends as an uninterrupted one, and it draws no random numbers.
     """
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
-        """Return the weights that a round from `start` ends with: `updates` are all clients', in node order.
+        """Return the weights at the end of a round that began with `start`, from all clients' updates in node order.
 
-        Names, shapes and types are those of `start`.
+        Names, shapes and types of the arrays must be those of `start`.
         """
         ...

@@ -1,1 +1,1 @@
-"""Multi-layer graph resource allocation (MLGRA): the problem, its optimal plan, baselines, replanning."""
+"""Multi-layer graph resource allocation (MLGRA): problem, optimal plan, baselines, budget sweeps, replanning."""

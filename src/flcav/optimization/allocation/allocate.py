@@ -1,7 +1,8 @@
-"""MLGRA: how many samples, edge rounds and cloud rounds each task gets, under both uplink budgets, to err least.
+"""MLGRA (multi-layer graph resource allocation): samples, edge rounds and cloud rounds per task under uplink budgets.
 
-Every plan is in whole numbers and within the budgets. What is best is the weighted error (`weighted`), the largest
-error (`fairness`) or the area of the accuracy polygon (`area`); the first two come with a proven lower bound.
+Plans are in whole numbers and within both budgets. The objective is the weighted error (`solvers.weighted`), the
+largest error (`solvers.fairness`), or the area of the accuracy polygon (`area`), which is maximised. Plans for the
+first two have a proven lower bound. Source: Wang et al., IEEE Network 37(3), 2023, solved exactly.
 """
 
 from collections.abc import Sequence
@@ -23,15 +24,15 @@ from flcav.optimization.solvers.weighted import least_weighted
 Array = NDArray[np.float64]
 
 MB_PER_GB = 1000.0
-EXACT = 1e-9  # gap sought for few tasks
-EXACT_TASKS = 4
-AREA_GAP = 1e-4  # of the steps towards a large area, which has no certificate anyway
+EXACT = 1e-9  # gap for problems of few tasks
+EXACT_TASKS = 4  # most tasks that are few
+AREA_GAP = 1e-4  # least gap for the weighted problems within the search for a large area
 NO_CERTIFICATE = "the area is not concave in the plan: this is the best of several local optima, with no certificate"
 
 
 @dataclass(frozen=True)
 class LearnerError:
-    """What one of the tasks that share a network is predicted to err."""
+    """The predicted error of one member of a cluster."""
 
     name: str
     predicted_error: float
@@ -39,7 +40,7 @@ class LearnerError:
 
 @dataclass(frozen=True)
 class TaskPlan:
-    """What one task gets."""
+    """The plan of one task: its samples and rounds, predicted error and uplink cost."""
 
     name: str
     samples: int
@@ -48,7 +49,7 @@ class TaskPlan:
     predicted_error: float  # of a cluster: the weighted mean of its members' errors
     wireless_mb: float
     wireline_mb: float
-    upper_error: float | None = None  # robust plans: by the upper band
+    upper_error: float | None = None  # of robust plans: predicted by the upper band
     members: tuple[LearnerError, ...] = ()  # of a cluster
 
 
@@ -58,9 +59,9 @@ class Allocation:
 
     status: str  # optimal: within the gap asked for; feasible: the gap is wider, or there is none
     objective: (
-        float  # weighted: sum of the errors; max-min: the largest; area: of the polygon of accuracies, to be large
+        float  # weighted: weighted sum of the errors; max-min: largest error; area: of the accuracy polygon, maximised
     )
-    lower_bound: float | None  # proven: no plan has less; none for the area
+    lower_bound: float | None  # proven: no plan has less; None for the area
     gap: float | None  # (objective - lower_bound) / lower_bound
     tasks: tuple[TaskPlan, ...]
     used_mb: Price
@@ -78,12 +79,13 @@ class _Best:
 
 
 def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
-    """Return the best plan within both budgets, proven to a relative `gap` (few tasks: to 1e-9).
+    """Return the best plan within both budgets, with its certificate: MLGRA of Wang et al., IEEE Network 37(3), 2023.
 
-    Robust plans minimise the upper bands of the curves. `marginal_error_per_gb` is the derivative of the optimum over
-    quantities that need not be whole, times 1000 MB: a price at these budgets, no forecast of what 1000 MB more bring,
-    for which see `budget_sweep.savings`. Raises `Infeasible`, naming the budget, the least that the limits allow, and
-    by how much that is over. MLGRA of Wang et al., IEEE Network 37(3), 2023, solved exactly.
+    It is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS` tasks. Robust plans minimise the upper
+    bands of the learning curves. `marginal_error_per_gb` is the derivative of the continuous optimum by each budget,
+    times 1000 MB: a shadow price at these budgets, not a forecast of what 1000 MB more bring, for which see
+    `budget_sweep.savings`. Raises `Infeasible`, naming the budget, the cost of the least plan within the limits and the
+    excess, and `InputError` where the solver cannot handle the problem's numbers.
 
     >>> from flcav import allocate, load_problem
     >>> plan = allocate(load_problem("recipes/allocation/objects.yaml"))
@@ -110,14 +112,15 @@ def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
 
 
 def relative_gap(objective: float, lower: float) -> float:
-    """Return by what share `objective` is above the bound `lower`; above one of 0, by all of it."""
+    """Return the relative gap (objective - lower) / lower to the bound `lower`; for a bound of 0, 0 or 1."""
     return (objective - lower) / lower if lower > 0 else float(objective > 0)
 
 
 def resolved(problem: Problem) -> Problem:
-    """Return the problem to solve: robust, it has upper bands for curves; given `performance`, importances for weights.
+    """Return the problem that is solved: with upper bands as curves if robust, importances as weights if given.
 
-    The importance of a task is the performance lost when it is left out; importances sum to 1.
+    The importance of a task is the performance lost when it is left out, `performance` - `performance_without`, at
+    least 0; importances are scaled to sum to 1.
     """
     tasks = problem.tasks
     if problem.robust:
@@ -130,7 +133,7 @@ def resolved(problem: Problem) -> Problem:
 
 
 def described(problem: Problem, x: Array) -> tuple[TaskPlan, ...]:
-    """Return the plans that x (3N,) stands for."""
+    """Return the tasks' plans for x (3N,): samples, edge rounds and cloud rounds of each task in order."""
     return tuple(_task_plan(problem, task, row) for task, row in zip(problem.tasks, x.reshape(-1, 3)))
 
 
@@ -150,18 +153,18 @@ def _task_plan(problem: Problem, task: Task, row: Array) -> TaskPlan:
 
 
 def used(plans: tuple[TaskPlan, ...]) -> Price:
-    """Return what the plans cost together."""
+    """Return the total cost of the plans."""
     return Price(sum(plan.wireless_mb for plan in plans), sum(plan.wireline_mb for plan in plans))
 
 
 def weighted_error(problem: Problem, plans: Sequence[TaskPlan]) -> float:
-    """Return the weighted sum of the predicted errors, of the upper ones where they are what counts."""
+    """Return the weighted sum of the predicted errors; of robust plans, of the upper errors."""
     errors = (plan.predicted_error if plan.upper_error is None else plan.upper_error for plan in plans)
     return sum(task.weight * error for task, error in zip(problem.tasks, errors, strict=True))
 
 
 def score(problem: Problem, plans: Sequence[TaskPlan]) -> float:
-    """Return what the problem's objective makes of the plans: a weighted or the largest error, or an area."""
+    """Return the value of the problem's objective at the plans: weighted error, largest error or area."""
     if problem.objective == "weighted":
         return weighted_error(problem, plans)
     counts = [(plan.samples, plan.edge_rounds, plan.cloud_rounds) for plan in plans]
@@ -173,7 +176,7 @@ def score(problem: Problem, plans: Sequence[TaskPlan]) -> float:
 
 
 def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:
-    """Return a sentence for each quantity that is planned beyond what its curve was measured to."""
+    """Return a warning for each quantity planned beyond the range in which its curve was measured."""
     return tuple(
         f"task {task.name!r}: {getattr(plan, name)} {name.replace('_', ' ')} are beyond the {most:g} that its curve "
         "was measured to"

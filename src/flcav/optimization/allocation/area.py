@@ -1,7 +1,9 @@
-"""The area of the polygon whose corners are the tasks' accuracies on equally spaced axes (the article's Fig. 6b).
+"""Largest area of the accuracy polygon: the tasks' accuracies on equally spaced axes of a radar chart.
 
-With N >= 3 corners it is sin(2 pi / N) / 2 times the sum of the products of neighbours. Its gradient weighs each task
-by its neighbours' accuracies, so a plan of least weighted error under those weights is tried next, from several starts.
+With N >= 3 corners r_i the area is sin(2 pi / N) / 2 * sum_i r_i r_(i+1) (Wang et al., IEEE Network 37(3), 2023,
+Fig. 6b). Its derivative by a task's accuracy is proportional to the sum of its neighbours' accuracies. It is climbed by
+successive linearisation: the next plan is the one of least weighted error with the gradient as weights. As the area is
+not concave, the climb has several starts.
 """
 
 from dataclasses import dataclass
@@ -16,29 +18,33 @@ from flcav.optimization.solvers.weighted import least_weighted
 
 Array = NDArray[np.float64]
 
-STEPS = 12  # from each start
-EMPHASIS = 3.0  # on one corner, in its start
-MOST_EMPHASISED = 6  # corners
-LEAST_WEIGHT = 1e-6
+STEPS = 12  # most steps from each start
+EMPHASIS = 3.0  # weight of one corner in the start that emphasises it
+MOST_EMPHASISED = 6  # corners, up to which each has a start of its own
+LEAST_WEIGHT = 1e-6  # of a corner
 
 
 @dataclass(frozen=True)
 class Polygon:
-    """Whole quantities and the area that they are predicted to reach."""
+    """A whole plan with the area of its predicted accuracies."""
 
     x: Array  # (n,)
     area: float
-    rates: Array  # (2,) area gained per MB of each link
+    rates: Array  # (2,) increase of the area per MB of each link
 
 
 def area(accuracy: Array) -> float:
-    """Return the area of the polygon with the (N,) accuracies as corners, in order; below 0 counts as 0."""
+    """Return the area of the polygon whose corners are the accuracies (N,), in order; one below 0 counts as 0."""
     corners = np.maximum(accuracy, 0)
     return 0.5 * float(np.sin(2 * np.pi / len(corners)) * (corners @ np.roll(corners, -1)))
 
 
 def largest_area(problem: Problem, gap: float) -> Polygon:
-    """Return the plan of largest area among local optima from several starts: the area is not concave."""
+    """Return the plan of largest area among the local optima from several starts; there is no certificate.
+
+    `gap` is the relative gap of each weighted problem, and the least relative gain of a step. Raises `Infeasible` where
+    no plan is within the budgets.
+    """
     corners = sum(len(task.learners) for task in problem.tasks)
     starts = [np.ones(corners)]
     if corners <= MOST_EMPHASISED:
@@ -72,7 +78,7 @@ def _accuracy(problem: Problem, x: Array) -> Array:
 
 
 def _weighed(problem: Problem, weights: Array) -> Problem:
-    """Return `problem` with other weights of what is learned, in order."""
+    """Return `problem` with other weights, one per learner in order."""
     left = iter(weights.tolist())
     tasks = []
     for task in problem.tasks:

@@ -1,4 +1,7 @@
-"""Plans to compare with: what one would do without joint optimisation, in whole numbers and within the budgets."""
+"""Baseline allocations without joint optimisation: equal shares, most messages, and the article's rounded optimum.
+
+Plans are in whole numbers and within both budgets.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,26 +22,27 @@ from flcav.optimization.vehicles import vehicle_shares
 
 Array = NDArray[np.float64]
 
-GAP = 1e-4
-LONGEST_S = 5.0  # of the search for most messages
+GAP = 1e-4  # relative optimality gap
+LONGEST_S = 5.0  # time limit of the search for most messages
 NOT_CARRIED = "its vehicles do not hold the samples for it, or their links do not carry it within horizon_s"
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """A plan and what it is predicted to reach, by the same measure as the optimum."""
+    """A baseline's plan and its predicted objective."""
 
-    name: str
-    objective: float
+    name: str  # of `BASELINES`
+    objective: float  # as of `Allocation`
     tasks: tuple[TaskPlan, ...]
     used_mb: Price
-    note: str | None = None  # why it cannot be carried out, if it cannot
+    note: str | None = None  # why the vehicles cannot carry it out; None: they can
 
 
 def baseline(problem: Problem, name: str) -> Baseline:
-    """Return the plan of `BASELINES[name]`; it knows the budgets alone, not what each vehicle holds and sends.
+    """Return the plan of `BASELINES[name]` with its predicted objective.
 
-    Raises `Infeasible` as `allocate` does.
+    Baselines respect the fleet's budgets alone: `note` says where the vehicles' samples or links do not suffice. Raises
+    `Infeasible` as `allocate` does, KeyError for an unknown name.
     """
     asked = resolved(problem)
     plans = described(problem, BASELINES[name](asked, instance(asked)))
@@ -50,9 +54,9 @@ def baseline(problem: Problem, name: str) -> Baseline:
 
 
 def equal_stages(problem: Problem, made: Instance) -> Array:
-    """Return the plan that shares each link equally over the stages that use it, beyond what the least plan takes.
+    """Return the plan (3N,) that splits what the least plan leaves of each link equally over the stages that use it.
 
-    Within its share each stage is split over the tasks as well as possible: stage I first, then II, then III.
+    Within a stage's share the tasks get the quantities of least weighted error: stage I first, then II, then III.
     """
     low, high = made.low.reshape(-1, 3), made.high.reshape(-1, 3)
     cost = made.cost.reshape(-1, 3, 2)
@@ -68,7 +72,10 @@ def equal_stages(problem: Problem, made: Instance) -> Array:
 
 
 def equal_tasks(problem: Problem, made: Instance) -> Array:
-    """Return the plan that shares each link equally over the tasks, beyond the least plan, each task planned alone."""
+    """Return the plan (3N,) that splits what the least plan leaves of each link equally over the tasks.
+
+    Each task is then planned alone for least error within its share.
+    """
     low, high = made.low.reshape(-1, 3), made.high.reshape(-1, 3)
     cost = made.cost.reshape(-1, 3, 2)
     share = (made.budget - made.low @ made.cost) / len(low)
@@ -82,7 +89,7 @@ def equal_tasks(problem: Problem, made: Instance) -> Array:
 
 
 def max_throughput(problem: Problem, made: Instance) -> Array:
-    """Return the plan that gets the most messages through, whatever they teach: samples and model updates count 1."""
+    """Return the plan (3N,) of maximum throughput: most messages, where a sample and a model update count 1 each."""
     k = problem.edge_rounds_per_cloud_round
     groups = [task.edge_groups for task in problem.tasks]
     messages = np.array([(1, sum(own), len(own) + k * sum(own)) for own in groups], dtype=np.float64).ravel()
@@ -98,7 +105,7 @@ def max_throughput(problem: Problem, made: Instance) -> Array:
 
 
 def article(problem: Problem, made: Instance) -> Array:
-    """Return the continuous optimum rounded down, as the article's allocator ends."""
+    """Return the continuous optimum rounded down (3N,), the last step of the article's allocator."""
     if made.effective is None:
         x = relax(made.separable).x
     else:

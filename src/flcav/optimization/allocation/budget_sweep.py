@@ -1,7 +1,7 @@
-"""What more or less budget would bring: the plan solved anew at other budgets (the Pareto front).
+"""Sensitivity to the budgets: the optimal objective over scaled budgets (a Pareto front), solved anew at each.
 
-Plans are in whole samples and rounds, so the objective falls in steps: what a larger budget saves is solved for, not
-extrapolated from the derivative at this one.
+Plans are in whole samples and rounds, so the objective falls in steps: the gain of a larger budget is computed, not
+extrapolated from the derivative at the present one.
 """
 
 from collections.abc import Sequence
@@ -12,31 +12,31 @@ from flcav.optimization.allocation.allocate import Allocation, Infeasible, relat
 from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.fleet import allocate_fleet
 
-FACTORS = (0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.25, 1.6, 2.0)
+FACTORS = (0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.25, 1.6, 2.0)  # of the problem's budgets
 LINKS = ("wireless", "wireline")
-ROUNDING = 1e-12  # relative: equal plans whose errors are added in another order
+ROUNDING = 1e-12  # relative difference of equal objectives whose errors are added in another order
 ADDED = (0.1, 0.5)  # shares of a budget that are added to it
 
 
 @dataclass(frozen=True)
 class BudgetPoint:
-    """The best plan at some budgets."""
+    """The optimal objective at one pair of budgets."""
 
     factor: float  # of the problem's own budgets, on the links that were scaled
     budgets_mb: Price
     objective: float
-    lower_bound: float | None  # proven: no plan within these budgets has less; none for the area
+    lower_bound: float | None  # proven: no plan within these budgets has less; None for the area
     gap: float | None  # (objective - lower_bound) / lower_bound
 
 
 @dataclass(frozen=True)
 class Saving:
-    """What the plan solved anew with more of one link's budget brings."""
+    """The gain of the plan solved anew with more of one link's budget."""
 
-    link: str
+    link: str  # one of `LINKS`
     added: float  # share of the budget
     added_mb: float
-    objective: float
+    objective: float  # with the larger budget
     lower_bound: float | None
     gap: float | None
     saved: float  # by how much the objective is less than this plan's; of an area: by how much it is more
@@ -45,10 +45,11 @@ class Saving:
 def budget_sweep(
     problem: Problem, plan: Allocation, scaled: Sequence[str] = LINKS, factors: Sequence[float] = FACTORS
 ) -> tuple[BudgetPoint, ...]:
-    """Return the best plan at each of `factors` times the budgets of the `scaled` links, where there is one.
+    """Return the optimal objective at each of `factors`, ascending, times the budgets of the `scaled` links.
 
-    `plan` is the one of the problem's own budgets. A plan of a smaller budget is one of a larger budget too: it stands
-    where solving anew finds no better one, as it may where vehicles' own links limit the plans.
+    Factors whose budgets allow no plan are left out. `plan` is the one at the problem's own budgets (factor 1). The
+    plan of a smaller budget is kept where solving anew finds no better one, which can happen where vehicles' links
+    limit the plans: it is within the larger budget too.
     """
     points: list[BudgetPoint] = []
     best: Allocation | None = None
@@ -69,7 +70,7 @@ def budget_sweep(
 
 
 def savings(problem: Problem, plan: Allocation) -> tuple[Saving, ...]:
-    """Return what a tenth and a half more of each link's budget bring to `plan`, each solved anew."""
+    """Return the gains over `plan` of 10 % and of 50 % more budget on each link alone, each solved anew."""
     found = []
     for link in LINKS:
         points = budget_sweep(problem, plan, (link,), (1.0, *(1 + added for added in ADDED)))

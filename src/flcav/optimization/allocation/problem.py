@@ -1,4 +1,4 @@
-"""An allocation problem as a user writes it: budgets, message sizes, limits and learning curves per task."""
+"""The configuration of an allocation problem: budgets, and per task message sizes, limits and learning curves."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -10,8 +10,8 @@ from pydantic import Field, model_validator
 from flcav.config import Config
 from flcav.optimization.curves.curves import STAGES, Additive, Curve, Effective, NonNegative, Positive, Shared
 
-MOST = 10**9  # of anything that is counted
-WORST = 1e6  # error that a curve may predict anywhere within the limits; of one that was fitted it is about 1
+MOST = 10**9  # largest count
+WORST = 1e6  # largest error that a curve may predict within the limits; that of a fitted curve is about 1
 Count = Annotated[int, Field(ge=0, le=MOST)]
 Vehicles = Annotated[int, Field(ge=1, le=MOST)]
 Range = tuple[Count, Count]  # least and most, both allowed
@@ -21,13 +21,13 @@ Objective = Literal["weighted", "max-min", "area"]
 
 
 class Quantities(Config):
-    """Base of what an allocation problem is made of."""
+    """Base of the parts of an allocation problem: numbers other than 0 are from 1e-9 to 1e9 in size."""
 
     magnitudes: ClassVar[tuple[float, float]] = (1e-9, 1e9)
 
 
 class Limits(Config):
-    """Least and most of each quantity, both allowed."""
+    """Least and most of each quantity of a task, both allowed."""
 
     samples: Range
     edge_rounds: Range
@@ -43,14 +43,14 @@ class Limits(Config):
 
 
 class Uplink(Quantities):
-    """What one vehicle can send [Mbit/s]."""
+    """Uplink rates of one vehicle [Mbit/s]."""
 
     wireless: Positive
-    wireline: Positive | None = None  # what its edge server passes on for it; None: as much as it sends
+    wireline: Positive | None = None  # of its edge server, on the vehicle's behalf; None: not limited
 
 
 class Learner(NamedTuple):
-    """What is learned with a task's resources: the task itself, or a member of its cluster."""
+    """A learning curve with its weight: of the task itself, or of a member of its cluster."""
 
     name: str
     weight: float
@@ -58,7 +58,7 @@ class Learner(NamedTuple):
 
 
 class Measured(Config):
-    """Most of each quantity that the curve's history covers; a plan beyond it is a guess, and says so."""
+    """The largest of each quantity in the curve's history; a plan beyond it extrapolates and has a warning."""
 
     samples: NonNegative | None = None
     edge_rounds: NonNegative | None = None
@@ -66,19 +66,20 @@ class Measured(Config):
 
 
 class Task(Quantities):
-    """One task, or a cluster of them: what its messages weigh, who takes part, and what its training brings.
+    """A unit of allocation: one perception task or a cluster, with its message sizes, vehicles and learning curve.
 
-    Tasks that share a network and its data are one task here, with a `shared` curve: the mean of theirs by weight.
+    Tasks that share a network and its data are a cluster, with a `shared` curve: their weighted mean error.
+    Construction raises pydantic's ValidationError where vehicles, limits and curves do not match.
     """
 
     name: Name
     weight: Positive = 1.0
-    sample_mb: Positive
-    model_mb: Positive
-    edge_groups: Annotated[tuple[Vehicles, ...], Field(min_length=1)]  # per edge server
+    sample_mb: Positive  # one labelled sample
+    model_mb: Positive  # one model update
+    edge_groups: Annotated[tuple[Vehicles, ...], Field(min_length=1)]  # vehicles per edge server
     uplink_mbps: Mapping[str, Uplink] | None = None  # by vehicle, in the order of the edge groups
-    samples_held: Mapping[str, Count] = {}  # by vehicle; one that is not named holds as many as are asked for
-    data_quality: Mapping[str, Positive] = {}  # by vehicle: what a sample of its is worth; 1 if not named
+    samples_held: Mapping[str, Count] = {}  # by vehicle; not limited for one that is not named
+    data_quality: Mapping[str, Positive] = {}  # by vehicle: worth of one of its samples; 1 if not named
     limits: Limits
     curve: Curve
     upper: Curve | None = None  # the upper band of `curve`, for robust plans
@@ -87,7 +88,7 @@ class Task(Quantities):
 
     @property
     def learners(self) -> tuple[Learner, ...]:
-        """Return what is learned; the weights sum to the task's."""
+        """The learning curves of the task or of its cluster's members, with weights that sum to the task's."""
         if not isinstance(self.curve, Shared):
             return (Learner(self.name, self.weight, self.curve),)
         total = sum(member.weight for member in self.curve.members)
@@ -154,9 +155,9 @@ class Budgets(Quantities):
 
 
 class Problem(Quantities):
-    """How to split the budgets of both links over tasks and stages.
+    """An allocation problem: how to split the budgets of both links over tasks and stages.
 
-    Fields are checked as a problem is made, by pydantic, whose ValidationError names the field.
+    Construction checks the fields and raises pydantic's ValidationError, which names the field.
 
     >>> from flcav import Problem
     >>> curve = {"model": "additive", "floor": 0.05, "pretrain": {"a": 0.51, "b": 0.1}}
@@ -169,9 +170,9 @@ class Problem(Quantities):
 
     budgets_mb: Budgets
     edge_rounds_per_cloud_round: Count = 1  # k: each cloud round runs, and pays, k edge rounds in every region
-    horizon_s: Positive | None = None  # how long each vehicle's own link may be busy with the plan
+    horizon_s: Positive | None = None  # longest time that each vehicle's own link may be busy with the plan
     objective: Objective = "weighted"
-    robust: bool = False  # plan for the upper bands of the curves instead of the curves
+    robust: bool = False  # whether to plan for the upper bands of the curves
     performance: Share | None = None  # of the whole system with all tasks; then weights are what each task adds to it
     tasks: Annotated[tuple[Task, ...], Field(min_length=1)]
 

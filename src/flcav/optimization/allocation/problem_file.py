@@ -1,4 +1,10 @@
-"""The YAML file of an allocation problem: variables that definitions name, and learned curves written back."""
+"""Fitted curves in the YAML file of an allocation problem, and the definitions of the terms of a plan.
+
+`flcav fit` writes the file that `flcav allocate` reads. An existing file keeps its text, comments included: only the
+values of the fields that a fit determines are replaced, or added after the other fields of their task. Numbers are
+rounded to `DIGITS` digits. Each term is defined once, in `TERMS`: the plan's page and the command line show these
+sentences, and the documentation repeats them.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,8 +20,8 @@ from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.curves import Additive, Effective
 from flcav.optimization.curves.fitting import QUANTITIES, CurveFit
 
-MEASURES = {"weighted": "weighted error", "max-min": "largest error", "area": "area"}  # by objective, as in `TERMS`
-STEPS = {  # what costs uplink megabytes
+MEASURES = {"weighted": "weighted error", "max-min": "largest error", "area": "area"}  # by objective; keys of `TERMS`
+STEPS = {  # the quantities that cost uplink megabytes
     "samples": "labelled samples go from the vehicles over a wireless link to their edge server and over a wireline to "
     "the cloud",
     "edge round": "in an edge round every vehicle sends its network to its edge server",
@@ -40,7 +46,10 @@ TERMS = {
 
 
 def meaning(problem: Problem, objective: float) -> str:
-    """Return what the problem's measure is, in a sentence; of a weighted error that is no mean, also the mean."""
+    """Return the definition of the problem's objective, in a sentence.
+
+    For weights that do not sum to 1, a second sentence gives the mean error of a plan whose objective is `objective`.
+    """
     sentence = TERMS[MEASURES[problem.objective]]
     weights = sum(task.weight for task in resolved(problem).tasks)
     if problem.objective != "weighted" or abs(weights - 1) < 1e-9:
@@ -49,23 +58,23 @@ def meaning(problem: Problem, objective: float) -> str:
 
 
 Array = NDArray[np.float64]
-Edit = tuple[int, int, str]  # from, to, what stands there then
-DIGITS = 6
-ENDLESS = 10**9  # columns of a line
+Edit = tuple[int, int, str]  # start, end, replacement
+DIGITS = 6  # significant digits of a number
+ENDLESS = 10**9  # width of a line that is never wrapped
 
 
 @dataclass(frozen=True)
 class Learned:
-    """What a history says of one task."""
+    """The fields of a task in an allocation problem that a history determines."""
 
     curve: Additive | Effective
     upper: Additive | Effective | None  # of the upper band; None: too few points for one
-    limits: Mapping[str, list[int]]  # least and most of each quantity that the history covers
-    measured: Mapping[str, float]  # most of each quantity that varies
+    limits: Mapping[str, list[int]]  # least and most of each quantity in the history
+    measured: Mapping[str, float]  # most of each quantity that varies in the history
 
 
 def learned(fit: CurveFit, resources: Array, upper: Additive | Effective | None) -> Learned:
-    """Return what `fit` and its upper band say of a task whose history covers `resources` (n, 3)."""
+    """Return the fields of a task from its `fit`, its `upper` band and the `resources` (n, 3) of its history."""
     least = np.ceil(resources.min(axis=0)).astype(int).tolist()
     most = np.floor(resources.max(axis=0)).astype(int).tolist()
     limits = {name: [low, max(low, high)] for name, low, high in zip(QUANTITIES, least, most, strict=True)}
@@ -73,7 +82,10 @@ def learned(fit: CurveFit, resources: Array, upper: Additive | Effective | None)
 
 
 def new_problem(tasks: Mapping[str, Learned], k: int, history: str) -> str:
-    """Return a problem of `tasks`; what no history tells is empty, for its user to fill in."""
+    """Return the YAML text of a new problem of `tasks`, by name; fields that no history determines are left empty.
+
+    `k` are the edge rounds per cloud round, `history` names the source of the curves in a comment.
+    """
     lines = [
         f"# Learning curves of {history}. What is empty is yours to fill in; then `flcav allocate` takes this file.",
         f"budgets_mb: {{wireless: , wireline: }} # [MB] {TERMS['budget']}",
@@ -95,15 +107,15 @@ def new_problem(tasks: Mapping[str, Learned], k: int, history: str) -> str:
 
 
 def task_names(text: str, origin: str) -> list[str]:
-    """Return the names of the tasks in a problem's `text`; raises `InputError` where it is none."""
+    """Return the names of the tasks in the `text` of a problem; raises `InputError` where it is no problem."""
     return list(_tasks(text, origin)[1])
 
 
 def with_curves(text: str, tasks: Mapping[str, Learned], k: int, origin: str) -> str:
-    """Return the problem `text`, written as tasks or as a three-layer graph, with what was learned of `tasks`.
+    """Return the `text` of a problem (a list of tasks or a graph) with the fitted fields of `tasks` put in, by name.
 
-    Limits that are there stand. `k` are the edge rounds per cloud round that effective samples were fitted with. Raises
-    `InputError` where the problem has none of a name or another `k`, or where its text cannot be changed in place.
+    Existing limits are kept. `k` are the edge rounds per cloud round of fits over effective samples. Raises
+    `InputError` where the problem has no task of a name or another `k`, or where its text cannot be edited in place.
     """
     (values, found), edits = _tasks(text, origin), []
     planned = values.get("edge_rounds_per_cloud_round", 1)
@@ -126,7 +138,7 @@ def with_curves(text: str, tasks: Mapping[str, Learned], k: int, origin: str) ->
 
 
 def _fields(own: Learned) -> dict[str, Any]:
-    """Return the fields of a task in a problem."""
+    """Return the fields of a task, as in a problem file."""
     return {
         "limits": dict(own.limits),
         "curve": _written(own.curve),
@@ -142,7 +154,7 @@ def _wanted(field: str, value: Any, held: Mapping[str, Any]) -> bool:
 
 
 def _tasks(text: str, origin: str) -> tuple[dict[str, Any], dict[str, tuple[dict[str, Any], yaml.MappingNode]]]:
-    """Return what `text` holds, and by name each of its tasks, within that, beside its node."""
+    """Return the values in `text`, and by name each task: its values (part of the former) and its YAML node."""
     if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
         raise InputError(f"{origin}: curves cannot be put into YAML with aliases (*): write out what they stand for")
     values, root = yaml.safe_load(text), yaml.compose(text)
@@ -167,7 +179,7 @@ def _entries(node: yaml.Node | None) -> dict[str, yaml.Node]:
 
 
 def _edits(text: str, node: yaml.MappingNode, fields: Mapping[str, Any]) -> list[Edit]:
-    """Return what to change in `text` for `node` to hold `fields`."""
+    """Return the edits of `text` that set `fields` in `node`."""
     held, edits = {key.value: (key, value) for key, value in node.value}, []
     for field, value in fields.items():
         if field in held:
@@ -186,7 +198,10 @@ def _edits(text: str, node: yaml.MappingNode, fields: Mapping[str, Any]) -> list
 
 
 def _end(node: yaml.Node) -> int:
-    """Return where the text of `node` ends: a block's own mark lies behind the blank lines and comments after it."""
+    """Return the index at which the text of `node` ends.
+
+    The end mark of a block is after the blank lines and comments that follow it, so it is that of its last value.
+    """
     if not isinstance(node, yaml.CollectionNode) or node.flow_style or not node.value:
         return node.end_mark.index
     last = node.value[-1]
@@ -198,7 +213,7 @@ def _written(curve: Additive | Effective) -> dict[str, Any]:
 
 
 def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `values` with numbers of `DIGITS` digits, whole ones without a point."""
+    """Return `values` with numbers rounded to `DIGITS` digits, whole ones as int."""
     return {name: _rounded(value) if isinstance(value, dict) else _number(value) for name, value in values.items()}
 
 

@@ -1,6 +1,6 @@
-"""Re-planning while a plan is carried out: what is spent is sunk, and the curves pass through what was observed.
+"""Replanning during a run: resources spent are lower limits, and learning curves are rescaled to observed accuracies.
 
-Stages follow each other: once edge rounds have run no sample is added, once cloud rounds have run no edge round is.
+Stages follow each other: after the first edge round no sample is added, after the first cloud round no edge round.
 """
 
 from collections.abc import Mapping
@@ -14,11 +14,11 @@ from flcav.optimization.allocation.problem import Budgets, Count, Problem, Share
 from flcav.optimization.curves.curves import Additive, Curve, Decay, Effective, NonNegative
 from flcav.optimization.solvers.instance import cost_of
 
-LEAST_ERROR = 1e-6  # that a perfect score is taken for: test sets are finite
+LEAST_ERROR = 1e-6  # error assumed for an accuracy of 1: test sets are finite
 
 
 class Spent(Config):
-    """What one task has had so far, and what its network reaches now."""
+    """The resources that one task has spent so far, and the accuracy of its network now."""
 
     samples: Count
     edge_rounds: Count = 0
@@ -27,37 +27,38 @@ class Spent(Config):
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Return samples, edge rounds, cloud rounds."""
+        """Samples, edge rounds, cloud rounds."""
         return self.samples, self.edge_rounds, self.cloud_rounds
 
 
 class Sent(Config):
-    """Uplink megabytes that the ledger holds."""
+    """Uplink messages in the ledger, in total per link [MB]."""
 
     wireless: NonNegative
     wireline: NonNegative
 
 
 class Progress(Config):
-    """How far a plan has been carried out."""
+    """The state of a plan's execution: resources spent by task, and megabytes sent."""
 
-    tasks: Annotated[Mapping[str, Spent], Field(min_length=1)]
-    used_mb: Sent | None = None  # None: what the counts cost by the problem's sizes
+    tasks: Annotated[Mapping[str, Spent], Field(min_length=1)]  # by name
+    used_mb: Sent | None = None  # None: the cost of the counts by the problem's sizes
 
 
 def replan(problem: Problem, progress: Progress, *, gap: float = 1e-4) -> Allocation:
-    """Return the best plan that goes on from `progress`; its counts are totals, what is spent included.
+    """Return the best plan that continues from `progress`; its counts are totals, including what is spent.
 
-    Raises `InputError` as `going_on` does, and `Infeasible` where what is spent leaves no plan.
+    Raises `InputError` as `going_on` does, and `Infeasible` where the rest of the budgets allows no plan.
     """
     return allocate(going_on(problem, progress), gap=gap)
 
 
 def going_on(problem: Problem, progress: Progress) -> Problem:
-    """Return the problem that is left: what is spent is the least of the limits, curves pass through what is observed.
+    """Return the problem given `progress`: resources spent are lower limits, curves pass through observed accuracies.
 
-    A task's curve, floor included, is scaled to the accuracy observed. Where more megabytes were sent than the counts
-    cost, the budgets shrink by the difference. Raises `InputError` for a task that is not in the problem.
+    A task's curve and upper band, floors included, are scaled by the ratio of observed to predicted error. Budgets are
+    reduced by the difference of megabytes sent and the cost of the counts. Raises `InputError` for a task that is not
+    in the problem, where a predicted error cannot be scaled, and where the megabytes sent leave nothing of a budget.
     """
     names = [task.name for task in problem.tasks]
     for name in progress.tasks:
@@ -106,7 +107,7 @@ def _smaller(decay: Decay, factor: float) -> Decay:
 
 
 def _left(problem: Problem, progress: Progress) -> Budgets:
-    """Return the budgets, less what was sent beyond what the counts cost."""
+    """Return the budgets less the difference of the megabytes sent and the cost of the counts."""
     budgets = problem.budgets_mb
     if progress.used_mb is None:
         return budgets

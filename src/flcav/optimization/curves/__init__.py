@@ -1,1 +1,1 @@
-"""Learning curves: their forms, fits, bands, and the history they are fitted to."""
+"""Learning curves: models of the error by samples and rounds, their fit to history, and bootstrap bands."""

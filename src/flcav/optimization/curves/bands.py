@@ -1,8 +1,8 @@
-"""Bands of learning curves: how far the curves of repeated histories would scatter, by the residual bootstrap.
+"""Confidence bands of learning curves by the residual bootstrap (Efron and Tibshirani 1993, section 9.3).
 
-Every repeat draws from the residuals of the fit, with replacement and widened by sqrt(n / (n - P)) for the P parameters
-that flattened them, adds them to the fitted errors, and fits the same form again (Efron and Tibshirani 1993, 9.3).
-Cases are not drawn: of five points a draw often leaves too few different ones.
+Every repeat draws n residuals of the fit with replacement, adds them to the fitted errors, and fits the same form
+again. Residuals are scaled by sqrt(n / (n - P)), as P fitted parameters make them smaller than the errors of
+measurement. Residuals are drawn rather than points: a draw of five points often has too few different ones for a fit.
 """
 
 from collections.abc import Sequence
@@ -18,20 +18,24 @@ from flcav.seeds import stream
 Array = NDArray[np.float64]
 
 METHOD = "residual bootstrap"
-BEYOND = (1.0, 2.0, 4.0)  # times the largest measured resources: where the upper curve has to be above the band
+BEYOND = (1.0, 2.0, 4.0)  # times the largest measured resources: where the upper curve must not be below the band
 
 
 @dataclass(frozen=True)
 class Bands:
-    """The curves of the repeats."""
+    """A pointwise confidence band, as the curves fitted in the bootstrap's repeats."""
 
     level: float  # share of the repeats between the lower and the upper band
     seed: int
-    curves: tuple[Additive | Effective, ...]
-    k: int
+    curves: tuple[Additive | Effective, ...]  # one per repeat
+    k: int  # edge rounds per cloud round
 
     def between(self, resources: Array) -> tuple[Array, Array]:
+<<<<<<< HEAD
         """Return the lower and upper band of the error (n,) at `resources` (n, 3); inf where curves have no end."""
+=======
+        """Return the lower and the upper band of the error, (n,) each, at `resources` (n, 3)."""
+>>>>>>> w_opt
         errors = np.array([curve.error(*resources.T, k=self.k) for curve in self.curves])
         with np.errstate(invalid="ignore"):  # between infinite errors
             low, high = np.quantile(errors, (0.5 - self.level / 2, 0.5 + self.level / 2), axis=0)
@@ -39,7 +43,7 @@ class Bands:
 
 
 def bands(fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 0, k: int = 1) -> Bands | None:
-    """Return the bands of `fit`; None where no residuals are left: no more points than parameters."""
+    """Return the confidence band of `fit`; None where there are no more points than parameters, so no residuals."""
     fitted = fit.fitted
     if fitted is None or fit.points <= len(fitted.parameters):
         return None
@@ -56,9 +60,10 @@ def bands(fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 
 
 
 def upper_curve(fit: CurveFit, found: Bands) -> Additive | Effective:
-    """Return a curve of the fit's form that is nowhere below the upper band, at the points and up to 4 times beyond.
+    """Return a curve of the fit's form that is not below the upper band: the worst case of a robust plan.
 
-    It is fitted to the band, then lifted by raising its floor: what a robust plan should assume.
+    It is fitted to the band, then its floor is raised until it is not below the band at the measured resources and at
+    1, 2 and 4 times the largest of them all.
     """
     fitted = fit.fitted
     assert fitted is not None
@@ -73,7 +78,10 @@ def upper_curve(fit: CurveFit, found: Bands) -> Additive | Effective:
 
 
 def pointwise(fit: CurveFit, found: Bands | None, resources: Array, k: int) -> list[dict[str, float | None]]:
-    """Return error, low and high at every row of `resources` (n, 3); without bands, low and high are None."""
+    """Return the curve with its bands at every row of `resources` (n, 3), a dictionary per row.
+
+    Keys: samples, edge_rounds, cloud_rounds, error, low and high; without bands, low and high are None.
+    """
     errors = fit.curve.error(*resources.T, k=k)
     edges: Sequence[Sequence[float | None]] = [[None] * len(errors)] * 2
     if found is not None:

@@ -1,4 +1,8 @@
-"""Learning curves: the error that is left after so many samples, edge rounds and cloud rounds."""
+"""Learning curves: models of the error as a function of samples, edge rounds and cloud rounds.
+
+`Additive` sums an inverse power law per stage; `Effective` is one inverse power law of effective samples; `Shared` is
+the weighted mean of the curves of tasks with the same network.
+"""
 
 from typing import Annotated, ClassVar, Literal, Self, overload
 
@@ -8,11 +12,11 @@ from pydantic import Field, model_validator
 
 from flcav.config import Config
 
-STAGES = ("pretrain", "edge", "cloud")  # measured in samples, edge rounds, cloud rounds
+STAGES = ("pretrain", "edge", "cloud")  # their resources are samples, edge rounds, cloud rounds
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
-Sizeable = Annotated[float, Field(ge=1e-9)]  # small enough for every curve, and large enough to divide by
+Sizeable = Annotated[float, Field(ge=1e-9)]  # large enough to divide by
 
 
 Array = NDArray[np.float64]
@@ -25,21 +29,22 @@ def effective_samples(samples: float | Array, t: Array, alpha: float | Array, gr
 def effective_samples(
     samples: float | Array, t: float | Array, alpha: float | Array, group: float | Array
 ) -> float | Array:
-    """Return n = alpha * samples + group * (1 - 1 / (t + 1)) effective samples, elementwise, after `t` rounds.
+    """Return the effective samples n = alpha * samples + group * (1 - 1 / (t + 1)) after `t` rounds, elementwise.
 
-    Rounds bring the vehicles' own `group` samples in, ever more slowly; `alpha` is what an uploaded one is worth.
+    `alpha` is the worth of an uploaded sample; `group` is the number of the vehicles' own samples times their worth,
+    of which the share 1 - 1 / (t + 1) is learned from in t rounds.
     """
     return alpha * samples + group * (1 - 1 / (t + 1))
 
 
 class Fitted(Config):
-    """Base of curves: their parameters are fitted, and of steep ones any size."""
+    """Base of learning curves: parameters come from fits, and those of steep curves may be very large or small."""
 
     magnitudes: ClassVar[tuple[float, float]] = (1e-100, 1e100)
 
 
 class Decay(Fitted):
-    """The error a * (x + x0)^(-b) that is left after x samples or rounds. The default is none at all."""
+    """Inverse power law a * (x + x0)^(-b): a stage's error after x samples or rounds. By default it is 0."""
 
     a: NonNegative = 0.0
     b: Sizeable = 1.0
@@ -51,18 +56,18 @@ class Decay(Fitted):
 
     @property
     def infinite_at_0(self) -> bool:
-        """Return whether the error is infinite before the first sample or round."""
+        """Whether the error is infinite before the first sample or round."""
         return self.a > 0 and self.x0 == 0
 
     def at(self, resource: ArrayLike) -> Array:
-        """Return the error left after `resource` samples or rounds."""
+        """Return the error after `resource` samples or rounds, elementwise."""
         shifted = np.asarray(resource, dtype=np.float64) + self.x0
         with np.errstate(divide="ignore"):
             return self.a * shifted**-self.b if self.a > 0 else np.zeros_like(shifted)
 
 
 class Additive(Fitted):
-    """error = floor + the decay of each stage."""
+    """Additive learning curve: error = floor + the sum of an inverse power law per stage."""
 
     model: Literal["additive"] = "additive"
     floor: NonNegative = 0.0
@@ -71,7 +76,7 @@ class Additive(Fitted):
     cloud: Decay = Decay()
 
     def __str__(self) -> str:
-        """Return the formula: x samples, y edge rounds, z cloud rounds."""
+        """Return the formula in x samples, y edge rounds and z cloud rounds."""
         parts = [str(decay).replace("x", name) for name, decay in zip("xyz", self.decays()) if decay.a > 0]
         return " + ".join([f"{self.floor:.4g}"] * (self.floor > 0) + parts) or "0"
 
@@ -80,42 +85,42 @@ class Additive(Fitted):
         return self.pretrain, self.edge, self.cloud
 
     def error(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1) -> Array:
-        """Return the error after so much of each stage, elementwise; `k` plays no part in this model."""
+        """Return the error after the samples and rounds given, elementwise; this model does not depend on `k`."""
         return self.floor + self.pretrain.at(samples) + self.edge.at(edge_rounds) + self.cloud.at(cloud_rounds)
 
 
 class Effective(Fitted):
-    """error = floor + a * n^(-b) at n `effective_samples` of group = beta * group_samples.
+    """Learning curve over effective samples: error = floor + a * n^(-b).
 
-    t = edge_rounds + k * cloud_rounds; group_samples are those that the vehicles of all groups hold.
+    n is `effective_samples` with group = beta * group_samples and t = edge_rounds + k * cloud_rounds.
     """
 
     model: Literal["effective"]
     floor: NonNegative = 0.0
     a: Sizeable
     b: Sizeable
-    alpha: Sizeable
-    beta: NonNegative
-    group_samples: NonNegative
+    alpha: Sizeable  # worth of an uploaded sample
+    beta: NonNegative  # worth of a vehicle's own sample
+    group_samples: NonNegative  # held by the vehicles of all edge groups
 
     def __str__(self) -> str:
-        """Return the formula: x samples, t rounds."""
+        """Return the formula in x samples and t rounds."""
         floor = f"{self.floor:.4g} + " if self.floor else ""
         held = f"{self.beta * self.group_samples:.4g} (1 - 1/(t + 1))"
         return f"{floor}{self.a:.4g} ({self.alpha:.4g} x + {held})^-{self.b:.4g}"
 
     def error(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1) -> Array:
-        """Return the error after so much of each stage, elementwise, at `k` edge rounds per cloud round."""
+        """Return the error after the samples and rounds given, elementwise, at `k` edge rounds per cloud round."""
         return self.floor + self.a * self.effective_samples(samples, edge_rounds, cloud_rounds, k) ** -self.b
 
     def effective_samples(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int) -> Array:
-        """Return n, elementwise."""
+        """Return the number of effective samples n, elementwise, at `k` edge rounds per cloud round."""
         t = np.asarray(edge_rounds, np.float64) + k * np.asarray(cloud_rounds)
         return effective_samples(np.asarray(samples, np.float64), t, self.alpha, self.beta * self.group_samples)
 
 
 class Member(Config):
-    """One of the tasks that share a network and its data."""
+    """A member of a cluster: one of the tasks that share a network and its data."""
 
     name: Annotated[str, Field(min_length=1)]
     weight: Positive = 1.0
@@ -123,7 +128,10 @@ class Member(Config):
 
 
 class Shared(Config):
-    """The weighted mean error of a cluster: one sample or round serves every member."""
+    """Learning curve of a cluster: the weighted mean error of its members, which all learn from each sample and round.
+
+    Construction raises pydantic's ValidationError where one of several members has an `Effective` curve.
+    """
 
     model: Literal["shared"]
     members: Annotated[tuple[Member, ...], Field(min_length=1)]
@@ -136,7 +144,7 @@ class Shared(Config):
         return self
 
     def error(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1) -> Array:
-        """Return the weighted mean error after so much of each stage, elementwise."""
+        """Return the weighted mean error after the samples and rounds given, elementwise."""
         weights = [member.weight for member in self.members]
         errors = [member.curve.error(samples, edge_rounds, cloud_rounds, k) for member in self.members]
         return np.asarray(np.average(errors, axis=0, weights=weights), dtype=np.float64)

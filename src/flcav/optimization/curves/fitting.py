@@ -1,8 +1,8 @@
-"""Learning curves fitted to history by bounded robust least squares, with bands.
+"""Fits of learning curves to history: bounded, robust least squares with model selection by AICc.
 
-Which of the floor and the x0 are fitted is chosen by AICc (Hurvich and Tsai 1989); for few points it is neither, and
-the fit is plain least squares: then it is the article's curve, accuracy = 1 - a x^(-b). From `ROBUST_FROM` points on,
-the loss is soft L1 around three standard deviations. `bands` says how far curves of repeated histories would scatter.
+AICc (Hurvich and Tsai 1989) decides whether the floor and each x0 are fitted. For few points neither is, and the fit is
+plain least squares: the article's curve, accuracy = 1 - a x^(-b). From `ROBUST_FROM` points on, the loss is soft L1,
+which turns from squares to absolute values at three standard deviations (estimated by the median absolute residual).
 """
 
 from collections.abc import Sequence
@@ -20,31 +20,31 @@ from flcav.optimization.curves.history import History
 
 Array = NDArray[np.float64]
 
-ROBUST_FROM = 10  # points: the spread of fewer residuals does not say which of them is an outlier
-EXACT, ROUGH = 1e-14, 1e-6  # tolerances: of the curve that is returned; of those that are only compared
+ROBUST_FROM = 10  # points: the spread of fewer residuals does not tell which of them are outliers
+EXACT, ROUGH = 1e-14, 1e-6  # tolerances of the solver: for the curve that is returned; for comparisons and repeats
 QUANTITIES = ("samples", "edge_rounds", "cloud_rounds")
 
 
 @dataclass(frozen=True)
 class Fit(Generic[CurveT]):
-    """A curve and how well it describes the points."""
+    """A fitted learning curve with its goodness of fit."""
 
     curve: CurveT
     rmse: float  # of the accuracy
     points: int
-    aicc: float
-    fitted: "Fitted[CurveT] | None" = None
+    aicc: float  # corrected Akaike information criterion
+    fitted: "Fitted[CurveT] | None" = None  # data and parameters of the fit; None: not known
 
     @property
     def r_squared(self) -> float | None:
-        """Return the share of the variance of the accuracy that the curve explains; None where none is known to be."""
+        """Coefficient of determination R^2 of the accuracy; None where all accuracies are equal or not known."""
         if self.fitted is None or np.ptp(self.fitted.error) == 0:
             return None
         return 1 - self.rmse**2 / float(np.var(self.fitted.error))
 
     @property
     def measured(self) -> dict[str, float]:
-        """Return the largest of each quantity that varies in the history."""
+        """The largest measured value of each quantity that varies in the history, by name of `QUANTITIES`."""
         if self.fitted is None:
             return {}
         spent = self.fitted.resources
@@ -52,7 +52,7 @@ class Fit(Generic[CurveT]):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return what should keep one from trusting the curve, a sentence each."""
+        """Reasons to distrust the curve, a sentence each: too few points, a steep exponent, or a low R^2."""
         if self.fitted is None:
             return ()
         said = []
@@ -74,7 +74,7 @@ class Fit(Generic[CurveT]):
         return tuple(said)
 
     def beyond(self, samples: float, edge_rounds: float, cloud_rounds: float) -> str | None:
-        """Return a sentence if that is more than the history covers of any quantity, else None."""
+        """Return a sentence that names the quantities above the largest in the history; None where there are none."""
         if self.fitted is None:
             return None
         over = [
@@ -92,18 +92,21 @@ CurveFit = Fit[Additive] | Fit[Effective]
 
 @dataclass(frozen=True)
 class Fitted(Generic[CurveT]):
-    """What a fit was made from: all that repeating it needs."""
+    """The parameters, data and loss of a fit: all that is needed to repeat it."""
 
     form: Form[CurveT]
     parameters: Array  # (P,)
     resources: Array  # (n, 3)
     error: Array  # (n,)
     weight: Array  # (n,)
-    scale: float | None  # of the residuals where the loss turns from squares to absolute values; None: squares
+    scale: float | None  # residual at which the soft L1 loss turns from squares to absolute values; None: squares
 
 
 def fit_power(resource: ArrayLike, accuracy: ArrayLike) -> Decay:
-    """Return the article's curve accuracy = 1 - a x^(-b) by plain least squares on the accuracies (n,)."""
+    """Return the article's curve, accuracy = 1 - a x^(-b), by plain least squares on accuracies (n,) at resources (n,).
+
+    Resources must be more than 0. Source: Wang et al., IEEE Network 37(3), 2023.
+    """
     amounts = np.asarray(resource, dtype=np.float64)
     spent = np.stack((amounts, np.zeros_like(amounts), np.zeros_like(amounts)), axis=1)
     middle = float(np.exp(np.log(amounts).mean()))
@@ -121,10 +124,11 @@ def fit(
     alpha: float = 0.1,
     beta: float | None = None,
 ) -> CurveFit:
-    """Return how the error falls with samples and rounds: the learning curve fitted to the history of one task.
+    """Return the learning curve fitted to the history of one task: the error by samples, edge rounds and cloud rounds.
 
-    For the other settings, of the effective model, see `fit_effective`. Raises `InputError` where there are too few
-    points, and where the effective model is told nothing of the samples that the rounds are about.
+    `model` is `Additive` or `Effective`; the other settings belong to the latter, see `fit_effective`. Raises
+    `InputError` where there are too few points, and where the effective model lacks `group_samples` for a history with
+    rounds.
 
     >>> from flcav import fit
     >>> from flcav.optimization import article_histories  # the points of Wang et al., Fig. 3a
@@ -148,9 +152,10 @@ def fit_additive(
     accuracy: ArrayLike,
     weight: ArrayLike | None = None,
 ) -> Fit[Additive]:
-    """Return the additive curve fitted jointly to accuracies (n,) after so much of each stage (n,).
+    """Return the additive curve fitted jointly over all stages to accuracies (n,) at samples and rounds (n,) each.
 
-    A stage that never varies is left out. Raises `InputError` where there are too few points.
+    `weight` (n,) multiplies the squared residuals; by default it is 1. A stage that never varies is left out. Raises
+    `InputError` where there are too few points or all weights are 0.
     """
     spent = _columns(samples, edge_rounds, cloud_rounds)
     return _chosen(additive_forms(spent), spent, accuracy, weight)
@@ -168,17 +173,22 @@ def fit_effective(
     alpha: float = 0.1,
     beta: float | None = None,
 ) -> Fit[Effective]:
-    """Return the effective-samples curve fitted to accuracies (n,) after so much of each stage (n,).
+    """Return the effective-samples curve fitted to accuracies (n,) at samples and rounds (n,) each.
 
-    `group_samples` are those that the vehicles of all groups hold. Only beta / alpha can be told from the data: alpha
-    is given, and beta is fitted unless given too, or unless the rounds never vary (then it is the article's 0.5).
+    `group_samples` is the number of samples that the vehicles of all groups hold, `k` the edge rounds per cloud round,
+    `weight` (n,) as in `fit_additive`. The data determine beta / alpha alone: alpha is given, and beta is fitted unless
+    it is given too, or the rounds never vary (then it is the article's 0.5). Raises `InputError` where there are too
+    few different points, a point has no samples, or all weights are 0.
     """
     spent = _columns(samples, edge_rounds, cloud_rounds)
     return _chosen(effective_forms(spent, alpha, beta, group_samples, k), spent, accuracy, weight)
 
 
 def refitted(fitted: Fitted[Any], error: Array) -> Array:
-    """Return the parameters fitted to other errors (n,) at the same resources, from the old ones on."""
+    """Return the parameters (P,) of the same form fitted to other errors (n,) at the same resources.
+
+    The search starts from the parameters of `fitted`.
+    """
     start, scale = fitted.parameters, fitted.scale
     return _least(fitted.form, fitted.resources, error, fitted.weight, [start], scale, ROUGH)[1]
 
@@ -188,7 +198,7 @@ def _columns(*columns: ArrayLike) -> Array:
 
 
 def _chosen(forms: Sequence[Form[CurveT]], spent: Array, accuracy: ArrayLike, weight: ArrayLike | None) -> Fit[CurveT]:
-    """Return the fit of least AICc: roughly of all forms, then exactly of the best."""
+    """Return the fit of least AICc: all forms are fitted to a rough tolerance, then the best one exactly."""
     error = 1 - np.asarray(accuracy, dtype=np.float64)
     weights = np.ones(len(error)) if weight is None else np.asarray(weight, dtype=np.float64)
     if not weights.sum() > 0:
@@ -201,7 +211,7 @@ def _chosen(forms: Sequence[Form[CurveT]], spent: Array, accuracy: ArrayLike, we
 def _solved(
     form: Form[CurveT], spent: Array, error: Array, weight: Array, robust: bool, tolerance: float = EXACT
 ) -> Fitted[CurveT]:
-    """Return the curve of least squares from several starts; then, if `robust`, of least soft L1 loss."""
+    """Return the least-squares fit from several starts; if `robust`, refined under the soft L1 loss."""
     starts = form.starts(max(float(np.median(error)), 1e-3))
     _, p = _least(form, spent, error, weight, starts, None, tolerance)
     scale = None
@@ -221,7 +231,7 @@ def _least(
     scale: float | None,
     tolerance: float,
 ) -> tuple[float, Array]:
-    """Return the least cost from any of `starts`, and its parameters."""
+    """Return the least cost over the local optima from all `starts`, and its parameters (P,)."""
     root = np.sqrt(weight)
     results = [
         least_squares(
@@ -244,7 +254,7 @@ def _measured(fitted: Fitted[CurveT]) -> Fit[CurveT]:
     form, weight = fitted.form, fitted.weight
     residual = form.predict(fitted.parameters, fitted.resources) - fitted.error
     mean_square = float((weight * residual**2).sum() / weight.sum())
-    n, parameters = len(residual), len(fitted.parameters) + 1  # and the variance
+    n, parameters = len(residual), len(fitted.parameters) + 1  # the variance is one more parameter
     spare = n - parameters - 1
     correction = 2 * parameters * (parameters + 1) / spare if spare > 0 else (1e9 if form.simplest else np.inf)
     aicc = n * np.log(max(mean_square, 1e-18)) + 2 * parameters + correction

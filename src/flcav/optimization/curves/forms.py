@@ -1,8 +1,8 @@
-"""The families of curves that are fitted to history, each in a well-conditioned parametrisation.
+"""Parametric forms of learning curves for least squares, in a well-conditioned parametrisation.
 
-A decay a (x + x0)^(-b) is fitted as h ((x + x0) / (m + x0))^(-b), where m is the geometric mean of the resources: h is
-the error in the middle of the data, of order 1 and almost independent of b, where a spans decades with b. Parameters
-are bounded to be >= 0, so every curve falls with every resource.
+A decay a (x + x0)^(-b) is fitted as h ((x + x0) / (m + x0))^(-b), where m is the geometric mean of the resources. h is
+the error in the middle of the data, of order 1 and almost independent of b, whereas a varies by orders of magnitude
+with b. Parameters are bounded to be >= 0, so every curve falls with every resource.
 """
 
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ Array = NDArray[np.float64]
 CurveT = TypeVar("CurveT", Additive, Effective, covariant=True)
 
 STEEPEST = 10.0  # largest exponent tried
-STARTS = (0.1, 0.5, 1.5)  # exponents to start from
-LARGEST_BETA = 1e3
+STARTS = (0.1, 0.5, 1.5)  # exponents at the starts of the search
+LARGEST_BETA = 1e3  # relative to alpha
 DEFAULT_BETA = 0.5  # of the article
-FITTED = "the fitted curve"
+FITTED = "the fitted curve"  # origin in error messages
 
 
 class Form(Protocol[CurveT]):
-    """A family of curves with bounded parameters p."""
+    """A parametric form of learning curve, with bounded parameters p (P,)."""
 
     @property
     def simplest(self) -> bool:
@@ -52,12 +52,15 @@ class Form(Protocol[CurveT]):
 
 @dataclass(frozen=True)
 class AdditiveForm:
-    """floor + a decay of each stage that varies; p = h per stage, b per stage, the floor, the fitted x0."""
+    """Form of an additive curve: floor + a decay per stage that varies.
 
-    stages: tuple[int, ...]
-    floor: bool
+    The parameters p are h of each stage, b of each stage, the floor if it is fitted, and the fitted x0.
+    """
+
+    stages: tuple[int, ...]  # those that vary, as indices into `STAGES`
+    floor: bool  # whether the floor is fitted; else it is 0
     shifted: tuple[int, ...]  # stages whose x0 is fitted; else it is 0, or 1 where the stage has a row at 0
-    middle: tuple[float, ...]  # per stage
+    middle: tuple[float, ...]  # per stage that varies: the geometric mean m of the resources
     rest: tuple[float, ...]  # per stage of all three: x0 where it is not fitted
 
     @property
@@ -105,7 +108,7 @@ class AdditiveForm:
 
 
 def additive_forms(resources: Array) -> list[AdditiveForm]:
-    """Return the forms to choose from for `resources` (n, 3): with and without a floor and each x0.
+    """Return the candidate forms for `resources` (n, 3): with and without a fitted floor and each fitted x0.
 
     A stage that never varies is left out. Raises `InputError` where there are too few points.
     """
@@ -125,17 +128,18 @@ def additive_forms(resources: Array) -> list[AdditiveForm]:
 
 @dataclass(frozen=True)
 class EffectiveForm:
-    """floor + a n^(-b) of effective samples n; p = h, b, the floor, beta.
+    """Form of an effective-samples curve: floor + a n^(-b) of n effective samples.
 
-    Only beta / alpha can be told from a, so alpha is given; beta is fitted where the rounds vary.
+    The parameters p are h, b, the floor if it is fitted, and beta if it is fitted. Scaling alpha and beta together is
+    the same as scaling a, so alpha is given; beta is fitted where the rounds vary.
     """
 
-    floor: bool
+    floor: bool  # whether the floor is fitted; else it is 0
     alpha: float
     beta: float | None  # None: fitted
     group_samples: float
-    k: int
-    middle: float
+    k: int  # edge rounds per cloud round
+    middle: float  # geometric mean of the effective samples
 
     @property
     def simplest(self) -> bool:
@@ -176,16 +180,17 @@ class EffectiveForm:
 
 
 def _share(fitted: float) -> float:
-    """Return a fitted floor or worth; 0 for one that has shrunk below all numbers of curves."""
+    """Return a fitted floor or beta; 0 for one below the smallest number that a curve may hold."""
     return float(fitted) if fitted >= Fitted.magnitudes[0] else 0.0
 
 
 def effective_forms(
     resources: Array, alpha: float, beta: float | None, group_samples: float, k: int
 ) -> list[EffectiveForm]:
-    """Return the forms to choose from for `resources` (n, 3): with and without a floor.
+    """Return the candidate forms for `resources` (n, 3): with and without a fitted floor.
 
-    Raises `InputError` where a point has no effective samples, or all have the same.
+    Raises `InputError` where a point has no samples, all points have the same effective samples, or there are fewer
+    points than parameters.
     """
     t = resources[:, 1] + k * resources[:, 2]
     if beta is None and (group_samples == 0 or len(np.unique(t)) < 2):

@@ -1,9 +1,12 @@
-"""History of training runs: what accuracy was reached after so many samples, edge rounds and cloud rounds.
+"""Points of learning curves: the accuracy reached after numbers of samples, edge rounds and cloud rounds.
 
-Two forms of table are read. Long: `task, stage, resource, accuracy[, weight]`, each row giving its own stage's
-resource; stages follow each other, so a row stands at the largest of the earlier stages and at 0 of the later ones.
-Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight]`, as our own runs write it. Either may say
-`error`, which is 1 - accuracy, in place of `accuracy`.
+Tables of two forms are read:
+
+- Long: `task, stage, resource, accuracy[, weight]`. A row gives the resource of its own stage. Stages follow each
+  other, so its other resources are the largest of each earlier stage, and 0 of each later one.
+- Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight]`, as the project's own runs write it.
+
+Either may have `error`, which is 1 - accuracy, in place of `accuracy`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,30 +26,31 @@ Table = Mapping[str, Sequence[str | float | None]]  # columns by name
 
 LONG = ("task", "stage", "resource", "accuracy")
 JOINT = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
-LEAST, MOST = 1e-9, 1e9  # of a number that is not 0
+LEAST, MOST = 1e-9, 1e9  # allowed size of a number other than 0
 ARTICLE = resources.files("flcav.optimization") / "data" / "article_history.csv"
-ROUNDED = 1.01e-3  # what accuracy and error, both rounded to three digits, may sum to beside 1
+ROUNDED = 1.01e-3  # largest deviation from 1 of accuracy + error, both rounded to three digits
 
 
 @dataclass(frozen=True)
 class History:
-    """The points of one task."""
+    """The points of one task's learning curve."""
 
     resources: Array  # (n, 3) samples, edge rounds, cloud rounds
     accuracy: Array  # (n,) 0 ... 1
-    weight: Array  # (n,)
+    weight: Array  # (n,) of each point's squared residual in a fit
 
 
 def article_histories() -> dict[str, History]:
-    """Return the points of Wang et al., IEEE Network 37(3), 2023, Fig. 3a, by task."""
+    """Return the histories of Wang et al., IEEE Network 37(3), 2023, Fig. 3a, by task."""
     with ARTICLE.open("rb") as file:
         return histories(pyarrow.csv.read_csv(file).to_pydict(), str(ARTICLE), "")
 
 
 def histories(columns: Table, origin: str, unnamed: str) -> dict[str, History]:
-    """Return the history of each task of a table in either form; `unnamed` is the task where no column says it.
+    """Return the history of each task, by name, from a table in either form.
 
-    Raises `InputError` naming `origin`, the row (from 1), the field and the value.
+    `unnamed` is the task's name in a table without a column `task`. Raises `InputError` naming `origin`, the row (from
+    1), the field and the value where a column is missing or a value is invalid.
     """
     columns = _with_accuracy(columns, origin)
     joint = "stage" not in columns
@@ -74,7 +78,10 @@ def histories(columns: Table, origin: str, unnamed: str) -> dict[str, History]:
 
 
 def _with_accuracy(columns: Table, origin: str) -> Table:
-    """Return `columns` with accuracies, from errors where there are none; raises `InputError` if both disagree."""
+    """Return `columns` with accuracies, computed from the errors where there are none.
+
+    Raises `InputError` where accuracy and error are both given and do not sum to 1.
+    """
     if "error" not in columns:
         return columns
     error = _numbers(columns, "error", origin, most=1.0)
@@ -89,7 +96,10 @@ def _with_accuracy(columns: Table, origin: str) -> Table:
 
 
 def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
-    """Return (n, 3) samples, edge rounds and cloud rounds of rows that give only their own stage's resource (n,)."""
+    """Return samples, edge rounds and cloud rounds (n, 3) of a long table's rows.
+
+    Each row has its own stage's `resource` (n,), the largest of each earlier stage, and 0 of each later one.
+    """
     amounts, number = np.asarray(resource, dtype=np.float64), np.array([STAGES.index(name) for name in stage])
     largest = [amounts[number == s].max(initial=0.0) for s in range(3)]
     own = np.where(number[:, None] == np.arange(3), amounts[:, None], 0.0)
@@ -97,7 +107,7 @@ def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
 
 
 def _numbers(columns: Table, name: str, origin: str, most: float = MOST) -> Array:
-    """Return column `name` as (n,) numbers from 0 to `most`."""
+    """Return column `name` as (n,) numbers from 0 to `most`; raises `InputError` naming the first that is not."""
     values = np.empty(len(columns[name]))
     for row, value in enumerate(columns[name]):
         try:

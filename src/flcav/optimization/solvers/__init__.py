@@ -1,1 +1,1 @@
-"""Exact solvers of allocation problems, with certificates."""
+"""Solvers of allocation problems over whole samples and rounds, with proven lower bounds."""

@@ -1,8 +1,8 @@
-"""Convex functions of whole numbers under linear budgets, by outer approximation with HiGHS.
+"""Convex integer programs under linear budgets, by outer approximation (Duran and Grossmann 1986) with HiGHS.
 
-Each convex term is bounded from below by straight lines, e.g. secants through neighbouring whole numbers, or tangents.
-Minimising the lines is a (mixed-integer) linear program; its optimum is a proven lower bound, and its solution says
-where the next lines are needed (Duran and Grossmann 1986).
+Each convex term is bounded from below by linear cuts: tangents, or secants through neighbouring whole numbers.
+With the cuts in place of the terms, the problem is a (mixed-integer) linear program. Its optimum is a proven lower
+bound, and the next cuts are added at its solution.
 """
 
 from collections.abc import Sequence
@@ -18,38 +18,38 @@ from flcav.optimization.solvers.instance import variables
 
 Array = NDArray[np.float64]
 
-LARGE = 1e4  # the objective in the solver's eyes, whose tolerances are absolute, around 1e-6
+LARGE = 1e4  # size to which the objective is scaled: the solver's tolerances are absolute, around 1e-6
 
 
 class Line(NamedTuple):
-    """A lower bound of a term: value + slope . x[of]."""
+    """A cut: the linear lower bound value + slope . x[of] of a convex term."""
 
-    of: tuple[int, ...]
-    slope: tuple[float, ...]
+    of: tuple[int, ...]  # indices of the quantities
+    slope: tuple[float, ...]  # by each of them
     value: float  # at x[of] = 0
 
 
 class Term(Protocol):
-    """A convex function of some of the quantities."""
+    """A convex function of some of the quantities, with its cuts."""
 
     def value(self, x: Array) -> float:
-        """Return the term at x (n,)."""
+        """Return the value of the term at x (n,)."""
         ...
 
     def lines(self, x: Array) -> list[Line]:
-        """Return lower bounds that are tight at x (n,) or at its whole neighbours."""
+        """Return cuts that are tight at x (n,) or at its whole neighbours."""
         ...
 
 
 @dataclass(frozen=True)
 class Program:
-    """Minimise the sum of the terms at whole x in [low, high] with x @ cost <= budget."""
+    """Convex integer program: minimise the sum of the terms over whole x in [low, high] with x @ cost <= budget."""
 
     terms: Sequence[Term]
-    low: Array  # (n,)
-    high: Array  # (n,)
-    cost: Array  # (n, 2)
-    budget: Array  # (2,)
+    low: Array  # (n,) least of each quantity
+    high: Array  # (n,) most of each quantity
+    cost: Array  # (n, 2) of one unit on each link
+    budget: Array  # (2,) of each link
 
     def value(self, x: Array) -> float:
         """Return the objective at x (n,)."""
@@ -57,7 +57,7 @@ class Program:
 
 
 class Cuts:
-    """The lines collected so far: the linear program that bounds a `Program` from below."""
+    """The cuts added so far to a `Program`: a linear program that bounds it from below."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -65,21 +65,24 @@ class Cuts:
         self._scale = LARGE / max(program.value(program.low), 1e-12)
 
     def add(self, x: Array) -> bool:
-        """Add the lines at x (n,); return whether any was new."""
+        """Add the cuts at x (n,); return whether any was new."""
         known = len(self._lines)
         for number, term in enumerate(self.program.terms):
             self._lines.update(dict.fromkeys((number, line) for line in term.lines(x)))
         return len(self._lines) > known
 
     def relax(self) -> tuple[Array, float]:
-        """Return the optimum over fractional x and its value."""
+        """Return the optimum x (n,) of the continuous relaxation, and its value; raises `InputError` if HiGHS fails."""
         matrix, limit = self._rows()
         bounds = np.stack((self._low(), self._high()), axis=1)
         result = linprog(self._objective(), A_ub=matrix, b_ub=limit, bounds=bounds, method="highs")
         return variables(result)[: len(self.program.low)], float(result.fun) / self._scale
 
     def solve(self, gap: float) -> tuple[Array, float]:
-        """Return the optimum over whole x to a relative `gap`, and the proven bound."""
+        """Return the optimum whole x (n,) to a relative `gap`, and the proven lower bound.
+
+        Raises `InputError` where HiGHS fails.
+        """
         matrix, limit = self._rows()
         whole = np.r_[np.ones(len(self.program.low)), np.zeros(len(self.program.terms))]
         result = milp(
@@ -101,7 +104,10 @@ class Cuts:
         return np.r_[self.program.high, np.full(len(self.program.terms), np.inf)]
 
     def _rows(self) -> tuple[csr_array, Array]:
-        """Return the budgets, then slope . x - term <= -value for every line; the budgets in units of themselves."""
+        """Return the constraint matrix over (quantities, terms) and its upper limits.
+
+        Its rows are the budgets, scaled to 1, then slope . x - term <= -value for every cut.
+        """
         program, n = self.program, len(self.program.low)
         link, quantity = np.repeat((0, 1), n), np.tile(np.arange(n), 2)
         rows, columns, values = [*link], [*quantity], [*(program.cost / program.budget).T.ravel()]
@@ -116,7 +122,11 @@ class Cuts:
 def continuous_optimum(
     program: Program, starts: Sequence[Array], gap: float, floor: float = 0.0
 ) -> tuple[Array, float, Cuts]:
-    """Return the fractional x that is within `gap` of the least, a proven lower bound, and the lines that prove it."""
+    """Return the optimum of the continuous relaxation, its proven lower bound, and the cuts that prove the bound.
+
+    The cuts at `starts` come first. It ends within a tenth of `gap` of the bound, relative to the bound plus `floor`,
+    when no cut is new, or after 40 rounds of cuts. Raises `InputError` where HiGHS fails.
+    """
     cuts = Cuts(program)
     for x in starts:
         cuts.add(x)
@@ -131,10 +141,11 @@ def continuous_optimum(
 def outer_approximation(
     program: Program, starts: Sequence[Array], gap: float, floor: float = 0.0
 ) -> tuple[list[Array], float]:
-    """Return the whole points visited and a proven lower bound.
+    """Return the whole points (n,) that outer approximation visited, and a proven lower bound.
 
-    A point may overspend by the solver's tolerance (1e-7 of a budget): the caller trims it. It ends when the best point
-    is within `gap` of the bound, relative to the bound plus `floor`, or adds no line: then it is optimal.
+    It ends when the best point is within `gap` of the bound, relative to the bound plus `floor`; when a point adds no
+    cut, as it is then optimal; or after 40 points. A point may exceed a budget by the solver's tolerance (1e-7 of it):
+    the caller trims it. Raises `InputError` where HiGHS fails.
     """
     _, bound, cuts = continuous_optimum(program, starts, gap, floor)
     visited: list[Array] = []

@@ -1,10 +1,12 @@
-"""Effective samples in arrays: what the least Lagrangian over whole samples and rounds is, for many tasks at once.
+"""Least Lagrangian of effective-samples curves over whole samples and rounds, vectorised over tasks.
 
-    weight a n^(-b),   n = `effective_samples` of x samples and t = y + k z rounds
+A task's error above its floor is
 
-A cloud round costs what k edge rounds cost on the wireless link and more on the wireline one, so of all (y, z) that
-give the same t the one with the fewest cloud rounds is as good as any: only the values of t need to be tried. For each,
-the best x is a closed form.
+    weight a n^(-b),   n = `effective_samples` of x samples and t = y + k z rounds.
+
+A cloud round costs as much as k edge rounds on the wireless link, and more on the wireline one. So among all (y, z)
+with the same t the one with the fewest cloud rounds is optimal, and only the values of t are enumerated. For each of
+them the best x has a closed form.
 """
 
 from collections.abc import Sequence
@@ -21,29 +23,29 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EffectiveTasks:
-    """E tasks and their T choices of rounds; where a task has fewer, the cost is infinite."""
+    """The E tasks with effective-samples curves, and T choices of rounds each; a missing choice has infinite cost."""
 
-    quantity: NDArray[np.intp]  # (E, 3) of the whole problem
+    quantity: NDArray[np.intp]  # (E, 3) indices of samples, edge rounds, cloud rounds in the whole problem
     gain: Array  # (E, 1) weight * a
     b: Array  # (E, 1)
     alpha: Array  # (E, 1)
     group: Array  # (E, 1) beta * G
-    k: int
+    k: int  # edge rounds per cloud round
     least: Array  # (E, 1) samples
     most: Array  # (E, 1) samples
-    sample_cost: Array  # (E, 2)
+    sample_cost: Array  # (E, 2) per link
     rounds: Array  # (E, T, 2) edge rounds, cloud rounds
     rounds_cost: Array  # (E, T, 2) per link
 
     def error(self, x: Array) -> Array:
-        """Return the weighted (E,) errors above their floors at x (n,) of the whole problem."""
+        """Return the weighted errors (E,) above their floors at x (n,) of the whole problem."""
         own = x[self.quantity]
         t = own[:, 1] + self.k * own[:, 2]
         effective = effective_samples(own[:, 0], t, self.alpha[:, 0], self.group[:, 0])
         return self.gain[:, 0] * effective ** -self.b[:, 0]
 
     def cheapest(self, multipliers: Array) -> tuple[Array, Array]:
-        """Return the (E, 3) whole quantities of least error plus price at `multipliers` (2,), and that least (E,)."""
+        """Return the whole quantities (E, 3) of least error plus price at `multipliers` (2,), and the minima (E,)."""
         samples, value = self._best_samples(multipliers)
         best = np.argmin(value, axis=1)
         task = np.arange(len(best))
@@ -51,7 +53,10 @@ class EffectiveTasks:
         return chosen, value[task, best]
 
     def within(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
-        """Return least and most (E, 3) of the choices whose error plus price is within `slack` of the least."""
+        """Return least and most quantities, (E, 3) each, of the choices within `slack` of a task's least Lagrangian.
+
+        The Lagrangian is error plus price at `multipliers` (2,).
+        """
         samples, value = self._best_samples(multipliers)
         limit = value.min(axis=1, keepdims=True) + slack
         kept = value <= limit
@@ -67,7 +72,7 @@ class EffectiveTasks:
         return np.column_stack((low, least)), np.column_stack((high, most))
 
     def _best_samples(self, multipliers: Array) -> tuple[Array, Array]:
-        """Return the best whole samples of each choice (E, T) and their error plus price (E, T)."""
+        """Return the best whole number of samples for each choice of rounds (E, T), and error plus price (E, T)."""
         price = (self.sample_cost @ multipliers)[:, None]
         with np.errstate(divide="ignore"):
             level = (self.gain * self.b * self.alpha / price) ** (1 / (self.b + 1))
@@ -85,7 +90,7 @@ class EffectiveTasks:
         return error + price * samples + np.where(np.isinf(self.rounds_cost[:, :, 0]), np.inf, rounds)
 
     def _effective(self, samples: Array | float) -> Array:
-        """Return the effective samples (E, T) of each choice with `samples` (E, T)."""
+        """Return the effective samples (E, T) of each choice of rounds with `samples` (E, T)."""
         return effective_samples(samples, self.rounds[:, :, 0] + self.k * self.rounds[:, :, 1], self.alpha, self.group)
 
 
@@ -93,7 +98,11 @@ def effective_tasks(
     numbers: Sequence[int], weights: Sequence[float], curves: Sequence[Effective], k: int, low: Array, high: Array,
     cost: Array,
 ) -> EffectiveTasks:  # fmt: skip
-    """Return the tasks of `numbers` in a problem with bounds `low`, `high` (3N,) and `cost` (3N, 2)."""
+    """Return the tasks with effective-samples `curves` and `weights`, and their choices of rounds.
+
+    `numbers` are the tasks' indices in a problem of N tasks with bounds `low` and `high` (3N,) and `cost` (3N, 2); `k`
+    is the number of edge rounds per cloud round.
+    """
     quantity = 3 * np.array(numbers)[:, None] + np.arange(3)
     choices = [_rounds(low[q], high[q], k) for q in quantity]
     rounds = np.zeros((len(numbers), max(map(len, choices)), 2))
@@ -109,7 +118,7 @@ def effective_tasks(
 
 
 def _rounds(low: Array, high: Array, k: int) -> Array:
-    """Return the (T, 2) edge and cloud rounds worth trying: one for each t, with the fewest cloud rounds."""
+    """Return the choices of edge and cloud rounds (T, 2): for each t = y + k z the one with the fewest cloud rounds."""
     if k == 0:
         edge = np.arange(low[1], high[1] + 1)
         return np.column_stack((edge, np.full(len(edge), low[2])))

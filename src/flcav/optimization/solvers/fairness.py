@@ -1,9 +1,10 @@
-"""Max-min fairness: the least common error level that every task can be held to, proven over whole plans.
+"""Max-min fairness: the plan of least largest error, with a proven lower bound over whole plans.
 
-For a level e, every pair of edge and cloud rounds of a task has a least whole number of samples that holds the task to
-e, so it has a cost. At link prices at which both budgets together cost 1, the sum of the tasks' least prices is a lower
-bound of what any plan pays: above 1, the level is out of reach (Lagrangian duality, Everett 1963). Bisection finds the
-lowest level that is not; above it, tasks are put together until a plan is found.
+For an error level e, every pair of edge and cloud rounds of a task needs a least whole number of samples to keep the
+task's error at or below e, and so has a least cost. At link prices at which both budgets together cost 1, the sum of
+the tasks' least costs is a lower bound of the price of any plan that keeps to e. Where it is above 1, level e is
+infeasible (Lagrangian duality; Everett 1963). Bisection finds the lowest level not excluded; from there on upwards,
+plans are combined task by task until one fits the budgets.
 """
 
 from collections.abc import Sequence
@@ -23,35 +24,35 @@ from flcav.optimization.solvers.separable import BUDGET_SLACK
 Array = NDArray[np.float64]
 
 MOST_CHOICES = 1_000_000  # pairs of rounds of one task
-MOST_MERGED = 4000  # sums kept while tasks are put together
-PROVEN = 1e-9  # of the budgets: what sums may err by
+MOST_MERGED = 4000  # partial plans kept while tasks are combined
+PROVEN = 1e-9  # of the budgets: tolerance for rounding of sums
 ROUNDING = 1e-12  # relative, of the samples needed for a level
-SMALL = 1e-3  # change of the level by which its price is measured
+SMALL = 1e-3  # relative change of the level in the finite difference of its price
 
 
 @dataclass(frozen=True)
 class Fair:
-    """Whole quantities and what is proven about the largest error."""
+    """A whole plan with its largest error and a proven lower bound."""
 
     x: Array  # (n,)
     level: float  # the largest predicted error
-    bound: float  # proven: no plan holds every task below
-    rates: Array  # (2,) how fast the level falls per MB of each link
+    bound: float  # proven: no plan has a smaller largest error
+    rates: Array  # (2,) decrease of the level per MB of each link
 
 
 @dataclass(frozen=True)
 class Choices:
-    """The pairs of rounds of one task, and the curves that all have to be held to a level."""
+    """The pairs of edge and cloud rounds of one task, and the learning curves of its members."""
 
     rounds: Array  # (C, 2) edge rounds, cloud rounds
     least: float  # samples
     most: float  # samples
     curves: tuple[Additive | Effective, ...]
-    k: int
+    k: int  # edge rounds per cloud round
     cost: Array  # (3, 2) of one sample, edge round, cloud round on each link
 
     def frontier(self, level: float) -> tuple[Array, Array]:
-        """Return the counts (P, 3) that hold every curve to `level` and that none undercuts, and their costs (P, 2)."""
+        """Return the Pareto-optimal counts (P, 3) that keep every curve at or below `level`, and their costs (P, 2)."""
         needed = np.full(len(self.rounds), self.least)
         for curve in self.curves:
             needed = np.maximum(needed, np.ceil(_samples_for(curve, self.rounds, self.k, level) * (1 - ROUNDING)))
@@ -63,9 +64,10 @@ class Choices:
 
 
 def least_largest(problem: Problem, made: Instance, gap: float) -> Fair:
-    """Return a plan whose largest error is within a relative `gap` of the least possible, where it can be found.
+    """Return a plan whose largest error is within a relative `gap` of the least possible, where one is found.
 
-    Raises `InputError` where a task has more than a million pairs of rounds to choose from.
+    `made` is `problem` in arrays. The bound is proven in any case. Raises `InputError` where the limits of a task leave
+    more than `MOST_CHOICES` pairs of rounds.
     """
     tasks = _choices(problem, made)
     level, bound = (max(map(_largest, tasks, x.reshape(-1, 3))) for x in (made.low, made.high))
@@ -95,21 +97,24 @@ def least_largest(problem: Problem, made: Instance, gap: float) -> Fair:
 
 @dataclass(frozen=True)
 class Held:
-    """What the tasks can choose from at one level, and the link prices at which the least of it costs most."""
+    """The Pareto-optimal choices of all tasks at one error level, and the link prices of the best lower bound."""
 
     counts: tuple[Array, ...]  # per task (P, 3)
     costs: tuple[Array, ...]  # per task (P, 2)
     budget: Array  # (2,)
     prices: Array  # (2,) per MB; both budgets together cost 1
-    out_of_reach: bool  # proven: no plan holds every task to the level
+    out_of_reach: bool  # proven: no plan keeps every task at or below the level
 
     def total(self, prices: Array) -> float:
-        """Return the sum of the least costs at `prices`; infinite where a task has nothing to choose from."""
+        """Return the sum of the tasks' least costs at `prices` (2,); infinite where a task has no choice."""
         return sum(float((cost @ prices).min()) if len(cost) else np.inf for cost in self.costs)
 
 
 def hold(tasks: Sequence[Choices], level: float, budget: Array) -> Held:
-    """Return what holds every task to `level`."""
+    """Return the tasks' choices at an error `level`, with the link prices that maximise the least total cost.
+
+    The total cost is concave in the wireless link's share of the price; bisection on its supergradient maximises it.
+    """
     counts, costs = zip(*(task.frontier(level) for task in tasks))
     if not all(map(len, counts)):
         return Held(counts, costs, budget, 0.5 / budget, out_of_reach=True)
@@ -130,10 +135,10 @@ def hold(tasks: Sequence[Choices], level: float, budget: Array) -> Held:
 
 
 def together(held: Held) -> tuple[NDArray[np.float64] | None, bool]:
-    """Return whole counts (N, 3) within the budgets, or None; and whether it is proven that there are none.
+    """Return a plan of whole counts (N, 3) within the budgets, or None; and whether it is proven that there is none.
 
-    Task by task, the sums that no other sum undercuts on both links are kept. A choice whose price is more above its
-    task's least than the budgets have left cannot be part of a plan.
+    Dynamic programming over the tasks: of the partial plans only those on the Pareto front of both links' costs are
+    kept. A choice that costs more above its task's least than the budgets have left is pruned.
     """
     if held.out_of_reach:
         return None, True
@@ -164,7 +169,7 @@ def together(held: Held) -> tuple[NDArray[np.float64] | None, bool]:
 
 
 def undominated(cost: Array) -> NDArray[np.intp]:
-    """Return the rows of cost (n, 2) that no other row undercuts on both links, one of equals."""
+    """Return the indices of the Pareto-optimal rows of `cost` (n, 2), sorted by the first column; one of equals."""
     order = np.lexsort((cost[:, 1], cost[:, 0]))
     second = cost[order, 1]
     before = np.minimum.accumulate(np.r_[np.inf, second[:-1]]) if len(order) else second
@@ -193,7 +198,7 @@ def _largest(task: Choices, counts: Array) -> float:
 
 
 def _samples_for(curve: Additive | Effective, rounds: Array, k: int, level: float) -> Array:
-    """Return the samples (C,), fractional, at which the error after `rounds` (C, 2) is `level`."""
+    """Return the fractional samples (C,) at which the error after `rounds` (C, 2) is `level`; infinite if none do."""
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         if isinstance(curve, Effective):
             if level <= curve.floor:

@@ -1,4 +1,4 @@
-"""An allocation problem in arrays: three quantities per task, what one of each costs, and what it saves."""
+"""An allocation problem in arrays: three quantities per task, their bounds and costs, and the error they leave."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,19 +19,22 @@ Array = NDArray[np.float64]
 
 
 def variables(result: OptimizeResult) -> Array:
-    """Return the variables of a linear program's optimum; raises `InputError` where the solver found none."""
+    """Return the optimal variables in the result of SciPy's solver; raises `InputError` where it found none."""
     if result.x is None:
         raise InputError(f"the solver fails on numbers of such different sizes: {shorten(result.message)}")
     return result.x
 
 
 class Infeasible(InputError):
-    """Even the least plan that the limits allow costs more than a budget."""
+    """No plan within the limits fits: even the least one exceeds a budget, the samples held or the links' capacity."""
 
 
 @dataclass(frozen=True)
 class Instance:
-    """Quantities 3 i, 3 i + 1, 3 i + 2 are the samples, edge rounds and cloud rounds of task i; n = 3 N in all."""
+    """An allocation problem of N tasks in n = 3 N quantities.
+
+    Quantities 3 i, 3 i + 1 and 3 i + 2 are the samples, edge rounds and cloud rounds of task i.
+    """
 
     separable: Separable  # every additive curve, and all bounds, costs and budgets
     effective: EffectiveTasks | None  # every effective-samples curve
@@ -39,22 +42,22 @@ class Instance:
 
     @property
     def low(self) -> Array:
-        """Least of each, (n,)."""
+        """Least of each quantity (n,)."""
         return self.separable.low
 
     @property
     def high(self) -> Array:
-        """Most of each, (n,)."""
+        """Most of each quantity (n,)."""
         return self.separable.high
 
     @property
     def cost(self) -> Array:
-        """Cost of one unit on each link, (n, 2)."""
+        """Cost of one unit of each quantity on each link (n, 2) [MB]."""
         return self.separable.cost
 
     @property
     def budget(self) -> Array:
-        """Budget of each link, (2,)."""
+        """Budget of each link, wireless and wireline (2,) [MB]."""
         return self.separable.budget
 
     def error(self, x: Array) -> float:
@@ -63,7 +66,7 @@ class Instance:
         return float(self.separable.error(x).sum()) + own
 
     def change(self, x: Array, step: int) -> Array:
-        """Return by how much the error changes when each quantity alone changes by `step`, (n,)."""
+        """Return the change of the weighted error (n,) when each quantity alone changes by `step`."""
         with np.errstate(divide="ignore", invalid="ignore"):
             change = self.separable.error(x + step) - self.separable.error(x)
             if self.effective is not None:
@@ -75,7 +78,7 @@ class Instance:
         return change
 
     def cheapest(self, multipliers: Array) -> tuple[Array, float]:
-        """Return the whole x (n,) of least error plus price at `multipliers` (2,), and the bound that this proves."""
+        """Return the whole x (n,) of least Lagrangian at `multipliers` (2,), and the lower bound that it proves."""
         problem, prices = self.separable, self.separable.prices(multipliers)
         below = np.floor(problem.cheapest(multipliers))
         above = np.minimum(below + 1, problem.high)
@@ -90,7 +93,11 @@ class Instance:
         return x, total - float(multipliers @ problem.budget)
 
     def narrowed(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
-        """Return bounds (n,), (n,) outside which error plus price is more than `slack` above the least."""
+        """Return least and most of each quantity, (n,) each, whose error plus price is within `slack` of its minimum.
+
+        Prices are those at `multipliers` (2,). If `slack` is the distance from the dual bound to a known plan's error,
+        no better plan has a quantity outside these bounds.
+        """
         problem, prices = self.separable, self.separable.prices(multipliers)
         best, _ = self.cheapest(multipliers)
         limit = problem.error(best) + prices * best + slack
@@ -106,7 +113,10 @@ class Instance:
 
 
 def instance(problem: Problem) -> Instance:
-    """Return `problem` in arrays; raises `Infeasible`, naming the budget, what the least plan costs, and the excess."""
+    """Return `problem` in arrays, its upper bounds lowered to what the budgets have room for.
+
+    Raises `Infeasible`, naming the budget, the cost of the least plan and the excess, where that exceeds a budget.
+    """
     low, high = (np.concatenate(edge) for edge in zip(*(_range(problem, task) for task in problem.tasks)))
     rows: list[tuple[float, float, float, int]] = []
     alone: list[tuple[int, float, Effective]] = []
@@ -140,18 +150,18 @@ def stage_plan(problem: Problem, task: Task, counts: Sequence[int]) -> StagePlan
 
 
 def cost_of(problem: Problem, task: Task, counts: Sequence[int]) -> Price:
-    """Return what `counts` of samples, edge rounds and cloud rounds of `task` cost."""
+    """Return the cost on each uplink [MB] of `counts` = samples, edge rounds, cloud rounds of `task`."""
     return price(stage_plan(problem, task, counts), MessageSizes(task.sample_mb, task.model_mb))
 
 
 def unit_costs(problem: Problem) -> Array:
-    """Return the (3N, 2) cost of one sample, edge round and cloud round of each task: `price` is linear."""
+    """Return the cost (3N, 2) [MB] of one sample, edge round and cloud round of each task: `price` is linear."""
     prices = [cost_of(problem, task, unit) for task in problem.tasks for unit in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
     return np.array([(each.wireless_mb, each.wireline_mb) for each in prices])
 
 
 def _range(problem: Problem, task: Task) -> tuple[Array, Array]:
-    """Return least and most (3,) of a task; an infinite error is never chosen."""
+    """Return least and most of a task's quantities, (3,) each, without those at which the error is infinite."""
     limits = task.limits
     ranges = np.array((limits.samples, limits.edge_rounds, limits.cloud_rounds), dtype=np.float64)
     for learner in task.learners:

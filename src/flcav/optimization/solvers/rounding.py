@@ -1,4 +1,4 @@
-"""Whole quantities within two budgets: units taken back where they lose least per price, added where they gain most."""
+"""Greedy rounding under two budgets: units are removed at the least loss per price, or added at the most gain."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -12,35 +12,38 @@ Array = NDArray[np.float64]
 
 
 class Budgeted(Protocol):
-    """An error of n whole quantities, which falls as any of them grows, under two budgets."""
+    """A problem of n whole quantities under two budgets, whose error falls as any quantity grows."""
 
     @property
     def low(self) -> Array:
-        """Least of each, (n,)."""
+        """Least of each quantity (n,)."""
         ...
 
     @property
     def high(self) -> Array:
-        """Most of each, (n,)."""
+        """Most of each quantity (n,)."""
         ...
 
     @property
     def cost(self) -> Array:
-        """Cost of one unit on each link, (n, 2)."""
+        """Cost of one unit of each quantity on each link (n, 2)."""
         ...
 
     @property
     def budget(self) -> Array:
-        """Budget of each link, (2,)."""
+        """Budget of each link (2,)."""
         ...
 
     def change(self, x: Array, step: int) -> Array:
-        """Return by how much the total error changes when each quantity alone changes by `step`, (n,)."""
+        """Return the change of the total error (n,) when each quantity alone changes by `step`."""
         ...
 
 
 def trim(problem: Budgeted, x: Array, prices: Array) -> Array:
-    """Return whole x (n,) with units taken back, the least loss per price (n,) first, until it is within budgets."""
+    """Return whole x (n,) with units removed until it is within the budgets, the least loss per price first.
+
+    `prices` (n,) are those of one unit of each quantity.
+    """
     x = x.copy()
     allowed = problem.budget * (1 + BUDGET_SLACK)
     while np.any(over := x @ problem.cost > allowed):
@@ -56,7 +59,10 @@ def trim(problem: Budgeted, x: Array, prices: Array) -> Array:
 
 
 def fill(problem: Budgeted, x: Array, prices: Array) -> Array:
-    """Return whole x (n,) with units added, the most gain per price (n,) first, while any fits and gains."""
+    """Return whole x (n,) with units added as long as one fits the budgets and gains, the most gain per price first.
+
+    `prices` (n,) are those of one unit of each quantity.
+    """
     x = x.copy()
     while True:
         left = problem.budget * (1 + BUDGET_SLACK) - x @ problem.cost
@@ -74,7 +80,10 @@ def fill(problem: Budgeted, x: Array, prices: Array) -> Array:
 
 
 def outermost(good: Callable[[Array], NDArray[np.bool_]], inside: Array, edge: Array) -> Array:
-    """Return the whole numbers nearest to `edge` that are good, where all from `inside` up to them are: bisection."""
+    """Return, by bisection, the whole numbers nearest to `edge` for which `good` holds, elementwise.
+
+    `good` must hold at `inside`, and from there towards `edge` up to a single change.
+    """
     while np.any(inside != edge):
         middle = np.where(edge < inside, np.floor((edge + inside) / 2), np.ceil((edge + inside) / 2))
         reached = good(middle)

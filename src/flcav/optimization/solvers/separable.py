@@ -1,10 +1,11 @@
-"""Sums of inverse powers under two budgets: the continuous optimum by its dual (water-filling).
+"""Separable convex programs of inverse powers under two budgets: the continuous optimum by Lagrangian duality.
 
     minimise sum_m a_m (x_of(m) + x0_m)^(-b_m)   subject to   sum_j cost_jl x_j <= budget_l,   low_j <= x_j <= high_j
 
-At multipliers l >= 0 each x_j is where its marginal gain equals its price p_j = cost_j . l, or it stands at a bound.
-For one power that is (a b / p)^(1 / (b + 1)) - x0; for several, Newton's method climbs to it from the largest of
-theirs. The dual is concave in the two multipliers; its gradient is the overspend. Nothing loops over tasks.
+At multipliers lambda >= 0, x_j is the point at which its marginal gain equals its price p_j = sum_l cost_jl lambda_l,
+or a bound (water-filling). For a single power it is (a b / p)^(1 / (b + 1)) - x0; for several, Newton's method finds
+it, starting from the largest of the single powers' points. The dual function is concave in the two multipliers, and its
+gradient is the overspend. All steps are vectorised over the quantities.
 """
 
 from dataclasses import dataclass, replace
@@ -18,17 +19,20 @@ from flcav.config import InputError
 Array = NDArray[np.float64]
 
 LARGEST_STEP = 4.0  # of a multiplier's logarithm in one iteration
-BUDGET_SLACK = 1e-12  # relative: rounding of the sums, not room to overspend
-CONVERGED = 1e-10  # relative: overspend, and what the slack of a priced budget is worth
-ALMOST = 1e-9  # relative: what a converged optimum may overspend
-ROUNDING = 1e-14  # relative: noise of the dual's value
-VANISHED = 1e-9  # of its first value: a multiplier of a budget that does not bind
-NO_DECAY = -1e9  # stands for the logarithm of a = 0
+BUDGET_SLACK = 1e-12  # relative tolerance of budgets, for rounding of sums
+CONVERGED = 1e-10  # relative tolerance of the overspend, and of complementary slackness
+ALMOST = 1e-9  # relative overspend allowed to a converged optimum
+ROUNDING = 1e-14  # relative noise of the dual's value
+VANISHED = 1e-9  # a multiplier below this share of its first value belongs to a budget that does not bind
+NO_DECAY = -1e9  # in place of the logarithm of a = 0
 
 
 @dataclass(frozen=True)
 class Separable:
-    """A problem of n quantities and m >= n powers; `low` is within the budgets, and the error there is finite."""
+    """A separable program of n quantities and m >= n inverse powers.
+
+    `low` must be within the budgets, and the error there finite.
+    """
 
     a: Array  # (m,) >= 0
     b: Array  # (m,) > 0
@@ -40,7 +44,7 @@ class Separable:
     of: NDArray[np.intp] | None = None  # (m,) the quantity of each power; default: one each, in order
 
     def error(self, x: Array) -> Array:
-        """Return the (n,) errors at x (n,)."""
+        """Return the error (n,) of each quantity at x (n,): the sum of its inverse powers."""
         if self.of is None:
             return self.a * (x + self.x0) ** -self.b
         return self._summed(self.a * (x[self.of] + self.x0) ** -self.b)
@@ -50,23 +54,23 @@ class Separable:
         return bool(np.all(self.spent(x) <= self.budget * (1 + BUDGET_SLACK)))
 
     def spent(self, x: Array) -> Array:
-        """Return what x (n,) costs on each link, (2,)."""
+        """Return the cost of x (n,) on each link (2,)."""
         return np.array([x @ column for column in self._columns])
 
     def prices(self, multipliers: Array) -> Array:
-        """Return the (n,) price of one unit of each quantity at `multipliers` (2,)."""
+        """Return the price (n,) of one unit of each quantity at `multipliers` (2,)."""
         return multipliers[0] * self._columns[0] + multipliers[1] * self._columns[1]
 
     def cheapest(self, multipliers: Array) -> Array:
-        """Return the (n,) quantities that minimise error plus price at `multipliers` (2,)."""
+        """Return the continuous x (n,) that minimises the Lagrangian, error plus price, at `multipliers` (2,)."""
         return self._level(self.prices(multipliers))
 
     def bend(self, x: Array, prices: Array) -> Array:
-        """Return how fast each quantity inside its bounds falls with the logarithm of its price, (n,)."""
+        """Return -dx / d(log price) (n,) of each quantity's minimiser x (n,) inside its bounds, at `prices` (n,)."""
         if self.of is None:
             return (x + self.x0) / (self.b + 1)
         shifted = x[self.of] + self.x0
-        with np.errstate(divide="ignore", invalid="ignore"):  # of what gains nothing: it stands at its least
+        with np.errstate(divide="ignore", invalid="ignore"):  # quantities without gain stay at their least
             return prices / self._summed(self.a * self.b * (self.b + 1) * shifted ** (-self.b - 2))
 
     def _level(self, prices: Array) -> Array:
@@ -77,7 +81,7 @@ class Separable:
             alone = np.exp((self._log_gain - log_price[self.of]) * self._root) - self.x0
             level = self.low.copy()
             np.maximum.at(level, self.of, np.minimum(alone, self._useful[self.of]))
-            for _ in range(50):  # the marginal gain is convex and falls: from below, no step goes too far
+            for _ in range(50):  # the marginal gain is convex and falls: from below, Newton never overshoots
                 shifted = level[self.of] + self.x0
                 gain = self.a * self.b * shifted ** (-self.b - 1)
                 step = (self._summed(gain) - prices) / self._summed(gain * (self.b + 1) / shifted)
@@ -104,14 +108,14 @@ class Separable:
 
     @cached_property
     def _useful(self) -> Array:
-        """What nothing is gained by stays at its least, even where it costs nothing."""
+        """Upper bounds (n,); a quantity without gain stays at its least, even where it costs nothing."""
         total = self.a if self.of is None else self._summed(self.a)
         return np.where(total > 0, self.high, self.low)
 
 
 @dataclass(frozen=True)
 class Relaxed:
-    """The continuous optimum."""
+    """The continuous optimum, with its multipliers and dual bound."""
 
     x: Array  # (n,)
     multipliers: Array  # (2,) error saved per unit of each budget
@@ -121,10 +125,11 @@ class Relaxed:
 def separable(
     a: ArrayLike, b: ArrayLike, x0: ArrayLike, low: ArrayLike, high: ArrayLike, cost: ArrayLike, budget: ArrayLike
 ) -> Separable:
-    """Return a checked problem of n quantities with one power each, from anything array-like.
+    """Return a checked separable program of n quantities with one inverse power each.
 
-    `high` is lowered to what the budgets leave room for. Raises `InputError` where a value is not a number or out of
-    range, and where `low` is not within the budgets.
+    Shapes are (n,), of `cost` (n, 2) and of `budget` (2,). `high` is lowered to what the budgets leave room for. Raises
+    `InputError` where a shape is wrong, a value is not a number or out of range, `low` is more than `high` or not
+    within the budgets, or the error at `low` is infinite.
     """
     named = {"a": a, "b": b, "x0": x0, "low": low, "high": high, "cost": cost, "budget": budget}
     arrays = {name: np.asarray(values, dtype=np.float64) for name, values in named.items()}
@@ -151,14 +156,17 @@ def separable(
 
 
 def room(problem: Separable) -> Array:
-    """Return how many whole units of each quantity alone fit on top of `low`, (n,)."""
+    """Return how many whole units of each quantity fit the budgets above `low`, the others staying at `low` (n,)."""
     left = problem.budget * (1 + BUDGET_SLACK) - problem.spent(problem.low)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.floor(np.min(np.where(problem.cost > 0, left / problem.cost, np.inf), axis=1))
 
 
 def relax(problem: Separable) -> Relaxed:
-    """Return the continuous optimum: the first set of binding budgets whose multipliers leave the others unbroken."""
+    """Return the continuous optimum, by an active-set search over the budgets that bind.
+
+    The sets are tried in this order: none, the scarcer budget, both, the other one.
+    """
     everything = _value(problem, np.zeros(2))
     if problem.fits(everything.x):
         return everything
@@ -182,7 +190,7 @@ def _value(problem: Separable, multipliers: Array) -> Relaxed:
 
 
 def _start(problem: Separable, binding: list[int]) -> Array:
-    """Return multipliers of the size of the mean gain per unit of a budget, half-way between the bounds."""
+    """Return initial multipliers (2,): the mean gain per unit of each binding budget half-way between the bounds."""
     middle = (problem.low + problem.high) / 2
     gain = problem.error(middle) / (middle + 1)
     multipliers = np.zeros(2)
@@ -191,7 +199,7 @@ def _start(problem: Separable, binding: list[int]) -> Array:
 
 
 def _ascend(problem: Separable, binding: list[int], start: Array) -> Relaxed:
-    """Return the best dual point at which only the `binding` budgets have a multiplier: Newton in its logarithm."""
+    """Return the maximum of the dual over the multipliers of the `binding` budgets, by Newton in their logarithms."""
     now = _value(problem, start)
     overspend = (problem.spent(now.x) - problem.budget)[binding]
     for _ in range(200):
@@ -217,7 +225,10 @@ def _ascend(problem: Separable, binding: list[int], start: Array) -> Relaxed:
 def newton_step(
     problem: Separable, x: Array, multipliers: Array, binding: list[int], overspend: Array
 ) -> NDArray[np.float64]:
-    """Return the Newton step of the logarithms of the binding multipliers, made an ascent direction and capped."""
+    """Return the Newton step of the logarithms of the binding multipliers, regularised and capped.
+
+    `x` (n,) minimises the Lagrangian at `multipliers` (2,); `overspend` is the dual's gradient, per binding budget.
+    """
     prices = problem.prices(multipliers)
     inside = (x > problem.low) & (x < problem.high) & (prices > 0)
     bend = problem.bend(x, prices)

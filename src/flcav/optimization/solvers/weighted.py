@@ -1,4 +1,10 @@
-"""The weighted sum of tasks' errors, minimised: its terms, and their solution."""
+"""Least weighted error over whole plans, with a proven lower bound.
+
+Minimising the Lagrangian over whole quantities gives the bound. The quantities at the best multipliers, trimmed and
+filled to the budgets, are nearly optimal where tasks are many. Where they are few, quantities that no plan better than
+the best known can have are excluded (Lagrangian bound tightening), and outer approximation over the rest
+(`cutting_planes`) closes the gap. The convex terms of the error and their cuts are `PowerTerm` and `EffectiveTerm`.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,15 +25,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PowerTerm:
-    """weight * a * (x[index] + x0)^(-b); its lines are secants between neighbouring whole numbers."""
+    """The inverse power a * (x[index] + x0)^(-b); its cuts are secants between neighbouring whole numbers."""
 
     index: int
-    a: float
+    a: float  # weight included
     b: float
     x0: float
 
     def value(self, x: Array) -> float:
-        """Return the term at x (n,)."""
+        """Return the value of the term at x (n,)."""
         return self._at(x[self.index])
 
     def lines(self, x: Array) -> list[Line]:
@@ -47,17 +53,20 @@ class PowerTerm:
 
 @dataclass(frozen=True)
 class EffectiveTerm:
-    """gain * n^(-b), n the `effective_samples` of x[first : first + 3], t = y + k z; its lines are tangents."""
+    """The inverse power gain * n^(-b) of effective samples n; its cuts are tangents.
+
+    n is `effective_samples` of x[first] samples after t = x[first + 1] + k x[first + 2] rounds.
+    """
 
     first: int
-    gain: float
+    gain: float  # weight * a
     b: float
     alpha: float
-    group: float
-    k: int
+    group: float  # beta * group_samples
+    k: int  # edge rounds per cloud round
 
     def value(self, x: Array) -> float:
-        """Return the term at x (n,)."""
+        """Return the value of the term at x (n,)."""
         samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
         return self.gain * self._effective(samples, edge_rounds + self.k * cloud_rounds) ** -self.b
 
@@ -76,7 +85,7 @@ class EffectiveTerm:
 
 
 def terms_of(instance: Instance) -> list[Term]:
-    """Return the terms whose sum is the weighted error above the floors."""
+    """Return the convex terms whose sum is the weighted error above the floors."""
     powers, effective = instance.separable, instance.effective
     of = np.arange(len(powers.a)) if powers.of is None else powers.of
     rows = zip(of.tolist(), powers.a.tolist(), powers.b.tolist(), powers.x0.tolist())
@@ -87,22 +96,22 @@ def terms_of(instance: Instance) -> list[Term]:
     return terms
 
 
-CORRECTIONS = 6  # of the multipliers, towards whole quantities that spend the budgets
-PLANES = 60  # of the dual
+CORRECTIONS = 6  # Newton steps of the multipliers over whole quantities; dual points tried
+PLANES = 60  # most cutting planes of the dual
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Whole quantities and what is proven about them."""
+    """A whole plan with its weighted error and a proven lower bound."""
 
     x: Array  # (n,)
     error: float  # above the floors
-    bound: float  # above the floors: no whole quantities within the budgets have less
+    bound: float  # above the floors: no whole plan within the budgets has less
     multipliers: Array  # (2,) at which the bound is proven
-    rates: Array  # (2,) error saved per MB more of each link, before rounding to whole quantities
+    rates: Array  # (2,) decrease of the error per MB more of each link, of the continuous or dual problem
 
     def gap(self, floor: float) -> float:
-        """Return (error - bound) / bound, both with `floor`."""
+        """Return the relative gap (error - bound) / bound, with `floor` added to both; for a bound of 0, 0 or 1."""
         bound = min(self.bound, self.error) + floor
         if bound > 0:
             return (self.error + floor - bound) / bound
@@ -110,12 +119,15 @@ class Solution:
 
 
 def whole_plan(problem: Separable, gap: float = 1e-4) -> Solution:
-    """Return whole quantities of `problem` within a relative `gap` of the least error: on arrays, without any task."""
+    """Return whole quantities of a separable program within a relative `gap` of the least error."""
     return least_weighted(Instance(problem, None, 0.0), gap)
 
 
 def least_weighted(instance: Instance, gap: float) -> Solution:
-    """Return whole quantities within a relative `gap` of the least error."""
+    """Return a whole plan whose weighted error is within a relative `gap` of the least, or the best found.
+
+    Raises `InputError` where HiGHS fails.
+    """
     best = Solution(instance.low, instance.error(instance.low), -np.inf, np.zeros(2), np.zeros(2))
     bound_at = best.multipliers
     for number, (multipliers, bound) in enumerate(_multipliers(instance, gap)):
@@ -137,7 +149,10 @@ def least_weighted(instance: Instance, gap: float) -> Solution:
 
 
 def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
-    """Yield multipliers near the best, and the bound that is known there; first those of the fractional optimum."""
+    """Yield multipliers (2,) near the dual optimum, each with a lower bound known there (-inf: none).
+
+    The first are those of the continuous optimum, except where a curve is over effective samples.
+    """
     if instance.effective is not None:
         yield from _planes(instance, gap)
         return
@@ -156,7 +171,7 @@ def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]
 
 
 def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
-    """Yield the best few of the multipliers that Kelley's cutting planes try on the dual over whole quantities."""
+    """Yield the best multipliers, with their bounds, of Kelley's cutting-plane method on the dual over whole plans."""
     left = instance.budget - instance.low @ instance.cost
     largest = instance.error(instance.low) / np.maximum(left, 1e-9 * instance.budget)
     rows, values, proven = [], [], []
@@ -176,7 +191,7 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
 
 
 def _closed(instance: Instance, best: Solution, gap: float) -> Solution:
-    """Return `best` or better, within `gap`, by an exact program over what can still be in an optimal plan."""
+    """Return `best` or a better plan, with its bound, by outer approximation within the tightened bounds."""
     _, bound = instance.cheapest(best.multipliers)
     low, high = instance.narrowed(best.multipliers, (best.error - bound) * (1 + 1e-9) + 1e-15)
     program = Program(terms_of(instance), low, high, instance.cost, instance.budget)

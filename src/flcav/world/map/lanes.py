@@ -79,6 +79,7 @@ def fill(points: Array, counts: NDArray[np.int64], shape: tuple[int, int]) -> ND
 
 
 def _polygons(layers: MapLayers) -> dict[str, list[Array]]:
+    """Return the polygons (K, 2) of each raster layer, world frame [m], in the order of `RASTER_LAYERS`."""
     across = ("stop_line", "yield_line")
     driving = [lane for lane in layers.lanes if lane.kind == "driving" and len(lane.centre_line) > 1]
     strips = shapely.buffer(
@@ -124,6 +125,7 @@ def map_layers(town: Town) -> MapLayers:
 
 
 def _lanes(net: RoadNet) -> Iterator[MapLane]:
+    """Yield the lanes of a net with their successors; lanes inside junctions also with their turn and light."""
     following: dict[str, list[str]] = {}
     entered = {connection.via: connection for connection in net.connections if connection.via}
     for connection in net.connections:
@@ -145,6 +147,7 @@ def _lanes(net: RoadNet) -> Iterator[MapLane]:
 
 
 def _crossings(net: RoadNet, roads: BaseGeometry) -> Iterator[Crossing]:
+    """Yield the pedestrian crossings of a net, clipped to `roads`; of a divided one the largest part."""
     for edge in net.edges.values():
         if edge.function == "crossing":
             lane = edge.lanes[0]
@@ -171,11 +174,13 @@ def _arrows(net: RoadNet) -> Iterator[Arrow]:
 
 
 def _way(turns: set[str]) -> ArrowKind | None:
+    """Return the kind of arrow that shows SUMO's `turns` (s, l, r, ...); None where it shows none of them."""
     names = [name for letter, name in (("s", "straight"), ("l", "left"), ("r", "right")) if letter in turns]
     return WAYS.get("_".join(names))
 
 
 def _along(edge: Edge, lane: Lane, way: ArrowKind) -> Iterator[Arrow]:
+    """Yield the arrows of one lane, `ARROWS_BEFORE_M` before its end, as far as the lane is long enough."""
     line = LineString(lane.shape)
     for before in ARROWS_BEFORE_M:
         middle = line.length - before

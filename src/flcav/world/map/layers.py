@@ -102,6 +102,7 @@ class MapLayers:
 
 
 def _plain(row: Any) -> Record:
+    """Return a record of the map as plain JSON values by field name."""
     values = ((field.name, getattr(row, field.name)) for field in fields(row))
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
@@ -110,6 +111,7 @@ def _plain(row: Any) -> Record:
 
 
 def _value(value: Any) -> Any:
+    """Return a JSON value as a field of a record has it: lists of points as arrays (K, 2), other lists as tuples."""
     if not isinstance(value, list):
         return value
     return np.array(value, dtype=np.float64) if value and isinstance(value[0], list) else tuple(value)

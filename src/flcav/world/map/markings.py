@@ -51,6 +51,7 @@ def markings(net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry) -> Iter
 
 
 def _drawn(net: RoadNet) -> Iterator[Marking]:
+    """Yield all markings of a net before they are clipped, edge by edge."""
     bends = _bends(net)
     facing: dict[tuple[str, str], list[Edge]] = {}
     for edge in net.edges.values():
@@ -77,6 +78,7 @@ def _drawn(net: RoadNet) -> Iterator[Marking]:
 
 
 def _between_lanes(lanes: list[Lane], approach: float) -> Iterator[Marking]:
+    """Yield the lines between neighbouring lanes (from the kerb to the middle); `approach` is as in `_broken`."""
     for right, left in pairwise(lanes):
         line = _beside(right, right.width / 2)
         if right.kind == left.kind == "driving":
@@ -87,6 +89,7 @@ def _between_lanes(lanes: list[Lane], approach: float) -> Iterator[Marking]:
 
 
 def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: float) -> Iterator[Marking]:
+    """Yield the centre line towards that edge of `across` (the opposite direction) which adjoins, else an edge line."""
     line = _beside(lanes[-1], lanes[-1].width / 2)
     for other in across:
         theirs = [lane for lane in other.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
@@ -142,6 +145,7 @@ def _entry(net: RoadNet, edge: Edge) -> Iterator[Marking]:
 
 
 def _controlled(net: RoadNet, edge: Edge) -> bool:
+    """Return whether an edge leads to a traffic light, a stop sign or a give-way sign."""
     junction = net.junctions.get(edge.end)
     return junction is not None and (
         junction.kind.startswith("traffic_light") or bool(set(net.right_of_way.get(edge.id, "")) & {"s", "m"})
@@ -175,6 +179,7 @@ def _beside(lane: Lane, left_m: float) -> Array:
 
 
 def _same(one: Array, other: Array) -> bool:
+    """Return whether two polylines (K, 2) coincide within `SAME_LINE_M`, at three points of the other."""
     line = LineString(one)
     whole = LineString(other)
     inner = [whole.interpolate(share, normalized=True) for share in (0.25, 0.5, 0.75)]

@@ -133,6 +133,7 @@ def _net(root: ElementTree.Element) -> RoadNet:
 
 
 def _refuse_unknown(what: str, named: Iterable[str], known: Container[str]) -> None:
+    """Raise `ValueError` for the first name that is not known."""
     for name in named:
         if name not in known:
             raise ValueError(f"no {what} has the id {shorten(name)}")
@@ -165,6 +166,7 @@ def _edge(row: ElementTree.Element) -> Edge:
 
 
 def _lane_kind(function: str, lane: ElementTree.Element) -> LaneKind:
+    """Return the kind of a lane from its edge's function and the vehicle classes that may use it."""
     if function == "crossing" or function == "walkingarea":
         return function
     if lane.get("disallow") == "all":
@@ -173,11 +175,13 @@ def _lane_kind(function: str, lane: ElementTree.Element) -> LaneKind:
 
 
 def _points(text: str) -> Array:
+    """Return the points (K, 2) of SUMO's "x,y x,y ..." without heights; raises `ValueError` for other text."""
     rows = [[_number(part) for part in point.split(",")[:2]] for point in text.split()]
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 
 
 def _number(text: str) -> float:
+    """Return a number; raises `ValueError` for NaN, for other text and beyond `FARTHEST_M`."""
     value = float(text)
     if not abs(value) <= FARTHEST_M:
         raise ValueError(f"{text} is no place in a town")

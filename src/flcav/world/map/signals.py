@@ -52,6 +52,7 @@ Head = tuple[tuple[float, float, float], float, tuple[float, float], str]
 
 
 def _approach(edge: Edge, connections: tuple[Connection, ...], sensors: Array) -> Iterator[Head]:
+    """Yield position, yaw, foot and link of each head of one approach."""
     driven = edge.lanes_of("driving")
     names = {lane.id for lane in driven}
     ruled = [way for way in connections if way.light and way.start in names]

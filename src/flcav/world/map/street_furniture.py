@@ -30,6 +30,7 @@ class Plot:
     """Occupancy of a town's land: the area closed to building, and the footprints of what has been built."""
 
     def __init__(self, closed: BaseGeometry) -> None:
+        """Start without buildings; `closed` is the area that stays free, world frame [m]."""
         self._closed = closed
         shapely.prepare(self._closed)
         self._taken: list[Polygon] = []
@@ -199,6 +200,7 @@ def _kerb_side(edge: Edge, before_end_m: float) -> tuple[float, float, float]:
 
 
 def _stations(verge: Verge, spacing_m: float, random: np.random.Generator) -> Iterator[float]:
+    """Yield places along a verge [m], jittered by up to 30 % about `spacing_m`."""
     along = spacing_m * random.uniform(0.2, 0.8)
     while along < verge.line.length - 2.0:
         yield float(along)

@@ -104,6 +104,7 @@ def _folder(name: str, beside: Path | None) -> Path:
 
 
 def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
+    """Raise `InputError` where the parameters lack a street type, or a pole is on an edge without a sidewalk."""
     if missing := sorted({edge.type for edge in net.streets} - set(parameters.streets)):
         raise InputError(f"{origin}: field 'streets' lacks the street type '{missing[0]}' of the net")
     walked = {edge.id for edge in net.streets if edge.lanes_of("sidewalk")}
@@ -113,6 +114,7 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
 
 
 def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:
+    """Return the town of a net: ground first, then buildings, clutter, trees, poles, signs, lamps and signals."""
     ground = surfaces(net, {kind: street.frontage_m for kind, street in parameters.streets.items()})
     rows = list(placement.verges(net, parameters))
     paved = ground.roads.union(ground.sidewalks)

@@ -77,6 +77,7 @@ class _Lower:
 
     @classmethod
     def of(cls, profile: Profile, length: float, half_width: float, height: float) -> "_Lower":
+        """Return the cross sections of a profile at these dimensions [m], denser around the wheel arches."""
         radius = profile.wheel_radius * ARCH
         arches = [axle * length + np.linspace(-1.02, 1.02, 9) * radius for axle in profile.axles]
         edges = [] if profile.bed is None else [profile.bed[0], profile.bed[0] + 0.004]
@@ -119,6 +120,7 @@ def _floor(lower: _Lower) -> Mesh:
 
 
 def _end(lower: _Lower, *, front: bool) -> Mesh:
+    """Return the front or the rear, with bumper, licence plate, lamps and grille."""
     at = -1 if front else 0
     height = lower.belt[at] - lower.clearance
     y = np.linspace(-1, 1, 9) * lower.half[at]
@@ -186,6 +188,7 @@ def _cabin_frame(profile: Profile, lower: _Lower, length: float) -> tuple[float,
 
 
 def _headroom(profile: Profile, length: float, height: float, x: float, waist: float) -> float:
+    """Return the height of the roof above the waist at `x` [m]."""
     u, z = np.transpose(profile.roof)
     return float(np.interp(x / length, u, z) * height - waist)
 
@@ -206,6 +209,7 @@ def _interior(profile: Profile, lower: _Lower, length: float, height: float) -> 
 
 
 def _driver(profile: Profile, lower: _Lower, length: float, height: float) -> Mesh:
+    """Return the head and torso of the driver, on the left front seat."""
     _, end, waist = _cabin_frame(profile, lower, length)
     x, side = end - FRONT_SEAT_M + 0.16, float(lower.half.max()) * 0.45
     chin = min(0.22, 0.85 * _headroom(profile, length, height, x, waist) - 0.24)

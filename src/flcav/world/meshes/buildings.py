@@ -60,4 +60,5 @@ def _gable(length: float, width: float, walls: float, height: float) -> Mesh:
 
 
 def _one(material: Material) -> np.ndarray:
+    """Return the material of a mesh of one face."""
     return np.array([material], np.uint8)

@@ -98,6 +98,7 @@ def candidate_poles(net: RoadNet) -> list[PoleParameters]:
 
 
 def _count(net: RoadNet, kind: str, per_km: float) -> int:
+    """Return the number of road users for the lanes of a kind, `MOST` at most."""
     metres = sum(LineString(lane.shape).length for edge in net.streets for lane in edge.lanes_of(kind))
     return min(round(per_km * metres / 1000), MOST)
 
@@ -107,6 +108,7 @@ def _length(edge: Edge) -> float:
 
 
 def _bend(edge: Edge) -> float:
+    """Return the largest distance of an edge's outermost lane from its chord [m]."""
     line = edge.lanes[0].shape
     chord = LineString(line[[0, -1]])
     return float(np.max(shapely.distance(shapely.points(line), chord)))

@@ -69,6 +69,7 @@ def join(prefix: Path, net: Path, origin: Path) -> None:
 
 
 def _run(options: dict[str, str], origin: Path) -> None:
+    """Run netconvert; raises `InputError` where it is missing, or with its first error where it fails."""
     found = importlib.util.find_spec("sumo")
     if found is None or not found.submodule_search_locations:
         raise InputError(f"importing towns needs SUMO's netconvert, which is not installed: {installation('towns')}")

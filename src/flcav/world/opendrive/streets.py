@@ -42,6 +42,8 @@ class Rewritten:
 
 @dataclass(frozen=True)
 class _Lane:
+    """A lane of the town."""
+
     kind: str  # a key of ALLOWED
     width: float  # [m]
     before: int | None  # its index in the map; None for an added lane
@@ -128,6 +130,7 @@ def _plain_lanes(row: ElementTree.Element) -> list[dict[str, str]]:
 
 
 def _kind(lane: dict[str, str]) -> str:
+    """Return the kind of a lane, a key of `ALLOWED`, from its OpenDRIVE type and SUMO's permissions."""
     kind = lane.get("type", "driving")
     if kind in WALKED:
         return "sidewalk"
@@ -141,6 +144,7 @@ def _kind(lane: dict[str, str]) -> str:
 
 
 def _write_edge(row: ElementTree.Element, lanes: list[_Lane], road: Road) -> None:
+    """Rewrite an edge in place: street type, priority, speed limit, and its lanes with their permissions."""
     old = _plain_lanes(row)
     driven = [lane.before for lane in lanes if lane.kind == "driving" and lane.before is not None]
     speed = road.speed or float(old[driven[0]].get("speed", "13.89"))
@@ -156,6 +160,7 @@ def _write_edge(row: ElementTree.Element, lanes: list[_Lane], road: Road) -> Non
 
 
 def _connect(root: ElementTree.Element, kept: dict[str, dict[int, int]]) -> None:
+    """Rewrite the connections in place with the town's lane indices; those of lanes not `kept` are removed."""
     for row in list(root):
         if row.tag != "connection":
             continue
@@ -193,6 +198,7 @@ def _open_short_lanes(root: ElementTree.Element, length: dict[str, float]) -> No
 
 
 def _length(row: ElementTree.Element) -> float:
+    """Return the length of an edge's shape [m]."""
     points = np.array([point.split(",")[:2] for point in row.attrib["shape"].split()], dtype=np.float64)
     return float(np.hypot(*np.diff(points, axis=0).T).sum())
 

@@ -135,6 +135,7 @@ class Embree:
     """The Embree engine."""
 
     def __init__(self) -> None:
+        """Test the library, once per process; raises `OSError` where it is missing or traces a known scene wrongly."""
         _self_test()
 
     def solid(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> Solid:
@@ -195,6 +196,7 @@ def _trace(
     far_m: float,
     threads: int,
 ) -> Hits:
+    """Return the first hit of each ray with the Embree scene `handle`, in whole packets by each thread."""
     rays, near, hits = _buffers(directions, near_m)
     origin = target_from_rays[:3, 3].astype(np.float32)
     rotation = np.ascontiguousarray(target_from_rays[:3, :3], np.float32)
@@ -227,6 +229,7 @@ def _trace(
 
 @lru_cache(maxsize=1)
 def _device() -> int:
+    """Return the Embree device of this process; raises `OSError` where it cannot start."""
     device = c.embree_library().rtcNewDevice(b"threads=1")
     if not device:
         raise OSError("Embree could not start on this machine")
@@ -235,10 +238,12 @@ def _device() -> int:
 
 @lru_cache(maxsize=2)
 def _address(function: str) -> int:
+    """Return the address of a function of the Embree library."""
     return ctypes.cast(getattr(c.embree_library(), function), ctypes.c_void_p).value or 0
 
 
 def _check(doing: str) -> None:
+    """Raise `OSError` where the device reports an error since the last check."""
     code = c.embree_library().rtcGetDeviceError(_device())
     if code:
         raise OSError(f"Embree failed with error {code} while {doing}")

@@ -96,4 +96,5 @@ def embree_library() -> ctypes.CDLL:
 
 
 def _matching(folders: tuple[Path, ...], stem: str) -> list[Path]:
+    """Return the library files of a name, with or without the prefix "lib", sorted."""
     return sorted(path for folder in folders for prefix in ("lib", "") for path in folder.glob(f"{prefix}{stem}*.*"))

@@ -55,6 +55,7 @@ class Director:
         self.stage.react(careless=self._busy)
 
     def _play(self, number: int, scenario: Scenario) -> Generator[None, None, None]:
+        """Try to cast a scenario every `LOOKS_AGAIN` steps, then note its event and run its script."""
         cast, act = SCRIPTS[scenario.kind]
         while (roles := cast(self.stage, scenario)) is None or self._busy & set(named(roles)):
             for _ in range(LOOKS_AGAIN):

@@ -94,6 +94,7 @@ def _beside(stage: Stage, ego: Spot) -> str | None:
 
 
 def _stands_at(ego: Spot, kind: str) -> float:
+    """Return the place of the front of a car at the kerb along the lane, `CLOSE_M` ahead of the ego [m]."""
     return ego.along + CLOSE_M + length_of(kind)
 
 
@@ -103,6 +104,7 @@ def _kerb(lane: Lane, kind: str) -> float:
 
 
 def _pull_out(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, None, None]:
+    """Let a car that has stood at the kerb pull out ahead of the vehicle under test and drive on with the traffic."""
     kind = scenario.actors.get("car", DEFAULT_CAR)
     name, lane, along = stage.cast(kind), roles.spot.lane, _stands_at(roles.spot, kind)
     aside = _kerb(lane, kind)
@@ -171,6 +173,7 @@ def width_of(kind: str) -> float:
 
 
 def _shape(kind: str) -> tuple[float, float]:
+    """Return length and width of a vehicle type [m]."""
     category, _, name = kind.partition(".")
     return next((shape.length, shape.width) for shape in SHAPES[category] if shape.name == name)
 

@@ -81,6 +81,7 @@ def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[Non
 
 
 def _walker(stage: Stage, roles: BehindVan, left: float) -> tuple[float, float, float]:
+    """Return x, y [m] and heading [rad] of the pedestrian, `left` metres to the left of the lane's middle."""
     x, y, heading = stage.point(roles.spot.lane, roles.along, left)
     return x, y, heading + math.pi / 2
 

@@ -171,11 +171,13 @@ def draw_type(category: str, parameters: TownParameters, random: np.random.Gener
 
 
 def _vehicle(name: str, kind: str, depart: float, edges: list[str]) -> Element:
+    """Return SUMO's <trip> of a vehicle along `edges`."""
     row = {"id": name, "type": kind, "depart": f"{depart:.1f}", "departPos": "random_free", "departLane": "best"}
     return Element("trip", row | {"from": edges[0], "to": edges[-1], "via": " ".join(edges[1:-1])})
 
 
 def _person(name: str, kind: str, depart: float, edges: list[str]) -> Element:
+    """Return SUMO's <person> who walks along `edges`."""
     person = Element("person", {"id": name, "type": kind, "depart": f"{depart:.1f}", "departPos": "random"})
     SubElement(person, "walk", {"from": edges[0], "to": edges[1]})
     for edge in edges[2:]:

@@ -70,6 +70,7 @@ def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
 def _run(
     net: Path, demand: str, seed: int, steps: NDArray[np.int64], scenarios: Sequence[Scenario]
 ) -> dict[str, NDArray]:
+    """Return the arrays of `sumo_process.run`; raises `RuntimeError` where SUMO fails."""
     with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
         folder = Path(name)
         (folder / "routes.rou.xml").write_text(demand, encoding="utf-8")
@@ -91,6 +92,7 @@ def _trace(
     windows: tuple[NDArray[np.int64], ...],
     parked: list[Parked],
 ) -> Trace:
+    """Return the trace of SUMO's states, averaged over `windows` (rows of the steps before, at and after the times)."""
     before, now, after = windows
     earlier, state, later = (_smooth(raw, window) for window in (before, now, after))
     rates = _rates(earlier, state, later)
@@ -218,11 +220,13 @@ def _beside(raw: dict[str, NDArray], parked: list[Parked]) -> list[Parked]:
 
 
 def _pavement(town: Town) -> BaseGeometry:
+    """Return the union of the sidewalks, prepared for queries."""
     pavement = shapely.union_all([Polygon(outline) for outline in town.sidewalks])
     shapely.prepare(pavement)
     return pavement
 
 
 def _natural(name: str) -> tuple[str, int]:
+    """Return the key that sorts names by their number: "veh2" before "veh10"."""
     kind = name.rstrip("0123456789")
     return kind, int(name[len(kind) :])
