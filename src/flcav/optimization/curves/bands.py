@@ -31,11 +31,7 @@ class Bands:
     k: int  # edge rounds per cloud round
 
     def between(self, resources: Array) -> tuple[Array, Array]:
-<<<<<<< HEAD
-        """Return the lower and upper band of the error (n,) at `resources` (n, 3); inf where curves have no end."""
-=======
-        """Return the lower and the upper band of the error, (n,) each, at `resources` (n, 3)."""
->>>>>>> w_opt
+        """Return the lower and the upper band of the error, (n,) each, at `resources` (n, 3); inf where it has no end."""
         errors = np.array([curve.error(*resources.T, k=self.k) for curve in self.curves])
         with np.errstate(invalid="ignore"):  # between infinite errors
             low, high = np.quantile(errors, (0.5 - self.level / 2, 0.5 + self.level / 2), axis=0)
