@@ -1,4 +1,4 @@
-"""By what results were made: revision, versions, kind of processor, threads, seed. Nothing of when."""
+"""Provenance of results: git revision, versions, kind of processor, threads and seed; no times."""
 
 import functools
 import platform
@@ -16,7 +16,7 @@ LEARNING = ("flwr", "scipy", "torch")  # packages that decide results, beside th
 
 @dataclass(frozen=True)
 class Provenance:
-    """What would have to be the same for the same result."""
+    """What has to be equal for equal results."""
 
     revision: str | None  # of git; None where flcav does not run from a checkout
     uncommitted: bool  # changes since that revision, in the package's folder
@@ -27,7 +27,7 @@ class Provenance:
 
 
 def provenance(seed: int | None = None) -> Provenance:
-    """Return the provenance of what this process makes on its processor."""
+    """Return the provenance of results that this process computes on its CPU."""
     import torch  # here, so that steps without networks start without it
 
     from flcav.perception.device import CPU, processor_of
@@ -43,7 +43,7 @@ def versions() -> dict[str, str]:
         try:
             found |= package_versions((name,))
         except PackageNotFoundError:
-            continue  # embreex is not everywhere
+            continue  # embreex is not on every platform
     return found
 
 
