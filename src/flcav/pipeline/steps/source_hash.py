@@ -61,9 +61,7 @@ class Sources:
             if module is None:
                 continue
             if package := name.rpartition(".")[0]:
-                left += (
-                    [(package, "")] if (package, "") not in seen else []
-                )  # a package's code runs before its modules'
+                left += [(package, "")] if (package, "") not in seen else []  # a package runs before its modules
                 seen.add((package, ""))
             for statement in {*module.always, *module.binding(wanted)} - found.setdefault(name, set()):
                 found[name].add(statement)
