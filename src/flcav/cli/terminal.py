@@ -1,4 +1,4 @@
-"""The terminal: width, live progress of steps, and what Ctrl-C leaves."""
+"""Terminal output: a plain console, live progress of steps, and messages for Ctrl-C."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from flcav.pipeline.steps import FINISHED, Notify
 
 
 def plain_console() -> Console:
-    """Return stdout's console; brackets and colons in what is printed are neither markup nor emoji."""
+    """Return a console on stdout without markup and emoji, since users' names may hold brackets and colons."""
     return Console(highlight=False, markup=False, emoji=False)
 
 
@@ -18,12 +18,12 @@ GOES_ON = "the same command goes on where it stopped"
 
 
 class Interrupted(Exception):
-    """Raised for Ctrl-C; the message says what is kept."""
+    """Raised for Ctrl-C; the message says what is kept of the work."""
 
 
 @contextlib.contextmanager
 def when_interrupted(kept: Callable[[], str] = lambda: GOES_ON) -> Iterator[None]:
-    """Turn Ctrl-C within into `Interrupted`, with what `kept` says then. Typer itself would leave a bare exit code."""
+    """Turn Ctrl-C within the context into `Interrupted` with the message of `kept`; Typer only sets an exit code."""
     try:
         yield
     except KeyboardInterrupt:
