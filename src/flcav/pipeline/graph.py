@@ -147,7 +147,7 @@ class Graph:
         starts = recipe.with_role("pretrain")
         pools = {task: [names.recording(region, "pool", task) for region in starts] for task in recipe.tasks}
         asked = recipe.model_dump(mode="json", exclude={"arms", "splits", "training", "recording", "placement"})
-        asked["placement"] = {"tasks": []}  # has no part in the plan, and its default asks for objects
+        asked["placement"] = {"tasks": []}  # not part of the plan; the default would depend on objects
         asked["federation"] = {"edge_rounds_per_cloud_round": recipe.federation.edge_rounds_per_cloud_round}
         planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "histories": self._histories()}
         plan = names.plan(arm.name)

@@ -11,15 +11,15 @@ from pathlib import Path
 import flcav
 from flcav.dataset.layout import PACKAGES, package_versions
 
-LEARNING = ("flwr", "scipy", "torch")  # packages that decide results, beside those that decide recordings
+LEARNING = ("flwr", "scipy", "torch")  # packages that affect results, beside those that affect recordings
 
 
 @dataclass(frozen=True)
 class Provenance:
     """What has to be equal for equal results."""
 
-    revision: str | None  # of git; None where flcav does not run from a checkout
-    uncommitted: bool  # changes since that revision, in the package's folder
+    revision: str | None  # of git; None without a checkout
+    uncommitted: bool  # whether the package's files have changed since that revision
     versions: Mapping[str, str]
     processor: str  # kind of, see `flcav.perception.device`
     threads: int
@@ -37,7 +37,7 @@ def provenance(seed: int | None = None) -> Provenance:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that decide results, as far as they are installed."""
+    """Return the versions of Python and of the installed packages that affect results."""
     found = {"python": platform.python_version()}
     for name in sorted({*PACKAGES, *LEARNING}):
         try:

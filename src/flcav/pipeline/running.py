@@ -80,7 +80,7 @@ def run(
     """
     out = Path(out)
     if (out / RESULTS).exists():
-        Run.load(out, RESULTS)  # of this version, or there is nothing here to go on with
+        Run.load(out, RESULTS)  # raises for results of another version
     graph, clock = Graph(recipe, Path(beside or ".")), stopwatch(out / WORK)
 
     def timed(step: str, done: int, total: int, note: str) -> None:
@@ -208,7 +208,9 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
             Ledger.load(work / names.edge(arm.name, region, task) / LEDGER) for task in tasks for region in arm.regions
         ]
     if CLOUD in arm.stages:
-        books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they go on from those
+        books = [
+            Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks
+        ]  # which continue those of stage II
     budgets = graph.recipe.budgets_mb
     book = Ledger(Budget(budgets.wireless, budgets.wireline), (entry for each in books for entry in each.entries))
     book.save(work.parent / "ledgers" / f"{arm.name}.parquet")

@@ -120,7 +120,7 @@ class ArmsResult(Record):
 
     seeds: tuple[ArmsSeed, ...]
     summary: ArmsSummary
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: not in results of before
+    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
     note: str = "road labels come from an ideal road detector: arms with a pole are upper bounds"
 
@@ -210,7 +210,7 @@ def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
 
 
 def _known(number: float | None) -> float:
-    assert number is not None  # every town has cars to find
+    assert number is not None  # every town has targets
     return number
 
 

@@ -44,7 +44,7 @@ from flcav.sources.recipe import Recipe
 
 WIDE, NARROW, LIDAR = "wide", "narrow", "velodyne"
 CAMERA = {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 640, "height": 384}}
-PRESENT = 5  # the spin that is shown: 2.5 s after the first, 3.5 s before the last
+PRESENT = 5  # spin that is shown: 2.5 s after the first, 3.5 s before the last
 RECIPE: Mapping[str, Any] = {
     "town": "grid",
     "seed": 79,
@@ -63,7 +63,7 @@ RECIPE: Mapping[str, Any] = {
 }
 MAP_M = 50.0  # shown to either side of the observer
 SCORE = 0.3  # lowest score that is shown
-CELL_M = 0.4  # of the voxels drawn: four of the network's, whose own would be too small to see
+CELL_M = 0.4  # of a drawn voxel, four of the network's wide: its own would be too small to see
 WAY, SELF, OTHERS, PEDESTRIAN = (0.75, 0.87, 0.95), (0.84, 0.37, 0), (0.0, 0.45, 0.7), (0.8, 0.47, 0.65)
 RASTER_COLOURS = {
     **dict(zip(("road", "lane", "crossing"), MAP_COLOURS, strict=True)),

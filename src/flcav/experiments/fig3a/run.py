@@ -83,7 +83,7 @@ class Fig3a(Record):
     own: OwnCurves
     findings: tuple[str, ...]
     level: float = LEVEL  # confidence level of the bands
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # not in results of before
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
 
 
 def fig3a() -> Fig3a:

@@ -79,6 +79,6 @@ class AllocationResult(Record):
     seeds: tuple[AllocationSeed, ...]
     summary: AllocationSummary
     findings: tuple[PlanFinding, ...] = ()
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: not in results of before
+    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
     note: str = "road labels come from an ideal road detector: AP after edge FL and cloud FL is an upper bound"

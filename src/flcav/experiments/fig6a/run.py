@@ -105,7 +105,7 @@ def _difference(estimate: Estimate | None) -> Estimate:
 
 
 def _history_ranges() -> dict[str, tuple[float, float]]:
-    """Return the least and the most of each count in the history that both plans were predicted from."""
+    """Return the least and most of each count in the history that both plans are predicted from."""
     columns = history_of(TASK).resources.T
     return {name: (float(column.min()), float(column.max())) for name, column in zip(COUNTS, columns, strict=True)}
 

@@ -86,7 +86,7 @@ class SimToReal(Record):
     clouds: Mapping[str, CloudNumbers]  # by origin: `REAL`, or a name in `RIGS`
     scores: tuple[RealScore, ...]
     frames: tuple[Story, ...]
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # not in results of before
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
 
 
 def run_sim_to_real(

@@ -123,7 +123,7 @@ def run_study(
     """
     recipe = study.recipe.at_scale(scale)
     study = replace(study, recipe=recipe)
-    assert study.evaluation  # before hours of work
+    assert study.evaluation  # raises before hours of work
     values = run_steps(steps_of(study, seeds), out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     runs = tuple(_seed_result(study, seed, values) for seed in seeds)
     return StudyResult(

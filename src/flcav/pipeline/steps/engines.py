@@ -75,7 +75,7 @@ def perform(step: Step, folder: Path, record: Record, made_by: Provenance, repor
 
 
 def seed_in(arguments: Mapping[str, Any]) -> int | None:
-    """Return the seed among a step's arguments, or in one of them: a recipe, a protocol; None where there is none."""
+    """Return the seed among a step's arguments or the fields of one of them, such as a recipe; None without one."""
     for values in (arguments, *arguments.values()):
         seed = values.get("seed") if isinstance(values, Mapping) else getattr(values, "seed", None)
         if isinstance(seed, int):

@@ -79,7 +79,7 @@ class Record:
 
 
 def digest(value: Any, **how: Any) -> str:
-    """Return a short hash of a JSON value."""
+    """Return the first 16 digits of the SHA-256 of a JSON value, in hexadecimal; `how`: options of `json.dumps`."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, **how).encode()).hexdigest()[:16]
 
 
@@ -98,7 +98,7 @@ def held_in(folder: Path) -> Record | None:
 
 
 def value_of(folder: Path) -> Any:
-    """Return the value of the finished step in `folder`."""
+    """Read the value of the finished step in `folder`."""
     return json.loads((folder / DONE).read_text())["value"]
 
 

@@ -131,7 +131,7 @@ class CloudNumbers:
 
 @style.styled
 def compare(clouds: Mapping[str, CloudNumbers]) -> Figure:
-    """Return four panels: returns per range, intensities, the street ahead, returns per car."""
+    """Return four panels: returns by range, distribution of intensity, intensity of the street, returns by car."""
     figure = style.canvas(9.0, 6.4)
     ranges, intensity, ground, cars = figure.subplots(2, 2).ravel()
     for numbers, colour in zip(clouds.values(), COLOURS, strict=False):

@@ -74,7 +74,7 @@ def _on_page(points: Array, observer: Array) -> Array:
 
 
 def paths_key(paths: Paths) -> list[Line2D]:
-    """Return legend entries of what `paths_on_map` draws."""
+    """Return the legend of `paths_on_map`."""
     horizon_s = paths.times_s[-1]
     handles = [
         Line2D([], [], linestyle="none", marker="^", markersize=6, color=style.INK, label="observer"),
