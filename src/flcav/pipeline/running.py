@@ -208,9 +208,7 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
             Ledger.load(work / names.edge(arm.name, region, task) / LEDGER) for task in tasks for region in arm.regions
         ]
     if CLOUD in arm.stages:
-        books = [
-            Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks
-        ]  # which continue those of stage II
+        books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they include the others
     budgets = graph.recipe.budgets_mb
     book = Ledger(Budget(budgets.wireless, budgets.wireline), (entry for each in books for entry in each.entries))
     book.save(work.parent / "ledgers" / f"{arm.name}.parquet")
