@@ -42,7 +42,7 @@ SPINS = 2
 
 
 def recipe(cameras: bool = False, spins: int = SPINS, scenes: int = 1) -> Recipe:
-    """Return five vehicles and nine roadside suites."""
+    """Return the recipe of five vehicles and nine roadside suites."""
     return Recipe.model_validate(
         {
             "town": "grid",
@@ -149,7 +149,7 @@ def growth_with_actors(repeats: int) -> dict[int, float]:
 
 
 def _together(one: Trace, other: Trace) -> Trace:
-    """Return the actors of two runs in one."""
+    """Return the union of the actors of two traffic runs."""
     names = {name: np.concatenate((getattr(one, name), getattr(other, name))) for name in ("category", "shape", "size")}
     moving = {
         name: np.concatenate((getattr(one, name), getattr(other, name)), axis=1)
@@ -160,7 +160,7 @@ def _together(one: Trace, other: Trace) -> Trace:
 
 
 def _first(trace: Trace, count: int) -> Trace:
-    """Return the trace with so many actors, as far apart in the table as they can be; "cav0" is one of them."""
+    """Return the trace with `count` actors, evenly spaced in the table; "cav0" is one of them."""
     kept = np.flatnonzero(trace.present[0])
     kept = np.unique(
         np.concatenate((np.flatnonzero(trace.actor == "cav0"), kept[np.linspace(0, len(kept) - 1, count, dtype=int)]))
@@ -171,7 +171,7 @@ def _first(trace: Trace, count: int) -> Trace:
 
 
 def memory_mb(frames: Sequence[int]) -> dict[int, float]:
-    """Return the peak memory of a process that records so many frames."""
+    """Return the peak memory [MB] of a process that records each number of frames."""
     found = {}
     for count in frames:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
@@ -189,7 +189,7 @@ def _peak_mb(frames: int) -> float:
 
 
 def encodings() -> dict[str, dict[str, float]]:
-    """Return kB, CPU-ms and PSNR [dB] (inf where nothing is lost) of ways to write an image of 640 x 384."""
+    """Return size [kB], CPU time [ms] and PSNR [dB] (inf: lossless) of each encoding of an image of 640 x 384."""
     source = EmbeddedSource(recipe(cameras=True))
     scene = Scene(source.town, source.trace(source.scenes()[0]))
     image = observe(scene, source.recipe.vehicle_rig, "cav0", 0, scene_name="s", seed=0).images["front"]

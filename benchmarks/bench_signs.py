@@ -1,4 +1,4 @@
-"""What one training sample and one inference of each sign detector cost, on pictures of recipes/signs.yaml.
+"""CPU time of one training sample and one inference of each sign detector, on pictures of recipes/signs.yaml.
 
 CPU milliseconds at one thread, medians, the networks taken in turns: a training sample is augmentation, targets,
 forward, loss, backward and optimiser on a window, in batches of the task's practice; inference is a whole picture.
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def training(network: SignDetector, samples: list[Sample], batch: int) -> Callable[[], object]:
-    """Return what takes one optimiser step of the network."""
+    """Return a function that takes one optimiser step of the network."""
     optimizer = adamw(network.train(), SIGNS.practice.learning_rate)
 
     def work() -> float:
@@ -59,7 +59,7 @@ def training(network: SignDetector, samples: list[Sample], batch: int) -> Callab
 
 
 def inference(network: SignDetector, samples: list[Sample]) -> Callable[[], object]:
-    """Return what finds boxes in one picture."""
+    """Return a function that detects signs in one picture."""
     return lambda: detect(network, samples[0].picture, threshold=LOWEST_SCORE)
 
 

@@ -1,4 +1,4 @@
-"""What one training sample and one inference cost of every network of every task, in CPU milliseconds at one thread.
+"""CPU time [ms] of one training sample and one inference of every network of every task, at one thread.
 
 A training sample is augmentation, forward, loss, backward and optimiser, the median of some steps of the task's batch
 but for the paper's networks, whose batches are of two. An inference is what `flcav infer` does with one input, reading

@@ -1,4 +1,4 @@
-"""What one training sample and one prediction of the trajectory networks cost, and extracting a sample.
+"""CPU time of one training sample and one prediction of the trajectory networks, and of extracting a sample.
 
 CPU milliseconds at one thread, median over steps of 16 samples: batch, forward, loss, backward and optimiser. The
 reference, 2.9 to 5.8, is a prototype (an LSTM with small convolutions on one raster of 64 x 64) on another machine,
@@ -53,7 +53,7 @@ def extraction_ms() -> float:
 
 
 def made_sample(config: TrajectoryConfig) -> Sample:
-    """Return a sample of random numbers."""
+    """Return a sample of random numbers with the configuration's shapes."""
     random = np.random.default_rng(0)
     cells, cameras = config.patch.cells, config.cameras
     surround = cameras and Surround(

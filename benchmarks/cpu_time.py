@@ -1,4 +1,4 @@
-"""CPU time of several works, taken in turns."""
+"""Median CPU time of several functions, run in turns."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -7,7 +7,7 @@ import numpy as np
 
 
 def cpu_ms(works: Sequence[Callable[[], object]], repeats: int) -> list[float]:
-    """Return the median CPU-ms of each of `works`, run in turns so that a busy machine slows them alike."""
+    """Return the median CPU time [ms] of each of `works`, run in turns so that load slows them alike."""
     taken = np.empty((repeats, len(works)))
     for repeat in range(-1, repeats):
         for number, work in enumerate(works):

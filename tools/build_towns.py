@@ -1,12 +1,12 @@
-"""Rebuild the road nets of the towns: nodes and streets written here, joined by SUMO's netconvert.
+"""Build the road nets of the towns from the nodes and streets defined here, by SUMO's netconvert.
 
 Run with an environment that has `eclipse-sumo` (the extra `towns`):
 
     python tools/build_towns.py  # writes src/flcav/world/towns/<name>/town.net.xml, and recipes/maps/quarter.xodr
 
-The nets are committed; a town's other properties stand in `town.yaml` beside its net. The quarter is a map (OpenDRIVE)
-to be imported: streets alone, without sidewalks or crossings, as maps often are. Right-hand traffic. An edge lists
-its lanes from the kerb to the middle: sidewalk, bicycle lane, parking lane (closed to all traffic), driving lanes.
+The nets are committed; a town's other properties are in `town.yaml` beside its net. The quarter is a map (OpenDRIVE)
+to be imported: streets without sidewalks or crossings, as maps often are. Traffic is right-hand. An edge lists its
+lanes from the kerb to the middle: sidewalk, bicycle lane, parking lane (closed to all traffic), driving lanes.
 """
 
 import math
@@ -41,7 +41,7 @@ class Profile(NamedTuple):
 
 @dataclass
 class Sketch:
-    """A town on the drawing board."""
+    """A road net under construction: nodes, edges, connections, roundabouts."""
 
     profiles: dict[str, Profile]
     nodes: dict[str, tuple[Point, str]] = field(default_factory=dict)
@@ -50,11 +50,11 @@ class Sketch:
     roundabouts: list[str] = field(default_factory=list)
 
     def node(self, name: str, at: Point, kind: str = "priority") -> None:
-        """Put a junction of a SUMO node type."""
+        """Add a junction at `at` [m]; `kind`: a SUMO node type."""
         self.nodes[name] = (at, kind)
 
     def edge(self, name: str, start: str, end: str, kind: str, via: Iterable[Point] = ()) -> None:
-        """Draw one direction from `start` to `end`, through the points `via`; `kind` names a profile."""
+        """Add one direction of a street from `start` to `end` through the points `via`; `kind` names a profile."""
         profile = self.profiles[kind]
         shape = [self.nodes[start][0], *via, self.nodes[end][0]]
         text = " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
@@ -66,7 +66,7 @@ class Sketch:
         )
 
     def street(self, start: str, end: str, kind: str, via: tuple[Point, ...] = ()) -> None:
-        """Draw both directions; the edges are called `start_end` and `end_start`."""
+        """Add both directions of a street; the edges are named `start_end` and `end_start`."""
         self.edge(f"{start}_{end}", start, end, kind, via)
         self.edge(f"{end}_{start}", end, start, kind, via[::-1])
 
@@ -90,7 +90,7 @@ class Sketch:
         ]
 
     def roundabout(self, name: str, centre: Point, radius: float, arms: dict[str, float], kind: str) -> None:
-        """Draw a roundabout; `arms` maps the suffix of each of its nodes to the node's bearing [deg], increasing."""
+        """Add a roundabout; `arms` maps the suffix of each of its nodes to the node's bearing [deg], increasing."""
         names = list(arms)
         for suffix, bearing in arms.items():
             self.node(f"{name}{suffix}", on_circle(centre, radius, math.radians(bearing)))
@@ -105,7 +105,7 @@ class Sketch:
         )
 
     def build(self, out: Path) -> None:
-        """Join the sketch to a net at `out`; raises `CalledProcessError` where netconvert refuses."""
+        """Write the sketch as a net, or OpenDRIVE map, to `out`; raises `CalledProcessError` where netconvert fails."""
         types = [
             f'<type id="{kind}" numLanes="{p.lanes}" width="{p.lane_m}" speed="{p.speed}" priority="{p.priority}" '
             + f'sidewalkWidth="{p.sidewalk_m}" '
@@ -138,7 +138,7 @@ class Sketch:
         out.write_text(text)
 
     def _format(self, out: Path) -> list[str]:
-        """Return netconvert's options for an OpenDRIVE map or a net with crossings, as the name `out` ends."""
+        """Return netconvert's output options by the suffix of `out`: an OpenDRIVE map, or a net with crossings."""
         if out.suffix == ".xodr":
             return ["--opendrive-output", str(out)]
         crossings = ["--crossings.guess", "true", "--crossings.guess.speed-threshold", "20", "--walkingareas", "true"]
@@ -146,7 +146,7 @@ class Sketch:
 
 
 def on_circle(centre: Point, radius: float, bearing: float) -> Point:
-    """Return the point of a circle at a bearing [rad]."""
+    """Return the point of a circle at a bearing [rad], counter-clockwise from the x axis."""
     return centre[0] + radius * math.cos(bearing), centre[1] + radius * math.sin(bearing)
 
 

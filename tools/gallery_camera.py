@@ -28,25 +28,25 @@ SIX = (60.0, 0.0, -60.0, 120.0, 180.0, -120.0)  # yaw of each of six cameras [de
 
 @lru_cache(maxsize=2)
 def scene_of(town: str) -> Scene:
-    """Return a busy instant of a town."""
+    """Return a scene of a town with dense traffic."""
     built = load_town(town)
     return Scene(built, simulate(built, seed=1, cavs=3, times_s=np.arange(40.0, 42.01, 0.5).round(1)))
 
 
 def shoot(scene: Scene, world_from_body: NDArray, weather: str, camera: Camera, hidden: int | None = None) -> Picture:
-    """Return one picture by a camera that looks along a body's x axis."""
+    """Return the picture of a camera that looks along a body's x axis."""
     at = world_from_body @ BODY_FROM_OPTICAL
     return photograph(scene, at, camera, WEATHERS[weather], np.random.default_rng(0), hidden=hidden).rgb
 
 
 def sheet(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Return pictures of one size as one, row after row."""
+    """Return pictures of one size tiled into one, row by row."""
     rows = [np.concatenate(pictures[first : first + columns], axis=1) for first in range(0, len(pictures), columns)]
     return np.concatenate(rows, axis=0)
 
 
 def ego(scene: Scene) -> tuple[int, NDArray]:
-    """Return the first CAV and where its windscreen camera is."""
+    """Return the first CAV and the pose (4, 4) of its windscreen camera in the world."""
     actor = int(np.flatnonzero(scene.trace.actor == "cav0")[0])
     return actor, scene.world_from_actor(actor) @ pose(0.8, 0.0, 1.5)
 
@@ -59,7 +59,7 @@ def weathers() -> Picture:
 
 
 def six_cameras() -> Picture:
-    """All round one vehicle."""
+    """Six cameras all around one vehicle."""
     scene, camera = scene_of("ring"), Camera(width=400, height=240, noise=0, fov_deg=70)
     own, at = ego(scene)
     return sheet([shoot(scene, at @ pose(0, 0, 0, np.radians(yaw)), "clear", camera, own) for yaw in SIX], 3)
@@ -77,7 +77,7 @@ def actors() -> Picture:
     """Every shape of every category, on an empty square."""
     town, trace = load_town("suburb"), scene_of("suburb").trace
     shapes = [(category, shape) for category, rows in SHAPES.items() for shape in range(len(rows))]
-    shapes.sort(key=lambda row: SHAPES[row[0]][row[1]].length)  # the long ones behind
+    shapes.sort(key=lambda row: SHAPES[row[0]][row[1]].length)  # long shapes last
     picked = np.arange(len(shapes)) % len(trace.actor)
     size = np.array([SHAPES[category][shape][1:4] for category, shape in shapes])
     row, column = np.divmod(np.arange(len(shapes)), 6)
@@ -128,7 +128,7 @@ def signs() -> Picture:
 
 
 def _in_plain_sight(scene: Scene, kind: str) -> tuple[NDArray, NDArray]:
-    """Return where a sign of that kind is, and a direction it is seen from at 60 m; the freest where all are hidden."""
+    """Return a sign's position and the direction of an unobstructed view of it from 60 m; else of the freest view."""
     found = []
     for place, yaw, own in zip(scene.town.signs.position, scene.town.signs.yaw, scene.town.signs.kind):
         for aside in np.radians((0, 2, -2, 5, -5, 8, -8, 12, -12, 16, -16)) if own == kind else ():

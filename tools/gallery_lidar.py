@@ -39,7 +39,7 @@ def busy_scene() -> tuple[Scene, int]:
 
 
 def truth(scene: Scene, own: int) -> Boxes:
-    """Return the boxes of everybody else in the carrier's frame."""
+    """Return the boxes of all other actors in the carrier's frame."""
     others = np.flatnonzero(scene.trace.present[0] & (np.arange(len(scene.trace.actor)) != own))
     x, y, z, yaw = scene.poses()[others].T
     size = scene.trace.size[others]
@@ -108,7 +108,7 @@ def radar_over_lidar(scene: Scene, own: int, path: Path) -> None:
 
 @style.styled
 def rolling(scene: Scene, own: int, path: Path) -> None:
-    """Draw what a spin that takes time does to its points."""
+    """Draw the motion distortion (rolling shutter) of a spin that takes time."""
     figure = style.canvas(8.0, 8.6)
     axes = figure.add_subplot()
     axes.set(xlim=(-20, 20), ylim=(-20, 20), aspect="equal")
@@ -129,7 +129,7 @@ def rolling(scene: Scene, own: int, path: Path) -> None:
 
 
 def main() -> None:
-    """Draw all of them."""
+    """Draw all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "gallery")
     out = parser.parse_args().out

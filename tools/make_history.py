@@ -34,7 +34,7 @@ class Chosen(NamedTuple):
 
     @classmethod
     def read(cls, text: str) -> Self:
-        """Return the plan that SEED:SAMPLES,EDGE_ROUNDS,CLOUD_ROUNDS says; raises `InputError` where it says none."""
+        """Parse SEED:SAMPLES,EDGE_ROUNDS,CLOUD_ROUNDS; raises `InputError` for other text."""
         try:
             return cls(*map(int, text.replace(":", ",").split(",")))
         except (TypeError, ValueError):
@@ -44,7 +44,7 @@ class Chosen(NamedTuple):
 
 
 def recipe_of(recipe: RunRecipe, task: str, chosen: Chosen) -> RunRecipe:
-    """Return the recipe of the run of one plan: `recipe` with this task alone, and no other arm."""
+    """Return the recipe of one plan's run: `recipe` with this task alone and without arms."""
     if task not in recipe.tasks:
         raise InputError(f"'{task}' is none of the recipe's tasks: {', '.join(recipe.tasks)}")
     asked = recipe.model_dump(mode="json")
@@ -65,7 +65,7 @@ def recipe_of(recipe: RunRecipe, task: str, chosen: Chosen) -> RunRecipe:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the plans, each in a folder of its own, and write the history."""
+    """Run each plan in a folder of its own, and write the history."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recipe", type=Path)
     parser.add_argument("task")

@@ -20,13 +20,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "contract"))
 
-MEMORY_B = 12 << 30  # that a worker may map
-HANGS_S = 1800.0  # without an outcome
-BATCH = 1000  # cases of one worker's life
+MEMORY_B = 12 << 30  # address space of a worker [bytes]
+HANGS_S = 1800.0  # without an outcome, after which a worker is killed
+BATCH = 1000  # cases of one worker process
 
 
 def main() -> None:
-    """Read the command line and do as it says."""
+    """Run the cases in worker processes and print the summary."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 class Tally:
-    """What came of the cases so far."""
+    """Counts of the outcomes of all cases so far."""
 
     def __init__(self, cases: int) -> None:
         self.cases, self.codes, self.broken, self.slow = cases, Counter[str](), Counter[str](), 0
@@ -87,7 +87,7 @@ class Tally:
 
 
 def supervise(batches: list[range], tally: Tally, asked: argparse.Namespace, folder: str) -> None:
-    """Have batches worked through by one process after another; one that dies or hangs broke the contract."""
+    """Run batches in one worker process after another; a worker that dies or hangs breaks the contract."""
     while batches:
         left = batches.pop(0)
         while left:

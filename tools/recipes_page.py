@@ -1,4 +1,4 @@
-"""Write docs/recipes.md from the models of recipes, their fields' comments among them: python tools/recipes_page.py."""
+"""Write docs/recipes.md from the models of recipes and the comments of their fields: python tools/recipes_page.py."""
 
 import ast
 import inspect
@@ -44,15 +44,15 @@ from flcav.world.weather import WEATHER_CLASSES, WEATHERS, Keyframe, Weather, We
 PAGE = Path(__file__).parents[1] / "docs" / "recipes.md"
 TEMPLATE = Path(__file__).with_name("recipes.md.j2")
 HEADER = ("field", "unit", "value", "default", "what it is")
-UNITS = {
+UNITS = {  # by suffix of a field's name
     **{"mm_h": "mm/h", "m_s": "m/s", "ms": "ms", "m": "m", "s": "s"},
     **{"deg": "°", "rad": "rad", "px": "px", "hz": "Hz", "k": "K"},
-}  # by the end of a field's name
+}
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
-LARGEST = 2**63  # of a seed: not worth a word
+LARGEST = 2**63  # limit of a seed, which is not mentioned
 WORDS = {int: "whole number", float: "number", bool: "true, false", str: "text"}
 LISTS = {int: "whole numbers", float: "numbers", str: "names"}
-LINKS: Mapping[type[Config], str] = {  # to where a model is explained
+LINKS: Mapping[type[Config], str] = {  # to the section on a model
     Rig: "[rig](#rigs)",
     Mount: "[pose](#rigs)",
     MountedLidar: "[LiDARs](#lidar)",
@@ -75,7 +75,7 @@ EXPLAINED = (
 
 
 def page() -> str:
-    """Return the page."""
+    """Return the page as Markdown."""
     jinja = Environment(loader=FileSystemLoader(TEMPLATE.parent), undefined=StrictUndefined, keep_trailing_newline=True)
     weathers, values = WEATHERS.items(), Weather.model_fields
     return jinja.get_template(TEMPLATE.name).render(
@@ -94,7 +94,7 @@ def page() -> str:
 
 
 def fields_of(model: type[Config], without: type[Config] = Config) -> str:
-    """Return a table of the model's fields but those of `without`."""
+    """Return a table of the model's fields, without those of `without`."""
     said = comments(model)
     rows = []
     for name, field in model.model_fields.items():
@@ -105,7 +105,7 @@ def fields_of(model: type[Config], without: type[Config] = Config) -> str:
 
 
 def comments(model: type[Config]) -> dict[str, str]:
-    """Return the comment beside each field of a model, those it inherits included."""
+    """Return the comment of each field of a model, inherited fields included."""
     found = {}
     for owner in reversed(model.__mro__):
         if not issubclass(owner, Config) or owner is Config:
@@ -121,19 +121,19 @@ def comments(model: type[Config]) -> dict[str, str]:
 
 
 def said_and_unit(name: str, comment: str) -> tuple[str, str]:
-    """Return a field's comment without its unit, and the unit: in brackets in the comment, or the end of its name."""
+    """Return a field's comment without its unit, and the unit: from brackets in the comment, or the name's suffix."""
     if bracket := re.search(r" *\[([^\]]*[a-z][^\]]*)\]", comment):
         return comment.replace(bracket[0], ""), bracket[1]
     return comment, next((unit for ending, unit in UNITS.items() if name.endswith(f"_{ending}")), "")
 
 
 def value_of(field: FieldInfo) -> str:
-    """Return what may be given, in words."""
+    """Return type and limits of a field's values in words."""
     return kind_of(field.annotation) + limits_of(field.metadata)
 
 
 def limits_of(metadata: Iterable[Any]) -> str:
-    """Return the limits of a number, in words."""
+    """Return the limits of a number in words."""
     limits = {name: getattr(each, name) for each in metadata for name in SIGNS if hasattr(each, name)}
     if {*limits} == {"ge", "le"}:
         return f", {number(limits['ge'])} to {number(limits['le'])}"
@@ -141,7 +141,7 @@ def limits_of(metadata: Iterable[Any]) -> str:
 
 
 def kind_of(annotation: Any) -> str:
-    """Return a type in words; of a model, a link to where it is explained."""
+    """Return a type in words; of a model, a link to its section."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return kind_of(inner[0]) + "".join(limits_of(getattr(each, "metadata", ())) for each in inner[1:])
@@ -159,7 +159,7 @@ def kind_of(annotation: Any) -> str:
 
 
 def default_of(field: FieldInfo) -> str:
-    """Return the default as YAML has it."""
+    """Return the default value of a field in YAML's notation."""
     if field.is_required():
         return "**required**"
     value = field.get_default(call_default_factory=True)
@@ -176,7 +176,7 @@ def default_of(field: FieldInfo) -> str:
 
 
 def sensors_of(rig: Rig) -> Iterator[str]:
-    """Yield the sensors of a rig, in words."""
+    """Yield a description of each sensor of a rig."""
     for name, lidar in rig.lidars.items():
         settings = lidar.settings
         beams = settings.beams or f"{settings.channels} channels from {settings.up_deg:g}° to {settings.down_deg:g}°"
@@ -192,7 +192,7 @@ def sensors_of(rig: Rig) -> Iterator[str]:
 
 
 def beams() -> Iterator[tuple[Any, ...]]:
-    """Yield a row for each LiDAR that has a name."""
+    """Yield a table row for each named set of beams."""
     for name, known in BEAMS.items():
         high, low = max(known.elevations_deg), min(known.elevations_deg)
         limits = f"{high:g}° to {low:g}°"
@@ -200,13 +200,13 @@ def beams() -> Iterator[tuple[Any, ...]]:
 
 
 def region(name: str) -> Iterator[str]:
-    """Yield the limits of a class of weather."""
+    """Yield the limits of each parameter in a weather class."""
     for field, (low, high) in WEATHER_CLASSES[name].items():
         yield f"`{field}` {low:g}" + (f" to {high:g}" if high > low else "")
 
 
 def number(value: Any) -> str:
-    """Return a number as one writes it."""
+    """Return a number with up to 12 significant digits."""
     return f"{value:.12g}"
 
 

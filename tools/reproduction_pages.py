@@ -1,8 +1,8 @@
-"""The tables of a reproduction's page, from its numbers: python tools/reproduction_pages.py reproductions/NAME.
+"""Fill the tables of a reproduction's page from its numbers: python tools/reproduction_pages.py reproductions/NAME.
 
-A page (README.md) marks where they go, `<!-- NAME -->` to `<!-- end -->`; what stands between is replaced by what the
-folder's result.json says, or its results.json, where the page is of a run (`flcav run`). The words around the tables
-are the authors'.
+A page (README.md) marks a table's place by `<!-- NAME -->` and `<!-- end -->`; the text between is replaced by the
+table of that name, made from the folder's result.json, or from results.json where the page is of a run (`flcav run`).
+All other text stays.
 """
 
 import re
@@ -46,7 +46,7 @@ def _of_study(
     return lambda values, origin: tables(results_of_json(study, values, origin))
 
 
-TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: of what its result.json holds, and its path
+TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of (content of its result.json, path)
     "demo": _told(ArmsResult, arms_tables.tables),
     "fig3a": _told(Fig3a, fig3a_tables.tables),
     "fig6a-allocation": _told(AllocationResult, fig6a_tables.tables),
@@ -61,7 +61,7 @@ _SPAN = re.compile(r"<!-- (?P<name>[a-z ]+) -->\n.*?<!-- end -->", re.DOTALL)
 
 
 def fill(page: str, tables: Tables) -> str:
-    """Return `page` with what stands between its marks replaced by the tables of those names; raises `InputError`."""
+    """Return `page` with the text between marks replaced by the named tables; raises `InputError` for unknown names."""
 
     def filled(span: re.Match[str]) -> str:
         name = span["name"]
@@ -73,7 +73,7 @@ def fill(page: str, tables: Tables) -> str:
 
 
 def tables_of(folder: Path) -> Tables:
-    """Return the tables of a reproduction, by name."""
+    """Return the tables of a reproduction's folder as Markdown, by name."""
     if (folder / RESULTS).is_file():
         return run_tables.tables(Run.load(folder, RESULTS))
     path = folder / "result.json"
@@ -81,12 +81,12 @@ def tables_of(folder: Path) -> Tables:
 
 
 def fill_folder(folder: Path) -> str:
-    """Return the page of a reproduction as its numbers have it."""
+    """Return the page of a reproduction with its tables filled in."""
     return fill((folder / "README.md").read_text(encoding="utf-8"), tables_of(folder))
 
 
 def main(folders: Sequence[str]) -> None:
-    """Fill the pages of the folders anew."""
+    """Fill the tables of the folders' pages."""
     for folder in map(Path, folders):
         write_bytes(folder / "README.md", fill_folder(folder).encode())
 

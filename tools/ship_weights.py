@@ -16,7 +16,7 @@ PACKAGE = Path(perception.__path__[0])
 
 
 def main() -> None:
-    """Read the command line and do as it says."""
+    """Copy weights and card into the task's folder of the package."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=TASKS)
     parser.add_argument("weights", type=Path)

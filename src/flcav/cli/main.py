@@ -1,4 +1,4 @@
-"""The `flcav` command. Exit 0 done; 2 invalid input, one sentence on stderr; 130 interrupted; 1 anything else."""
+"""The `flcav` command. Exit codes: 0 done; 2 bad input, one sentence on stderr; 130 interrupted; 1 anything else."""
 
 import sys
 
@@ -18,7 +18,7 @@ from flcav.cli.terminal import Interrupted
 from flcav.config import InputError
 
 INTERRUPTED = 130
-LONGEST = 1000  # characters of a sentence
+LONGEST = 1000  # characters of a message
 
 app = typer.Typer(
     name="flcav",
@@ -65,10 +65,10 @@ for command in (
 
 
 def run(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit with its code: the only place where exceptions become exit codes."""
+    """Run the command line and exit with its code; only here are exceptions turned into exit codes."""
     try:
         code = literal(typer.main.get_command(app))(args=arguments, standalone_mode=False)
-        if code == INTERRUPTED:  # what typer makes of Ctrl-C
+        if code == INTERRUPTED:  # typer's exit code for Ctrl-C
             raise KeyboardInterrupt
     except Interrupted as kept:
         print(f"flcav: interrupted; {kept}", file=sys.stderr)
@@ -84,12 +84,12 @@ def run(arguments: list[str] | None = None) -> None:
         code = 2
     except OSError as error:
         _say(f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error))
-        code = 2 if isinstance(error, FileNotFoundError | IsADirectoryError) else 1  # what was named is not there
+        code = 2 if isinstance(error, FileNotFoundError | IsADirectoryError) else 1  # a named file is missing
     sys.exit(code if isinstance(code, int) else 0)
 
 
 def _say(message: str) -> None:
-    """Print one line on stderr, whatever the names and reasons in it; none where the help was asked for, and shown."""
+    """Print a message as one line on stderr, cut to `LONGEST`; an empty one (after the help) is not printed."""
     line = " ".join(message.split())
     if line:
         print(f"flcav: {line if len(line) <= LONGEST else f'{line[:LONGEST]} ...'}", file=sys.stderr)

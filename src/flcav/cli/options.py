@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and how bad ones are refused."""
+"""Options that several commands share with their choices, checks of options, and help texts free of markup."""
 
 import inspect
 import math
@@ -15,7 +15,7 @@ from flcav.perception.tasks import TASKS
 
 
 class Device(StrEnum):
-    """Where networks run."""
+    """Device that networks run on."""
 
     auto = "auto"
     cpu = "cpu"
@@ -23,7 +23,7 @@ class Device(StrEnum):
 
 
 class Format(StrEnum):
-    """What datasets are exported to, see `flcav.dataset.formats.export`."""
+    """Format of an export, see `flcav.dataset.formats.export`."""
 
     kitti = "kitti"
     yolo = "yolo"
@@ -34,14 +34,14 @@ class Format(StrEnum):
 
 
 class Engine(StrEnum):
-    """Who works, see `flcav.dataset.recording.recorder` and `flcav.pipeline.steps`."""
+    """Execution engine, see `flcav.dataset.recording.recorder` and `flcav.pipeline.steps`."""
 
     processes = "processes"
     ray = "ray"
 
 
 class Stale(StrEnum):
-    """What becomes of what other code did, see `flcav.pipeline.steps`."""
+    """Treatment of steps that were done by other code, see `flcav.pipeline.steps`."""
 
     refuse = "refuse"
     redo = "redo"
@@ -49,14 +49,14 @@ class Stale(StrEnum):
 
 
 class Method(StrEnum):
-    """How sensors are placed, see `flcav.optimization.placement`."""
+    """Method of placement, see `flcav.optimization.placement`."""
 
     exact = "exact"
     greedy = "greedy"
 
 
 def listed(choices: Iterable[str]) -> str:
-    """Return the choices in words."""
+    """Return the choices in words: "a, b or c"."""
     *others, last = choices
     return f"{', '.join(others)} or {last}"
 
@@ -87,14 +87,14 @@ STALE = typer.Option(
 
 
 def finite(parameter: click.Parameter, value: float | None) -> float | None:
-    """Return the value of an option, as its callback; raises `InputError` for nan, which lies within any limits."""
+    """Callback of a number's option: return the value; raises `InputError` for nan, which passes any limits."""
     if value is not None and not math.isfinite(value):
         raise InputError(f"{parameter.opts[0]} {value}: a finite number is wanted")
     return value
 
 
 def refuse_unused(what: str, *names: str) -> None:
-    """Raise `InputError` where one of the options of these parameters was given, for which `what` has no use."""
+    """Raise `InputError` where an option of the parameters `names` was given, which has no effect on `what`."""
     context = click.get_current_context()
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
@@ -103,9 +103,9 @@ def refuse_unused(what: str, *names: str) -> None:
 
 
 def literal(command: click.Command) -> click.Command:
-    """Return the command with its help, its parameters' and its subcommands' safe from being read as markup.
+    """Escape Rich's markup in the help of a command, its parameters and its subcommands; return the command.
 
-    Lines that a docstring breaks are joined: they are broken again as wide as the terminal is.
+    Typer would read "[m]" as a style. Lines of a paragraph are joined, to be wrapped at the width of the terminal.
     """
     for owner in (command, *command.params):
         text = inspect.cleandoc(getattr(owner, "help", None) or "")

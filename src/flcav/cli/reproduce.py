@@ -1,4 +1,4 @@
-"""`flcav reproduce`: the figures and comparisons of the article, from commands anyone can run again."""
+"""`flcav reproduce`: the figures and comparisons of the article, and the tasks' studies."""
 
 from collections.abc import Mapping
 from enum import StrEnum
@@ -14,7 +14,7 @@ from flcav.threads import use_threads
 
 
 class Target(StrEnum):
-    """What can be reproduced beside the tasks' studies."""
+    """Targets other than the tasks' studies."""
 
     demo_arms = "demo-arms"
     fig1b = "fig1b"
@@ -24,15 +24,15 @@ class Target(StrEnum):
 
 
 class Scale(StrEnum):
-    """How large."""
+    """Scale of a reproduction."""
 
     quick = "quick"
     paper = "paper"
     full = "full"
 
 
-RUN = ("jobs", "engine", "stale")  # options of what is run as steps
-STUDY = ("seeds", "scale", *RUN)  # of what is run over seeds
+RUN = ("jobs", "engine", "stale")  # options of targets that run as steps
+STUDY = ("seeds", "scale", *RUN)  # options of targets that run over seeds
 TASK = "task-"  # before the name of a task's study
 TARGETS: tuple[str, ...] = (*(target.value for target in Target), *(f"{TASK}{name}" for name in STUDIES))
 TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
@@ -46,10 +46,10 @@ COMMON_SEEDS = 3
 
 
 class Reproducible(click.Choice):
-    """One of `TARGETS`, or somebody's own."""
+    """Choice of one of `TARGETS`, or a user's own as module:NAME."""
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the target; raises `click.BadParameter` for one that is neither."""
+        """Return the target; raises `click.BadParameter` for an unknown one."""
         return value if ":" in value else super().convert(value, param, ctx)
 
 

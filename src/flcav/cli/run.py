@@ -1,4 +1,4 @@
-"""`flcav run`, `flcav demo`, `flcav compare`: the three stages of a recipe, and two runs side by side."""
+"""`flcav run`, `flcav demo`, `flcav compare`: run a recipe through the three stages, and compare two runs."""
 
 import dataclasses
 from pathlib import Path

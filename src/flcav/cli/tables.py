@@ -1,4 +1,4 @@
-"""Tables that users hand over: CSV or Parquet, with the columns that were asked for."""
+"""Reading users' tables (CSV or Parquet), with checks of columns and numbers."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from flcav.parquet import read_parquet
 
 
 def read_table(path: Path, columns: Sequence[str]) -> pa.Table:
-    """Return the CSV or Parquet table at `path`; raises `InputError` if it is none or lacks one of `columns`."""
+    """Return the CSV or Parquet table at `path`; raises `InputError` if it is no table, empty, or lacks a column."""
     table = read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     for column in columns:
         if table.column_names.count(column) != 1:
@@ -35,7 +35,7 @@ def _read_csv(path: Path) -> pa.Table:
 
 
 def numbers(table: pa.Table, columns: Sequence[str], path: Path) -> np.ndarray:
-    """Return (rows, columns) finite floats; raises `InputError` naming `path`, the column, the row and the value."""
+    """Return the columns as finite floats (rows, columns); raises `InputError` naming row, column and value."""
     out = np.empty((table.num_rows, len(columns)))
     for i, column in enumerate(columns):
         for row, value in enumerate(table[column].to_pylist()):

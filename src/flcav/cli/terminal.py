@@ -1,4 +1,8 @@
+<<<<<<< HEAD
 """What commands print, and what Ctrl-C leaves."""
+=======
+"""Terminal output: a plain console, live progress of steps, and messages for Ctrl-C."""
+>>>>>>> w_system
 
 import contextlib
 import json
@@ -16,10 +20,15 @@ if TYPE_CHECKING:
 GOES_ON = "the same command goes on where it stopped"
 
 
+<<<<<<< HEAD
 def plain_console() -> "Console":
     """Return stdout's console; brackets and colons in what is printed are neither markup nor emoji."""
     from rich.console import Console
 
+=======
+def plain_console() -> Console:
+    """Return a console on stdout without markup and emoji, since users' names may hold brackets and colons."""
+>>>>>>> w_system
     return Console(highlight=False, markup=False, emoji=False)
 
 
@@ -37,12 +46,12 @@ def _finite(value: Json) -> Json:
 
 
 class Interrupted(Exception):
-    """Raised for Ctrl-C; the message says what is kept."""
+    """Raised for Ctrl-C; the message says what is kept of the work."""
 
 
 @contextlib.contextmanager
 def when_interrupted(kept: Callable[[], str] = lambda: GOES_ON) -> Iterator[None]:
-    """Turn Ctrl-C within into `Interrupted`, with what `kept` says then. Typer itself would leave a bare exit code."""
+    """Turn Ctrl-C within the context into `Interrupted` with the message of `kept`; Typer only sets an exit code."""
     try:
         yield
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""flcav towns: what towns there are, their maps, and new ones from OpenDRIVE."""
+"""`flcav towns`: list towns, draw their maps, and import new ones from OpenDRIVE."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -88,7 +88,7 @@ def _poles_table(town: "Town") -> "pa.Table":
 
 
 def summary(counts: dict[str, float]) -> str:
-    """Return a town's counts as one line."""
+    """Return a town's extent and counts as one line."""
     extent = f"{counts['width_m']:.0f} m x {counts['height_m']:.0f} m"
     lengths = f"{counts['driving_km']:g} km of lanes"
     shown = ("junctions", "lights", "crossings", "buildings", "trees", "signs", "poles", "vehicles", "pedestrians")

@@ -1,1 +1,1 @@
-"""The demo and the figures: config in, result out."""
+"""Reproductions of the article's figures, comparisons of arms and plans, and the studies of tasks."""

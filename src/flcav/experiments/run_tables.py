@@ -1,4 +1,4 @@
-"""The tables on the page of a run, from its results."""
+"""Markdown tables of a run's results."""
 
 from flcav.markdown import bullets, table
 from flcav.network.ledger import LINKS
@@ -8,7 +8,7 @@ from flcav.pipeline.results import Run
 
 
 def tables(run: Run) -> dict[str, str]:
-    """Return Markdown by name: findings, tests, differences, plan, budgets, sensors."""
+    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors."""
     return {
         "findings": bullets(f"*{each.question}* **{each.verdict}**. {each.sentence}" for each in run.findings),
         "tests": _tests(run),
@@ -20,7 +20,7 @@ def tables(run: Run) -> dict[str, str]:
 
 
 def _tests(run: Run) -> str:
-    """Return each task's measure in every region, a column per arm and stage."""
+    """Return each task's measure with its interval in every region, a column per arm and stage."""
     columns = list(dict.fromkeys(in_words(test.arm, test.stage) for test in run.tested))
     rows = []
     for task in run.recipe.tasks:
@@ -50,7 +50,7 @@ def _plan(run: Run) -> str:
 
 
 def _budgets(run: Run) -> str:
-    """Return what went up over both links: the whole ledger, and each task's part of it."""
+    """Return the traffic of both uplinks [MB]: budget, planned, used, and each task's part of what was used."""
     main, rows = run.arms[MAIN], []
     for link in LINKS:
         use = main.links[link]

@@ -1,4 +1,4 @@
-"""The system: a run recipe in, typed results out, through the three stages of training."""
+"""Runs of the three-stage federated learning system: `run` carries out a `RunRecipe` and returns a `Run`."""
 
 from typing import TYPE_CHECKING
 

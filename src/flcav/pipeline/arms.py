@@ -1,4 +1,4 @@
-"""The arms of a run as whole settings, and the names of the steps that they share."""
+"""Arms of a run: their complete settings, and the names of their steps, which equal arms share."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,27 +7,27 @@ from typing import Literal
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, Arm, Federation, Placement, RunRecipe
 
 PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
-PLANNED = ("plan",)
-PLACED = ("plan", "placement")
-LEARNED = ("plan", "placement", "labels", "federation")
+PLANNED = ("plan",)  # fields of `Setting` that decide the plan, pretraining and registered errors
+PLACED = ("plan", "placement")  # those that decide where sensors stand
+LEARNED = ("plan", "placement", "labels", "federation")  # those that decide a federation
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One arm, nothing left open."""
+    """The complete settings of one arm, those it takes over from the recipe included."""
 
     name: str
     plan: PlanRule
     placement: Placement
-    labels: Mapping[str, str]  # by task
+    labels: Mapping[str, str]  # kind of labels, by task
     federation: Federation
     central: Literal["pretrain", "federate"] | None
-    regions: tuple[str, ...]  # that federate in it
+    regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
 
 
 def settings_of(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:
-    """Return the run itself and its other arms by name, the run first; `labels` by task are the run's."""
+    """Return the settings of the run itself and of its arms by name, the run first; `labels`: the run's, by task."""
     return {name: _setting(recipe, labels, name, arm) for name, arm in {MAIN: Arm(), **recipe.arms}.items()}
 
 
@@ -45,17 +45,17 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, arm: Arm) 
 
 
 class Names:
-    """The names of a run's steps. Arms that agree in what a step rests on share it, under the first one's name."""
+    """Names of a run's steps. Arms that agree in all settings a step depends on share it, named after the first arm."""
 
     def __init__(self, settings: Mapping[str, Setting]) -> None:
         self._settings = settings
 
     def recording(self, region: str, split: str, task: str) -> str:
-        """Return the step that records frames; all arms share it."""
+        """Return the step that records a split for a task; all arms share it."""
         return f"{region}-{split}-{task}"
 
     def plan(self, arm: str) -> str:
-        """Return the step that plans."""
+        """Return the step that allocates the budgets."""
         return "plan" + self._suffix(arm, PLANNED)
 
     def pretrain(self, arm: str, task: str) -> str:
@@ -79,11 +79,11 @@ class Names:
         return f"{CLOUD}-fl-{task}" + self._suffix(arm, LEARNED, task)
 
     def central(self, arm: str, region: str, task: str) -> str:
-        """Return the training of a central arm."""
+        """Return the centralised training of an arm in a region."""
         return f"{region}-{CENTRAL}-{task}-{arm}"
 
     def stage(self, arm: str, stage: str, region: str, task: str) -> str:
-        """Return the step whose network an arm has in a region after a stage."""
+        """Return the step that trained an arm's network for a region in a stage."""
         if stage == PRETRAIN:
             return self.pretrain(arm, task)
         if stage == CLOUD:
@@ -104,7 +104,7 @@ class Names:
         return "" if first == MAIN else f"-{first}"
 
     def _rests_on(self, arm: str, fields: tuple[str, ...], task: str | None) -> list[object]:
-        """Return what a step rests on; a task's labels, not those of the others."""
+        """Return the settings that a step depends on, of the labels only those of `task`."""
         setting = self._settings[arm]
         values = {name: getattr(setting, name) for name in fields}
         if task is not None:

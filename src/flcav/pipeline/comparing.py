@@ -1,4 +1,4 @@
-"""Two runs side by side: paired differences of every test that both made on the same frames."""
+"""Paired comparison of two runs, over all tests that both made on the same frames."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ Key = tuple[str, str, str, str]  # arm, stage, region, task
 
 @dataclass(frozen=True)
 class Compared:
-    """A measure in the second run minus that in the first, on the same frames."""
+    """Difference of a measure between two runs on the same frames: second minus first."""
 
     arm: str
     stage: str
@@ -33,8 +33,9 @@ class Compared:
 
 
 def compare(first: Path, second: Path) -> tuple[Compared, ...]:
-    """Return every test that both runs made, of each seed that both have.
+    """Return the paired difference of every test that both runs made, over the seeds that both have.
 
+    Its interval (95 %) is a bootstrap over scenes for one common seed, Student's t over seeds for several.
     Raises `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
     """
     folders = [seed_folders(folder) for folder in (first, second)]

@@ -1,7 +1,7 @@
-"""What the method claims, held against one run: sentences computed from the run's numbers.
+"""Findings of a run: verdicts on the claims of the method, as sentences with the numbers behind them.
 
-A claim is about a difference of a measure. Its interval is a paired bootstrap over scenes (95 %): wholly above 0 the
-claim held, wholly below it did not, around 0 the run does not decide.
+A claim says that a difference of a measure is positive. Its 95 % interval is a paired bootstrap over scenes. The claim
+held if the interval lies above 0, did not hold if it lies below, and is undecided if the interval contains 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ WORDS = {PRETRAIN: "pretrained", EDGE: "edge FL", CLOUD: "edge + cloud FL", CENT
 
 
 def in_words(arm: str, stage: str) -> str:
-    """Return an arm's stage as pages name it."""
+    """Return the name of an arm's stage in reports, such as "edge FL (densest)"."""
     return WORDS[stage] if arm == MAIN else f"{WORDS[stage]} ({arm})"
 
 
@@ -28,7 +28,7 @@ def findings(
 ) -> tuple[Finding, ...]:
     """Return a finding for each difference of the run itself.
 
-    `rules` are the arms' placement rules, `roles` the regions', `caveats` by task what FL figures rest on.
+    `rules`: placement rule of each arm. `roles`: role of each region. `caveats`: those of the labels, by task.
     """
     values = {(test.arm, test.stage, test.region, test.task): test for test in tests}
     return tuple(
@@ -91,7 +91,7 @@ def _question(each: Difference, rules: Mapping[str, str], roles: Mapping[str, st
 
 
 def _same_poles(each: Difference, arms: Mapping[str, ArmResult]) -> tuple[int, ...] | None:
-    """Return the poles of both arms where they differ in nothing but the rule that chose the same ones."""
+    """Return the poles of both arms where their rules chose the same ones, so that nothing differs; else None."""
     if each.before_arm == MAIN or each.estimate.mean or each.estimate.low or each.estimate.high:
         return None
     chosen = [

@@ -1,4 +1,4 @@
-"""The frames of a run: recorded from a town, or those of datasets already recorded."""
+"""Data splits of a run: recorded in a town, or divided by scenes out of a recorded dataset."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -32,12 +32,12 @@ def find_place(name: str, beside: Path) -> Path | None:
 
 
 DATA = "data"
-SHORTEST_S = 10.0  # of a scene whose tracks are learned: a past, a future, and some presents
+SHORTEST_S = 10.0  # shortest scene for tracks: it takes a past, a future, and several presents
 
-Fields = Mapping[str, Any]  # of a `Recipe`, as YAML has it
+Fields = Mapping[str, Any]  # fields of a `Recipe`, as YAML has them
 
 
-SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # of a dataset's scenes
+SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # fractions of a dataset's scenes
     "pretrain": {"pool": 0.7, "validation": 0.15, "test": 0.15},
     "federate": {"validation": 0.15, "registry": 0.2, "edge": 0.4, "test": 0.25},
     "unseen": {"validation": 0.3, "test": 0.7},
@@ -46,11 +46,11 @@ SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # of a dataset's scenes
 
 @dataclass(frozen=True)
 class Frames:
-    """An opened split."""
+    """A data split, open for reading, with its frames by who recorded them."""
 
     data: Dataset
-    vehicles: tuple[int, ...]  # numbers of the vehicles' frames
-    poles: Mapping[int, tuple[int, ...]]  # of each roadside sensor's
+    vehicles: tuple[int, ...]  # frame numbers of all vehicles
+    poles: Mapping[int, tuple[int, ...]]  # frame numbers of each roadside sensor, by pole
 
     @classmethod
     def open(cls, folder: Path) -> "Frames":
@@ -60,14 +60,17 @@ class Frames:
 
 
 def recording_fields(recipe: RunRecipe, region: str, split: SplitName, task: str) -> Fields:
-    """Return the recipe of one split in a region's town, as YAML has it, without poles."""
+    """Return the recording recipe of a split in a region's town, without poles.
+
+    Settings of the task, the run, the region, and the run's entry of the task override each other in this order.
+    """
     place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
     changes = [shared(task_named(task)).recording, recipe.recording.fields(), place.recording.fields()]
     how: dict[str, Any] = {"every_s": frames.every_s}
     for more in (*changes, recipe.tasks[task].recording.fields()):
         how |= more
     spins = frames.spins
-    if how["every_s"] < frames.every_s:  # as long a drive, looked at more often
+    if how["every_s"] < frames.every_s:  # the same duration, sampled more often
         spins = round(max(frames.spins * frames.every_s, SHORTEST_S) / how["every_s"]) + 1
     return {
         **how,
@@ -81,7 +84,7 @@ def recording_fields(recipe: RunRecipe, region: str, split: SplitName, task: str
 
 
 def record_frames(fields: Fields, poles: Sequence[int], beside: Path, folder: Path, report: Report) -> Recorded:
-    """Record a split below `folder`, seen by the vehicles and these poles; goes on where it was interrupted."""
+    """Record a split below `folder` with the vehicles' and these poles' sensors; resumes an interrupted recording."""
     asked = parse_config(Recipe, {**fields, "poles": sorted(set(poles))}, folder.name)
     source = EmbeddedSource(asked, beside)
     record(source, folder / DATA, progress=report)
@@ -89,15 +92,15 @@ def record_frames(fields: Fields, poles: Sequence[int], beside: Path, folder: Pa
 
 
 def deal_frames(path: Path, split: SplitName, role: Role, seed: int, whole: bool) -> Recorded:
-    """Return the frames of one split of a recorded dataset: all of it, or its share of the scenes, dealt at random.
+    """Return one split of a recorded dataset: all frames (`whole`), or those of a random share of its scenes.
 
-    Raises `InputError` where there are too few scenes.
+    Raises `InputError` where there are too few scenes, or no frame of a vehicle.
     """
     data = Dataset.open(path)
     if whole:
         return describe(data, str(path))
     scenes = sorted({key.scene for key in data.keys})
-    least = len(SPLITS_OF[role]) + 1  # tests take two
+    least = len(SPLITS_OF[role]) + 1  # one of each split, and two of test
     if len(scenes) < least:
         raise InputError(f"{path}: {len(scenes)} scenes; at least {least} are wanted to deal to a region to {role}")
     order = stream(seed, "deal").permutation(len(scenes))
@@ -105,7 +108,7 @@ def deal_frames(path: Path, split: SplitName, role: Role, seed: int, whole: bool
 
 
 def _own_part(split: SplitName, role: Role, scenes: int) -> slice:
-    """Return which of the shuffled scenes are a split's: at least one, of tests two, and shares of the rest."""
+    """Return the slice of the shuffled scenes that is a split's: one scene (test: two) and its share of the rest."""
     shares = SHARES[role]
     least = {name: 2 if name == "test" else 1 for name in shares}
     free = scenes - sum(least.values())
@@ -117,7 +120,7 @@ def _own_part(split: SplitName, role: Role, scenes: int) -> slice:
 
 
 def describe(data: Dataset, folder: str, scenes: set[str] | None = None) -> Recorded:
-    """Return which frames of a dataset are whose, in these scenes (None: all); raises `InputError` for no vehicle's."""
+    """Group the frames of these scenes (None: all) by who recorded them; raises `InputError` for no vehicle's."""
     frames = data.select(scenes=scenes)
     vehicles = tuple(i for i in frames if kind_of(data.keys[i].agent) != POLE)
     if not vehicles:
@@ -132,7 +135,10 @@ def describe(data: Dataset, folder: str, scenes: set[str] | None = None) -> Reco
 
 
 def town_hashes(town: str, beside: Path) -> dict[str, str]:
-    """Return what names the version of a town that does not come with flcav: its files and their SHA-256."""
+    """Return the SHA-256 of each file of a user's own town, by file name; nothing for a town of the package.
+
+    Raises `InputError` where there is no such town.
+    """
     if town in TOWNS:
         return {}
     folder = find_place(town, beside)
@@ -144,6 +150,6 @@ def town_hashes(town: str, beside: Path) -> dict[str, str]:
 
 
 def data_hash(path: Path) -> str:
-    """Return what names a dataset's version: its manifest's SHA-256; raises `InputError` where there is none."""
+    """Return the SHA-256 of a dataset's manifest, which names its version; raises `InputError` where there is none."""
     read_manifest(path)
     return sha256(path / "manifest.json")

@@ -1,6 +1,6 @@
-"""The graph of a run's steps: for every task, region and arm of a recipe, each done once where arms agree on it.
+"""The dependency graph of a run's steps, for every task, region and arm; arms that agree on a step share it.
 
-Plan, pretrain, register errors, place, edge FL, cloud FL, test.
+The order is: plan, pretrain, register errors, place sensors, edge FL, cloud FL, test.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +33,7 @@ LOOK, OBJECTS = "look", "objects"
 
 
 class Graph:
-    """The steps of a recipe, in an order where each comes after what it needs.
+    """The steps of a recipe in topological order: each comes after those it needs.
 
     `beside` is the folder that towns, datasets and histories are looked for in. Raises `InputError` where a task, its
     labels, a town or a dataset cannot be used.
@@ -61,16 +61,20 @@ class Graph:
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """Return the steps."""
+        """Return the steps in topological order."""
         return tuple(self._steps.values())
 
     def sites(self, region: str) -> tuple[str, ...]:
-        """Return the steps that place sensors in a region, for every arm that federates there."""
+        """Return the placement steps of a region, of all arms that federate there."""
         placed = [self.names.place(name, region) for name, arm in self.settings.items() if region in arm.regions]
         return tuple(dict.fromkeys(placed))
 
     def tested(self, arm: Setting) -> list[tuple[str, str, str]]:
-        """Return stage, region and task of every test of an arm: pretrained and after cloud FL in every region."""
+        """Return stage, region and task of every test of an arm.
+
+        Pretrained networks (of an arm with its own plan) and those of cloud FL are tested in every region, others in
+        the regions that federate in the arm.
+        """
         tests = []
         for task in self.recipe.tasks:
             if arm.name == MAIN or self.names.plan(arm.name) != self.names.plan(MAIN):
@@ -81,7 +85,7 @@ class Graph:
         return tests
 
     def watched(self) -> list[tuple[str, str, str]]:
-        """Return stage, region and task of what is measured after every round: the run itself, where it federates."""
+        """Return stage, region and task of each federation that is validated after each round: the main arm's."""
         main = self.settings[MAIN]
         return [(stage, region, task) for task in self.recipe.tasks for stage in main.stages for region in main.regions]
 
@@ -98,7 +102,7 @@ class Graph:
                         self._add(self._recording(region, split, task, ()))
 
     def _first(self, task: str) -> bool:
-        """Return whether a task is the one whose recorded traffic says where it is dense."""
+        """Return whether the traffic recorded for this task is the one whose density the placement uses."""
         return task == (self.recipe.placement.tasks or tuple(self.recipe.tasks))[0]
 
     def _recording(self, region: str, split: SplitName, task: str, places: Sequence[str]) -> Step:
@@ -112,7 +116,7 @@ class Graph:
         helped = any(KINDS[arm.labels[task]].from_poles for arm in self.settings.values())
         seen = list(places) if helped else []
         version = town_hashes(fields["town"], self.beside)
-        beside = str(self.beside) if version else ""  # a town that comes with flcav is beside no recipe
+        beside = str(self.beside) if version else ""  # a town of the package depends on no folder
         arguments = {"fields": fields, "beside": beside, "places": seen, "version": version}
         return _step(name, record_step, arguments, seen)
 
@@ -124,7 +128,7 @@ class Graph:
         return found.absolute()
 
     def _histories(self) -> dict[str, str]:
-        """Return the learning history of each task that has one, as text: another text, another plan."""
+        """Return the learning history (CSV) of each task that has one, as text: another text, another plan."""
         own = {name: task.history for name, task in self.recipe.tasks.items()}
         return {name: history_text(name, history, self.beside) for name, history in own.items() if history is not None}
 
@@ -138,12 +142,12 @@ class Graph:
         return [self.recipe.budgets_mb.wireless, self.recipe.budgets_mb.wireline]
 
     def _add_start(self, arm: Setting) -> None:
-        """Add plan, stage I, registered errors and placed sensors of an arm."""
+        """Add the steps before a federation: plan, stage I, registration of errors, placement of sensors."""
         recipe, names = self.recipe, self.names
         starts = recipe.with_role("pretrain")
         pools = {task: [names.recording(region, "pool", task) for region in starts] for task in recipe.tasks}
         asked = recipe.model_dump(mode="json", exclude={"arms", "splits", "training", "recording", "placement"})
-        asked["placement"] = {"tasks": []}  # has no part in the plan, and its default asks for objects
+        asked["placement"] = {"tasks": []}  # not part of the plan; the default would depend on objects
         asked["federation"] = {"edge_rounds_per_cloud_round": recipe.federation.edge_rounds_per_cloud_round}
         planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "histories": self._histories()}
         plan = names.plan(arm.name)
@@ -184,7 +188,7 @@ class Graph:
         self._add(_step(names.place(arm.name, region), place_step, arguments, needs))
 
     def _rests_on(self, arm: Setting, region: str, task: str) -> dict[str, Any]:
-        """Return the steps that a vehicle's labelled samples rest on, see `work`."""
+        """Return the steps and settings that a vehicle's labelled samples depend on, see `flcav.pipeline.work`."""
         names = self.names
         helped = any(KINDS[each.labels[task]].from_poles for each in self.settings.values())
         return {
@@ -267,6 +271,6 @@ def _step(name: str, function: Callable[..., None], arguments: Mapping[str, Any]
 
 
 def _named_in(steps: Mapping[str, Any]) -> list[str]:
-    """Return the names of the steps that `Graph._rests_on` tells, and that of stage II for stage III."""
+    """Return the names of the steps in what `Graph._rests_on` returned; for stage III also that of stage II."""
     one = [steps[key] for key in ("plan", "pretrain", "frames", "place", "edge") if key in steps]
     return [*one, *steps["sites"]]

@@ -1,4 +1,4 @@
-"""Labels of stages II and III: how the samples of a vehicle come by them, by name."""
+"""Labels of stages II and III: pseudo-labels by the pretrained network and roadside sensors, or ground truth."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,28 +23,28 @@ from flcav.perception.tasks import task_named
 from flcav.pipeline.frames import Frames
 from flcav.progress import Report
 
-PRECISION = 0.9  # on validation, of the detections that a vehicle may take for labels
+PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A way to come by labels."""
+    """A source of labels."""
 
-    from_detections: bool = False  # of the frozen stage I network
-    from_poles: bool = False  # of roadside sensors
-    caveat: str = ""  # what every figure on them says
+    from_detections: bool = False  # pseudo-labels of the frozen stage I network
+    from_poles: bool = False  # boxes of roadside sensors
+    caveat: str = ""  # stated with every result that depends on them
 
 
 KINDS: Mapping[str, Kind] = {
     "own-detections": Kind(from_detections=True),
     "ideal-road": Kind(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
     "annotated": Kind(caveat="ground truth as labels, upper bound"),
-    "future": Kind(caveat="every vehicle knows all tracks around it, upper bound"),  # where everybody went
+    "future": Kind(caveat="every vehicle knows all tracks around it, upper bound"),  # the recorded future of each track
 }
 
 
 def labels_of(task: str, asked: str | None) -> str:
-    """Return the kind of labels of a task, its first for None; raises `InputError` for one it has not."""
+    """Return the kind of labels of a task (None: its first); raises `InputError` for one the task does not have."""
     known = shared(task_named(task)).labels
     if asked is not None and asked not in known:
         raise InputError(f"labels of '{task}': '{asked}' is none of {', '.join(known)}")
@@ -52,7 +52,10 @@ def labels_of(task: str, asked: str | None) -> str:
 
 
 def own_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
-    """Return the lowest score from which on at least `PRECISION` of the detections on validation frames are right."""
+    """Return the score threshold of pseudo-labels: the lowest with a precision of `PRECISION` on validation frames.
+
+    Detections are right that match a target at IoU 0.5. Where no score has that precision, the threshold is 1.
+    """
     frames = [split.data.frame(i) for split in splits for i in split.vehicles]
     truths = [asked_of(frame, network.config) for frame in frames]
     found = detect_all(network, [frame.lidar[only_lidar(frame)] for frame in frames])
@@ -65,7 +68,7 @@ def own_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
 def annotated_samples(
     task: Task, config: Any, split: Frames, frames: Sequence[int], region: str
 ) -> dict[str, Sequence[Any]]:
-    """Return each vehicle's samples as they were recorded with them, by its name."""
+    """Return each vehicle's samples with their recorded annotations, by "region/vehicle"."""
     own: dict[str, list[int]] = {}
     for i in frames:
         own.setdefault(f"{region}/{split.data.keys[i].agent}", []).append(i)
@@ -82,9 +85,10 @@ def self_labelled_samples(
     report: Report,
     book: Ledger | None = None,
 ) -> dict[str, list[Sample]]:
-    """Return each vehicle's sweeps, labelled by the frozen network's detections and the roadside sensors `poles`.
+    """Return each vehicle's sweeps with pseudo-labels, by "region/vehicle".
 
-    The road's views are booked as downlink where a `book` is given (once: the labels are kept through the stages).
+    Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`.
+    Messages of the sensors enter `book` as downlinks; stage III passes none, since its labels are those of stage II.
     """
     data = split.data
     views = _views(split, poles)
@@ -113,7 +117,7 @@ def _views(split: Frames, poles: Sequence[int]) -> dict[tuple[str, int], list[Ro
 
 
 def frames_near(split: Frames, sites: np.ndarray, range_m: float) -> tuple[int, ...]:
-    """Return the vehicles' frames within `range_m` of one of the sites (P, 2), world [m]; all for no site."""
+    """Return the vehicles' frames taken within `range_m` of one of the sites (P, 2), world [m]; without sites, all."""
     if not len(sites):
         return split.vehicles
 

@@ -1,4 +1,4 @@
-"""Where errors lie in a region, and where its roadside sensors are placed."""
+"""Placement of roadside sensors by VRCSP or by traffic density; detections of two networks in one test sweep."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,11 +23,14 @@ from flcav.pipeline.stages import stage_network
 from flcav.world.map.census import mean_actors
 from flcav.world.trace import Trace
 
-SHOWN_SCORE = 0.3
+SHOWN_SCORE = 0.3  # lowest score of a detection that is shown
 
 
 def look(before: Path, after: Path, split: Frames) -> Looked:
-    """Detect with the networks of two steps in the test frame that holds most targets, whatever they find there."""
+    """Return the detections of two networks in the test frame with the most targets.
+
+    `before`, `after`: folders of the steps that trained the networks. Detections score `SHOWN_SCORE` or more.
+    """
     networks = {name: stage_network(OBJECTS, folder) for name, folder in (("before", before), ("after", after))}
     config = networks["before"].config
     truths = [asked_of(split.data.frame(i), config) for i in split.vehicles]
@@ -42,7 +45,7 @@ def look(before: Path, after: Path, split: Frames) -> Looked:
 
 
 def _matched(found: Boxes, truth: Asked) -> Seen:
-    """Return the detections that count, which of them hit, and which targets were found."""
+    """Match detections to targets at IoU 0.5; detections of neutral objects are left out."""
     target = assign_targets(found, truth.targets, 0.5)
     counts = (target >= 0) | ~on_neutral(found, truth.neutral)
     hits = target[counts]
@@ -56,14 +59,14 @@ def _rows(boxes: Boxes) -> tuple[tuple[float, ...], ...]:
 
 @dataclass(frozen=True)
 class Sites:
-    """The candidate poles of a region."""
+    """The candidate sites of a region's roadside sensors: its poles."""
 
-    number: NDArray[np.int64]  # (P,)
+    number: NDArray[np.int64]  # (P,) of the pole
     position: NDArray[np.float64]  # (P, 3) of the sensor's mount, world [m]
 
 
 def sites_of(drive: Frames, edge: Frames | None) -> Sites:
-    """Return the candidates: the town's poles, of recorded data those whose sweeps it holds."""
+    """Return the candidate sites: the town's poles or, of recorded data (`edge`), the poles whose sweeps it holds."""
     town = drive.data.town()
     if edge is None:
         return Sites(town.poles.id, town.poles.position) if town is not None else Sites(*_none())
@@ -80,7 +83,10 @@ def place_sensors(
     weights: Mapping[str, float],
     traces: Sequence[Trace],
 ) -> Placed:
-    """Return the poles that a rule chooses: errors by task, those of a task weighing what the run says."""
+    """Place a region's sensors by the rule in `how`: VRCSP over registered errors, or the densest traffic.
+
+    `errors` and `weights` are by task: an error weighs its own weight times its task's. `traces` give the traffic.
+    """
     every = [replace(error, weight=error.weight * weights[task]) for task in how.tasks for error in errors[task]]
     xyz = np.array([(error.x, error.y, error.z) for error in every]).reshape(-1, 3)
     weight = np.array([error.weight for error in every])
@@ -90,7 +96,7 @@ def place_sensors(
     within = coverage(xyz, sites.position, how.range_m)
     count = min(how.count, len(sites.number))
     chosen: list[int] = []
-    if how.rule == "vrcsp" and len(xyz):  # without errors there is nothing to look for
+    if how.rule == "vrcsp" and len(xyz):  # without errors there is nothing to cover
         chosen = list(place(xyz, sites.position, how.range_m, count, weight=weight).chosen)
     elif how.rule == "densest":
         chosen = np.argsort(-actors, kind="stable")[:count].tolist()
@@ -109,7 +115,7 @@ def place_sensors(
 
 
 def traces_of(data: Dataset, frames: Sequence[int]) -> list[Trace]:
-    """Return the recorded traffic of the frames' scenes, where it is known."""
+    """Return the recorded traffic of the frames' scenes; scenes without a trace are left out."""
     scenes = sorted({data.keys[i].scene for i in frames})
     return [trace for scene in scenes if (trace := data.trace(scene)) is not None]
 

@@ -1,4 +1,4 @@
-"""The plan: how many samples and rounds of each task both uplink budgets buy, by what earlier runs learned."""
+"""Allocation of both uplink budgets to the samples and rounds of all tasks, by learning curves of earlier runs."""
 
 import csv
 import io
@@ -30,24 +30,24 @@ from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
 from flcav.pipeline.results import Plan, TaskPlan
 
 HISTORIES = resources.files("flcav.pipeline") / "histories"
-POINT: tuple[str, ...] = ("task", *JOINT, "weight", "run")
+POINT: tuple[str, ...] = ("task", *JOINT, "weight", "run")  # columns of a history that a run writes
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What one task's plan rests on."""
+    """One task as the planner sees it: weight, message sizes, and its learning history or fixed plan."""
 
     name: str
     weight: float
     sizes: MessageSizes
-    pool: int  # samples that can be had
+    pool: int  # samples available for upload
     history: History | None  # None: the plan is fixed
     fixed: FixedPlan | None
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What all tasks share."""
+    """What the plans of all tasks have in common: budgets, bounds, and the topology of the federation."""
 
     budgets_mb: Price
     headroom: float
@@ -56,15 +56,15 @@ class Frame:
     edge_rounds_per_cloud_round: int
 
     def stage_plan(self, samples: int, edge_rounds: int, cloud_rounds: int) -> StagePlan:
-        """Return what a task moves."""
+        """Return the transfers of a task with these counts."""
         return StagePlan(samples, edge_rounds, cloud_rounds, self.edge_groups, self.edge_rounds_per_cloud_round)
 
 
 def make_plan(tasks: tuple[Asked, ...], frame: Frame, rule: PlanRule) -> tuple[Plan, Problem | None]:
-    """Return the allocation of both budgets, and the problem it solves: that of the tasks whose plan is not fixed.
+    """Return the plan of all tasks, and the allocation problem that was solved for those without a fixed plan.
 
-    Fixed plans are paid first. Raises `InputError` where the budgets do not carry them, `Infeasible` where they do not
-    carry the least of the others.
+    Fixed plans are paid first; the problem is None where all are fixed. Raises `InputError` where the budgets do not
+    cover the fixed plans, `Infeasible` where the rest does not cover the lower bounds of the other tasks.
     """
     plans: dict[str, TaskPlan] = {}
     left = np.array([frame.budgets_mb.wireless_mb, frame.budgets_mb.wireline_mb]) * (1 - frame.headroom)
@@ -136,14 +136,14 @@ def _planned(task: Asked, own: Allotted, problem: Problem) -> TaskPlan:
 
 
 def model_mb(task: Task, network: str | None) -> float:
-    """Return the size of one model update on the wire, by a dry run of the message [MB]."""
+    """Return the serialised size of one model update [MB], by a dry run of the message."""
     return update_bytes(to_arrays(fresh(task, configuration(task, network), 0))) / BYTES_PER_MB
 
 
 def history_text(task: str, name: str, beside: Path) -> str:
-    """Return a task's learning history, a CSV table: one of the package by its name, or a file beside the recipe.
+    """Return the text of a task's learning history (CSV): one of the package by its name, or a file below `beside`.
 
-    Raises `InputError` where there is none, or no rows of the task in it.
+    Raises `InputError` where there is no such table, or it has no rows of the task.
     """
     known = sorted(entry.name.removesuffix(".csv") for entry in HISTORIES.iterdir() if ".csv" in entry.name)
     if name in known:
@@ -164,7 +164,7 @@ def history_text(task: str, name: str, beside: Path) -> str:
 
 
 def parse_history(task: str, text: str, origin: str) -> History:
-    """Return the task's points of a history's text; raises `InputError` naming `origin` where there are none."""
+    """Return the task's points in a history (CSV); raises `InputError`, naming `origin`, where there are none."""
     try:
         table = pyarrow.csv.read_csv(io.BytesIO(text.encode()))
     except pyarrow.ArrowInvalid as error:
@@ -176,12 +176,12 @@ def parse_history(task: str, text: str, origin: str) -> History:
 
 
 def history_of(name: str) -> History:
-    """Return the history of the package for the task of that name."""
+    """Return the package's learning history of the task `name`."""
     return parse_history(name, history_text(name, name, Path()), name)
 
 
 def append_points(path: Path, points: list[Mapping[str, Any]]) -> None:
-    """Add to the history at `path` the points that it does not hold yet; it reads as `flcav fit` reads one."""
+    """Append the points that the history at `path` lacks (columns: `POINT`); `flcav fit` reads the file."""
     held: list[dict[str, str]] = []
     if path.exists():
         with path.open(newline="", encoding="utf-8") as file:

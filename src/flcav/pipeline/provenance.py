@@ -1,4 +1,4 @@
-"""By what results were made: revision, versions, kind of processor, threads, seed. Nothing of when."""
+"""Provenance of results: git revision, versions, kind of processor, threads and seed; no times."""
 
 import functools
 import platform
@@ -11,15 +11,15 @@ from pathlib import Path
 import flcav
 from flcav.dataset.layout import PACKAGES, package_versions
 
-LEARNING = ("flwr", "scipy", "torch")  # packages that decide results, beside those that decide recordings
+LEARNING = ("flwr", "scipy", "torch")  # packages that affect results, beside those that affect recordings
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """What would have to be the same for the same result."""
+    """What has to be equal for equal results."""
 
-    revision: str | None  # of git; None where flcav does not run from a checkout
-    uncommitted: bool  # changes since that revision, in the package's folder
+    revision: str | None  # of git; None without a checkout
+    uncommitted: bool  # whether the package's files have changed since that revision
     versions: Mapping[str, str]
     processor: str  # kind of, see `flcav.perception.device`
     threads: int
@@ -27,7 +27,7 @@ class Provenance:
 
 
 def provenance(seed: int | None = None) -> Provenance:
-    """Return the provenance of what this process makes on its processor."""
+    """Return the provenance of results that this process computes on its CPU."""
     import torch  # here, so that steps without networks start without it
 
     from flcav.perception.device import CPU, processor_of
@@ -37,13 +37,13 @@ def provenance(seed: int | None = None) -> Provenance:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that decide results, as far as they are installed."""
+    """Return the versions of Python and of the installed packages that affect results."""
     found = {"python": platform.python_version()}
     for name in sorted({*PACKAGES, *LEARNING}):
         try:
             found |= package_versions((name,))
         except PackageNotFoundError:
-            continue  # embreex is not everywhere
+            continue  # embreex is not on every platform
     return found
 
 

@@ -1,4 +1,4 @@
-"""What a run is asked to do: tasks, regions, budgets, placement, federation, and the arms that it compares."""
+"""The schema of a run recipe: tasks, regions, uplink budgets, sensor placement, federation, and arms to compare."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_]*$")]
 Count = Annotated[int, Field(ge=0, le=10**6)]
 Positive = Annotated[float, Field(gt=0)]
 
-SPLITS_OF: Mapping[Role, tuple[SplitName, ...]] = {  # what is recorded of a region
+SPLITS_OF: Mapping[Role, tuple[SplitName, ...]] = {  # splits of a region, by its role
     "pretrain": ("pool", "validation", "test"),
     "federate": ("validation", "registry", "edge", "test"),
     "unseen": ("validation", "test"),
@@ -29,22 +29,22 @@ SPLITS_OF: Mapping[Role, tuple[SplitName, ...]] = {  # what is recorded of a reg
 
 
 class Split(Config):
-    """Frames of one purpose in one region: `scenes` x `spins` x `cavs` of them."""
+    """Size of a data split in one region: `scenes` x `spins` x `cavs` frames."""
 
     scenes: int = Field(ge=1, le=10**6)
-    spins: int = Field(ge=1, le=10**6)  # of each vehicle in a scene
-    cavs: int = Field(ge=1, le=8)  # vehicles; of `edge`, where the region does not say
-    every_s: float = Field(default=4.0, ge=2.0)  # so that a network does not see the same second twice
+    spins: int = Field(ge=1, le=10**6)  # frames of each vehicle in a scene
+    cavs: int = Field(ge=1, le=8)  # vehicles that record; of `edge`: default of a region's `vehicles`
+    every_s: float = Field(default=4.0, ge=2.0)  # between frames [s]; nearer ones would be alike
 
 
 class Splits(Config):
-    """Frames of every purpose; each has traffic of its own, so that no scene is in two of them."""
+    """Sizes of all data splits. Each split has traffic of its own, so that no scene is in two of them."""
 
-    pool: Split  # pretraining regions: what stage I may choose from
-    validation: Split  # every region: what training is watched on
-    registry: Split  # federating regions: where errors are registered
-    edge: Split  # federating regions: what their vehicles learn from
-    test: Split  # every region: looked at once, at the end
+    pool: Split  # pretraining regions: candidates for the upload of stage I
+    validation: Split  # every region: scored during training
+    registry: Split  # federating regions: errors are registered here
+    edge: Split  # federating regions: their vehicles' training data
+    test: Split  # every region: scored once, at the end
 
     @field_validator("test")
     @classmethod
@@ -55,21 +55,21 @@ class Splits(Config):
 
 
 class Training(Config):
-    """How long and how fast networks train; rates are shares of the task's own learning rate."""
+    """Training schedule of a task's networks. Rates are fractions of the task's own learning rate."""
 
-    batch: int | None = Field(default=None, ge=1, le=4096)  # samples of a step; None: the task's
-    block_steps: int = Field(default=100, ge=1, le=10**6)  # pretraining goes in blocks, validated after each
-    max_blocks: int = Field(default=12, ge=1, le=10**4)
-    patience: int = Field(default=3, ge=1)  # blocks without `min_gain` after which validation has levelled off
+    batch: int | None = Field(default=None, ge=1, le=4096)  # samples of an optimiser step; None: the task's
+    block_steps: int = Field(default=100, ge=1, le=10**6)  # optimiser steps of a pretraining block
+    max_blocks: int = Field(default=12, ge=1, le=10**4)  # before the cooldown; validation follows each block
+    patience: int = Field(default=3, ge=1)  # blocks; with less than `min_gain` over them: a plateau
     min_gain: float = Field(default=0.01, ge=0)
-    cooldown: tuple[float, ...] = (0.3, 0.05)  # rates of the blocks after that
-    local_steps: int = Field(default=16, ge=1, le=10**6)  # of a vehicle in a round
-    local_rate: float = Field(default=0.5, gt=0)  # in the first round
-    final_rate: float = Field(default=0.1, gt=0)  # in the last
+    cooldown: tuple[float, ...] = (0.3, 0.05)  # rates of the blocks after the plateau
+    local_steps: int = Field(default=16, ge=1, le=10**6)  # optimiser steps of a vehicle in a round
+    local_rate: float = Field(default=0.5, gt=0)  # rate of the first round
+    final_rate: float = Field(default=0.1, gt=0)  # rate of the last round
 
 
 class FixedPlan(Config):
-    """A task's plan that was chosen by hand."""
+    """A task's plan, given by hand instead of computed."""
 
     samples: int = Field(ge=1, le=10**6)
     edge_rounds: Count
@@ -77,7 +77,7 @@ class FixedPlan(Config):
 
 
 class Recording(Config):
-    """How frames are recorded where it is not as the task has it: fields of a recording's recipe."""
+    """Changes to a task's recording settings, by the fields of `flcav.sources.recipe.Recipe`; None: no change."""
 
     vehicle_rig: NamedRig | None = None
     pole_rig: NamedRig | None = None
@@ -88,29 +88,29 @@ class Recording(Config):
     scenarios: tuple[Scenario, ...] | None = None
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields that are given."""
+        """Return the fields that are not None, as JSON values."""
         return {name: value for name, value in self.model_dump(mode="json").items() if value is not None}
 
 
 class TaskRecipe(Config):
-    """What is learned of one task."""
+    """Settings of one perception task in a run."""
 
     network: str | None = None  # name of the configuration; None: the task's first
-    weight: Positive = 1.0  # in the plan
-    labels: str | None = None  # of stages II and III; None: the task's first kind
-    history: str | None = None  # learning curves: a history of the package, or a table beside the recipe
+    weight: Positive = 1.0  # of the task's error in the plan's objective
+    labels: str | None = None  # kind of labels in stages II and III; None: the task's first
+    history: str | None = None  # points of learning curves: a name of the package's, or a CSV file
     plan: FixedPlan | None = None  # instead of a history
     recording: Recording = Recording()
     training: Training | None = None  # None: the run's
 
 
 class Region(Config):
-    """A town with vehicles and an edge server, or datasets that were recorded already."""
+    """A region with its vehicles and edge server: a town to simulate, or datasets already recorded."""
 
     role: Role
     town: str | None = None  # a town's name or folder; None: the region's name
-    data: str | Mapping[SplitName, str] | None = None  # a dataset's folder, whose scenes are dealt; or one per split
-    vehicles: int | None = Field(default=None, ge=1, le=8)  # of a federating town
+    data: str | Mapping[SplitName, str] | None = None  # a dataset divided by scenes, or one per split
+    vehicles: int | None = Field(default=None, ge=1, le=8)  # clients of the edge server
     recording: Recording = Recording()
 
     @model_validator(mode="after")
@@ -132,7 +132,7 @@ class Budgets(Config):
 
 
 class Limits(Config):
-    """Least and most of what a plan may take of each stage."""
+    """Bounds (least, most) of a plan's decision variables."""
 
     samples: tuple[Count, Count | None] = (40, None)  # None: all that the pools hold
     edge_rounds: tuple[Count, Count] = (1, 6)
@@ -140,32 +140,32 @@ class Limits(Config):
 
 
 class Placement(Config):
-    """Where roadside sensors stand."""
+    """How the sites of roadside sensors are chosen."""
 
-    rule: Literal["vrcsp", "densest", "none"] = "vrcsp"  # most errors covered; most traffic around; no sensor
-    count: int = Field(default=1, ge=1, le=100)  # per region
-    range_m: float = Field(default=40.0, gt=0, le=1000)
-    group_range_m: float = Field(default=60.0, gt=0, le=10_000)  # a group: vehicles this near to a sensor of any arm
-    tasks: tuple[str, ...] = ()  # whose errors count; if not given, objects where they are learned
+    rule: Literal["vrcsp", "densest", "none"] = "vrcsp"  # most errors covered; densest traffic; no sensor
+    count: int = Field(default=1, ge=1, le=100)  # sensors of a region
+    range_m: float = Field(default=40.0, gt=0, le=1000)  # within which a sensor covers an error
+    group_range_m: float = Field(default=60.0, gt=0, le=10_000)  # of vehicles that federate to a sensor of any arm
+    tasks: tuple[str, ...] = ()  # whose errors are to be covered; default: objects where they are learned
 
 
 class Federation(Config):
-    """How models are averaged."""
+    """How the clients' models are aggregated."""
 
-    strategy: str = "fedavg"  # a name, or module:NAME of one's own
+    strategy: str = "fedavg"  # name of a strategy, or module:NAME of a user's own
     edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)
 
 
 class Arm(Config):
-    """A comparison: what is different from the run itself, and how much of it is run."""
+    """An arm of a comparison: how it differs from the run itself, and which stages it runs."""
 
     plan: Literal["joint", "equal-stages", "equal-tasks", "max-throughput"] = "joint"
     placement: Mapping[str, Any] = {}  # fields of `Placement` that differ
-    federation: Mapping[str, Any] = {}  # of `Federation`
-    labels: Mapping[str, str] = {}  # by task
-    central: Literal["pretrain", "federate"] | None = None  # train on, centrally, on ground truth of these regions
+    federation: Mapping[str, Any] = {}  # fields of `Federation` that differ
+    labels: Mapping[str, str] = {}  # kind of labels, by task
+    central: Literal["pretrain", "federate"] | None = None  # role of the regions whose ground truth is trained on
     stages: tuple[Literal["edge", "cloud"], ...] = ("edge", "cloud")
-    regions: tuple[str, ...] | None = None  # that federate; None: all
+    regions: tuple[str, ...] | None = None  # federating ones; None: all
 
     @field_validator("stages")
     @classmethod
@@ -176,10 +176,10 @@ class Arm(Config):
 
 
 class RunRecipe(Config):
-    """One run of the three stages: pretraining, edge FL, cloud FL (Wang et al., IEEE Network 37(3), 2023).
+    """The recipe of a run: pretraining, edge FL and cloud FL (Wang et al., IEEE Network 37(3), 2023).
 
-    A seed names its traffic, its sensors' noise and its networks' weights. docs/runs.md has every field. Raises
-    pydantic's `ValidationError` for what cannot be run; `load_run_recipe` makes one sentence of it.
+    The seed determines traffic, sensor noise and initial weights. docs/runs.md describes every field. Raises pydantic's
+    `ValidationError` for a recipe that cannot be run; `load_run_recipe` raises `InputError` with one sentence instead.
 
     >>> from flcav import RunRecipe
     >>> recipe = RunRecipe.model_validate({
@@ -192,13 +192,13 @@ class RunRecipe(Config):
     """
 
     seed: int = Field(default=1, ge=0, lt=2**31)
-    size: Literal["toy", "demo", "full"] = "demo"  # of what `splits` and `training` do not say
+    size: Literal["toy", "demo", "full"] = "demo"  # preset of `splits` and `training` where they are None
     splits: Splits | None = None
     training: Training | None = None
     tasks: Annotated[Mapping[str, TaskRecipe], Field(min_length=1)]
     regions: Annotated[Mapping[Name, Region], Field(min_length=1)]
     budgets_mb: Budgets
-    headroom: float = Field(default=0.02, ge=0, lt=0.5)  # share that the plan leaves unspent: samples differ in size
+    headroom: float = Field(default=0.02, ge=0, lt=0.5)  # fraction left unspent: samples differ in size
     limits: Limits = Limits()
     placement: Placement = Placement()
     federation: Federation = Federation()
@@ -208,7 +208,7 @@ class RunRecipe(Config):
     @model_validator(mode="before")
     @classmethod
     def _filled(cls, values: Any) -> Any:
-        """Take a task without fields for one of defaults, and place by the errors of objects where they are learned."""
+        """Fill in defaults: of tasks without fields, and of the tasks whose errors decide the placement."""
         if not isinstance(values, dict) or not isinstance(values.get("tasks"), dict):
             return values
         tasks = {name: {} if task is None else task for name, task in values["tasks"].items()}
@@ -251,25 +251,25 @@ class RunRecipe(Config):
                 raise ValueError(str(error)) from None
 
     def with_role(self, role: Role) -> tuple[str, ...]:
-        """Return the names of the regions of a role, in order."""
+        """Return the names of the regions of a role, in the recipe's order."""
         return tuple(name for name, region in self.regions.items() if region.role == role)
 
     @property
     def sized_splits(self) -> Splits:
-        """Return the splits: those written out, or those of the size."""
+        """Return the sizes of the splits: the recipe's own, or those of the preset `size`."""
         return self.splits or SIZES[self.size][0]
 
     def training_of(self, task: str) -> Training:
-        """Return how a task's networks train: its own, the run's, or as the size says."""
+        """Return a task's training schedule: its own, else the run's, else that of the preset `size`."""
         return self.tasks[task].training or self.training or SIZES[self.size][1]
 
     def vehicles(self, region: str) -> int:
-        """Return how many vehicles a federating town's edge server has."""
+        """Return the number of vehicles of a federating region's edge server."""
         return self.regions[region].vehicles or self.sized_splits.edge.cavs
 
 
 SIZES: Mapping[str, tuple[Splits, Training]] = {
-    "toy": (  # seconds: shows that a run works, and nothing else
+    "toy": (  # seconds: a smoke test, its scores mean nothing
         Splits(
             pool=Split(scenes=2, spins=3, cavs=4),
             validation=Split(scenes=1, spins=2, cavs=3),
@@ -279,7 +279,7 @@ SIZES: Mapping[str, tuple[Splits, Training]] = {
         ),
         Training(block_steps=4, max_blocks=2, patience=1, cooldown=(0.2,), local_steps=1),
     ),
-    "demo": (  # what two cores do in under ten minutes
+    "demo": (  # under ten minutes on two cores
         Splits(
             pool=Split(scenes=16, spins=5, cavs=4),
             validation=Split(scenes=8, spins=2, cavs=3),
@@ -305,7 +305,7 @@ SIZES: Mapping[str, tuple[Splits, Training]] = {
 def load_run_recipe(path: Path | str) -> RunRecipe:
     """Return the run recipe (YAML) at `path`; raises `InputError` naming the field, the value and what is allowed.
 
-    Towns, datasets and histories that it names by a path are looked for in the folder that `run` is told.
+    Towns, datasets and histories named by a relative path are looked for in the folder `beside` of `run`.
 
     >>> import flcav
     >>> demo = flcav.load_run_recipe("recipes/runs/demo.yaml")

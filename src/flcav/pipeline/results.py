@@ -1,4 +1,4 @@
-"""What the steps of a run result in: frozen records, each saved to and loaded from its folder."""
+"""Records of the results of a run and of its steps, saved to and loaded from JSON in their folders."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ WEIGHTS, LEDGER, ERRORS, OUTCOMES = "weights.safetensors", "ledger.parquet", "er
 
 
 class Saved(Record):
-    """A record that is kept as JSON in a folder."""
+    """A record that is saved as JSON in a folder."""
 
     def save(self, folder: Path, name: str = RESULT) -> None:
         """Write the record to `folder`, atomically; tasks and regions stay in their order."""
@@ -31,7 +31,7 @@ class Saved(Record):
 
 @dataclass(frozen=True)
 class Recorded(Saved):
-    """The frames of one split: a dataset's folder and which of its frames."""
+    """A data split: the folder of its dataset, and its frames by who recorded them."""
 
     folder: str  # relative to the step's own, or absolute
     vehicles: tuple[int, ...]  # numbers of the vehicles' frames
@@ -41,16 +41,16 @@ class Recorded(Saved):
 
 @dataclass(frozen=True)
 class TaskPlan:
-    """How much of each stage one task takes."""
+    """The plan of one task: its samples and rounds, and their price on both uplinks."""
 
     samples: int
     edge_rounds: int
     cloud_rounds: int
-    wireless_mb: float
+    wireless_mb: float  # uplink, all stages
     wireline_mb: float
-    sample_mb: float
-    model_mb: float
-    predicted: Mapping[str, float] | None  # accuracy after each stage by the learning curve; None for a fixed plan
+    sample_mb: float  # of one sample
+    model_mb: float  # of one model update
+    predicted: Mapping[str, float] | None  # score after each stage, by the learning curve; None: a fixed plan
 
 
 @dataclass(frozen=True)
@@ -63,38 +63,38 @@ class Plan(Saved):
 
 @dataclass(frozen=True)
 class Block:
-    """One block of pretraining."""
+    """One block of pretraining and the validation after it."""
 
-    rate: float  # share of the learning rate
+    rate: float  # fraction of the task's learning rate
     loss: float
     score: float  # on validation frames
 
 
 @dataclass(frozen=True)
 class Pretrained(Saved):
-    """Stage I of a task; weights and ledger are beside."""
+    """Result of stage I of a task; weights and ledger are in the same folder."""
 
     task: str
     network: str  # name of the configuration
     uploaded: Mapping[str, tuple[int, ...]]  # frames by region
     blocks: tuple[Block, ...]
-    steps: int
-    threshold: float | None  # from which score on its detections serve as labels; None where labels come otherwise
+    steps: int  # of the optimiser
+    threshold: float | None  # lowest score of detections that serve as labels; None where none do
 
 
 @dataclass(frozen=True)
 class ErrorRegistry(Saved):
-    """The errors of a pretrained network in a region, each once; the table is beside."""
+    """Number of registered errors of a pretrained network in a region; their table is in the same folder."""
 
     region: str
     task: str
     counts: Mapping[str, int]  # by kind
-    dropped: int  # false positives that point at no place of the town
+    dropped: int  # false positives without a place in the town
 
 
 @dataclass(frozen=True)
 class Pole:
-    """A candidate site."""
+    """A candidate site of a roadside sensor."""
 
     pole: int
     covered: int  # errors within range
@@ -103,25 +103,25 @@ class Pole:
 
 @dataclass(frozen=True)
 class Placed(Saved):
-    """Where a region's roadside sensors stand."""
+    """Placement of a region's roadside sensors."""
 
     region: str
     rule: str
-    chosen: tuple[int, ...]
-    errors: int
-    covered: int
+    chosen: tuple[int, ...]  # poles
+    errors: int  # registered
+    covered: int  # errors within range of a chosen pole
     range_m: float
-    poles: tuple[Pole, ...]
+    poles: tuple[Pole, ...]  # all candidates
 
     @property
     def densest(self) -> int:
-        """Return the site with most road users around."""
+        """Return the pole with the most road users within range on average."""
         return max(self.poles, key=lambda site: site.actors).pole
 
 
 @dataclass(frozen=True)
 class Round:
-    """A round of a federation, measured on validation frames."""
+    """A round of a federation and the validation score after it."""
 
     round: int
     score: float
@@ -129,21 +129,21 @@ class Round:
 
 @dataclass(frozen=True)
 class StageResult(Saved):
-    """A federated stage of a task, or a central arm's training; weights and ledger are beside."""
+    """Result of a federated stage of a task, or of centralised training; the weights are in the same folder."""
 
     stage: str
     task: str
-    region: str | None  # None: all that federate
+    region: str | None  # None: all federating regions together
     rounds: int
-    samples: int  # that the clients hold together
+    samples: int  # of all clients together
     clients: int
-    poles: tuple[int, ...]  # whose sensors helped to label
+    poles: tuple[int, ...]  # whose sensors contributed labels
     losses: tuple[float, ...] = ()  # mean training loss of each round
 
 
 @dataclass(frozen=True)
 class Watched(Saved):
-    """A federation measured after each of its rounds; stage II also before them, as round 0."""
+    """Validation scores of a federation in a region after each round; of stage II also before it, as round 0."""
 
     stage: str
     task: str
@@ -154,32 +154,32 @@ class Watched(Saved):
 
 @dataclass(frozen=True)
 class Tested(Saved):
-    """A network measured on a region's test frames; what it did in each is beside."""
+    """Test of a network on a region's test frames; the outcome of each frame is in the same folder."""
 
     region: str
     task: str
-    measure: str  # what the estimate is of
+    measure: str  # name of what is estimated
     estimate: Estimate
-    numbers: Mapping[str, float | None]  # more of the task's
+    numbers: Mapping[str, float | None]  # other numbers of the task, by name
     frames: int
     scenes: int
 
 
 @dataclass(frozen=True)
 class Test:
-    """A test as part of a run."""
+    """A test with the arm, stage, region and task that it is of."""
 
     arm: str
     stage: str
     region: str
     task: str
-    step: str  # whose folder holds the outcomes
+    step: str  # its folder holds the outcomes
     result: Tested
 
 
 @dataclass(frozen=True)
 class Difference:
-    """A measure after something minus before it, on the same test frames."""
+    """Paired difference of a measure on the same test frames: `arm` at `stage` minus `before_arm` at its stage."""
 
     name: str
     arm: str
@@ -193,7 +193,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Finding:
-    """What a run says of a claim."""
+    """The verdict of a run on one claim."""
 
     place: str  # region and task
     question: str
@@ -203,26 +203,26 @@ class Finding:
 
 @dataclass(frozen=True)
 class Seen:
-    """What one network found in a sweep, LiDAR frame."""
+    """Detections of one network in a sweep, matched to the targets; boxes are in the LiDAR frame."""
 
-    boxes: tuple[tuple[float, ...], ...]  # x y z length width height yaw; without those of neutral objects
-    hit: tuple[bool, ...]  # of each box
-    found: tuple[bool, ...]  # of each target
+    boxes: tuple[tuple[float, ...], ...]  # x y z length width height yaw [m, rad]; without those of neutral objects
+    hit: tuple[bool, ...]  # whether each box matches a target
+    found: tuple[bool, ...]  # whether each target is matched
 
 
 @dataclass(frozen=True)
 class Looked(Saved):
-    """One test sweep seen by two networks."""
+    """Detections of two networks in the same test sweep."""
 
     frame: int  # number in its dataset
-    targets: tuple[tuple[float, ...], ...]
+    targets: tuple[tuple[float, ...], ...]  # boxes as in `Seen`
     before: Seen
     after: Seen
 
 
 @dataclass(frozen=True)
 class Spent:
-    """What one stage of a task sent up over a link [MB]."""
+    """Uplink traffic of one stage of a task on one link."""
 
     stage: str
     task: str
@@ -232,7 +232,7 @@ class Spent:
 
 @dataclass(frozen=True)
 class LinkUse:
-    """One uplink: what it may carry, was planned to, and did [MB]."""
+    """Budget, planned traffic and actual traffic of one uplink [MB]."""
 
     budget_mb: float
     planned_mb: float
@@ -241,7 +241,7 @@ class LinkUse:
 
 @dataclass(frozen=True)
 class ArmResult:
-    """What belongs to one arm."""
+    """Results of one arm: its plan, placements, stages, and uplink traffic."""
 
     plan: Plan
     placed: tuple[Placed, ...]
@@ -250,13 +250,13 @@ class ArmResult:
     spent: tuple[Spent, ...]
 
     def sent_mb(self, task: str, link: str) -> float:
-        """Return what went up for a task over a link in all stages [MB]."""
+        """Return the uplink traffic of a task on a link, over all stages [MB]."""
         return sum(row.mb for row in self.spent if (row.task, row.link) == (task, link))
 
 
 @dataclass(frozen=True)
 class Run(Saved):
-    """A finished run."""
+    """Results of a finished run."""
 
     recipe: RunRecipe
     arms: Mapping[str, ArmResult]
@@ -265,13 +265,13 @@ class Run(Saved):
     tested: tuple[Test, ...]
     differences: tuple[Difference, ...]
     findings: tuple[Finding, ...]
-    gap_closed: Mapping[str, float]  # to central training on ground truth; where an arm does that
-    caveats: tuple[str, ...]
+    gap_closed: Mapping[str, float]  # fraction closed of the gap to centralised training
+    caveats: tuple[str, ...]  # of the kinds of labels
     provenance: Provenance
-    elapsed_s: float = 0.0  # over all starts
+    elapsed_s: float = 0.0  # wall time of all starts together
 
     def test(self, *, stage: str, region: str, task: str, arm: str = "main") -> Tested:
-        """Return a test; raises `KeyError` for one that was not made."""
+        """Return the result of a test; raises `KeyError` for one that was not made."""
         for each in self.tested:
             if (each.arm, each.stage, each.region, each.task) == (arm, stage, region, task):
                 return each.result
@@ -280,7 +280,7 @@ class Run(Saved):
 
 @dataclass(frozen=True)
 class Mean:
-    """A number over seeds: Student's 95 % interval."""
+    """The mean of a number over seeds, with Student's 95 % interval."""
 
     name: str
     estimate: Estimate
@@ -288,7 +288,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class Summary(Saved):
-    """What several seeds of a recipe say together."""
+    """Means over several seeds of a recipe."""
 
     seeds: tuple[int, ...]
     measures: tuple[Mean, ...]

@@ -1,4 +1,4 @@
-"""A run: a recipe carried out, and what its steps result in."""
+"""Running a recipe, with one seed or several, and collecting the results of its steps."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -58,9 +58,9 @@ def run(
 ) -> Run:
     """Run or finish a recipe in the folder `out`; write results.json and history.csv there, and return the results.
 
-    Towns, datasets and histories are looked for in `beside` (None: the working directory). `jobs` workers of one thread
-    each; `engine` and `stale` are those of `run_steps`. Raises `InputError` where something of the recipe cannot be
-    used, or `out` holds another run, or one by other code that is refused.
+    Towns, datasets and histories are looked for in `beside` (None: the working directory). `jobs` workers compute, of
+    one thread each; `engine` and `stale` are those of `run_steps`. Raises `InputError` where a part of the recipe
+    cannot be used, and where `out` holds another run or, if `stale` refuses that, one of other code.
 
     >>> import flcav
     >>> few = {"scenes": 2, "spins": 1, "cavs": 1}
@@ -80,7 +80,7 @@ def run(
     """
     out = Path(out)
     if (out / RESULTS).exists():
-        Run.load(out, RESULTS)  # of this version, or there is nothing here to go on with
+        Run.load(out, RESULTS)  # raises for results of another version
     graph, clock = Graph(recipe, Path(beside or ".")), stopwatch(out / WORK)
 
     def timed(step: str, done: int, total: int, note: str) -> None:
@@ -103,9 +103,9 @@ def run_seeds(
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> tuple[tuple[Run, ...], Summary]:
-    """Run or finish a recipe with `seeds` seeds, from its own on, each in a folder of `out`; return what they say.
+    """Run or finish a recipe with `seeds` consecutive seeds, its own first; return all runs and their summary.
 
-    summary.json and a common history.csv are written beside. Everything else is as of `run`.
+    Each seed has a folder in `out`, beside summary.json and a common history.csv. Other arguments are those of `run`.
     """
     out = Path(out)
     graphs = {
@@ -122,7 +122,7 @@ def run_seeds(
 
 
 def _kept(graph: Graph, out: Path, history: Path, elapsed_s: float) -> Run:
-    """Return the results of finished steps, written to `out`, their points added to the history."""
+    """Collect the results of finished steps, write them to `out`, and add their points to the history."""
     result = replace(collect(graph, out / WORK), elapsed_s=round(elapsed_s, 1))
     append_points(history, points_of(result, f"seed{graph.recipe.seed}"))
     result.save(out, RESULTS)
@@ -130,7 +130,7 @@ def _kept(graph: Graph, out: Path, history: Path, elapsed_s: float) -> Run:
 
 
 def summarise(runs: Sequence[Run]) -> Summary:
-    """Return means over the seeds of a recipe with Student's intervals."""
+    """Return means over the seeds of a recipe with Student's 95 % intervals."""
 
     def means(of: Callable[[Run], Mapping[str, float]]) -> tuple[Mean, ...]:
         rows = [of(each) for each in runs]
@@ -158,7 +158,7 @@ def seed_folders(folder: Path) -> dict[int, Path]:
 
 
 def collect(graph: Graph, work: Path) -> Run:
-    """Return what the finished steps in `work` resulted in."""
+    """Collect the results of the finished steps in `work`, and write each arm's ledger to `ledgers` beside it."""
     recipe, names, main = graph.recipe, graph.names, graph.settings[MAIN]
     tests = []
     for arm in graph.settings.values():
@@ -189,7 +189,7 @@ def collect(graph: Graph, work: Path) -> Run:
 
 
 def test_folder(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:
-    """Return the step that tested an arm's network after a stage."""
+    """Return the name of the step, and of its folder, that tested an arm's network after a stage."""
     return graph.names.test(graph.names.stage(arm, stage, region, task), region)
 
 
@@ -208,7 +208,7 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
             Ledger.load(work / names.edge(arm.name, region, task) / LEDGER) for task in tasks for region in arm.regions
         ]
     if CLOUD in arm.stages:
-        books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they go on from those
+        books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they include the others
     budgets = graph.recipe.budgets_mb
     book = Ledger(Budget(budgets.wireless, budgets.wireline), (entry for each in books for entry in each.entries))
     book.save(work.parent / "ledgers" / f"{arm.name}.parquet")
@@ -256,24 +256,27 @@ def _differences(graph: Graph, work: Path) -> list[Difference]:
 
 
 def _owner(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:
-    """Return the first arm that shares the step."""
+    """Return the first of the arms that share this stage's step."""
     step = graph.names.stage(arm, stage, region, task)
     return next(name for name in graph.settings if graph.names.stage(name, stage, region, task) == step)
 
 
 def paired(task: str, before: Path, after: Path, seed: int) -> Estimate:
-    """Return the measure in the test folder `after` minus that in `before`, and its 95 % interval over scenes."""
+    """Return the paired difference `after` - `before` of two test folders' measure, by bootstrap over scenes."""
     first, second = (Outcomes.load(folder / OUTCOMES) for folder in (before, after))
     return Estimate(*difference(task_named(task), first, second, seed))
 
 
 def gap_closed(start: float, reached: float, end: float) -> float:
-    """Return which share of the way from `start` to `end` was come."""
+    """Return the fraction (reached - start) / (end - start) of a gap that was closed; 0 where there is no gap."""
     return (reached - start) / (end - start) if end != start else 0.0
 
 
 def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
-    """Return how much of the gap to central training on a region's own ground truth each stage closes, if there is."""
+    """Return the fraction of the gap from pretraining to centralised training that each stage closes, by its name.
+
+    The reference trains on the region's own ground truth; regions without such an arm are left out.
+    """
     values = {(test.arm, test.stage, test.region, test.task): test.result.estimate.mean for test in tests}
     oracle = next((name for name, arm in recipe.arms.items() if arm.central == "federate"), None)
     closed = {}
@@ -286,9 +289,9 @@ def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
 
 
 def points_of(result: Run, run: str) -> list[Mapping[str, Any]]:
-    """Return what a run adds to history: what each task reached on validation frames after so much of each stage.
+    """Return a run's points of the learning history, named by `POINT`: samples, rounds, and the score they reached.
 
-    A point is the mean over the regions, weighted by frames.
+    The score is the mean over regions on validation frames, weighted by frames.
     """
     points: list[Mapping[str, Any]] = []
     for task, own in result.arms[MAIN].plan.tasks.items():

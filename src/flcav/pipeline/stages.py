@@ -1,8 +1,8 @@
-"""The stages as functions: what is trained on what, from which weights, on whose account.
+"""The three stages of training: centralised pretraining, edge federated learning, cloud federated learning.
 
-Stage I: labelled samples travel to the cloud, which trains on them until validation levels off. Stage II: vehicles
-federate with their edge server. Stage III: edge servers federate with the cloud (Wang et al., IEEE Network 37(3),
-2023).
+Stage I: labelled samples are uploaded to the cloud, which trains on them until validation reaches a plateau. Stage II:
+vehicles federate with their edge server. Stage III: edge servers federate with the cloud (Wang et al., IEEE Network
+37(3), 2023). Every message is entered in a ledger.
 """
 
 import json
@@ -37,7 +37,7 @@ BLOCKS, ROUND = "blocks.json", "round.json"
 
 @dataclass(frozen=True)
 class Learning:
-    """How a task's networks learn in a run."""
+    """What a task's training in a run is given: network configuration, schedule, and seed."""
 
     task: Task
     network: str | None  # name of the configuration
@@ -46,7 +46,7 @@ class Learning:
 
     @property
     def batch(self) -> int:
-        """Return the samples of a step."""
+        """Return the batch size: samples of an optimiser step."""
         return self.training.batch or self.task.practice.batch
 
     @property
@@ -55,18 +55,18 @@ class Learning:
         return configuration(self.task, self.network)
 
     def fresh(self) -> Any:
-        """Return a network with weights drawn from the seed."""
+        """Return a network with initial weights drawn from the seed."""
         return fresh(self.task, self.config, self.seed)
 
     def schedule(self, rounds: int, steps: int, *names: str) -> Schedule:
-        """Return what clients do in `rounds` rounds of `steps` local steps."""
+        """Return the clients' schedule of `rounds` rounds with `steps` local steps; `names` seed the stream."""
         rate, training = self.task.practice.learning_rate, self.training
         rates = training.local_rate * rate, training.final_rate * rate
         return Schedule(rounds, steps, *rates, child_seed(self.seed, *names))
 
 
 def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) -> dict[str, tuple[int, ...]]:
-    """Return which frames of each region's pool are uploaded, drawn at random over all of them."""
+    """Draw the frames to upload at random from the union of all regions' pools; return them by region."""
     every = [(region, frame) for region, frames in pools.items() for frame in frames]
     drawn = np.sort(stream(seed, "upload").permutation(len(every))[:samples])
     chosen: dict[str, list[int]] = {region: [] for region in pools}
@@ -77,7 +77,7 @@ def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) 
 
 
 def book_uploads(book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int]) -> None:
-    """Enter each sample twice: vehicle to edge server by wireless, edge server to cloud by wireline."""
+    """Enter each sample in the ledger twice: vehicle to edge server (wireless), edge server to cloud (wireline)."""
     sizes = shared(task).sample_bytes(pool.data, config, chosen)
     for frame, size in zip(chosen, sizes, strict=True):
         key = pool.data.keys[frame]
@@ -88,10 +88,10 @@ def book_uploads(book: Ledger, task: Task, config: Any, region: str, pool: Frame
 def train_until_level(
     learning: Learning, samples: Sequence[Any], validation: Sequence[Frames], folder: Path, report: Report
 ) -> tuple[Block, ...]:
-    """Train in blocks until validation levels off, and write the weights; return how each block went.
+    """Pretrain in blocks until validation reaches a plateau, then at falling rates; return the record of each block.
 
-    What is kept is the last block's network: the rate has cooled down by then. A killed training goes on from its last
-    whole block.
+    Writes the weights of the last block, whose rate is the lowest. An interrupted training resumes after its last
+    complete block.
     """
     training, task = learning.training, learning.task
     blocks: list[Block] = []
@@ -120,12 +120,12 @@ def train_until_level(
 
 
 def mean_score(task: Task, network: Any, splits: Sequence[Frames]) -> float:
-    """Return the mean over regions of the task's measure on their vehicles' frames."""
+    """Return the task's measure on the vehicles' frames, as the mean over `splits`."""
     return float(np.mean([score_on(task, network, split.data, split.vehicles) for split in splits]))
 
 
 def next_rate(scores: Sequence[float], training: Training) -> float | None:
-    """Return the rate of the block after those that reached `scores`; None when training is over."""
+    """Return the rate of the next block, as a fraction, from the scores so far; None when training is over."""
     full = _full_rate_blocks(scores, training)
     if full is None:
         return 1.0
@@ -134,9 +134,9 @@ def next_rate(scores: Sequence[float], training: Training) -> float | None:
 
 
 def _full_rate_blocks(scores: Sequence[float], training: Training) -> int | None:
-    """Return after how many blocks validation has levelled off (or `max_blocks` are spent); None if not yet.
+    """Return the number of blocks until the plateau of validation, at most `max_blocks`; None before that.
 
-    Level: the last `patience` blocks brought less than `min_gain` over the best before them.
+    Plateau: the best of the last `patience` blocks is less than `min_gain` above the best before them.
     """
     for spent in range(training.patience + 1, min(len(scores), training.max_blocks) + 1):
         before, recent = scores[: spent - training.patience], scores[spent - training.patience : spent]
@@ -148,7 +148,7 @@ def _full_rate_blocks(scores: Sequence[float], training: Training) -> int | None
 def train_centrally(
     learning: Learning, network: Any, samples: Sequence[Any], rounds: int, clients: int, name: str
 ) -> tuple[float, ...]:
-    """Train in place for as many steps as a federation of `clients` takes in `rounds`, at the same rates.
+    """Train centrally, in place, for as many steps as a federation of `clients` takes in `rounds`, at the same rates.
 
     Returns the mean loss of each round.
     """
@@ -171,7 +171,7 @@ def train_centrally(
 
 
 def clients_of(learning: Learning, config: Any, samples: Mapping[str, Sequence[Any]]) -> dict[str, TaskClient]:
-    """Return a federation's vehicles with their samples, those without any left out."""
+    """Return a federation's clients by vehicle; vehicles without samples are left out."""
     return {
         name: TaskClient(learning.task, config, samples[name], batch=learning.batch)
         for name in sorted(samples)
@@ -180,14 +180,14 @@ def clients_of(learning: Learning, config: Any, samples: Mapping[str, Sequence[A
 
 
 class Federating:
-    """A federation that goes on after a kill: each round's weights, its loss, and what the ledger held then."""
+    """Checkpoints of a federation: weights, loss and ledger after each round, to resume from."""
 
     def __init__(self, task: Task, folder: Path, book: Ledger, report: Report) -> None:
         self._task, self._folder, self._book, self._report = task, folder, book, report
         self.losses: list[float] = []
 
     def resume(self, weights: Weights) -> tuple[Weights, int]:
-        """Return the weights to go on from and the rounds done, with the ledger as it was then."""
+        """Return the last round's weights and number, restoring ledger and losses; without one, `weights` and 0."""
         if not (self._folder / ROUND).exists():
             return weights, 0
         state = json.loads((self._folder / ROUND).read_text())
@@ -198,7 +198,7 @@ class Federating:
         return load_file(round_path(self._folder, state["round"])), state["round"]
 
     def keeping(self, rounds: int) -> OnRound:
-        """Return what keeps each of `rounds` rounds."""
+        """Return the callback that saves a checkpoint after each of `rounds` rounds."""
 
         def keep(round_: int, weights: Weights, loss: float) -> None:
             self.losses.append(loss)
@@ -211,7 +211,7 @@ class Federating:
         return keep
 
     def finish(self, network: Any, rounds: int) -> None:
-        """Write the last round's weights, those of `network` where there was none, and the ledger."""
+        """Write the final weights (without rounds, those of `network`) and the ledger."""
         if rounds:
             network = round_network(self._task, network.config, self._folder, rounds)
         save_network(self._task, network, self._folder / WEIGHTS)
@@ -251,9 +251,9 @@ def federate_cloud(
     folder: Path,
     report: Report,
 ) -> tuple[float, ...]:
-    """Run stage III: `regions` are each edge server's vehicles and its stage II weights.
+    """Run stage III from `network`; `regions`: each edge server's clients and its stage II weights.
 
-    Writes weights and ledger, returns each round's loss.
+    An edge server runs `edge_rounds` rounds in a cloud round. Writes weights and ledger, returns each round's loss.
     """
     federating = Federating(learning.task, folder, book, report)
     start, done = federating.resume(to_arrays(network))
@@ -270,9 +270,9 @@ def federate_cloud(
 
 
 def purse(budget: Budget, planned: Mapping[str, tuple[float, float]], task: str) -> Budget:
-    """Return a task's part of both budgets: in proportion to what is planned for it [MB wireless, wireline].
+    """Return a task's share of both budgets, in proportion to its planned traffic [MB wireless, wireline].
 
-    Parts are rounded down to bytes, so that together they are never more than the whole.
+    Shares are rounded down to bytes, so that their sum never exceeds the budget.
     """
     parts = []
     for link, whole_mb in enumerate((budget.wireless_mb, budget.wireline_mb)):
@@ -283,13 +283,13 @@ def purse(budget: Budget, planned: Mapping[str, tuple[float, float]], task: str)
 
 
 def region_budget(stage_one: Ledger, vehicles: Mapping[str, int], region: str) -> Budget:
-    """Return what a region's stage II may send: after stage I, its share of the wireless budget by its vehicles."""
+    """Return the budget of a region's stage II: its share, by vehicles, of the wireless budget that stage I left."""
     share = vehicles[region] / sum(vehicles.values())
     return Budget(share * stage_one.left_mb("wireless"), 0.0)
 
 
 def round_path(folder: Path, round_: int) -> Path:
-    """Return where a federation's weights after a round are kept."""
+    """Return the file of a federation's weights after a round."""
     return folder / f"round{round_}.safetensors"
 
 
@@ -301,5 +301,5 @@ def round_network(task: Task, config: Any, folder: Path, round_: int) -> Any:
 
 
 def stage_network(task: Task, folder: Path) -> Any:
-    """Return the network that a stage ended with."""
+    """Return the trained network of the stage in `folder`."""
     return load_network(task, folder / WEIGHTS)

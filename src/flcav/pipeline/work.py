@@ -1,6 +1,7 @@
-"""The steps of a run: each reads what earlier ones saved, calls a function of its stage, and saves the result.
+"""The step functions of a run: each loads the results of earlier steps, calls its stage's function, saves the result.
 
-Arguments are JSON values, so that they name a step's work; folders of other steps are found by the names given.
+Arguments are JSON values, of which a step's fingerprint is made. Other steps are given by name; `Work.inputs` has their
+folders.
 """
 
 from collections.abc import Mapping, Sequence
@@ -70,7 +71,10 @@ Fields = Mapping[str, Any]
 
 
 def record_step(work: Work, fields: Fields, beside: str, places: Sequence[str], version: Mapping[str, str]) -> None:
-    """Record one split, seen by the poles that the steps `places` chose, too; `version` names the town's files."""
+    """Record one split, also from the poles that the steps `places` chose; `version`: SHA-256 of the town's files.
+
+    Raises `InputError` where the files have changed.
+    """
     if town_hashes(fields["town"], Path(beside)) != version:
         raise InputError(f"{fields['town']}: the town was changed while the run was under way")
     poles = [pole for step in places for pole in Placed.load(work.inputs[step]).chosen]
@@ -78,7 +82,10 @@ def record_step(work: Work, fields: Fields, beside: str, places: Sequence[str], 
 
 
 def deal_step(work: Work, path: str, split: SplitName, role: Role, seed: int, whole: bool, version: str) -> None:
-    """Take one split from a recorded dataset; `version` names its manifest."""
+    """Take one split from the dataset at `path`; `version`: SHA-256 of its manifest.
+
+    Raises `InputError` where the manifest has changed.
+    """
     if data_hash(Path(path)) != version:
         raise InputError(f"{path}: the dataset was changed while the run was under way")
     deal_frames(Path(path), split, role, seed, whole).save(work.folder)
@@ -87,7 +94,7 @@ def deal_step(work: Work, path: str, split: SplitName, role: Role, seed: int, wh
 def plan_step(
     work: Work, recipe: Fields, rule: PlanRule, pools: Mapping[str, Sequence[str]], histories: Mapping[str, str]
 ) -> None:
-    """Allocate both budgets to all tasks; `pools` are the recorded pools, `histories` their tables, by task."""
+    """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables."""
     asked_for = RunRecipe.model_validate(recipe)
     asked, groups = [], _edge_groups(asked_for)
     for name in asked_for.tasks:
@@ -124,7 +131,7 @@ def pretrain_step(
     validation: Sequence[str],
     thresholded: bool,
 ) -> None:
-    """Upload the planned samples of a task, train on them, and fix the threshold of own labels."""
+    """Run stage I of a task: upload the planned samples, train on them, fix the score threshold of pseudo-labels."""
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     own = Plan.load(work.inputs[plan])
     opened = {region: Frames.open(work.inputs[step]) for region, step in pools.items()}
@@ -151,7 +158,10 @@ def pretrain_step(
 
 
 def errors_step(work: Work, task: str, region: str, pretrained: str, registry: str) -> None:
-    """Drive the pretrained network through a region and register what it gets wrong."""
+    """Register the errors of the pretrained network in a region.
+
+    Raises `InputError` for a task whose errors have no position.
+    """
     learned = task_named(task)
     if not isinstance(learned, RegistersErrors):
         raise InputError(f"placement.tasks: the errors of '{task}' have no place in a town")
@@ -175,7 +185,10 @@ def place_step(
     registry: str,
     edge: str | None,
 ) -> None:
-    """Place a region's roadside sensors; `edge`: recorded data, which limits the choice to the poles in it."""
+    """Place a region's roadside sensors by the errors and weights of each task.
+
+    `edge`: step of the recorded training data, if any, whose poles are the only candidates.
+    """
     drive = Frames.open(work.inputs[registry])
     sites = sites_of(drive, None if edge is None else Frames.open(work.inputs[edge]))
     found = {task: load_errors(work.inputs[step] / ERRORS) for task, step in errors.items()}
@@ -195,7 +208,7 @@ def edge_step(
     federation: Fields,
     steps: Mapping[str, Any],
 ) -> None:
-    """Stage II of a task in a region; `steps` names those it rests on: see `_labelled`."""
+    """Run stage II of a task in a region; `steps`: what its samples depend on, see `_labelled`."""
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     own = Plan.load(work.inputs[steps["plan"]]).tasks[task]
     stage_one = Ledger.load(work.inputs[steps["pretrain"]] / LEDGER)
@@ -220,7 +233,7 @@ def cloud_step(
     federation: Fields,
     regions: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Stage III of a task: the edge servers of all `regions` with the cloud, vehicles with their edge servers."""
+    """Run stage III of a task: the edge servers of `regions` federate with the cloud, vehicles with edge servers."""
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     first = next(iter(regions.values()))
     own, how = Plan.load(work.inputs[first["plan"]]), Federation.model_validate(federation)
@@ -252,9 +265,9 @@ def central_step(
     source: Role,
     steps: Mapping[str, Any],
 ) -> None:
-    """Go on training centrally on ground truth, as many steps as stage II takes in the region.
+    """Continue training centrally on ground truth, for as many optimiser steps as stage II takes in the region.
 
-    `source` "pretrain": on the uploaded samples. "federate": on the frames that the region's vehicles learn from.
+    `source` "pretrain": on the uploaded samples. "federate": on the training frames of the region's vehicles.
     """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     trained = stage_network(learning.task, work.inputs[steps["pretrain"]])
@@ -274,7 +287,10 @@ def central_step(
 
 
 def test_step(work: Work, task: str, region: str, trained: str, frames: str, seed: int) -> None:
-    """Measure a step's network on a region's test frames."""
+    """Test the network of the step `trained` on a region's test frames.
+
+    Raises `InputError` where the frames hold no target, so that the measure is undefined.
+    """
     learned, split = task_named(task), Frames.open(work.inputs[frames])
     network, how = stage_network(learned, work.inputs[trained]), measurable(learned)
     outcomes = how.outcomes(network, split.data, split.vehicles, work.report)
@@ -295,9 +311,9 @@ def test_step(work: Work, task: str, region: str, trained: str, frames: str, see
 
 
 def rounds_step(work: Work, task: str, region: str, trained: str, start: str, frames: str) -> None:
-    """Measure a federation's network after each round on some of a region's validation frames.
+    """Validate a federation's network after each round on up to `WATCHED_FRAMES` frames of a region.
 
-    Of stage II also the pretrained one, as round 0.
+    For stage II the pretrained network is validated too, as round 0.
     """
     learned, split = task_named(task), Frames.open(work.inputs[frames])
     stage = StageResult.load(work.inputs[trained])
@@ -314,16 +330,16 @@ def rounds_step(work: Work, task: str, region: str, trained: str, start: str, fr
 
 
 def look_step(work: Work, before: str, after: str, frames: str) -> None:
-    """Look at one test sweep with the networks of two steps."""
+    """Detect objects in one test sweep with the networks of two steps."""
     look(work.inputs[before], work.inputs[after], Frames.open(work.inputs[frames])).save(work.folder)
 
 
 def _labelled(
     work: Work, learning: Learning, region: str, labels: str, steps: Mapping[str, Any], book: Ledger | None = None
 ) -> tuple[Mapping[str, Sequence[Any]], tuple[int, ...]]:
-    """Return each vehicle's labelled samples, and the poles that helped.
+    """Return each vehicle's labelled samples, and the poles that contributed labels.
 
-    `steps`: "pretrain", the recorded "frames", the arm's "place", and "sites", the places of all arms.
+    `steps`: "pretrain", the recorded "frames", the arm's "place", and "sites", the placements of all arms.
     """
     split, kind = Frames.open(work.inputs[steps["frames"]]), KINDS[labels]
     frames = _grouped(work, split, steps)
@@ -338,7 +354,10 @@ def _labelled(
 
 
 def _grouped(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[int, ...]:
-    """Return the vehicles' frames near a roadside sensor of any arm, so that all arms have the same."""
+    """Return the vehicles' frames near a roadside sensor of any arm, so that all arms have the same frames.
+
+    Raises `InputError` where there are none.
+    """
     placed = [Placed.load(work.inputs[step]) for step in steps["sites"]]
     numbers = {pole for each in placed for pole in each.chosen}
     if not numbers:
@@ -368,5 +387,5 @@ def _entries(work: Work, *steps: str) -> list[LedgerEntry]:
 
 
 def _each(samples: Sequence[Any]) -> list[Any]:
-    """Return the samples in memory: each is drawn many times."""
+    """Load all samples into memory: each is drawn many times."""
     return [samples[number] for number in range(len(samples))]

@@ -1,1 +1,1 @@
-"""Results in, pictures and pages out; computes nothing."""
+"""Figures and HTML pages of results."""

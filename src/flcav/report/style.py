@@ -1,6 +1,6 @@
-"""One look for every picture: quiet greys for what is given, the Okabe-Ito colours for what is shown.
+"""Style of all figures: greys for context, the colour-blind safe palette of Okabe and Ito (2008) for data.
 
-Sizes are final: a figure is drawn as wide as it is shown, so that its smallest text stays at 9 pt or more.
+Figures are drawn at the size they are shown at, so that their smallest text has 9 pt or more.
 """
 
 import io
@@ -31,8 +31,8 @@ PURPLE = "#cc79a7"
 
 HIT, MISSED, FALSE = BLUE, ORANGE, VERMILLION
 TOWN_COLOURS = {"grid": BLUE, "ring": VERMILLION, "suburb": MUTED}
-OTHER_COLOURS = (GREEN, PURPLE, ORANGE, SKY)  # of towns of one's own, in turn
-STAGE_COLOURS = (RULE, SKY, ORANGE)  # in the order of the run
+OTHER_COLOURS = (GREEN, PURPLE, ORANGE, SKY)  # of users' own towns, in turn
+STAGE_COLOURS = (RULE, SKY, ORANGE)  # in the order of the stages
 
 SMALL, TEXT = 9, 10  # [pt]
 
@@ -62,16 +62,16 @@ STYLE: dict[Any, Any] = {
     "svg.hashsalt": "flcav",
 }
 
-styled = matplotlib.rc_context(STYLE)  # decorates a function that draws
+styled = matplotlib.rc_context(STYLE)  # decorator of functions that draw
 
 
 def canvas(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure of that size [inch]; no window, no global state."""
+    """Return an empty figure of the given size [inch], without a window or global state."""
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
 def bare(axes: Axes) -> None:
-    """Take away the ticks and the frame: for pictures that are maps."""
+    """Remove ticks and frame, for maps and pictures."""
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
@@ -79,7 +79,7 @@ def bare(axes: Axes) -> None:
 
 
 def scale_bar(axes: Axes, length_m: float) -> None:
-    """Draw a bar of `length_m` in the lower right corner of axes in metres."""
+    """Draw a scale bar of `length_m` in the lower right corner of axes in metres."""
     x_low, x_high = axes.get_xlim()
     y_low, y_high = axes.get_ylim()
     right = x_high - 0.03 * (x_high - x_low)
@@ -91,14 +91,14 @@ def scale_bar(axes: Axes, length_m: float) -> None:
 
 
 def key(owner: FigureBase | Axes, handles: Sequence[Artist], **changes: Any) -> None:
-    """Put the legend of `handles`, which carry labels, in one line below what it explains."""
+    """Add a legend of `handles`, which carry labels, in one line below `owner`; `changes`: options of the legend."""
     options: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "handlelength": 1.2}
     spacing: dict[str, Any] = {"handletextpad": 0.5, "columnspacing": 1.4, "ncols": len(handles)}
     owner.legend(handles=handles, **{**options, **spacing, **changes})
 
 
 def keep_apart(heights: Sequence[float], gap: float, top: float) -> list[float]:
-    """Return where names of what ends at `heights` stand: there or lower, `gap` from each other and from `top`."""
+    """Return heights of labels for lines that end at `heights`: there or lower, `gap` from each other and `top`."""
     places: dict[int, float] = {}
     above = top
     for i in sorted(range(len(heights)), key=lambda i: -heights[i]):

@@ -1,4 +1,4 @@
-"""flcav birdseye: a frame from above, as a picture."""
+"""`flcav birdseye`: bird's-eye view of a frame as a picture."""
 
 from pathlib import Path
 

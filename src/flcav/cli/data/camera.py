@@ -1,4 +1,4 @@
-"""flcav camera: what the cameras of a frame saw."""
+"""`flcav camera`: pictures of a frame's cameras, with annotations."""
 
 from pathlib import Path
 

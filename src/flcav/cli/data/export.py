@@ -1,4 +1,4 @@
-"""flcav export: a dataset in another format."""
+"""`flcav export`: convert a dataset to another format."""
 
 from collections import Counter, defaultdict
 from pathlib import Path
@@ -60,7 +60,7 @@ def export(
 
 
 def _left_out(left_out: Counter[tuple[str, str]]) -> list[str]:
-    """Return a line for each reason why frames were left out."""
+    """Return a line for each reason for which frames were left out."""
     frames: dict[str, list[str]] = defaultdict(list)
     count: Counter[str] = Counter()
     for (why, which), number in left_out.items():

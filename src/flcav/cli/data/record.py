@@ -1,4 +1,4 @@
-"""flcav record: a recipe to a dataset."""
+"""`flcav record`: record a dataset by a recipe."""
 
 from pathlib import Path
 

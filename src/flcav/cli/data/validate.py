@@ -1,4 +1,4 @@
-"""flcav validate: every check of datasets."""
+"""`flcav validate`: all checks of datasets."""
 
 from pathlib import Path
 

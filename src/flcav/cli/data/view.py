@@ -1,4 +1,4 @@
-"""flcav view: a scene of a dataset in Rerun."""
+"""`flcav view`: show a scene of a dataset in Rerun."""
 
 import os
 import sys

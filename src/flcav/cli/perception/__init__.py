@@ -1,1 +1,1 @@
-"""Commands about tasks: train, evaluate, infer, register errors."""
+"""Commands about perception tasks: train, evaluate, infer, register errors."""

@@ -1,4 +1,4 @@
-"""flcav errors: what a network misses and invents, as `flcav place` reads it."""
+"""`flcav errors`: register a network's errors, as a table for `flcav place`."""
 
 from collections import Counter
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""flcav evaluate: how good a network is on a dataset."""
+"""`flcav evaluate`: evaluate a network on a dataset."""
 
 from pathlib import Path
 

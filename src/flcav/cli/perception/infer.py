@@ -1,4 +1,4 @@
-"""flcav infer: a network on what sensors saw."""
+"""`flcav infer`: run a network on files or datasets."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""flcav train: a dataset to a network."""
+"""`flcav train`: train a network on datasets."""
 
 from pathlib import Path
 

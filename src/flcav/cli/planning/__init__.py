@@ -1,1 +1,1 @@
-"""Commands about plans: fit learning curves, allocate resources, place sensors."""
+"""Commands about plans: fit learning curves, allocate budgets, place sensors."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Compared(StrEnum):
-    """What the optimum can be compared with."""
+    """Baseline plans."""
 
     equal_stages = "equal-stages"
     equal_tasks = "equal-tasks"
@@ -94,7 +94,7 @@ def _as_json(plan: "Allocation", shares: "Shares", more: "Sequence[Saving]") -> 
 
 
 def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
-    """Return the plan as JSON has it: links by name, and without optional fields that say nothing."""
+    """Return the plan as a JSON value: links by name, without empty optional fields."""
     values = dataclasses.asdict(plan)
     values["tasks"] = [_given(task, "upper_error", "members") for task in values["tasks"]]
     for name in ("used_mb", "marginal_error_per_gb"):

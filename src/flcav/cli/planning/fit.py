@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Model(StrEnum):
-    """How the stages add up."""
+    """Form of the learning curve: how the stages add up."""
 
     additive = "additive"
     effective = "effective"
@@ -98,9 +98,9 @@ def fit(
 
 
 def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
-    """Return the text of the problem, if there is one, and what a history is of that does not name its task.
+    """Return the text of the problem, if there is one, and the task of a history that does not name any.
 
-    That is the only task of the problem, or what the history's file is called.
+    That is the only task of the problem, or the name `stem` of the history's file.
     """
     from flcav.config import InputError, read_yaml
     from flcav.optimization.allocation.problem_file import task_names
@@ -109,7 +109,7 @@ def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
         return None, stem
     if problem.suffix == ".json":
         raise InputError(f"{problem}: --problem writes YAML")
-    read_yaml(problem)  # refuses what is none
+    read_yaml(problem)  # raises for a file that is no YAML
     text = problem.read_bytes().decode("utf-8")
     names = task_names(text, str(problem))
     return text, names[0] if len(names) == 1 else stem
@@ -124,7 +124,7 @@ def _write(problem: Path, held: str | None, found: "Mapping[str, Learned]", k: i
 
 
 def _next(problem: Path, tasks: list[str]) -> str:
-    """Return what was written, and whether a plan can be made of it."""
+    """Return the message about what was written, and whether `flcav allocate` takes it."""
     from flcav.config import InputError
     from flcav.optimization.graph import load_problem
 

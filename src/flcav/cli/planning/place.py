@@ -1,4 +1,4 @@
-"""`flcav place`: where a roadside sensor covers most of the registered errors (VRCSP)."""
+"""`flcav place`: roadside sensors that cover most of the registered errors (VRCSP)."""
 
 from pathlib import Path
 

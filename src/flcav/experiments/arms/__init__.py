@@ -1,1 +1,1 @@
-"""The demo with several arms over seeds: what each stage and sensor is worth."""
+"""Ablation of the demo over seeds: the contribution of each stage and of the roadside sensor."""

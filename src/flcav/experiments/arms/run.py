@@ -1,7 +1,7 @@
-"""What each step buys, against its alternatives: the arms of recipes/runs/arms.yaml on the same frames, over seeds.
+"""Ablation: each stage and sensor against its alternatives, as the arms of recipes/runs/arms.yaml on the same frames.
 
-Every arm takes as many optimiser steps as the vehicles of stage II take together, and has a ledger of its own. Within a
-seed, intervals redraw test scenes; over seeds, they are Student's t, so they hold what training and traffic vary too.
+Every arm takes as many optimiser steps as the vehicles of stage II take together, and has a ledger of its own. Within
+a seed, intervals are a bootstrap over test scenes; over seeds, Student's t, which covers training and traffic too.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +24,7 @@ from flcav.report.charts import figures
 from flcav.sources.recipe import recipe_path
 
 TASK = "objects"
-ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: what the page calls an arm's stage
+ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: name in the tables -> arm, stage
     "grid": {
         "pretrained": (MAIN, PRETRAIN),
         "more pretraining": ("more", CENTRAL),
@@ -52,7 +52,7 @@ COMPARED = (  # (after, before): claims of the article and controls
 
 @dataclass(frozen=True)
 class Reached:
-    """AP of a network, at IoU 0.5 with its interval over test scenes, and at 0.7."""
+    """AP of a network at IoU 0.5, with its interval over test scenes, and at IoU 0.7."""
 
     ap50: float
     ap50_low: float | None
@@ -62,7 +62,7 @@ class Reached:
 
 @dataclass(frozen=True)
 class Counts:
-    """How much of each stage was planned."""
+    """The plan's samples and rounds."""
 
     samples: int
     edge_rounds: int
@@ -71,16 +71,16 @@ class Counts:
 
 @dataclass(frozen=True)
 class Pretraining:
-    """How stage I went."""
+    """Stage I: optimiser steps, threshold of pseudo-labels, and the training curve."""
 
     steps: int
-    threshold: float | None  # from which score on its detections serve as labels
+    threshold: float | None  # lowest score of detections that serve as labels
     curve: tuple[Mapping[str, float], ...]  # of every `Block`
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a region's roadside sensor stands."""
+    """Placement of a region's roadside sensor, and the errors it covers."""
 
     chosen: int
     densest: int  # pole of the densest traffic
@@ -92,7 +92,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class ArmsSeed:
-    """What one seed came to; by town: by arm, as `ARMS` calls them."""
+    """Results of one seed; arms are named as in `ARMS`."""
 
     seed: int
     plan: Counts
@@ -116,17 +116,17 @@ class ArmsSummary:
 
 @dataclass(frozen=True)
 class ArmsResult(Record):
-    """The numbers of the comparison of arms."""
+    """Results of the comparison of arms: numbers by seed, and means over seeds."""
 
     seeds: tuple[ArmsSeed, ...]
     summary: ArmsSummary
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: not in results of before
+    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
     note: str = "road labels come from an ideal road detector: arms with a pole are upper bounds"
 
 
 def study_recipe(name: str, scale: str) -> RunRecipe:
-    """Return the committed recipe of a comparison: "paper" as it stands, "quick" of the demo's size."""
+    """Return the package's recipe `runs/<name>`, unchanged for the scale "paper", of the demo's size for others."""
     recipe = read_config(RunRecipe, recipe_path(f"runs/{name}"))
     return recipe if scale == "paper" else recipe.model_copy(update={"size": "demo"})
 
@@ -141,14 +141,14 @@ def run_arms(
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> ArmsResult:
-    """Run or finish all arms of each seed in folders below `out` and return the results."""
+    """Run or finish all arms of each seed, in folders below `out`, and return the results."""
     runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     rows = tuple(one_seed(run) for run in runs)
     return ArmsResult(rows, summarise(rows), recipe.model_dump(mode="json", exclude={"seed"}), provenance())
 
 
 def one_seed(run: Run) -> ArmsSeed:
-    """Return what the page tells of a seed."""
+    """Return the numbers of one seed's run."""
     main, pretrained = run.arms[MAIN], run.pretrained[0]
     own, plan = main.links, main.plan.tasks[TASK]
     ap = {town: {arm: _tested(run, town, *stage) for arm, stage in arms.items()} for town, arms in ARMS.items()}
@@ -210,7 +210,7 @@ def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
 
 
 def _known(number: float | None) -> float:
-    assert number is not None  # every town has cars to find
+    assert number is not None  # every town has targets
     return number
 
 

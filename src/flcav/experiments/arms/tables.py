@@ -1,4 +1,4 @@
-"""The tables on the page of the comparison of arms, from its numbers."""
+"""Markdown tables of the comparison of arms."""
 
 from collections import Counter
 
@@ -18,7 +18,7 @@ def tables(results: ArmsResult) -> dict[str, str]:
 
 
 def _town(results: ArmsResult, town: str) -> str:
-    """Return AP by arm; in grid, which has an oracle, also how much of the gap to it each arm closes."""
+    """Return AP by arm; in grid, which has an oracle, also the fraction of the gap to it that each arm closes."""
     summary = results.summary
     closed = summary.gap_closed if town == "grid" else {}
     rows = [

@@ -1,1 +1,1 @@
-"""Fig. 1b of the article: four tasks on one scene."""
+"""Fig. 1b of the article: the four perception tasks on one scene."""

@@ -1,4 +1,4 @@
-"""Tasks side by side, each a column from what a sensor saw, through the network's own layers, to what it says."""
+"""A figure with a column per task: sensor data, preprocessed input, activations of layers, output."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,38 +17,38 @@ from flcav.report import style
 Draw = Callable[[Axes], None]
 ROWS = ("sensor", "processing", "network", "output")
 WIDTH_IN, HEIGHT_IN = 13.0, 9.0
-ASPECT = 0.6  # height of a panel by its width
-FROM_ABOVE: dict[str, Any] = {"xlim": (-28, 28), "ylim": (0, 33.6), "aspect": "auto"}  # of a sweep [m]
-BEHIND_M, ABOVE_M = 9.0, 5.0  # where one stands to see a sweep, from its sensor
-SHOWN_MAPS = 3  # of a layer
+ASPECT = 0.6  # height of a panel, divided by its width
+FROM_ABOVE: dict[str, Any] = {"xlim": (-28, 28), "ylim": (0, 33.6), "aspect": "auto"}  # limits of axes for a sweep [m]
+BEHIND_M, ABOVE_M = 9.0, 5.0  # viewpoint of a sweep in perspective, from its sensor
+SHOWN_MAPS = 3  # most active feature maps of a layer
 ACTIVE = LinearSegmentedColormap.from_list("active", ["#f4f7fa", style.SKY, style.BLUE, "#00284a"])
 
 
 @dataclass(frozen=True)
 class Layer:
-    """What a layer put out."""
+    """The output of a layer for one sample."""
 
     name: str
     values: NDArray[np.float32]  # (C, H, W) maps or (C,) a vector
 
     @property
     def shape(self) -> str:
-        """Return the shape in words."""
+        """Return the shape as text, such as "16 × 5 × 5"."""
         return " × ".join(str(side) for side in self.values.shape)
 
 
 @dataclass(frozen=True)
 class Column:
-    """One task, from top to bottom."""
+    """The column of one task: a drawing function and a caption for each of `ROWS`."""
 
     title: str
-    draws: Mapping[str, Draw]  # of each of ROWS
+    draws: Mapping[str, Draw]  # by row
     captions: Mapping[str, str]
 
 
 @style.styled
 def task_columns(columns: Sequence[Column]) -> Figure:
-    """Return the figure: a column per task, a row per step."""
+    """Return the figure: a column per task, a row for each of `ROWS`."""
     figure = style.canvas(WIDTH_IN, HEIGHT_IN)
     panels = figure.subplots(len(ROWS), len(columns), squeeze=False)
     for number, column in enumerate(columns):
@@ -71,7 +71,7 @@ def show_picture(axes: Axes, picture: NDArray[np.uint8], *, smooth: bool = True)
 
 
 def show_layers(axes: Axes, layers: Sequence[Layer]) -> None:
-    """Draw the layers as slabs one behind the other: of maps the most active ones, of vectors all numbers."""
+    """Draw the layers from left to right: the `SHOWN_MAPS` most active feature maps, or a vector as a column."""
     x = 0.0
     for number, layer in enumerate(layers):
         x += _slab(axes, x, layer, lower=number % 2 == 1)
@@ -80,7 +80,7 @@ def show_layers(axes: Axes, layers: Sequence[Layer]) -> None:
 
 
 def _slab(axes: Axes, x: float, layer: Layer, *, lower: bool) -> float:
-    """Draw a layer with its left edge at `x`; return how far right of it the next one begins."""
+    """Draw a layer with its left edge at `x`; return the distance to the left edge of the next one."""
     width = 0.0
     if layer.values.ndim == 1:
         column = np.abs(layer.values)[:, None] / max(float(np.abs(layer.values).max()), 1e-9)
@@ -117,7 +117,7 @@ def show_probabilities(axes: Axes, probabilities: Mapping[str, float]) -> None:
 
 
 def show_anchors(axes: Axes, picture: NDArray[np.uint8], stride: int, anchors: Sequence[tuple[float, float]]) -> None:
-    """Show a picture greyed, its coarsest cells, and the anchors (width, height [px]) side by side in its middle."""
+    """Show a picture in grey with the coarsest grid cells, and the anchors (width, height [px]) side by side."""
     grey = picture.mean(axis=2, keepdims=True).repeat(3, axis=2)
     show_picture(axes, (128 + 0.5 * grey).clip(0, 255).astype(np.uint8))
     height, width = picture.shape[:2]
@@ -131,7 +131,7 @@ def show_anchors(axes: Axes, picture: NDArray[np.uint8], stride: int, anchors: S
 
 
 def show_voxels(axes: Axes, points: NDArray[np.float32], range_m: Sequence[float], cell_m: float) -> None:
-    """Draw from above how many heights of each ground cell hold a voxel with points."""
+    """Draw from above the number of occupied voxels in each column of cells, `cell_m` wide."""
     x0, y0, z0, x1, y1, z1 = range_m
     inside = ((points[:, :3] >= (x0, y0, z0)) & (points[:, :3] < (x1, y1, z1))).all(1)
     voxels = np.unique(((points[inside, :3] - (x0, y0, z0)) / cell_m).astype(int), axis=0)
@@ -144,7 +144,7 @@ def show_voxels(axes: Axes, points: NDArray[np.float32], range_m: Sequence[float
 
 
 def show_sweep(axes: Axes, points: NDArray[np.float32], range_m: Sequence[float], height_m: float) -> None:
-    """Draw a sweep as seen from behind and above its sensor, coloured by height, as far as the network looks."""
+    """Draw a sweep in perspective from behind and above its sensor, coloured by height, within the network's range."""
     x1, half = range_m[3], range_m[4]
     near = points[(points[:, 0] > 1) & (points[:, 0] < x1) & (np.abs(points[:, 1]) < half)]
     depth = near[:, 0] + BEHIND_M
@@ -156,7 +156,7 @@ def show_sweep(axes: Axes, points: NDArray[np.float32], range_m: Sequence[float]
 
 
 def show_raster(axes: Axes, raster: NDArray[np.float32], colours: Sequence[str | tuple[float, ...] | None]) -> None:
-    """Draw the layers (L, H, W) of a raster over each other, each in its colour; None leaves one out."""
+    """Draw the layers (L, H, W) of a raster over each other, each in its colour; None: the layer is left out."""
     picture = np.ones((*raster.shape[1:], 3))
     for layer, colour in zip(raster, colours, strict=True):
         if colour is not None:

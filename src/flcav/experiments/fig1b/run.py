@@ -1,7 +1,7 @@
-"""Fig. 1b of Wang et al. (IEEE Network 37(3), 2023), of our own: four tasks on one recorded scene.
+"""Fig. 1b of Wang et al. (IEEE Network 37(3), 2023), redrawn: the four perception tasks on one recorded scene.
 
-From top to bottom: what the sensor saw, what became of it on the way into the network, what the network's layers hold
-while they look at it, and what it says. The networks are those that come with the package.
+From top to bottom: sensor data, the network's preprocessed input, activations of its layers, and its output. The
+networks are those of the package.
 """
 
 from collections.abc import Mapping
@@ -44,7 +44,7 @@ from flcav.sources.recipe import Recipe
 
 WIDE, NARROW, LIDAR = "wide", "narrow", "velodyne"
 CAMERA = {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 640, "height": 384}}
-PRESENT = 5  # the spin that is shown: 2.5 s after the first, 3.5 s before the last
+PRESENT = 5  # spin that is shown: 2.5 s after the first, 3.5 s before the last
 RECIPE: Mapping[str, Any] = {
     "town": "grid",
     "seed": 79,
@@ -61,9 +61,9 @@ RECIPE: Mapping[str, Any] = {
     },
     "weather": "clear",
 }
-MAP_M = 50.0  # to either side of the observer
-SCORE = 0.3  # lowest that is shown
-CELL_M = 0.4  # of the voxels drawn: four of the network's, whose own would be too small to see
+MAP_M = 50.0  # shown to either side of the observer
+SCORE = 0.3  # lowest score that is shown
+CELL_M = 0.4  # of a drawn voxel, four of the network's wide: its own would be too small to see
 WAY, SELF, OTHERS, PEDESTRIAN = (0.75, 0.87, 0.95), (0.84, 0.37, 0), (0.0, 0.45, 0.7), (0.8, 0.47, 0.65)
 RASTER_COLOURS = {
     **dict(zip(("road", "lane", "crossing"), MAP_COLOURS, strict=True)),
@@ -75,7 +75,7 @@ RASTER_COLOURS = {
 
 
 def fig1b(out: Path, progress: Report = silent) -> bytes:
-    """Record the scene into `out`, look at it with the networks of the package, and return the figure as a PNG.
+    """Record the scene into `out`, run the package's networks on it, and return the figure as a PNG.
 
     Raises `InputError` where one of the tasks has no weights in the package.
     """
@@ -93,7 +93,7 @@ def fig1b(out: Path, progress: Report = silent) -> bytes:
 
 
 def most_to_see(data: Dataset) -> int:
-    """Return the frame of the present with the most signs that can be read and objects near ahead."""
+    """Return the number of the frame with the most legible signs and near objects ahead, of the spin `PRESENT`."""
 
     def worth(number: int) -> float:
         frame = data.frame(number)
@@ -180,7 +180,7 @@ def _objects(network: Any, points: Path) -> page.Column:
 
 
 def _trajectory(network: Any, data: Dataset, number: int) -> page.Column:
-    """Return the column of the rasters that one road user's future is predicted from, and the futures of all."""
+    """Return the column of the trajectory task: the raster of one road user, and the predicted paths of all."""
     with watched(LAYERS["trajectory"](network)) as seen, given_to(network.view) as given:
         finding = next(islice(TRAJECTORY.infer(network, data.folder), number, None))
     raster = given[0].raster[0].cpu().numpy()

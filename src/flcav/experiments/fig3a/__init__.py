@@ -1,1 +1,1 @@
-"""Fig. 3a of the article: learning curves and the plans that follow from them."""
+"""Fig. 3a of the article: the three-layer graph and learning curves."""

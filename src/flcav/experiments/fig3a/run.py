@@ -1,7 +1,7 @@
-"""Fig. 3a of Wang et al. (IEEE Network 37(3), 2023): the three-layer graph, and learning curves with points and bands.
+"""Fig. 3a of Wang et al. (IEEE Network 37(3), 2023): the three-layer graph, and learning curves with confidence bands.
 
-Curves of the article's own points, in its form accuracy = 1 - a x^(-b); and of the history that our own runs wrote, in
-the additive form that plans are made from.
+One set of curves is fitted to the article's own points, in its form accuracy = 1 - a x^(-b); the other to the history
+of this package's runs, in the additive form that plans use.
 """
 
 from collections.abc import Mapping
@@ -26,14 +26,14 @@ from flcav.report.charts import curves as curve_charts
 
 Array = NDArray[np.float64]
 
-PRINTED = {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}  # a and b of its software
-NEAR = 0.03  # relative: how near to the printed constants a plain least-squares fit is to come
-LEVEL = 0.95  # of the bands
+PRINTED = {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}  # a and b of the authors' software
+NEAR = 0.03  # relative: deviation of fitted from printed constants that counts as near
+LEVEL = 0.95  # confidence level of the bands
 
 
 @dataclass(frozen=True)
 class Constants:
-    """The two of the article's form accuracy = 1 - a x^(-b)."""
+    """The constants of the article's form accuracy = 1 - a x^(-b)."""
 
     a: float
     b: float
@@ -46,9 +46,9 @@ class ArticleCurve:
     points: tuple[tuple[float, float], ...]  # samples, accuracy
     fitted: Additive
     printed: Constants
-    off: Constants  # fitted / printed - 1
+    off: Constants  # relative deviation: fitted / printed - 1
     rmse: float  # of accuracy
-    resource: tuple[float, ...]  # samples, where the next three are
+    resource: tuple[float, ...]  # samples at which the next three are given
     accuracy: tuple[float, ...]
     low: tuple[float, ...]  # band
     high: tuple[float, ...]
@@ -56,18 +56,18 @@ class ArticleCurve:
 
 @dataclass(frozen=True)
 class OwnLine:
-    """A section of our own curve: of one number of samples, along a run's rounds."""
+    """The package's own curve at one number of samples, along the rounds of a run."""
 
     samples: int
     accuracy: tuple[float, ...]  # at each of `OwnCurves.route`
     low: tuple[float, ...]  # band
     high: tuple[float, ...]
-    points: tuple[tuple[int, float], ...]  # place in the route, accuracy
+    points: tuple[tuple[int, float], ...]  # index in the route, accuracy
 
 
 @dataclass(frozen=True)
 class OwnCurves:
-    """The curve of our own history."""
+    """The learning curve fitted to the package's own history."""
 
     route: tuple[tuple[int, int], ...]  # edge rounds, cloud rounds
     curve: Additive
@@ -77,17 +77,17 @@ class OwnCurves:
 
 @dataclass(frozen=True)
 class Fig3a(Record):
-    """The curves with their points and bands, and how near the fits come to the printed constants."""
+    """Numbers of the figure: curves with points and bands, and findings about the fits."""
 
     article: Mapping[str, ArticleCurve]  # by task
     own: OwnCurves
     findings: tuple[str, ...]
-    level: float = LEVEL  # of the bands
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # not in results of before
+    level: float = LEVEL  # confidence level of the bands
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
 
 
 def fig3a() -> Fig3a:
-    """Return the numbers of the figure."""
+    """Fit both sets of curves and return the numbers of the figure."""
     article = {task: _article_curve(points, PRINTED[task]) for task, points in article_histories().items()}
     own = _own_curves()
     return Fig3a(article, own, _findings(article, own), provenance=provenance())
@@ -115,14 +115,14 @@ def _article_curve(points: History, printed: tuple[float, float]) -> ArticleCurv
 
 
 def _line(fit: Fit[Additive], found: Bands | None, where: Array) -> tuple[tuple[float, ...], ...]:
-    """Return the accuracy at `where` (n, 3), and the low and high end of its band."""
+    """Return the accuracy at `where` (n, 3), and the low and high ends of its band; without a band, the accuracy."""
     accuracy = 1 - fit.curve.error(*where.T)
     low, high = (accuracy, accuracy) if found is None else (1 - error for error in found.between(where)[::-1])
     return tuple(tuple(each.tolist()) for each in (accuracy, low, high))
 
 
 def _own_curves() -> OwnCurves:
-    """Return a line per number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
+    """Return a line for each number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
     history = history_of("objects")
     samples, edge_rounds, cloud_rounds = history.resources.T
     fit = fit_additive(samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
@@ -140,7 +140,7 @@ def _own_curves() -> OwnCurves:
 
 
 def _findings(article: Mapping[str, ArticleCurve], own: OwnCurves) -> tuple[str, ...]:
-    """Return what the numbers say, in sentences."""
+    """Return the findings as sentences."""
     off = {(task, name): value for task, each in article.items() for name, value in vars(each.off).items()}
     (task, name), worst = max(off.items(), key=lambda item: abs(item[1]))
     near = all(abs(value) <= NEAR for value in off.values())
@@ -155,7 +155,7 @@ def _findings(article: Mapping[str, ArticleCurve], own: OwnCurves) -> tuple[str,
 
 
 def article_graph() -> nx.Graph:
-    """Return the graph of the article's experiments: three tasks, seven vehicles, two edge servers, links not known."""
+    """Return the three-layer graph of the article's experiments: three tasks, seven vehicles, two edge servers."""
     networks = {
         "CNN": ("weather", 23.0, "camera", 700),
         "YOLOv5": ("signs", 14.0, "camera", 7000),
@@ -186,7 +186,7 @@ def _effective(a: float, b: float, group_samples: int) -> dict[str, str | float]
 
 
 def draw_fig3a(results: Fig3a) -> bytes:
-    """Return the figure as a PNG: the graph on the left, the article's curves, our own."""
+    """Return the figure as a PNG: the graph, the article's curves, the package's own curves."""
     article = [
         curve_charts.Curve(
             f"{task}\n1 − {each.fitted.pretrain.a:.3g}·x$^{{-{each.fitted.pretrain.b:.2g}}}$",

@@ -1,4 +1,4 @@
-"""The tables on the page of the learning curves, from their numbers."""
+"""Markdown tables of Fig. 3a."""
 
 from flcav.experiments.fig3a.run import Fig3a
 from flcav.markdown import bullets, table

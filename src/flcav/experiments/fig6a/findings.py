@@ -1,4 +1,4 @@
-"""What the comparison of two plans says, in sentences computed from its numbers."""
+"""Findings of the comparison of two plans: verdicts on claims, as sentences with the numbers behind them."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds
 
 
 def allocation_findings(results: AllocationResult) -> tuple[PlanFinding, ...]:
-    """Return findings about `results`."""
+    """Return the findings: gain, ranking by prediction, gain of every stage, accuracy of prediction, budgets."""
     return (_better(results), _ranking(results), _every_stage(results), _accuracy(results), _budgets(results))
 
 
@@ -29,7 +29,7 @@ def _better(results: AllocationResult) -> PlanFinding:
 
 
 def _difference(results: AllocationResult) -> tuple[MeanOverSeeds, str]:
-    """Return the paired difference after the last stage: over seeds, or over the scenes of the only one."""
+    """Return the paired difference after the last stage, and over what its interval is: seeds, or one seed's scenes."""
     seeds = results.seeds
     if len(seeds) == 1:
         own = seeds[0].differences[TOWN]["cloud"]
@@ -59,7 +59,7 @@ def _ranking(results: AllocationResult) -> PlanFinding:
 
 
 def _why(results: AllocationResult) -> str:
-    """Return where prediction and training part most, and whether the plans go beyond what history holds."""
+    """Return where prediction and training differ most, and which counts of the plans are outside the history."""
     summary = results.summary
     predicted = _gains(summary.predicted_difference)
     realised = _gains({stage: each.mean for stage, each in summary.realised_difference[TOWN].items()})
@@ -79,7 +79,7 @@ def _why(results: AllocationResult) -> str:
 
 
 def _every_stage(results: AllocationResult) -> PlanFinding:
-    """Return what each stage of federation added in each plan: the curves fall always and cannot foresee a loss."""
+    """Return the gain of each federated stage in each plan; the learning curves cannot predict a loss."""
     gains = {(name, stage): _gain(results, TOWN, name, stage) for name in (EQUAL, JOINT) for stage in ("edge", "cloud")}
     plans = results.seeds[0].plans
     rounds = {(name, stage): plans[name].counts[f"{stage}_rounds"] for name, stage in gains}
@@ -105,7 +105,7 @@ def _every_stage(results: AllocationResult) -> PlanFinding:
 
 
 def _gain(results: AllocationResult, town: str, name: str, stage: str) -> MeanOverSeeds:
-    """Return what a stage added to what was there before it, over seeds; a single seed decides nothing."""
+    """Return a stage's gain over the stage before it, as the mean over seeds; of a single seed it is undecided."""
     before = {"edge": "pretrain", "cloud": "edge"}[stage]
     rows = [seed.realised[town][name] for seed in results.seeds]
     gain = mean_over_seeds([row[stage].ap50 - row[before].ap50 for row in rows])
@@ -117,7 +117,7 @@ def _interval(gain: MeanOverSeeds) -> str:
 
 
 def _gains(after: Mapping[str, float]) -> dict[str, float]:
-    """Return what each stage adds to what was there before it."""
+    """Return the gain of each stage over the stage before it."""
     before = {"pretrain": 0.0, "edge": after["pretrain"], "cloud": after["edge"]}
     return {stage: after[stage] - before[stage] for stage in STAGE_NAMES}
 

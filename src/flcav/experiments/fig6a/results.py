@@ -1,4 +1,4 @@
-"""The numbers of the comparison of two plans: what was predicted of them, and what training reached."""
+"""Records of the comparison of two plans: predictions of the learning curve, and scores after training."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from flcav.pipeline.results import LinkUse
 from flcav.records import LEFT_OUT, Record
 
 EQUAL, JOINT = "equal-stages", "joint"  # the plans
-TOWN = "grid"  # whose accuracies the planner's history holds
+TOWN = "grid"  # of the accuracies in the planner's history
 COUNTS = ("samples", "edge_rounds", "cloud_rounds")
 
 
@@ -28,7 +28,7 @@ class Planned:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Return `COUNTS` by name."""
+        """Return samples, edge rounds and cloud rounds by name."""
         return dict(zip(COUNTS, (self.samples, self.edge_rounds, self.cloud_rounds), strict=True))
 
 
@@ -41,7 +41,7 @@ class Reached:
 
 @dataclass(frozen=True)
 class AllocationSeed:
-    """What one seed came to; by plan are `EQUAL` and `JOINT`, by stage pretrain, edge and cloud."""
+    """Results of one seed. Plans are `EQUAL` and `JOINT`; stages are pretrain, edge and cloud."""
 
     seed: int
     plans: Mapping[str, Planned]
@@ -64,7 +64,7 @@ class AllocationSummary:
 
 @dataclass(frozen=True)
 class PlanFinding:
-    """What the numbers say of a claim."""
+    """The verdict on one claim."""
 
     question: str
     verdict: str
@@ -73,12 +73,12 @@ class PlanFinding:
 
 @dataclass(frozen=True)
 class AllocationResult(Record):
-    """The numbers of both plans, and what they say."""
+    """Results of the comparison: numbers of both plans by seed, means over seeds, and findings."""
 
-    history: Mapping[str, tuple[float, float]]  # least and most of each count in what both plans were predicted from
+    history: Mapping[str, tuple[float, float]]  # least and most of each count in the planner's history
     seeds: tuple[AllocationSeed, ...]
     summary: AllocationSummary
     findings: tuple[PlanFinding, ...] = ()
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: not in results of before
+    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
     note: str = "road labels come from an ideal road detector: AP after edge FL and cloud FL is an upper bound"

@@ -1,9 +1,9 @@
-"""Proof by training of MLGRA (Wang et al., IEEE Network 37(3), 2023, Fig. 6a): equal stages against the joint plan.
+"""Validation of MLGRA by training (Wang et al., IEEE Network 37(3), 2023, Fig. 6a): joint plan against equal stages.
 
 Both plans, the arms of recipes/runs/allocation.yaml, have the demo's budgets, the same learning curve, and the same
-limits, wider than the demo's, so that budgets and not time bind. They share their recorded frames; each places its own
-poles, as the errors of its own pretrained network ask. What the curve predicts after each stage stands beside what
-training reached.
+limits, wider than the demo's, so that only the budgets bind. They share their recorded frames; each places its sensors
+by the errors of its own pretrained network. The score that the curve predicts after each stage is compared with the
+score after training.
 """
 
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ def run_allocation(
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> AllocationResult:
-    """Run or finish both plans of each seed in folders below `out` and return the results."""
+    """Run or finish both plans of each seed, in folders below `out`, and return the results."""
     runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     rows = tuple(one_seed(run) for run in runs)
     asked = recipe.model_dump(mode="json", exclude={"seed"})
@@ -59,7 +59,7 @@ def run_allocation(
 
 
 def one_seed(run: Run) -> AllocationSeed:
-    """Return what the page tells of a seed."""
+    """Return the numbers of one seed's run."""
     towns = run.recipe.with_role("federate")
     arms = {name: run.arms[arm] for name, arm in ARM_OF.items()}
     plan_of = {name: arm.plan.tasks[TASK] for name, arm in arms.items()}
@@ -100,12 +100,12 @@ def _ap50(run: Run, arm: str, stage: str, town: str) -> float:
 
 
 def _difference(estimate: Estimate | None) -> Estimate:
-    """Return a difference; none where both plans are the same and share their steps."""
+    """Return the difference; 0 for None: both plans are equal and share their steps."""
     return Estimate(0.0, 0.0, 0.0) if estimate is None else estimate
 
 
 def _history_ranges() -> dict[str, tuple[float, float]]:
-    """Return the least and the most of each count in the history that both plans were predicted from."""
+    """Return the least and most of each count in the history that both plans are predicted from."""
     columns = history_of(TASK).resources.T
     return {name: (float(column.min()), float(column.max())) for name, column in zip(COUNTS, columns, strict=True)}
 

@@ -1,4 +1,4 @@
-"""The tables on the page of the proof by training, from its numbers."""
+"""Markdown tables of Fig. 6a."""
 
 from flcav.experiments.fig6a.findings import STAGE_NAMES
 from flcav.experiments.fig6a.results import EQUAL, JOINT, TOWN, AllocationResult
@@ -8,7 +8,7 @@ NAMES = {EQUAL: "equal stages", JOINT: "joint"}
 
 
 def tables(results: AllocationResult) -> dict[str, str]:
-    """Return Markdown by name: findings, plans, accuracy, differences, megabytes."""
+    """Return Markdown by name: findings (a list), plans, accuracy, differences, megabytes."""
     return {
         "findings": bullets(
             f"*{finding.question}* **{finding.verdict}.** {finding.sentence}" for finding in results.findings

@@ -1,1 +1,1 @@
-"""The detector trained in simulation, on real sweeps."""
+"""Sim-to-real transfer: simulated clouds compared with KITTI's, and the simulation-trained detector on KITTI."""

@@ -1,6 +1,6 @@
-"""What a LiDAR's clouds are like, in numbers that real and simulated ones can be compared by.
+"""Statistics of LiDAR clouds: returns by range, intensities, the street ahead, and cars.
 
-Only what a camera ahead shows is looked at: KITTI keeps no more of its clouds.
+Only points inside the view of a forward camera count, since KITTI's labels cover no others.
 """
 
 import itertools
@@ -14,17 +14,17 @@ from flcav.perception.objects.augment import in_view
 from flcav.report.pictures.clouds import CloudNumbers, SeenCar, Street
 
 RANGES_M = (0, 5, 10, 15, 20, 25, 30, 40, 50, 60, 80)
-GROUND_M = (5, 8, 12, 16, 20, 25)  # limits of the stretches of street ahead
-ASIDE_M = 4.0  # half the width of the street that is looked at
-LOW_M = -1.2  # what lies lower is taken for ground [sensor frame]
+GROUND_M = (5, 8, 12, 16, 20, 25)  # limits of the sections of street ahead
+ASIDE_M = 4.0  # half the width of the street
+LOW_M = -1.2  # points below are ground, sensor frame
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-NO_INTENSITY = 0.005
+NO_INTENSITY = 0.005  # below this a return counts as without intensity
 
 Labelled = tuple[NDArray[np.float32], Boxes]  # points (N, 4) and cars of a frame, LiDAR frame
 
 
 def describe(frames: Iterable[Labelled]) -> CloudNumbers:
-    """Return the numbers of some frames."""
+    """Return the statistics of the clouds of several frames."""
     frames = [(points[in_view(points)], cars) for points, cars in frames]
     points = np.concatenate([points for points, _ in frames])
     distance = np.linalg.norm(points[:, :3], axis=1)
@@ -41,7 +41,7 @@ def describe(frames: Iterable[Labelled]) -> CloudNumbers:
 
 
 def _ground(points: NDArray[np.float32]) -> tuple[Street, ...]:
-    """Return median height and intensity, and the spread of height, of the street at several distances."""
+    """Return the median height and intensity of the street, and the spread of its height, by distance ahead."""
     low = points[(np.abs(points[:, 1]) < ASIDE_M) & (points[:, 2] < LOW_M)]
     rows = []
     for near, far in itertools.pairwise(GROUND_M):
@@ -54,7 +54,7 @@ def _ground(points: NDArray[np.float32]) -> tuple[Street, ...]:
 
 
 def _cars(points: NDArray[np.float32], cars: Boxes) -> list[SeenCar]:
-    """Return distance, returns, size and share of returns without intensity of each car that has returns."""
+    """Return distance, returns, size and share of returns without intensity of each car with returns."""
     inside = points_in_boxes(points, cars)
     rows = []
     for box, own in zip(cars.array(), inside, strict=True):

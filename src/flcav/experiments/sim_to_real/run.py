@@ -1,7 +1,7 @@
-"""From simulation to reality: what sets their clouds apart, and how well a detector that never saw a real one does.
+"""Sim-to-real gap: statistics of simulated and KITTI's clouds, and AP on KITTI of a detector trained in simulation.
 
-Two recordings of the same scenes are compared with KITTI's frames: with the LiDAR of the `kitti` rig, and with one that
-has its beams alone, on Lambertian surfaces. The detector is the one that comes with the package.
+KITTI's frames are compared with two recordings of the same simulated scenes: with the LiDAR of the `kitti` rig, and
+with one that has only its beams, on Lambertian surfaces. The detector is the package's own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ from flcav.records import LEFT_OUT, Class, Record
 from flcav.report import style
 from flcav.report.pictures.clouds import CloudNumbers, real_frame
 
-RECIPE: dict[str, Any] = {
+RECIPE: dict[str, Any] = {  # of the simulated scenes
     "town": "suburb",
     "seed": 21,
     "scenes": 4,
@@ -45,19 +45,19 @@ RIGS: dict[str, Any] = {
 }
 REAL = "KITTI"
 LIDAR = "velodyne"
-SHOWN = 0.3  # score from which a detection counts as found in the lists of frames
-NEUTRAL = {"Van": "Car", "Truck": "Car", "Tram": "Car", "Misc": "Car", "Person_sitting": "Pedestrian"}
+SHOWN = 0.3  # lowest score of the detections that are counted and listed by frame
+NEUTRAL = {"Van": "Car", "Truck": "Car", "Tram": "Car", "Misc": "Car", "Person_sitting": "Pedestrian"}  # -> class
 
 
 @dataclass(frozen=True)
 class RealScore:
-    """What was found of one class in real frames, under one measure of overlap."""
+    """Detections of one class in real frames, matched at one limit of one kind of IoU."""
 
     label: Class
     kind: Kind
     iou: float
     targets: int
-    found: int  # those that score `SHOWN` or more, as `false_positives`
+    found: int  # with a score of `SHOWN` or more, as `false_positives`
     false_positives: int
     ap: float | None  # None without targets
 
@@ -67,12 +67,12 @@ class LabelledCar:
     """A labelled car of a real frame."""
 
     distance_m: float
-    found_at: tuple[float, ...]  # limits of IoU
+    found_at: tuple[float, ...]  # limits of IoU at which a detection matches it
 
 
 @dataclass(frozen=True)
 class Story:
-    """What was found and missed in a real frame; the labels stay where they are: they are KITTI's."""
+    """Detections and misses in a real frame; KITTI's labels themselves are not copied."""
 
     frame: str
     boxes: tuple[ObjectFound, ...]
@@ -81,12 +81,12 @@ class Story:
 
 @dataclass(frozen=True)
 class SimToReal(Record):
-    """The comparison of clouds, and the detections in real frames."""
+    """Results of the experiment: statistics of clouds, detections by class, and by real frame."""
 
-    clouds: Mapping[str, CloudNumbers]  # by where they are from
+    clouds: Mapping[str, CloudNumbers]  # by origin: `REAL`, or a name in `RIGS`
     scores: tuple[RealScore, ...]
     frames: tuple[Story, ...]
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # not in results of before
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
 
 
 def run_sim_to_real(
@@ -99,9 +99,9 @@ def run_sim_to_real(
     stale: str = "refuse",
     engine: str = "processes",
 ) -> SimToReal:
-    """Return the comparison of clouds, and the detections of `network` in the frames of the folder `kitti`.
+    """Compare simulated clouds with those of the folder `kitti`, and evaluate `network` on its frames.
 
-    Frames are recorded in `out`, as `run_steps` does. Raises `InputError` where that is no KITTI folder.
+    Simulated frames are recorded in `out` by `run_steps`. Raises `InputError` where `kitti` is no KITTI folder.
     """
     folder = KittiFolder.open(kitti)
     real = [folder.frame(number) for number in range(len(folder))]
@@ -118,16 +118,16 @@ def run_sim_to_real(
 
 
 def labelled(data: Dataset, number: int) -> Labelled:
-    """Return the cloud and the cars and vans of a recorded frame."""
+    """Return the cloud (N, 4) of a recorded frame and the boxes of its cars and vans, LiDAR frame."""
     frame = data.frame(number)
     boxes = frame.annotations.boxes.transformed(inverse(frame.world_from_sensor(LIDAR)))
     return frame.lidar[LIDAR], boxes[np.isin(boxes.label, ("car", "van"))]
 
 
 def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[RealScore, ...], tuple[Story, ...]]:
-    """Return AP per class, kind of overlap and IoU over real frames, and of each frame what was found and missed.
+    """Return AP by class, kind and limit of IoU over real frames, and the detections and misses of each frame.
 
-    As on KITTI, vans and the like are neutral, and so is whatever a frame's image does not show.
+    As in KITTI's evaluation, similar classes (`NEUTRAL`) are neutral. Detections outside the image are left out.
     """
     found = [shown(detect(network, frame.points, score_threshold=LOWEST_SCORE), frame) for frame in frames]
     scores = []
@@ -145,12 +145,12 @@ def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[Rea
 
 
 def shown(boxes: Boxes, frame: KittiFrame) -> Boxes:
-    """Return the boxes whose centre the frame's image shows."""
+    """Return the boxes whose centre is inside the frame's image."""
     return boxes[kitti_view(frame.image, frame.calibration).shows(boxes.center)]
 
 
 def draw_frame(kitti: Path, story: Story) -> bytes:
-    """Return the picture of one frame of the results: its cloud from above and its image, with boxes."""
+    """Return a PNG of one frame of the results: cloud from above and image, with labelled cars and detections."""
     folder = KittiFolder.open(kitti)
     frame = folder.frame(folder.names.index(story.frame))
     view = kitti_view(frame.image, frame.calibration)
@@ -164,7 +164,7 @@ def _neutral(frame: KittiFrame, name: str) -> Boxes:
 
 
 def _story(frame: KittiFrame, found: Boxes) -> Story:
-    """Return the frame's found boxes, and of each labelled car its distance and the limits of IoU it was found at."""
+    """Return the frame's detections, and each labelled car's distance and the limits of IoU it was found at."""
     boxes = frame.objects.boxes
     cars = of_class(boxes, "Car")
     score = found.score if found.score is not None else np.ones(len(found))

@@ -1,4 +1,4 @@
-"""The tables on the page about simulation and reality."""
+"""Markdown tables of the sim-to-real experiment."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,7 +10,7 @@ from flcav.report.pictures.clouds import CloudNumbers, SeenCar
 
 
 def tables(results: SimToReal) -> dict[str, str]:
-    """Return the page's tables by name, from what `run_sim_to_real` returned."""
+    """Return Markdown by name: detections, cars, clouds."""
     clouds = results.clouds
     return {
         "detections": table(

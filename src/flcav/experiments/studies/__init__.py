@@ -1,6 +1,6 @@
-"""The studies of the tasks by name: `STUDIES`, the one list of those of the package, and those of users' own tasks.
+"""Registry of the tasks' studies: those of the package by name, and users' own as `module:NAME`.
 
-What is recorded, trained and tested is the task's own (`flcav.perception.study`); here is how its results are drawn.
+What is recorded, trained and tested is in `flcav.perception.study`; the modules here draw and tabulate the results.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ STUDIES: Mapping[str, str] = {  # name -> module:NAME, so that listing them load
 
 
 def study_named(name: str) -> "Study":
-    """Return the study of that name, one of `STUDIES`, or as `module:NAME` a study or a studied task of somebody's own.
+    """Return a study: one of `STUDIES`, or for `module:NAME` a user's own study, or the study of a user's own task.
 
     Raises `InputError` where there is none.
     """
@@ -44,7 +44,7 @@ def study_named(name: str) -> "Study":
 
 
 def draw_numbers(results: "StudyResult") -> bytes:
-    """Return a PNG with a panel per test: a bar for the mean of each number, a dot for each seed."""
+    """Return a PNG with a panel per test: the mean over seeds of each number as a bar, each seed as a dot."""
     from flcav.report import style
     from flcav.report.charts.studies import Bar, precisions
 

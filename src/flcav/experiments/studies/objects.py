@@ -1,4 +1,4 @@
-"""The study of the object task: its picture, and the tables of its page."""
+"""Study of the object task: AP by class, distance and occlusion, headings, calibration and tracks."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -18,16 +18,16 @@ from flcav.report import style
 from flcav.report.charts.studies import Bar, precisions
 from flcav.verdicts import aim_sentence
 
-WANTED = {  # of cars on other scenes of the towns that were learned from
+WANTED = {  # aims, for cars on other scenes of the training towns: least value, claim
     "Car AP 3d at 0.5": (0.85, "Car AP3D@0.5 of 0.85"),
     "Car right headings": (0.9, "90 % of the cars found at 3D IoU 0.5 within 90 degrees of their heading"),
 }
-HEADINGS = ("AOS3D at 0.5", "right headings")  # of those found in 3D at IoU 0.5
+HEADINGS = ("AOS3D at 0.5", "right headings")  # of objects found at 3D IoU 0.5
 MEASURES = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
 
 
 def tables(results: StudyResult[ObjectsEvaluation]) -> dict[str, str]:
-    """Return the page's tables by name, from what `run_study` returned."""
+    """Return Markdown by name: findings (a list), classes, slices, training, tracks."""
     heads = [f"{kind} at {overlap}" for kind, overlap in MEASURES]
     return {
         "findings": bullets(_findings(results)),
@@ -81,7 +81,7 @@ def _tracks(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
 
 
 def _measures(seeds: Sequence[Sequence[Score | SlicePrecision]]) -> list[str]:
-    """Return the mean AP over seeds of each measure; seeds: the rows of each."""
+    """Return the mean AP over seeds of each of `MEASURES`; `seeds`: rows of each seed."""
     return [_mean(row.ap for rows in seeds for row in rows if (row.kind, row.iou) == measure) for measure in MEASURES]
 
 
@@ -91,12 +91,12 @@ def _mean(values: Iterable[float | None]) -> str:
 
 
 def followed(found: ObjectsEvaluation, network: Second, data: Dataset) -> ObjectsEvaluation:
-    """Return the evaluation with that of the network's tracks besides."""
+    """Return the evaluation completed by that of the network's tracks (MOTA, AMOTA)."""
     return replace(found, tracks=evaluate_tracks(network, data))
 
 
 def _draw(results: StudyResult[ObjectsEvaluation]) -> bytes:
-    """Return AP at IoU 0.5 in 3D of each test: of the classes, and of cars by distance and occlusion."""
+    """Return a PNG of AP at 3D IoU 0.5 for each test: by class, and of cars by distance and occlusion."""
     panels = {}
     for test in results.summary:
         rows: dict[tuple[str, int], list[float]] = {}

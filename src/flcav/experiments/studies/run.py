@@ -1,6 +1,7 @@
-"""The study of one task: frames recorded from recipes, a network per seed, each tested once on frames of other scenes.
+"""Study of one task: record the splits, train a network per seed, and test each once on frames of other scenes.
 
-The epoch that is kept is chosen on the validation frames; the test frames are used for nothing else.
+The best epoch is chosen on the validation frames; the test frames are used for nothing else. Intervals over seeds are
+Student's t.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,16 +31,16 @@ VALIDATION = "validation"
 
 @dataclass(frozen=True)
 class SeedResult(Generic[EvaluationT]):
-    """What one seed came to."""
+    """Results of one seed: the card of its network, and its evaluations."""
 
     seed: int
     card: Card
-    tests: Mapping[str, EvaluationT]  # by name
+    tests: Mapping[str, EvaluationT]  # by name of the test
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What was recorded."""
+    """The recording recipes of all splits."""
 
     train: tuple[RecipeFields, ...]
     validation: RecipeFields
@@ -48,7 +49,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class StudyResult(Generic[EvaluationT]):
-    """The numbers of a study: of its seeds, and their means."""
+    """Results of a study: of each seed, and means over seeds."""
 
     task: str
     network: str
@@ -57,8 +58,8 @@ class StudyResult(Generic[EvaluationT]):
     patience: int
     recipes: Recorded
     seeds: tuple[SeedResult[EvaluationT], ...]
-    summary: Mapping[str, Mapping[str, MeanOverSeeds]]  # test -> name of a number
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # always there, but in results of before
+    summary: Mapping[str, Mapping[str, MeanOverSeeds]]  # by test and name of the number
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
 
     def tested(self, test: str) -> list[EvaluationT]:
         """Return the evaluations of a test, one per seed."""
@@ -67,32 +68,33 @@ class StudyResult(Generic[EvaluationT]):
 
 @dataclass(frozen=True)
 class Study(Generic[EvaluationT]):
-    """What is recorded, trained and tested; functions are module-level ones, since steps run in other processes.
+    """A study: its task and recipe, and how its results are drawn.
 
-    Fields that two studies are not compared by are of no step: what they reach makes none stale.
+    Functions are module-level, since steps run in other processes. Fields with `compare=False` are not part of the
+    steps' code: a change of what they reach makes no step stale.
     """
 
     task: Task
     recipe: StudyRecipe
-    draw: Callable[[StudyResult[EvaluationT]], bytes] = field(compare=False)  # -> PNG
+    draw: Callable[[StudyResult[EvaluationT]], bytes] = field(compare=False)  # PNG of the results
     extra: Mapping[str, Callable[[EvaluationT, Any, Dataset], EvaluationT]] = field(default_factory=dict)  # by test
 
     @property
     def evaluation(self) -> type[EvaluationT]:
-        """Return the record that the task's `evaluate` is annotated to return; raises `InputError` for no such."""
+        """Return the class that the task's `evaluate` returns, by its annotation; raises `InputError` without one."""
         found = get_type_hints(self.task.evaluate).get("return")
         if not (isinstance(found, type) and issubclass(found, Evaluated) and is_dataclass(found)):
             raise InputError(f"task '{self.task.name}': its evaluate() has no annotation of the dataclass it returns")
         return cast("type[EvaluationT]", found)
 
     def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> Json:
-        """Train one seed, going on where an interrupted run left off; return its card."""
+        """Train the network of one seed, resuming an interrupted training; return its card as JSON."""
         data = [opened(work, step) for step in _training_steps(self)]
         request = Request(data, opened(work, VALIDATION), network, epochs, patience, seed)
         return train_network(self.task, request, work.folder, work.report).model_dump(mode="json")
 
     def test(self, work: Work, *, seed: int) -> Json:
-        """Return what the network of one seed reaches on each test."""
+        """Return the evaluation of one seed's network on each test, as JSON by test."""
         network = load_network(self.task, work.inputs[_seed_step(seed)] / WEIGHTS)
         return {name: self._tested(name, network, opened(work, _test_step(name)), work) for name in self.recipe.tests}
 
@@ -114,14 +116,14 @@ def run_study(
     stale: str = "refuse",
     engine: str = "processes",
 ) -> StudyResult[EvaluationT]:
-    """Run what of the study is not done yet in `out`, as `run_steps`; return its numbers: of seeds, and their means.
+    """Run or finish a study in the folder `out` by `run_steps`; return its results.
 
     Raises `InputError` for an unknown scale, where `out` holds another study, and where the task does not say which
     record its evaluation returns.
     """
     recipe = study.recipe.at_scale(scale)
     study = replace(study, recipe=recipe)
-    assert study.evaluation  # before hours of work
+    assert study.evaluation  # raises before hours of work
     values = run_steps(steps_of(study, seeds), out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     runs = tuple(_seed_result(study, seed, values) for seed in seeds)
     return StudyResult(
@@ -138,17 +140,17 @@ def run_study(
 
 
 def results_as_json(study: Study[EvaluationT], results: StudyResult[EvaluationT]) -> Json:
-    """Return the results of a study as JSON has them."""
+    """Return the results of a study as a JSON value."""
     return to_json(results, _kind(study))
 
 
 def results_of_json(study: Study[EvaluationT], values: Json, origin: str) -> StudyResult[EvaluationT]:
-    """Return what `results_as_json` returned as a record again; raises `InputError` where it is no such."""
+    """Return the results that `results_as_json` wrote; raises `InputError`, naming `origin`, for other values."""
     return of_json(_kind(study), values, origin)
 
 
 def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int, str]]:
-    """Return of each seed of a study's results: its number, samples, steps, and the score after each epoch."""
+    """Return seed, samples, optimiser steps, and the scores after each epoch, for each seed of a study's results."""
     rows = []
     for run in results.seeds:
         scores = ", ".join(f"{score:.2f}" for score in run.card.learning.scores)
@@ -157,7 +159,7 @@ def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int
 
 
 def steps_of(study: Study, seeds: Sequence[int]) -> list[Step]:
-    """Return the steps: a recording per recipe, a training and a test per seed."""
+    """Return the steps of a study: a recording per recipe, a training and a test per seed."""
     recipe = study.recipe
     recipes = dict(zip(_training_steps(study), recipe.train, strict=True)) | {VALIDATION: recipe.validation}
     tests = {_test_step(name): fields for name, fields in recipe.tests.items()}
@@ -192,7 +194,7 @@ def _seed_result(study: Study[EvaluationT], seed: int, values: Mapping[str, Any]
 
 
 def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, MeanOverSeeds]:
-    """Return the means of the numbers that all seeds have."""
+    """Return means over seeds of the numbers that all seeds have."""
     return {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
 
 
@@ -204,12 +206,12 @@ DATA = "data"
 
 
 def record_split(work: Work, recipe: dict[str, Any]) -> dict[str, int]:
-    """Record one split."""
+    """Record one split by its recipe; return its number of frames."""
     source = EmbeddedSource(parse_config(Recipe, recipe, work.folder.name))
     record(source, work.folder / DATA, progress=work.report)
     return {"frames": len(Dataset.open(work.folder / DATA))}
 
 
 def opened(work: Work, step: str) -> Dataset:
-    """Return what `record_split` made in the step `step`."""
+    """Open the dataset that `record_split` recorded in the step `step`."""
     return Dataset.open(work.inputs[step] / DATA)

@@ -1,4 +1,4 @@
-"""The studies of the trajectory task, on rasters and through cameras: their picture, and the tables of their pages."""
+"""Studies of the trajectory task, on rasters and through cameras: ADE, FDE and miss rate by slice and predictor."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,7 +14,7 @@ from flcav.report import style
 from flcav.report.charts.studies import ErrorBar, path_errors
 from flcav.verdicts import aim_sentence
 
-WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # of constant velocity's final error at junctions, at most
+WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # aims: largest ratio to constant velocity's final error
 SLICE = "at junctions"
 PREDICTORS = {
     "single path": ("single_ADE", "single_FDE", "miss_rate_single"),
@@ -25,7 +25,7 @@ PREDICTORS = {
 
 
 def tables(results: StudyResult[TrajectoryEvaluation]) -> dict[str, str]:
-    """Return the page's tables by name, from what `run_study` returned."""
+    """Return Markdown by name: findings (a list), errors, training."""
     return {
         "findings": bullets(
             _finding(wanted, test, means, len(results.seeds))
@@ -86,7 +86,7 @@ def _trained(seed: SeedResult[TrajectoryEvaluation]) -> list[str]:
 
 
 def _draw(results: StudyResult[TrajectoryEvaluation]) -> bytes:
-    """Return final errors of each test and slice."""
+    """Return a PNG of the final displacement errors by test and slice."""
     panels = {}
     for test in results.summary:
         slices: dict[str, list[PathErrors]] = {}

@@ -31,7 +31,7 @@ class Bands:
     k: int  # edge rounds per cloud round
 
     def between(self, resources: Array) -> tuple[Array, Array]:
-        """Return the lower and the upper band of the error, (n,) each, at `resources` (n, 3); inf where it has no end."""
+        """Return the lower and upper band of the error, (n,) each, at `resources` (n, 3); inf where it has no end."""
         errors = np.array([curve.error(*resources.T, k=self.k) for curve in self.curves])
         with np.errstate(invalid="ignore"):  # between infinite errors
             low, high = np.quantile(errors, (0.5 - self.level / 2, 0.5 + self.level / 2), axis=0)

@@ -1,4 +1,4 @@
-"""An experiment as named steps that leave files: what is done stands, what is independent runs side by side."""
+"""Resumable workflows of named steps: finished steps are kept, independent ones run in parallel."""
 
 from flcav.pipeline.steps.run import ENGINES, run_side_by_side, run_steps, stopwatch
 from flcav.pipeline.steps.step import FINISHED, STALE, Notify, Stale, Step, Work

@@ -1,10 +1,10 @@
-"""Steps by actors of a Ray cluster, on any of its machines; they need share no storage.
+"""Execution of steps by actors of a Ray cluster, on machines without shared storage.
 
-What a step needs travels to its actor: the folders of the steps that it builds on, which stay there for the next, and
-its own unfinished one. Its files travel back when it is done and, where it reports in between, as they are then: at
-most a twentieth of its time goes into that. So a killed step goes on from its last report that came back; lost is what
-it did since, or all where it reports nothing. Files travel as they are, those behind links too, in pieces, so that
-neither side holds a folder in memory. Either side has a folder whole, as it was at one time, or as it was before.
+An actor is sent the folders of the steps that its step needs, which it keeps for later steps, and the step's own
+unfinished folder. The step's files are sent back when it is done and, as they are then, at its reports; that takes at
+most a twentieth of its time (`SENDING`). A killed step resumes from the last report whose files came back. Files are
+sent unchanged, linked ones too, in pieces of `PIECE_BYTES`, so that no folder is held in memory. A folder is replaced
+as a whole: it is never seen in part.
 """
 
 import contextlib
@@ -28,15 +28,15 @@ from flcav.pipeline.steps.step import Record, Step, aside, remove, value_of
 from flcav.threads import use_threads
 
 PIECE_BYTES = 8_000_000
-SENDING = 1 / 20  # of a step's time
-LEAVING_S = 5.0  # that actors have to remove what they wrote
+SENDING = 1 / 20  # of a step's time, at most, for sending files back
+LEAVING_S = 5.0  # for actors to remove their files
 
-Stamps = dict[str, tuple[int, int]]  # of each file of a folder: when it was changed, bytes
+Stamps = dict[str, tuple[int, int]]  # of each file of a folder: time of its last change [ns], size [bytes]
 
 
 @contextlib.contextmanager
 def ray_cluster(jobs: int) -> Iterator[Engine]:
-    """Yield the cluster that RAY_ADDRESS names, or one of `jobs` processors on this machine.
+    """Yield an engine on the cluster that RAY_ADDRESS names, or on `jobs` processors of this machine.
 
     Raises `InputError` where Ray is not installed.
     """
@@ -45,7 +45,7 @@ def ray_cluster(jobs: int) -> Iterator[Engine]:
 
 
 class _Cluster:
-    """Actors of a cluster, each driven by a thread here."""
+    """An engine of Ray actors, each driven by a thread of this process."""
 
     def __init__(self, ray: Any) -> None:
         self._ray = ray
@@ -53,8 +53,8 @@ class _Cluster:
 
     @contextlib.contextmanager
     def hands(self, folder: Path, jobs: int) -> Iterator[Hands]:
-        """Yield `jobs` actors; raises `OSError` where one was killed, or runs another flcav than this machine."""
-        remote = self._ray.remote(num_cpus=1, max_concurrency=3)(_Worker)  # it works, is heard, and told to leave
+        """Yield `jobs` actors; a step raises `OSError` where its actor was killed, or runs another flcav."""
+        remote = self._ray.remote(num_cpus=1, max_concurrency=3)(_Worker)  # perform, hear and leave at the same time
         actors = [remote.remote() for _ in range(jobs)]
         self._actors += actors
         reports: Queue[Any] = Queue()
@@ -72,7 +72,7 @@ class _Cluster:
                 self._leave(actors)
 
     def stop(self) -> None:
-        """Stop all actors; what they reported last is here."""
+        """Stop all actors; the files of their last reports have been received."""
         self._leave(self._actors)
 
     def _leave(self, actors: Iterable[Any]) -> None:
@@ -99,7 +99,7 @@ class _Cluster:
             free.put(actor)
 
     def _send(self, actor: Any, step: Step, folder: Path) -> None:
-        """Send what the actor does not have yet."""
+        """Send the actor the folders that it does not have yet."""
         there = self._ray.get(actor.holds.remote(package_hash()))
         for name in {*step.needs, step.name} - set(there):
             with packed(folder / name, stamps(folder / name)) as pieces:
@@ -108,7 +108,7 @@ class _Cluster:
             self._ray.get(actor.unpack.remote(name))
 
     def _hear(self, actor: Any, own: Path, report: Any) -> None:
-        """Hear a step out: pass on what it reports, and have its folder here as it is there."""
+        """Receive what a step sends until it ends: pass on its reports, and update its folder `own`."""
         with tempfile.TemporaryFile() as file:
             while (heard := self._ray.get(actor.hear.remote())) is not None:
                 kind, *said = heard
@@ -123,34 +123,34 @@ class _Cluster:
 
 
 class _Worker:
-    """On one of the machines: performs one step after another in a folder of its own."""
+    """The actor on a machine: performs one step after another in a temporary folder."""
 
     def __init__(self) -> None:
         use_threads(1)
         self._folder = Path(tempfile.mkdtemp(prefix="flcav-steps-"))
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - as long as this lives
-        self._told: Queue[Any] = Queue(maxsize=2)  # what is not heard yet waits, and the step with it
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the actor lives
+        self._told: Queue[Any] = Queue(maxsize=2)  # bounded: a step waits until it is heard
 
     def holds(self, package: str) -> list[str]:
-        """Return the steps whose folders are here; raises `OSError` where this is not the flcav that is asked for."""
+        """Return the steps whose folders are here; raises `OSError` where the hash of flcav here is not `package`."""
         if package != package_hash():
             raise OSError(f"{os.uname().nodename} runs another flcav: install the same on all machines of the cluster")
         return [path.name for path in self._folder.iterdir()]
 
     def take(self, piece: bytes) -> None:
-        """Take a piece of a folder."""
+        """Append a piece to the archive that is being received."""
         self._file.write(piece)
 
     def unpack(self, name: str) -> None:
-        """Unpack what was taken as the folder of the step `name`."""
+        """Unpack the received archive as the folder of the step `name`."""
         replace_folder(self._folder / name, None, self._file)
         self._file.seek(0)
         self._file.truncate()
 
     def perform(self, pickled: bytes) -> None:
-        """Perform a step, by a record; what it reports, and its files, are told to whoever hears."""
+        """Perform a pickled (step, record); reports and files are queued for `hear`."""
         try:
-            step, record = pickle.loads(pickled)  # here, so that the end is told where its function is not to be had
+            step, record = pickle.loads(pickled)  # within try: the end is told even if this fails
             sender = _Sender(self._folder / step.name, self._told)
             perform(step, self._folder, record, provenance(), sender.report)
             sender.send()
@@ -158,16 +158,16 @@ class _Worker:
             self._told.put(None)
 
     def hear(self) -> Any:
-        """Return what is told next: a report, a piece of changed files, the names of all; None at the end."""
+        """Return the next message: a report, a piece of changed files, or the names of all files; None at the end."""
         return self._told.get()
 
     def leave(self) -> None:
-        """Remove what is here."""
+        """Remove the temporary folder."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
 class _Sender:
-    """Tells what a step reports, and its files as they are then."""
+    """Queues a step's reports and its changed files."""
 
     def __init__(self, folder: Path, told: Queue[Any]) -> None:
         self._folder, self._told = folder, told
@@ -175,7 +175,7 @@ class _Sender:
         self._next_s = 0.0
 
     def report(self, done: int, total: int, note: str = "") -> None:
-        """Tell a report, after the files where it is time."""
+        """Queue a report, and before it the changed files where `SENDING` allows that."""
         if (start := time.monotonic()) >= self._next_s:
             self.send()
             end = time.monotonic()
@@ -183,7 +183,7 @@ class _Sender:
         self._told.put(("report", done, total, note))
 
     def send(self) -> None:
-        """Tell the pieces of what has changed since the last time, and the names of all files."""
+        """Queue the files that have changed since the last time, in pieces, then the names of all files."""
         now = stamps(self._folder)
         with packed(self._folder, [name for name in now if self._sent.get(name) != now[name]]) as pieces:
             for piece in pieces:
@@ -193,7 +193,7 @@ class _Sender:
 
 
 def stamps(folder: Path) -> Stamps:
-    """Return the stamp of each file below `folder`, links followed, and of each empty folder, which ends in a slash."""
+    """Return the stamp of each file below `folder`, by relative path; links are followed, empty folders end in "/"."""
     found: Stamps = {}
     for place, folders, files in os.walk(folder, followlinks=True):
         below = Path(place)
@@ -207,7 +207,7 @@ def stamps(folder: Path) -> Stamps:
 
 @contextlib.contextmanager
 def packed(folder: Path, names: Iterable[str]) -> Iterator[Iterator[bytes]]:
-    """Yield the pieces of an archive of the files `names` of a folder."""
+    """Yield a ZIP archive of the files `names` of a folder, in pieces of `PIECE_BYTES`."""
     with tempfile.TemporaryFile() as file:
         with zipfile.ZipFile(file, "w", strict_timestamps=False) as archive:
             for name in names:
@@ -217,9 +217,9 @@ def packed(folder: Path, names: Iterable[str]) -> Iterator[Iterator[bytes]]:
 
 
 def replace_folder(folder: Path, names: Collection[str] | None, archive: IO[bytes]) -> None:
-    """Make `folder` hold the files of an archive and, of those that it held, those in `names`; None for nothing else.
+    """Replace `folder` by the files of a ZIP archive and, of the files it held, those in `names` (None: no others).
 
-    It is replaced as a whole: an interruption leaves it as it was, or not there.
+    It is replaced as a whole: an interruption leaves the old folder, or none.
     """
     new = aside(folder, "new")
     new.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Who performs steps: an engine takes them one by one, and tells what they report."""
+"""Execution engines: the protocol of an engine, and worker processes on this machine."""
 
 import contextlib
 import multiprocessing
@@ -20,14 +20,14 @@ KILLED = "a step's process was killed from outside, most often for want of memor
 
 @dataclass(frozen=True)
 class Hands:
-    """Those that work on the steps of one folder."""
+    """The workers for the steps of one folder."""
 
-    submit: Callable[[Step, Record], Future[Any]]  # -> its value
-    reports: Any  # a queue of (step, done, total, note)
+    submit: Callable[[Step, Record], Future[Any]]  # -> future value of the step
+    reports: Any  # queue of (step, done, total, note)
 
 
 class Engine(Protocol):
-    """What steps are performed by."""
+    """What executes steps: processes, or a cluster."""
 
     def hands(self, folder: Path, jobs: int) -> contextlib.AbstractContextManager[Hands]:
         """Return a context of `jobs` workers for the steps in `folder`; leaving it by an exception stops them."""
@@ -39,7 +39,7 @@ class Engine(Protocol):
 
 
 class Processes:
-    """Processes of one thread each on this machine, which end with this one however it ends."""
+    """Worker processes of one thread each on this machine; they end with this process, however it ends."""
 
     @contextlib.contextmanager
     def hands(self, folder: Path, jobs: int) -> Iterator[Hands]:
@@ -53,7 +53,7 @@ class Processes:
             except BrokenProcessPool:
                 raise OSError(KILLED) from None
             except BaseException:
-                for process in list(pool._processes.values()):  # not those of a run beside this one
+                for process in list(pool._processes.values()):  # of this pool alone: other runs may have theirs
                     process.terminate()
                 raise
 
@@ -64,7 +64,7 @@ class Processes:
 
 
 def perform(step: Step, folder: Path, record: Record, made_by: Provenance, report: Report) -> Any:
-    """Do a step in its folder below `folder`, where the steps that it needs lie too, and return its value."""
+    """Execute a step in its folder below `folder`, where those it needs lie too; write its record, return its value."""
     own = folder / step.name
     own.mkdir(parents=True, exist_ok=True)
     report(0, 1, "")
@@ -75,7 +75,7 @@ def perform(step: Step, folder: Path, record: Record, made_by: Provenance, repor
 
 
 def seed_in(arguments: Mapping[str, Any]) -> int | None:
-    """Return the seed among a step's arguments, or in one of them: a recipe, a protocol; None where there is none."""
+    """Return the seed among a step's arguments or the fields of one of them, such as a recipe; None without one."""
     for values in (arguments, *arguments.values()):
         seed = values.get("seed") if isinstance(values, Mapping) else getattr(values, "seed", None)
         if isinstance(seed, int):

@@ -1,12 +1,11 @@
-"""Steps run in order, by processes or on a cluster, going on with what is there.
+"""Execution of steps in dependency order, by processes or on a cluster, resuming from those that are finished.
 
-A step is finished when its `done.json` is there: its value, what was asked of it, the code that it reaches, and by what
-it was made. That is written last, so a killed run goes on from its last finished step; a step may keep files to go on
-from within itself. What was asked stands in `started.json` before that, so that it is not gone on with as it was not
-begun.
+A step is finished when its folder has a `done.json`: value, fingerprint, hash of the code it reaches, and provenance.
+That is written last, so an interrupted run resumes after its last finished step; a step may also keep checkpoints of
+its own. `started.json` has fingerprint and code before, so that a checkpoint is not resumed with other arguments.
 
-What was asked differently, by function or arguments, belongs into another folder. What other code began or finished is
-stale, and so is whatever was built on it: it is refused, done again or kept, as one chooses.
+Steps with another fingerprint (function or arguments) need another folder. Steps begun or finished by other code are
+stale, and so are all steps that depend on them: they are refused, done again or kept, by the argument `stale`.
 """
 
 import contextlib
@@ -67,12 +66,12 @@ def run_steps(
     stale: str = "refuse",
     engine: str = "processes",
 ) -> dict[str, Any]:
-    """Run `steps` (in an order where each comes after what it needs) and return their values by name.
+    """Run `steps`, given in topological order, in `folder`, and return their values by name.
 
     `jobs` workers of one thread each: processes, which end with this one however it ends, or actors on the machines of
-    a Ray cluster, see `flcav.pipeline.steps.cluster`. What other code began or finished is refused, done again
-    ("redo") or taken as it is ("keep"); what is kept stays known as of that code. Raises `InputError` where `folder`
-    holds steps of other arguments or, where that is refused, of other code; `OSError` where a worker was killed.
+    a Ray cluster, see `flcav.pipeline.steps.cluster`. Steps begun or finished by other code are refused, done again
+    ("redo") or kept ("keep", their records unchanged). Raises `InputError` where `folder` holds steps of other
+    arguments or, where that is refused, of other code; `OSError` where a worker was killed.
     """
     plan = _planned(steps, folder, notify, stale, Sources())
     if plan.waiting:
@@ -90,9 +89,9 @@ def run_side_by_side(
     engine: str = "processes",
     names: Mapping[Path, str] | None = None,
 ) -> dict[Path, dict[str, Any]]:
-    """Run the steps of each folder, up to `jobs` folders at a time; return `run_steps` of each.
+    """Run the steps of each folder, up to `jobs` folders in parallel; return each folder's values as `run_steps` does.
 
-    `names` are what the folders' steps are told under (None: the folders' own names).
+    `names`: prefixes of the folders' steps in `notify` (None: the folders' own names).
     """
     sources = Sources()
 
@@ -118,12 +117,12 @@ def run_side_by_side(
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is to be done in a folder."""
+    """The work that is left in a folder."""
 
     folder: Path
     records: Mapping[str, Record]
     waiting: list[Step]
-    values: dict[str, Any]  # of the steps that are done
+    values: dict[str, Any]  # of finished steps
 
 
 def _opened(engine: str, jobs: int) -> contextlib.AbstractContextManager[Engine]:
@@ -134,7 +133,7 @@ def _opened(engine: str, jobs: int) -> contextlib.AbstractContextManager[Engine]
 
 
 def _planned(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Plan:
-    """Return what of `steps` is left to do; raises `InputError` as `run_steps` does."""
+    """Return the work that is left of `steps`, notifying of those done before; raises `InputError` as `run_steps`."""
     records, kept = _settled(steps, folder, stale, sources)
     values: dict[str, Any] = {}
     for step in steps:
@@ -162,7 +161,7 @@ def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify) -> None:
 
 
 def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
-    """Return the steps, those first on which most others rest, directly or through others: they hold up the run."""
+    """Sort the steps by how many others depend on them, directly or not, most first: those hold up the run."""
     rests: dict[str, set[str]] = {step.name: set() for step in steps}
     for step in reversed(steps):
         for name in step.needs:
@@ -172,7 +171,7 @@ def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
 
 
 def _settled(steps: Sequence[Step], folder: Path, stale: str, sources: Sources) -> tuple[dict[str, Record], set[str]]:
-    """Return the records by which steps are to be done, or are, and the steps that are kept though stale."""
+    """Return the record by which each step is, or is to be, done, and the stale steps; "redo" removes these."""
     if stale not in STALE:
         raise InputError(f"stale '{stale}': choose one of {', '.join(STALE)}")
     records: dict[str, Record] = {}
@@ -198,9 +197,9 @@ def _settled(steps: Sequence[Step], folder: Path, stale: str, sources: Sources) 
 
 
 def stopwatch(folder: Path) -> Callable[[], float]:
-    """Return a clock of the seconds spent on the run in `folder`, those of its earlier, interrupted starts included.
+    """Return a clock of the wall time [s] spent on the run in `folder`, its earlier, interrupted starts included.
 
-    A start's seconds count up to the last time that the clock was read.
+    Each reading is saved; of an earlier start, the time up to its last reading counts.
     """
     path, start = folder / "elapsed.json", time.monotonic()
     kept: Any = read_json(path) if path.exists() else {"elapsed_s": 0.0}

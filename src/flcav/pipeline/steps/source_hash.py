@@ -1,12 +1,13 @@
-"""The code that a step's value rests on: what its function reaches of the package, by imports and by names.
+"""Hash of the code that a step's value depends on: the definitions reachable from its function by static analysis.
 
-They are read from the source's syntax; nothing is imported. A definition is what one statement at the top of a module
-binds: a function, a class, a constant. It reaches those that it mentions, through imports at the top of its module or
-within itself, and through packages that only hand names on, to the module that defines them. Formatting, comments and
-docstrings do not count, nor do imports for type checkers, and code that runs only where a module is the program.
+Only syntax trees are read; nothing is imported. A definition is what one statement at the top of a module binds: a
+function, a class, a constant. It reaches the definitions that it mentions, through imports at the top of its module or
+within itself, and through packages that re-export names. Formatting, comments and docstrings do not count, nor do
+imports for type checkers and blocks under `__name__ == "__main__"`.
 
-A string `module:NAME` is taken for that name, and so are those of a module's `__getattr__` (see `_lazy`). Not seen are
-other names looked up by strings, data files, and other packages: their versions are in `flcav.pipeline.provenance`.
+A string `module:NAME` counts as a mention of that name, and so do the re-exported names of a module's `__getattr__`
+(see `_lazy`). Not covered are other names looked up by strings, data files, and other packages, whose versions are in
+`flcav.pipeline.provenance`.
 """
 
 import ast
@@ -26,12 +27,12 @@ import flcav
 Place = tuple[str, str]  # module, name that a statement at its top binds; WHOLE: all of them
 Target = tuple[str, str]  # module, dotted name in it, "" for the module itself
 WHOLE = "*"
-NAMED = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)")  # how tables, recipes and options name what is of a module
+NAMED = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)")  # a definition, as named in tables and recipes
 PACKAGES = {"flcav": Path(flcav.__file__).parent}
 
 
 class Sources:
-    """The source of `packages` (name -> folder), and of single modules beside them, as it is when first read."""
+    """Sources of `packages` (name -> folder), and of single modules beside them, each read once."""
 
     def __init__(self, packages: Mapping[str, Path] = PACKAGES) -> None:
         self._packages = packages
@@ -39,7 +40,7 @@ class Sources:
         self._hashes: dict[frozenset[Place], dict[str, str]] = {}
 
     def hashes(self, starts: Iterable[Place]) -> dict[str, str]:
-        """Return of every module that `starts` reach a hash of what they reach in it."""
+        """Return, by module, a hash of the definitions in it that are reachable from `starts`."""
         key = frozenset(starts)
         if key not in self._hashes:
             self._hashes[key] = {
@@ -50,7 +51,7 @@ class Sources:
         return self._hashes[key]
 
     def _reached(self, starts: Iterable[Place]) -> dict[str, list[str]]:
-        """Return the statements that `starts` reach, as text in the order of the source, by module."""
+        """Return, by module, the text of the statements reachable from `starts`, in the order of the source."""
         found: dict[str, set[_Statement]] = {}
         others: dict[str, set[str]] = {}
         left, seen = list(starts), set(starts)
@@ -60,7 +61,7 @@ class Sources:
             if module is None:
                 continue
             if package := name.rpartition(".")[0]:
-                left += [(package, "")] if (package, "") not in seen else []  # it is run before its modules
+                left += [(package, "")] if (package, "") not in seen else []  # a package runs before its modules
                 seen.add((package, ""))
             for statement in {*module.always, *module.binding(wanted)} - found.setdefault(name, set()):
                 found[name].add(statement)
@@ -76,7 +77,7 @@ class Sources:
         }
 
     def _resolve(self, target: Target) -> Iterator[Place]:
-        """Yield where what an import names is defined; nothing where that is in no source here."""
+        """Yield the definitions that an import or mention names; none where they are outside these sources."""
         name, path = target
         while (module := self._module(name)) is not None:
             part, _, beyond = path.partition(".")
@@ -116,9 +117,9 @@ class Sources:
 
 
 def starts(value: Any) -> Iterator[Place]:
-    """Yield where the functions and classes in `value` are defined: in its fields, items and bound arguments too.
+    """Yield the definitions of all functions and classes in `value`, its fields, items and bound arguments included.
 
-    Of a dataclass, fields that it is not compared by are left out.
+    Fields of a dataclass with `compare=False` are left out.
     """
     if isinstance(value, MethodType):
         yield from starts(value.__self__)
@@ -142,7 +143,7 @@ def starts(value: Any) -> Iterator[Place]:
 
 
 def package_hash() -> str:
-    """Return a hash of all of flcav's source as it is, to tell whether two machines run the same."""
+    """Return a hash of all source files of flcav, to tell whether two machines run the same code."""
     hashed = hashlib.sha256()
     for name, folder in PACKAGES.items():
         for path in sorted(folder.rglob("*.py")):
@@ -151,7 +152,7 @@ def package_hash() -> str:
 
 
 class _Statement:
-    """A statement at the top of a module."""
+    """A statement at the top level of a module."""
 
     def __init__(self, module: "_Module", node: ast.stmt) -> None:
         self.module, self.node, self.line = module, node, node.lineno
@@ -162,7 +163,7 @@ class _Statement:
 
     @functools.cached_property
     def mentions(self) -> list[tuple[Target, str]]:
-        """What it mentions of its module and of others, with the name that this has here."""
+        """The definitions that it mentions, in its module and others, each with the name used here ("" without)."""
         names = _Names(self.module.name, self.module.package)
         names.visit(self.node)
         found = [((module, ""), module) for module in names.star] + [(target, "") for target in names.named]
@@ -177,13 +178,13 @@ class _Statement:
 
 
 class _Module:
-    """What a module's source says."""
+    """The syntax of a module: imports, definitions, and statements that always run."""
 
     def __init__(self, name: str, package: bool) -> None:
         self.name, self.package = name, package
-        self.imports: dict[str, Target] = {}  # by the name that they bind
+        self.imports: dict[str, Target] = {}  # by bound name
         self.defined: dict[str, list[_Statement]] = {}
-        self.always: list[_Statement] = []  # what runs whatever is asked for
+        self.always: list[_Statement] = []  # statements that run with any import
         self.lazy: dict[str, str] = {}
 
     def binding(self, name: str) -> list[_Statement]:
@@ -194,7 +195,7 @@ class _Module:
 
 
 class _Names(ast.NodeVisitor):
-    """The names in a piece of source, with the attributes that follow them, and the imports in it."""
+    """Visitor that collects the names in a syntax tree, each with its attributes, and the imports."""
 
     def __init__(self, module: str, package: bool) -> None:
         self._module, self._package = module, package
@@ -274,7 +275,7 @@ def _read(name: str, package: bool, text: str) -> _Module:
 
 
 class _Undocumented(ast.NodeTransformer):
-    """Leaves out strings that are statements: docstrings."""
+    """Transformer that removes docstrings: strings that are statements."""
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         return None if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str) else node
@@ -287,7 +288,7 @@ class _Undocumented(ast.NodeTransformer):
 
 
 def _bound(node: ast.AST) -> Iterator[str]:
-    """Yield the names that a statement which does nothing else binds, or changes in place: `NAMES["x"] = 1`."""
+    """Yield the names that a definition or an assignment binds, or changes in place: `NAMES["x"] = 1`."""
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         yield node.name
     targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
@@ -301,13 +302,13 @@ def _bound(node: ast.AST) -> Iterator[str]:
 
 
 def _left_out(test: ast.expr) -> bool:
-    """Return whether a block under this condition is for type checkers, or for when its module is the program."""
+    """Return whether a block under this condition is only for type checkers, or for running the module as a program."""
     text = ast.unparse(test)
     return text in ("TYPE_CHECKING", "typing.TYPE_CHECKING") or text == "__name__ == '__main__'"
 
 
 def _lazy(tree: ast.Module) -> dict[str, str]:
-    """Return the modules of the names that a `__getattr__` hands on, from a dictionary of strings at the top."""
+    """Return the modules of the names that a `__getattr__` re-exports, from dictionaries of strings at the top."""
     pairs = (
         (k, v)
         for node in tree.body

@@ -1,4 +1,8 @@
-"""A step of a run, what it works with, and the record of one that is done."""
+"""A step of a workflow, the context it runs in, and the record of its execution on disk.
+
+The record says what was asked (function, arguments, inputs), which decides whether a folder is the right one, and by
+which code it was done, which decides whether its result still holds.
+"""
 
 import hashlib
 import json
@@ -18,14 +22,14 @@ DONE_NOW, DONE_BEFORE, KEPT = FINISHED = ("done", "done before", "kept, of other
 
 @dataclass(frozen=True)
 class Work:
-    """What a step is given."""
+    """The context that a step runs in."""
 
-    folder: Path  # its own
+    folder: Path  # the step's own
     inputs: Mapping[str, Path]  # folders of the steps it needs
-    report: Report  # to be called where what is in its folder can be gone on from
+    report: Report  # to be called when the folder's files are a checkpoint
 
     def result(self, step: str) -> Any:
-        """Return the value of a step that this one needs."""
+        """Return the value of the finished step `step`, one that this step needs."""
         return value_of(self.inputs[step])
 
 
@@ -39,13 +43,16 @@ class Step:
     needs: tuple[str, ...] = ()
 
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
-        """Return what identifies what is asked of this step: its function, arguments and what it is built on."""
+        """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).
+
+        Raises `TypeError` for an argument that is neither a JSON value nor a dataclass of them.
+        """
         asked = [self.run.__module__, self.run.__qualname__, self.arguments, {n: inputs[n] for n in self.needs}]
         return digest(asked, default=_named)
 
 
 def _named(value: Any) -> list[Any]:
-    """Return what identifies a record among a step's arguments: its class and its fields."""
+    """Return the identity of a dataclass among a step's arguments as JSON: its class and its fields."""
     if not is_dataclass(value):
         raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a dataclass of them")
     return [type(value).__module__, type(value).__qualname__, {f.name: getattr(value, f.name) for f in fields(value)}]
@@ -53,33 +60,33 @@ def _named(value: Any) -> list[Any]:
 
 DONE, STARTED = "done.json", "started.json"
 Stale = str  # one of STALE
-STALE = ("refuse", "redo", "keep")  # what becomes of steps that other code began or finished
-NAMED = 3  # steps, and modules, that a sentence names
+STALE = ("refuse", "redo", "keep")  # what to do with steps begun or done by other code
+NAMED = 3  # most steps, or modules, that a message lists
 
 
 @dataclass(frozen=True)
 class Record:
-    """What a step is."""
+    """The record of a step's execution: hashes of what was asked and of the code that did it."""
 
-    fingerprint: str  # of what was asked: function, arguments, and those of the steps it needs
-    code: Mapping[str, str]  # hash of what it reaches of each module, see `flcav.pipeline.steps.source_hash`
+    fingerprint: str  # see `Step.fingerprint`
+    code: Mapping[str, str]  # hash of the code it reaches, by module: see `steps.source_hash`
     lineage: str  # of its code and of the lineages of the steps it needs; "" where the code is not known
 
     @classmethod
     def of(cls, fingerprint: str, code: Mapping[str, str], needs: Iterable["Record"]) -> "Record":
-        """Return the record of a step that this code does, on top of `needs`."""
+        """Return the record of a step done by `code`, where the steps it needs have the records `needs`."""
         return cls(fingerprint, code, digest([sorted(code.items()), *(need.lineage for need in needs)]))
 
 
 def digest(value: Any, **how: Any) -> str:
-    """Return a short hash of a JSON value."""
+    """Return the first 16 digits of the SHA-256 of a JSON value, in hexadecimal; `how`: options of `json.dumps`."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, **how).encode()).hexdigest()[:16]
 
 
 def held_in(folder: Path) -> Record | None:
-    """Return by which record the step in `folder` was done, or else begun; None where it was neither.
+    """Read the record by which the step in `folder` was done or, if it is not, begun; None where it was neither.
 
-    Steps that were done before code was recorded have none: their lineage is "".
+    Without recorded code, `code` is empty and `lineage` is "". Raises `InputError` for a file that is no record.
     """
     for path in (folder / DONE, folder / STARTED):
         if path.exists():
@@ -91,29 +98,29 @@ def held_in(folder: Path) -> Record | None:
 
 
 def value_of(folder: Path) -> Any:
-    """Return the value of the finished step in `folder`."""
+    """Read the value of the finished step in `folder`."""
     return json.loads((folder / DONE).read_text())["value"]
 
 
 def write_started(folder: Path, record: Record) -> None:
-    """Write that the step in `folder` has begun."""
+    """Write the record of the step in `folder` that begins."""
     write_json(folder / STARTED, asdict(record))
 
 
 def write_done(folder: Path, record: Record, value: Any, provenance: Mapping[str, Any]) -> None:
-    """Write that the step in `folder` is finished."""
+    """Write record, value and provenance of the step in `folder`; it is finished with that."""
     write_json(folder / DONE, asdict(record) | {"value": value, "provenance": provenance})
 
 
 def changed_modules(held: Record, wanted: Record) -> list[str]:
-    """Return the modules of which two records of a step reach other code; none where one does not know its code."""
+    """Return the modules whose reached code differs between two records; none where `held` does not know its code."""
     if not held.code:
         return []
     return [name for name in sorted({*held.code, *wanted.code}) if held.code.get(name) != wanted.code.get(name)]
 
 
 def refusal(folder: Path, outdated: Mapping[str, tuple[Record, Record]]) -> InputError:
-    """Return the refusal of a folder whose steps `outdated` (held, wanted) were begun or done by other code."""
+    """Return the error for a folder whose steps are of other code; `outdated`: records (held, wanted) by step."""
     modules = {name: changed_modules(*records) for name, records in outdated.items()}
     unknown = [name for name, (held, _) in outdated.items() if not held.code]
     changed = [name for name in outdated if modules[name]]
@@ -131,13 +138,13 @@ def refusal(folder: Path, outdated: Mapping[str, tuple[Record, Record]]) -> Inpu
 
 
 def _some(names: Sequence[str]) -> str:
-    """Return a few names in words, and how many more there are."""
+    """Return the first `NAMED` names in words, and how many more there are."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def remove(folder: Path) -> None:
-    """Remove a step's folder, at once as far as one can see; of a link, the link."""
+    """Remove a step's folder, or the link to it; the folder is renamed first, so that it disappears at once."""
     if folder.is_symlink():
         folder.unlink()
         return
@@ -148,7 +155,7 @@ def remove(folder: Path) -> None:
 
 
 def aside(folder: Path, what: str) -> Path:
-    """Return a new hidden name beside a step's folder; what an interrupted run left there is removed."""
+    """Return a hidden path beside a step's folder, free for use: what an interrupted run left there is removed."""
     path = folder.with_name(f".{folder.name}.{what}")
     shutil.rmtree(path, ignore_errors=True)
     return path

@@ -1,1 +1,1 @@
-"""Charts of runs, plans, curves and studies."""
+"""Charts of runs, plans, learning curves and studies."""

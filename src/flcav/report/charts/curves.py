@@ -1,4 +1,7 @@
-"""Charts of learning curves: layers of error by stage, and curves with their points and bands."""
+"""Charts of the article's Fig. 3a: the three-layer graph, and learning curves with their points and bands.
+
+The graph joins tasks, networks, modalities and vehicles, a column each (Wang et al., IEEE Network 37(3), 2023).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +21,7 @@ Node = tuple[str, str]  # kind, name
 
 @style.styled
 def three_layers(graph: nx.Graph) -> Figure:
-    """Return the picture of a graph that `flcav.optimization.graph.build` made."""
+    """Return the figure of a graph made by `flcav.optimization.graph.build`."""
     tallest = max(sum(kind == column for _, kind in graph.nodes(data="kind")) for column in COLUMNS)
     figure = style.canvas(6.6, 1.0 + 0.42 * max(tallest, 4))
     draw_layers(figure.add_subplot(), graph)
@@ -26,7 +29,7 @@ def three_layers(graph: nx.Graph) -> Figure:
 
 
 def draw_layers(axes: Axes, graph: nx.Graph) -> None:
-    """Draw the columns and what joins them: weights, megabytes of a sample, and the quality of what vehicles hold."""
+    """Draw nodes by kind in columns, and edges; an edge to a vehicle is as wide as the quality of its data."""
     places = layout(graph)
     for one, other, edge in graph.edges(data=True):
         (x0, y0), (x1, y1) = sorted((places[one], places[other]))
@@ -53,7 +56,7 @@ def _draw_node(axes: Axes, graph: nx.Graph, node: Node, x: float, y: float) -> N
 
 
 def _note(graph: nx.Graph, node: Node) -> str:
-    """Return what the picture says of a node besides its name."""
+    """Return the number written beside a node's name: weight, model or sample size, uplink; of no uplink, the edge."""
     kind, own = node[0], graph.nodes[node]
     if kind == "task":
         return f" · {next(iter(graph[node].values()))['weight']:.2g}"
@@ -65,7 +68,7 @@ def _note(graph: nx.Graph, node: Node) -> str:
 
 
 def layout(graph: nx.Graph) -> dict[Node, tuple[float, float]]:
-    """Return the place of every node: a column per kind, within it next to what it is joined to, centred."""
+    """Return the position (x, y) of every node: a column per kind, centred, sorted by the barycentres of neighbours."""
     columns = [[node for node, kind in graph.nodes(data="kind") if kind == column] for column in COLUMNS]
     tallest = max(map(len, columns))
     heights: dict[Node, float] = {}
@@ -75,7 +78,7 @@ def layout(graph: nx.Graph) -> dict[Node, tuple[float, float]]:
             joined = [heights[other] for other in graph[node] if other in heights]
             return -float(np.mean(joined)) if joined else 0.0
 
-        spread = (tallest - 1) / max(len(column), 1)  # short columns are drawn apart
+        spread = (tallest - 1) / max(len(column), 1)  # short columns are spread out
         for row, node in enumerate(sorted(column, key=wish)):
             heights[node] = -(row - (len(column) - 1) / 2) * (spread + 1 / max(len(column), 1))
     return {node: (number * GAP, heights[node]) for number, column in enumerate(columns) for node in column}
@@ -84,14 +87,14 @@ def layout(graph: nx.Graph) -> dict[Node, tuple[float, float]]:
 NAME_HEIGHT = 0.11  # of the axes: two lines of text
 SERIES_COLOURS = (style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.VERMILLION)
 
-Route = Sequence[tuple[int, int]]  # edge rounds, cloud rounds, place by place
+Route = Sequence[tuple[int, int]]  # edge rounds, cloud rounds, at each x
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A learning curve as it is drawn."""
+    """A learning curve to draw."""
 
-    name: str  # at its end
+    name: str  # written at its end
     x: Sequence[float]
     accuracy: Sequence[float]  # at each x
     low: Sequence[float]  # band
@@ -101,7 +104,7 @@ class Curve:
 
 @style.styled
 def fig3a(article: Sequence[Curve], own: Sequence[Curve], route: Route, graph: nx.Graph) -> Figure:
-    """Return the graph, the curves of the article's points by task, and those of our own history by sample size."""
+    """Return three panels: graph, curves of the article's points by task, curves of our own history by sample size."""
     figure = style.canvas(14.4, 4.4)
     left, middle, right = figure.subplots(1, 3, width_ratios=(5.6, 3, 3))
     draw_layers(left, graph)
@@ -123,7 +126,7 @@ def draw_power_curves(axes: Axes, curves: Sequence[Curve]) -> None:
 
 
 def draw_own_curves(axes: Axes, curves: Sequence[Curve], route: Route) -> None:
-    """Draw accuracy along a run, pretrained, edge rounds, cloud rounds: a curve per sample size."""
+    """Draw accuracy along `route` (pretrained, edge rounds, cloud rounds), a curve per sample size."""
     places = range(len(route))
     _draw(axes, curves, SERIES_COLOURS[1:])
     _name_ends(axes, curves, SERIES_COLOURS[1:])
@@ -147,7 +150,7 @@ def _draw(axes: Axes, curves: Sequence[Curve], colours: Sequence[str]) -> None:
 
 
 def _name_ends(axes: Axes, curves: Sequence[Curve], colours: Sequence[str]) -> None:
-    """Name curves at their ends; names keep a distance from each other."""
+    """Write the curves' names at their ends, without overlaps."""
     low, high = axes.get_ylim()
     places = style.keep_apart([curve.accuracy[-1] for curve in curves], NAME_HEIGHT * (high - low), high)
     for curve, place, colour in zip(curves, places, colours, strict=False):

@@ -1,4 +1,4 @@
-"""The pictures: plain tables and arrays in, matplotlib figures out. `style.png` makes a file of one."""
+"""Figures of a run's report: tables and arrays in, matplotlib figures out; `style.png` encodes one."""
 
 from collections.abc import Mapping, Sequence
 
@@ -11,13 +11,13 @@ from flcav.report.charts.runs import Row
 from flcav.report.pictures import clouds as sweeps
 from flcav.report.pictures import maps
 
-WIDTH = 3.8  # [inch] hardly more than a phone shows; a desktop enlarges it
-EXTENT: sweeps.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: where the tiny detector looks
+WIDTH = 3.8  # [inch] of a figure that a phone shows
+EXTENT: sweeps.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of the network `tiny`
 
 
 @style.styled
 def town_map(scene: maps.ErrorMap) -> Figure:
-    """Return the town with its candidate poles, the registered errors, and what the placed pole covers."""
+    """Return the map of a town with candidate poles, registered errors, and the range of the chosen poles."""
     x_low, y_low, x_high, y_high = scene.town.bounds
     figure = style.canvas(WIDTH, WIDTH * (y_high - y_low) / (x_high - x_low) + 0.3)
     axes = figure.add_subplot()
@@ -28,7 +28,7 @@ def town_map(scene: maps.ErrorMap) -> Figure:
 
 @style.styled
 def before_after(sweep: sweeps.Sweep, extent: sweeps.Extent = EXTENT) -> Figure:
-    """Return the sweep twice, one above the other: what each of two networks found in it."""
+    """Return one sweep twice, one above the other, with the detections of each of two networks."""
     figure = style.canvas(WIDTH, 2 * WIDTH)
     for axes, found in zip(figure.subplots(2), (sweep.before, sweep.after), strict=True):
         sweeps.draw_detections(axes, sweep, found, extent)
@@ -40,7 +40,7 @@ def before_after(sweep: sweeps.Sweep, extent: sweeps.Extent = EXTENT) -> Figure:
 
 @style.styled
 def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figure:
-    """Return a measure through the stages, a line per town; `tested` are rows of all towns, see `charts`."""
+    """Return a measure after every round, a line per town; for the rows see `charts.runs.draw_by_round`."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
     charts.draw_by_round(figure.add_subplot(), rounds, tested, measure)
     return figure
@@ -48,7 +48,7 @@ def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figu
 
 @style.styled
 def megabytes(ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
-    """Return what each stage sent over each link, against the budgets (link -> MB)."""
+    """Return the traffic of each stage on each link, against the budgets (link -> MB)."""
     figure = style.canvas(WIDTH, 0.55 * WIDTH)
     charts.draw_megabytes(figure.add_subplot(), ledger_by_stage, budgets)
     return figure
@@ -56,7 +56,7 @@ def megabytes(ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> F
 
 @style.styled
 def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
-    """Return a forest plot of AP50 by town and arm: a panel per town, one above the other."""
+    """Return a forest plot of AP50 by arm, a panel per town."""
     figure = style.canvas(6.4, 0.9 + 0.32 * sum(map(len, towns.values())))
     panels = figure.subplots(len(towns), sharex=True, squeeze=False)[:, 0]
     for axes, (town, rows) in zip(panels, towns.items(), strict=True):
@@ -70,7 +70,7 @@ def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
 def overview(
     scene: maps.ErrorMap, sweep: sweeps.Sweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
 ) -> Figure:
-    """Return one wide picture of a run: errors and pole, a sweep before and after, a measure through the stages."""
+    """Return the overview of a run: map of errors, a sweep before and after, and a measure after every round."""
     figure = style.canvas(9.6, 4.4)
     grid = figure.add_gridspec(1, 3, width_ratios=(4.1, 2.1, 3.4))
     left, middle, right = (figure.add_subfigure(grid[column]) for column in range(3))

@@ -1,4 +1,4 @@
-"""Charts of plans: budgets, frontiers, and how plans differ."""
+"""Charts of plans: megabytes by link, objective against budget, and predicted against realised scores."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ LINKS = {"both links": style.RULE, "wireless alone": style.BLUE, "wireline alone
 
 
 class Part(TypedDict):
-    """What a task sends over a link in one stage."""
+    """Traffic of a task on a link in one stage."""
 
     link: str
     task: str
@@ -29,7 +29,7 @@ class Part(TypedDict):
 
 @style.styled
 def megabytes(parts: Sequence[Part], links: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Return a bar per link: a part per task (colour) and stage (shade), against the budget [MB]."""
+    """Return a stacked bar per link, a part per task (colour) and stage (shade), against the budget [MB]."""
     tasks = list(dict.fromkeys(row["task"] for row in parts))
     colours = dict(zip(tasks, TASKS, strict=False))
     figure = style.canvas(WIDTH, 0.72 * WIDTH + 0.1 * len(tasks))
@@ -60,10 +60,10 @@ def megabytes(parts: Sequence[Part], links: Mapping[str, Mapping[str, float]]) -
 
 @style.styled
 def best_by_budget(sweep: Mapping[str, Sequence[Mapping[str, float]]], measure: str) -> Figure:
-    """Return the best objective, called `measure`, at multiples of the budgets, scaled together and one at a time."""
+    """Return the optimal objective, called `measure`, against the budgets, scaled together and one at a time."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
     axes = figure.add_subplot()
-    widths = dict(zip(LINKS, (5.0, 1.6, 1.6), strict=True))  # lines that coincide are both seen
+    widths = dict(zip(LINKS, (5.0, 1.6, 1.6), strict=True))  # so that coinciding lines are both visible
     for name, colour in LINKS.items():
         points = sweep[name]
         line = {"color": colour, "linewidth": widths[name], "marker": "o", "markersize": widths[name] + 1.5}
@@ -84,12 +84,12 @@ def best_by_budget(sweep: Mapping[str, Sequence[Mapping[str, float]]], measure: 
 COLOURS = {"equal-stages": style.ORANGE, "joint": style.BLUE}
 NAMES = {"equal-stages": "equal stages", "joint": "joint plan"}
 STAGES = {"pretrain": "pretrained", "edge": "edge FL", "cloud": "edge +\ncloud FL"}
-ASIDE = 0.07  # so that two plans' intervals do not hide each other
+ASIDE = 0.07  # offset that keeps intervals of two plans apart
 
 
 @dataclass(frozen=True)
 class StageReached:
-    """A number after a stage: predicted, over seeds, and of each seed."""
+    """A number after a stage: prediction, mean over seeds with its interval, and value by seed."""
 
     predicted: float
     trained: MeanOverSeeds
@@ -101,7 +101,7 @@ ByStage = Mapping[str, StageReached]  # of each of `STAGES`
 
 @style.styled
 def predicted_and_realised(ap: Mapping[str, ByStage], differences: ByStage, town: str) -> Figure:
-    """Return AP50 of both plans after each stage in `town`, and joint minus equal stages, seed by seed."""
+    """Return AP50 of both plans after each stage in `town`, predicted and trained, and their paired differences."""
     figure = style.canvas(9.0, 3.9)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     _draw_ap(left, ap, town)

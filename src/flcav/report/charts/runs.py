@@ -1,4 +1,4 @@
-"""Charts of numbers: a measure through the stages, megabytes per link, arms side by side."""
+"""Charts of runs: a measure after every round, megabytes by link, and a forest plot of arms."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -11,15 +11,15 @@ from flcav.report import style
 
 Row = Mapping[str, Any]
 
-LINE = 0.07  # height of a name, as a share of the axis
-STAGES = ("pretraining", "edge FL", "cloud FL")  # what `rounds` call them, in the order of a town's tested rows
+LINE = 0.07  # height of a name, as a fraction of the axis
+STAGES = ("pretraining", "edge FL", "cloud FL")  # as rows name them, in their order
 
 
 def draw_by_round(axes: Axes, rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> None:
-    """Draw a measure after every round, a line per town, and the tested values with their intervals where stages end.
+    """Draw a validation measure after every round, a line per town, and test scores with intervals at ends of stages.
 
-    `rounds` has rows stage, round, town, score; `tested` has rows stage, town, score, low, high. Stages are called as
-    in `STAGES`; every one is equally wide, however many rounds it has.
+    `rounds` has rows stage, round, town, score; `tested` has rows stage, town, score, low, high. Stages are named as in
+    `STAGES`; all are equally wide, whatever their number of rounds.
     """
     places = _places(rounds)
     lines = {
@@ -32,7 +32,7 @@ def draw_by_round(axes: Axes, rounds: Sequence[Row], tested: Sequence[Row], meas
         axes.plot(*zip(*line, strict=True), color=colours[town], linewidth=1.6, marker="o", markersize=2.5)
     ends = {town: line[-1] for town, line in lines.items()}
     for number, town in enumerate(towns):
-        aside = 0.04 * (number - (len(towns) - 1) / 2)  # so that the intervals of two towns do not hide each other
+        aside = 0.04 * (number - (len(towns) - 1) / 2)  # keeps intervals of towns apart
         for row in tested:
             if row["town"] == town and row["stage"] in places:
                 x = max(places[row["stage"]].values()) + aside
@@ -47,7 +47,7 @@ def draw_by_round(axes: Axes, rounds: Sequence[Row], tested: Sequence[Row], meas
 
 
 def _name_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Mapping[str, str]) -> None:
-    """Write each town beside its end (x, y), those of one stage above each other."""
+    """Write each town's name beside the end (x, y) of its line, without overlaps within a stage."""
     top = axes.get_ylim()[1]
     for stage in dict.fromkeys(int(x) for x, _ in ends.values()):
         own = {town: end for town, end in ends.items() if int(end[0]) == stage}
@@ -66,13 +66,13 @@ def _name_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Map
 
 
 def _colour(town: str, towns: Iterable[str]) -> str:
-    """Return a town's colour: its own, or one that is left."""
+    """Return a town's own colour, or one of `style.OTHER_COLOURS`, in turn."""
     others = [name for name in dict.fromkeys(towns) if name not in style.TOWN_COLOURS]
     return style.TOWN_COLOURS.get(town) or style.OTHER_COLOURS[others.index(town) % len(style.OTHER_COLOURS)]
 
 
 def _places(rounds: Sequence[Row]) -> dict[str, dict[int, float]]:
-    """Return the place on the x axis of every round that was taken, by stage; stage n spans n to n + 1."""
+    """Return the x of every round, by stage; the n-th stage spans [n, n + 1]."""
     numbers = {stage: sorted({row["round"] for row in rounds if row["stage"] == stage}) for stage in STAGES}
     taken = {stage: known for stage, known in numbers.items() if known}
     return {
@@ -82,7 +82,7 @@ def _places(rounds: Sequence[Row]) -> dict[str, dict[int, float]]:
 
 
 def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
-    """Name the stages above, draw their borders, and number the first and last round of each."""
+    """Write the stages' names above, draw their borders, and number the first and last round of each."""
     for start, stage in enumerate(places):
         axes.text(start + 0.5, 1.02, stage, transform=axes.get_xaxis_transform(), ha="center")
         if start:
@@ -91,7 +91,7 @@ def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
     axes.set_xticks(list(ends), [str(number) for number in ends.values()])
     lasts = {max(known.values()) for known in places.values() if len(known) > 1}
     for place, label in zip(ends, axes.get_xticklabels(), strict=True):
-        label.set_horizontalalignment("right" if place in lasts else "left")  # neighbours of two stages stay apart
+        label.set_horizontalalignment("right" if place in lasts else "left")  # keeps neighbouring numbers apart
     axes.set_xlim(0, len(places) + 0.12)
 
 
@@ -102,7 +102,7 @@ def _draw_tested(axes: Axes, x: float, row: Row, colour: str) -> None:
 
 
 def draw_megabytes(axes: Axes, ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> None:
-    """Draw one stacked bar per link, a part per stage, against a line at the link's budget [MB]."""
+    """Draw a stacked bar per link, a part per stage, against a line at the link's budget [MB]."""
     stages = list(dict.fromkeys(row["stage"] for row in ledger_by_stage))
     widest = max([*budgets.values(), *(row["mb"] for row in ledger_by_stage)])
     for y, (link, budget) in enumerate(budgets.items()):
@@ -122,7 +122,7 @@ def draw_megabytes(axes: Axes, ledger_by_stage: Sequence[Row], budgets: Mapping[
 
 
 def draw_arms(axes: Axes, town: str, rows: Mapping[str, MeanOverSeeds]) -> None:
-    """Draw a forest plot of a town: one line per arm, with its numbers."""
+    """Draw the forest plot of a town: mean and interval of each arm, with the numbers."""
     colour = _colour(town, [town])
     for y, ap in enumerate(rows.values()):
         axes.plot([ap.low, ap.high], [y, y], color=colour, linewidth=2)

@@ -1,4 +1,4 @@
-"""Charts of studies: confusion matrices, average precision and errors of paths."""
+"""Charts of studies: confusion matrices, bars of average precision, and final displacement errors."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ SIDE_IN, LABELS_IN = 3.6, 1.1
 
 @style.styled
 def confusions(counts: Mapping[str, NDArray[np.int64]], classes: Sequence[str]) -> Figure:
-    """Return a panel per title: of each class's pictures (row), the share that was taken for each class (column).
+    """Return confusion matrices, a panel per title; a cell is the share of its row's class predicted as its column's.
 
-    `counts` are (classes, classes) numbers of pictures; a class without pictures is an empty row.
+    `counts`: (classes, classes) numbers of pictures by title; a class without pictures is an empty row.
     """
     names = [name.replace("_", " ") for name in classes]
     figure = style.canvas(SIDE_IN * len(counts) + LABELS_IN, SIDE_IN + LABELS_IN)
@@ -46,17 +46,17 @@ ABREAST = 3  # panels side by side, at most
 
 @dataclass(frozen=True)
 class Bar:
-    """One number of a test."""
+    """One number of a test, drawn as a bar with a dot per seed."""
 
     name: str
     mean: float  # over seeds
-    seeds: tuple[float, ...]  # one each
-    targets: int | None = None  # how many there were to find; None: all of the others
+    seeds: tuple[float, ...]  # its value by seed
+    targets: int | None = None  # number of targets; None: a mean over the other bars
 
 
 @style.styled
 def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precision at IoU 0.5") -> Figure:
-    """Return a panel per title: a bar for each number, a dot for each seed, from 0 to 1 where all are within."""
+    """Return a panel per title with a bar per number and a dot per seed; axes span [0, 1] and all values."""
     every = [value for bars in panels.values() for bar in bars for value in (bar.mean, *bar.seeds)]
     rows = max(len(bars) for bars in panels.values())
     columns = min(len(panels), ABREAST)
@@ -81,9 +81,9 @@ def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precis
 
 @dataclass(frozen=True)
 class ErrorBar:
-    """One error in metres, by seed."""
+    """One error [m], drawn as a bar with a dot per seed."""
 
-    name: str  # of who predicts
+    name: str  # of the predictor
     mean: float
     seeds: Sequence[float]
 
@@ -96,7 +96,7 @@ THICK = 0.26
 
 @style.styled
 def path_errors(panels: Panels) -> Figure:
-    """Return a panel per test: for each slice the final error of each who predicts, every seed a dot."""
+    """Return a panel per test with the final displacement error of each predictor in each slice, a dot per seed."""
     figure = style.canvas(8.6, 3.3)
     axes_of = figure.subplots(1, len(panels), sharex=True, squeeze=False)[0]
     for number, (axes, (test, slices)) in enumerate(zip(axes_of, panels.items(), strict=True)):

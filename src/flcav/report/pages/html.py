@@ -1,4 +1,4 @@
-"""The report: one page that needs nothing but itself."""
+"""Rendering of self-contained HTML pages by Jinja templates, with embedded pictures."""
 
 import base64
 from collections.abc import Mapping
@@ -8,11 +8,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 
 def render(results: Mapping[str, Any], pictures: Mapping[str, bytes], template: str = "report.html.j2") -> str:
-    """Return the page about `results` as HTML, style and pictures inside.
+    """Return the page about `results` as HTML, with style and pictures embedded.
 
-    `pictures` are PNG files by name (of a run: town_map, before_after, ap_by_round, megabytes); those missing are left
-    out. `template`: report.html.j2 about a run, plan.html.j2 about a plan. Raises `jinja2.UndefinedError` where
-    `results` lack something the page tells.
+    `pictures` are PNG files by name, as `run_page.draw` or `plan_page` names them; the page leaves out missing ones.
+    `template`: report.html.j2 about a run, plan.html.j2 about a plan. Raises `jinja2.UndefinedError` where `results`
+    lack a value that the page shows.
     """
     environment = Environment(
         loader=PackageLoader("flcav", "report"),

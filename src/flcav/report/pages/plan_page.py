@@ -1,4 +1,4 @@
-"""The page about a plan: everything it shows, computed from the problem and the plan."""
+"""The HTML page about a plan: transfers, budgets and their sweep, comparison with simpler plans, and vehicles."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -19,9 +19,9 @@ from flcav.report.charts import plans as plan_charts
 from flcav.report.pages import html
 
 STAGES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
-SHOWN = 6  # tasks with a colour of their own; the others are drawn as one
-COARSE = (0.5, 1.0, 2.0)  # budgets that are tried where a plan takes seconds: one without a certificate, or by links
-BETTER = {  # what more megabytes do to the objective
+SHOWN = 6  # tasks with a colour of their own; the others are drawn together
+COARSE = (0.5, 1.0, 2.0)  # budget factors where a plan takes seconds: without a certificate, or by links
+BETTER = {  # effect of more megabytes on the objective
     "weighted": {"verb": "lower the weighted error", "gain": "weighted error saved"},
     "max-min": {"verb": "lower the largest error", "gain": "largest error saved"},
     "area": {"verb": "raise the area", "gain": "area gained"},
@@ -38,7 +38,7 @@ Shares = Mapping[str, Sequence[VehicleShare]]
 def plan_page(
     problem: Problem, plan: Allocation, shares: Shares, more: Sequence[Saving], graph: nx.Graph | None = None
 ) -> str:
-    """Return the page as HTML that needs nothing but itself; `graph`: what the problem was made from, if it was."""
+    """Return the page as self-contained HTML; `graph`: the three-layer graph that the problem was made from, if any."""
     results = plan_results(problem, plan, shares, more)
     pictures = {
         "megabytes": plan_charts.megabytes(results["parts"], results["links"]),
@@ -50,7 +50,10 @@ def plan_page(
 
 
 def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Sequence[Saving]) -> dict[str, Any]:
-    """Return what the page shows: numbers and sentences."""
+    """Return the numbers and sentences of the page, for its template.
+
+    Solves the problem again at multiples of the budgets, and by each of the simpler methods.
+    """
     scaled = {"both links": LINKS, "wireless alone": ("wireless",), "wireline alone": ("wireline",)}
     factors = FACTORS if plan.note is None else COARSE
     sweep = {name: budget_sweep(problem, plan, links, factors) for name, links in scaled.items()}
@@ -95,7 +98,7 @@ def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Seque
 
 
 def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
-    """Return the words that the page has to define."""
+    """Return the terms that the page defines, with their definitions."""
     measure, saved = MEASURES[problem.objective], "gained" if problem.objective == "area" else "saved"
     terms = {"error": TERMS["error"], measure: meaning(problem, plan.objective), "budget": TERMS["budget"]}
     terms[saved] = TERMS["saved"]
@@ -104,7 +107,7 @@ def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
 
 
 def _parts(problem: Problem, plan: Allocation) -> list[plan_charts.Part]:
-    """Return megabytes by link, task and stage; tasks beyond the `SHOWN` largest are one."""
+    """Return megabytes by link, task and stage; tasks beyond the `SHOWN` largest are one part."""
     ordered = sorted(plan.tasks, key=lambda row: -(row.wireless_mb + row.wireline_mb))
     shown = {row.name for row in ordered[: SHOWN if len(ordered) > SHOWN + 1 else len(ordered)]}
     others = f"{len(ordered) - len(shown)} other tasks"
@@ -124,7 +127,7 @@ def _stage_prices(problem: Problem, task: Task, row: TaskPlan) -> dict[str, Pric
 
 
 def _vehicles(problem: Problem, shares: Shares) -> list[dict[str, Any]]:
-    """Return a row per vehicle: what it uploads and joins for all tasks, and how long its wireless link is busy."""
+    """Return a row per vehicle: its samples and rounds of all tasks, and how long its wireless link is busy [s]."""
     rows: dict[str, dict[str, Any]] = {}
     for task in problem.tasks:
         for share in shares.get(task.name, ()):
@@ -159,7 +162,7 @@ def _proof(values: Mapping[str, Any]) -> str:
 
 
 def _link(name: str, link: Mapping[str, Any], verb: str) -> str:
-    """Return how much of a budget is used, and what more of it would bring."""
+    """Return the sentence on the use of a budget and on the gain of a larger one."""
     used = f"{link['used_mb']:,.0f} of {link['budget_mb']:,.0f} MB of the {name} budget are used"
     if not any(each["saved"] for each in link["more"]):
         most = max(each["added"] for each in link["more"])
@@ -169,7 +172,7 @@ def _link(name: str, link: Mapping[str, Any], verb: str) -> str:
 
 
 def _others(values: Mapping[str, Any]) -> str:
-    """Return how the plan compares with the best of the simpler ones that can be carried out."""
+    """Return the sentence that compares the plan with the best of the simpler plans that are feasible."""
     larger = values["measure"]["kind"] == "area"
     carried = [other for other in values["others"] if other["note"] is None]
     if not carried:

@@ -1,4 +1,4 @@
-"""The page and the pictures of a run, from its results and the tables that its steps left."""
+"""The HTML page and the pictures of a run, from its results and the files of its steps."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,7 +45,7 @@ def write_report(run: Run, out: Path | str) -> Path:
 
 
 def page(run: Run) -> dict[str, Any]:
-    """Return what the page tells, for its template."""
+    """Return the values of the page, for its template."""
     recipe, main = run.recipe, run.arms[MAIN]
     first = recipe.with_role("federate")[0]
     rows = [
@@ -83,7 +83,7 @@ def page(run: Run) -> dict[str, Any]:
 
 
 def draw(run: Run, work: Path) -> dict[str, bytes]:
-    """Return the pictures as PNG files by name."""
+    """Return the pictures as PNG files by name: maps, rounds by task, megabytes, before and after, overview."""
     main, drawn = run.arms[MAIN], {}
     scenes = [(placed, scene) for placed in main.placed if (scene := _map(run, work, placed)) is not None]
     for placed, scene in scenes:
@@ -110,7 +110,7 @@ def _names(run: Run) -> Names:
 
 
 def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
-    """Return a region's errors and poles; None where its town is not known."""
+    """Return a region's errors and poles; None where its town, its poles or the tasks of the placement are missing."""
     names, tasks = _names(run), run.recipe.placement.tasks
     if not tasks:
         return None
@@ -133,7 +133,7 @@ def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
 
 
 def _chart(run: Run, task: str) -> tuple[list[Row], list[Row]]:
-    """Return the rounds of a task and its tests, as the chart takes them."""
+    """Return the rows `rounds` and `tested` of a task for `charts.runs.draw_by_round`."""
     starts = " + ".join(run.recipe.with_role("pretrain"))
     (pretrained,) = (each for each in run.pretrained if each.task == task)
     rounds: list[Row] = [
@@ -167,7 +167,7 @@ def _measure(run: Run, task: str) -> str:
 
 
 def _sent(run: Run) -> Sequence[Row]:
-    """Return what the run itself sent over each link, by stage."""
+    """Return the uplink traffic of the main arm by stage and link [MB]."""
     stages = dict.fromkeys(spent.stage for spent in run.arms[MAIN].spent)
     links: dict[str, LinkUse] = dict(run.arms[MAIN].links)
     return [

@@ -1,1 +1,1 @@
-"""Pictures of what sensors see and networks find."""
+"""Pictures of sensor data, annotations, predictions and towns."""

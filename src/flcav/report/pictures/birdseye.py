@@ -1,4 +1,4 @@
-"""One frame from above: its points by height, its boxes, its agent. Ahead of the agent is up."""
+"""Bird's-eye view of a frame: points coloured by height, boxes, and the agent; ahead of the agent is up."""
 
 from dataclasses import dataclass
 
@@ -22,13 +22,13 @@ HEIGHT_COLOURS = ListedColormap(colormaps["turbo"](np.linspace(0.08, 0.92, 64)))
 
 @dataclass(frozen=True)
 class View:
-    """What is to be seen; everything in the agent's frame, heights above ground."""
+    """Content of the view: everything in the agent's frame, heights above ground."""
 
     points: NDArray  # (N, 3) x, y, height [m]
     truth: Boxes
     returns: NDArray[np.int64]  # (M,) LiDAR returns from each of `truth`
     title: str
-    range_m: float = 50.0  # shown ahead, behind and to both sides
+    range_m: float = 50.0  # half the side of the square shown
     predictions: Boxes | None = None
     agent_size: tuple[float, float] | None = None  # length, width of a vehicle [m]; None is a pole
 
@@ -50,7 +50,7 @@ def birdseye(view: View) -> Figure:
 
 
 def draw_view(axes: Axes, view: View) -> None:
-    """Draw the view on axes of its own."""
+    """Draw the view into axes."""
     axes.set(xlim=(-view.range_m, view.range_m), ylim=(-view.range_m, view.range_m), aspect="equal")
     style.bare(axes)
     _draw_rings(axes, view.range_m)

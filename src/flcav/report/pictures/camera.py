@@ -1,4 +1,4 @@
-"""Camera images with what stands in them: boxes in the picture, actors, signs."""
+"""Camera images with projected points and boxes, and with the annotated actors and signs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,14 +20,14 @@ from flcav.report import style
 from flcav.sensors.frame import Frame, SignViews
 
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
-TICK = 1.3  # of the way from the middle of a box to its front
-ALONG = np.linspace(0, 1, 33)  # of an edge: distortion bends it, and it may end behind the camera
+TICK = 1.3  # length of the heading's tick, as a multiple of the distance from a box's centre to its front
+ALONG = np.linspace(0, 1, 33)  # points of an edge: distortion bends it, and it may end behind the camera
 DISTANCES_M = Normalize(0, 60, clip=True)
 DISTANCE_COLOURS = ListedColormap(colormaps["turbo"](np.linspace(0.08, 0.92, 64))[::-1])
 
 
 def show_view(axes: Axes, view: CameraView) -> None:
-    """Show the picture; `axes` are in its pixels."""
+    """Show the picture of a view; `axes` are in its pixels."""
     height, width = view.picture.shape[:2]
     axes.imshow(view.picture)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
@@ -35,7 +35,7 @@ def show_view(axes: Axes, view: CameraView) -> None:
 
 
 def points_on_picture(axes: Axes, points: NDArray[np.float32], view: CameraView) -> ScalarMappable:
-    """Draw the points (N, >=3) that the picture shows, coloured by distance; return what a colour bar needs."""
+    """Draw the points (N, >=3) inside the picture, coloured by distance; return the mappable of a colour bar."""
     shown = points[view.shows(points[:, :3]), :3]
     distance = np.linalg.norm(shown, axis=1)
     order = np.argsort(-distance, kind="stable")
@@ -48,7 +48,7 @@ def points_on_picture(axes: Axes, points: NDArray[np.float32], view: CameraView)
 def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *, width: float = 1.0) -> None:
     """Draw the edges of boxes (in the points' frame) as far as they are in front of the camera.
 
-    A tick on the ground through its front says which way each box heads.
+    A tick on the ground through the front shows the heading of each box.
     """
     corners = boxes.corners()
     foot, front = corners[:, :4].mean(axis=1), corners[:, (0, 3)].mean(axis=1)
@@ -65,10 +65,10 @@ def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *,
     axes.add_collection(lines, autolim=False)
 
 
-ONE_IN, SHEET_IN = 8.0, 12.0  # width of a picture alone, and of several
+ONE_IN, SHEET_IN = 8.0, 12.0  # width of a figure of one picture, and of several
 TITLE_IN = 0.32
 ONE_ROW = 3
-KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {  # in the key -> colour, categories
+KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {  # name in the legend -> colour, categories
     "cars and vans": (style.BLUE, ("car", "van")),
     "trucks and buses": (style.PURPLE, ("truck", "bus")),
     "two-wheelers": (style.GREEN, ("motorcycle", "bicycle")),
@@ -79,20 +79,23 @@ SIGNS = ("signs and lights", style.ORANGE)
 
 @dataclass(frozen=True)
 class Shot:
-    """What one camera saw."""
+    """The picture of one camera with the annotations that it shows."""
 
     name: str
-    view: CameraView  # of points in the world's frame
-    boxes: Boxes  # (N,) of the annotated actors that show, world frame, at the instant of the picture
-    track: NDArray[np.str_]  # (N,) of each of `boxes`
-    signs: SignViews | None  # None: of an infrared camera
+    view: CameraView  # projects points of the world frame
+    boxes: Boxes  # (N,) of the visible actors, world frame, at the time of the picture
+    track: NDArray[np.str_]  # (N,) track of each of `boxes`
+    signs: SignViews | None  # None for an infrared camera
 
 
 def shot(frame: Frame, camera: str) -> Shot:
-    """Return what a camera of a frame saw, calibrated as it is. A thermal image becomes grey, warm is bright."""
+    """Return the picture and the visible annotations of a frame's camera, by its true calibration.
+
+    Boxes are moved from the LiDAR spin to the time of the picture. A thermal image becomes grey, warm is bright.
+    """
     picture = frame.images[camera].rgb if camera in frame.images else thermal_grey(frame.infrared[camera])
     calibration, seen = frame.calibration, frame.annotations
-    late_s = calibration.offset_ms.get(camera, 0.0) / 1000  # boxes are where actors are at the LiDAR spin
+    late_s = calibration.offset_ms.get(camera, 0.0) / 1000  # after the LiDAR spin, which boxes are of
     boxes = replace(seen.boxes, center=seen.boxes.center + late_s * seen.velocity)
     camera_from_world, shows = inverse(frame.world_from_sensor(camera)), seen.views[camera].pixels > 0
     return Shot(
@@ -105,9 +108,9 @@ def shot(frame: Frame, camera: str) -> Shot:
 
 
 def in_rows(frame: Frame, cameras: Sequence[str]) -> list[list[str]]:
-    """Return the cameras as they are looked at: those that look ahead from left to right, below them those behind.
+    """Return the cameras in rows: those that look ahead from left to right, and below them those that look back.
 
-    Up to three are in one row.
+    Up to `ONE_ROW` cameras are in one row.
     """
     yaw = {}
     for name in cameras:
@@ -120,7 +123,7 @@ def in_rows(frame: Frame, cameras: Sequence[str]) -> list[list[str]]:
 
 @style.styled
 def camera_sheet(title: str, rows: Sequence[Sequence[Shot]], *, boxes: bool) -> Figure:
-    """Return the pictures in rows as one figure; with `boxes`, those of the actors and the rectangles of signs."""
+    """Return the pictures in rows as one figure; `boxes`: also boxes of actors and rectangles of signs."""
     shots = [shot for row in rows for shot in row]
     width = ONE_IN if len(shots) == 1 else SHEET_IN
     aspects = [[shot.view.picture.shape[1] / shot.view.picture.shape[0] for shot in row] for row in rows]
@@ -151,7 +154,7 @@ def _draw_truth(axes: Axes, shot: Shot) -> None:
 
 
 def _key(shots: Sequence[Shot]) -> list[Patch]:
-    """Return the colours, with how many there are of each: one that two cameras see counts once."""
+    """Return the legend: colours with numbers of objects; an object in two pictures counts once."""
     label = np.concatenate([shot.boxes.label for shot in shots])
     track = np.concatenate([shot.track for shot in shots])
     found = [(name, colour, set(track[np.isin(label, kinds)])) for name, (colour, kinds) in KINDS.items()]
@@ -164,7 +167,7 @@ def _key(shots: Sequence[Shot]) -> list[Patch]:
 
 
 def thermal_grey(image: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Return a thermal image (H, W) as a grey picture (H, W, 3), warm is bright; equalised in part, as cameras do."""
+    """Return a thermal image (H, W) as a grey picture (H, W, 3), warm is bright, with a partly equalised histogram."""
     rank = np.searchsorted(np.sort(image.ravel()), image) / image.size
     low, high = np.percentile(image, (30, 99.8))
     grey = 255 * (0.45 * rank + 0.55 * np.clip((image - low) / max(high - low, 1.0), 0, 1))

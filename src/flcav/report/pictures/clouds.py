@@ -1,4 +1,4 @@
-"""Point clouds seen from above, with boxes: one sweep, and two compared."""
+"""Point clouds seen from above, with boxes and matched detections; statistics of real and simulated clouds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ Extent = tuple[float, float, float]  # shown behind (negative), ahead, aside [m]
 
 @dataclass(frozen=True)
 class Detections:
-    """What one network found in a sweep, matched with the sweep's targets by whoever evaluated it."""
+    """Detections of one network in a sweep, matched with the sweep's targets by the caller."""
 
     title: str
     boxes: Boxes  # (N,) without those of neutral objects
@@ -32,22 +32,22 @@ class Detections:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One sweep seen by two networks. One frame for all: x forward, y left, at the sensor or its vehicle."""
+    """A sweep with detections of two networks, all in one frame: x forward, y left, at the sensor or its vehicle."""
 
     points: NDArray[np.float32]  # (P, >=3) x, y, z [m]
-    ground_m: float  # z of the ground there
+    ground_m: float  # z of the ground in that frame
     targets: Boxes  # (M,)
     before: Detections
     after: Detections
 
 
 def on_page(xy: NDArray) -> NDArray:
-    """Return (..., 2) x ahead, y left as picture coordinates: across, up."""
+    """Return points (..., 2), x ahead and y left, in page coordinates: to the right, up."""
     return np.stack((-xy[..., 1], xy[..., 0]), axis=-1)
 
 
 def draw_points(axes: Axes, points: NDArray[np.float32], ground_m: float, extent: Extent) -> None:
-    """Draw the (P, >=3) points within `extent`, what stands on the ground darker than it, and set the axes to it."""
+    """Draw the points (P, >=3) within `extent`, those above the ground darker, and set the limits of the axes."""
     behind, ahead, aside = extent
     shown = points[(points[:, 0] > behind) & (points[:, 0] < ahead) & (np.abs(points[:, 1]) < aside)]
     low = shown[:, 2] < ground_m + GROUND_M
@@ -59,7 +59,7 @@ def draw_points(axes: Axes, points: NDArray[np.float32], ground_m: float, extent
 def draw_boxes(
     axes: Axes, boxes: Boxes, colour: str, *, fill: float = 0.0, width: float = 1.2, dashed: bool = False
 ) -> None:
-    """Draw the ground outlines of `boxes`, filled with opacity `fill`, each with a tick through its front."""
+    """Draw the footprints of `boxes`, filled with opacity `fill`, each with a tick in its heading."""
     ahead = np.stack((np.cos(boxes.yaw), np.sin(boxes.yaw)), axis=1)
     tip = boxes.center[:, :2] + ahead * (boxes.size[:, :1] / 2 + 0.6)
     ticks = on_page(np.stack((boxes.center[:, :2], tip), axis=1))
@@ -71,7 +71,7 @@ def draw_boxes(
 
 
 def draw_detections(axes: Axes, sweep: Sweep, found: Detections, extent: Extent) -> None:
-    """Draw the sweep, its targets and what one network found: hits, misses and false positives told apart."""
+    """Draw a sweep with hits, misses and false positives of one network's detections in different colours."""
     draw_points(axes, sweep.points, sweep.ground_m, extent)
     draw_boxes(axes, sweep.targets, style.INK)
     draw_boxes(axes, sweep.targets[~found.found], style.MISSED, fill=0.6)
@@ -81,7 +81,7 @@ def draw_detections(axes: Axes, sweep: Sweep, found: Detections, extent: Extent)
 
 
 def key(found: Detections | None = None) -> list[Patch]:
-    """Return legend entries of what `draw_detections` draws, with counts where `found` is given."""
+    """Return the legend of `draw_detections`, with counts where `found` is given."""
     entries = (("found", style.HIT, 0.35), ("missed", style.MISSED, 0.6), ("false", style.FALSE, 0.2))
     counts = ("", "", "") if found is None else (found.found.sum(), (~found.found).sum(), (~found.hit).sum())
     return [
@@ -96,17 +96,17 @@ EXTENT = (0.0, 60.0, 22.0)
 
 @dataclass(frozen=True)
 class Street:
-    """The street at some distance ahead; medians."""
+    """Medians of the points of the street at some distance ahead."""
 
     ahead_m: str  # "near-far"
     height_m: float  # sensor frame
-    spread_m: float  # of height: between quartiles
+    spread_m: float  # interquartile range of height
     intensity: float
 
 
 @dataclass(frozen=True)
 class SeenCar:
-    """A car that has returns."""
+    """A car with returns."""
 
     distance_m: float
     returns: int
@@ -118,7 +118,7 @@ class SeenCar:
 
 @dataclass(frozen=True)
 class CloudNumbers:
-    """What the clouds of some frames are like; means per frame."""
+    """Statistics of the clouds of several frames; numbers of returns are means per frame."""
 
     frames: int
     returns: float
@@ -131,7 +131,7 @@ class CloudNumbers:
 
 @style.styled
 def compare(clouds: Mapping[str, CloudNumbers]) -> Figure:
-    """Return four panels: returns per range, intensities, the street ahead, returns per car."""
+    """Return four panels: returns by range, distribution of intensity, intensity of the street, returns by car."""
     figure = style.canvas(9.0, 6.4)
     ranges, intensity, ground, cars = figure.subplots(2, 2).ravel()
     for numbers, colour in zip(clouds.values(), COLOURS, strict=False):
@@ -163,9 +163,9 @@ def compare(clouds: Mapping[str, CloudNumbers]) -> Figure:
 def real_frame(
     name: str, points: NDArray[np.float32], view: CameraView, cars: Boxes, hit: NDArray[np.bool_], found: Boxes
 ) -> Figure:
-    """Return a real frame's cloud from above beside its image, with the labelled cars and the boxes found.
+    """Return a real frame's cloud from above beside its image, with the labelled cars and the detections.
 
-    `hit` (cars,): which were found at IoU 0.5.
+    `hit` (cars,): which cars were found at IoU 0.5.
     """
     figure = style.canvas(11.0, 4.9)
     above, ahead = figure.subplots(1, 2, width_ratios=(1, 1.55))

@@ -1,4 +1,4 @@
-"""What a network found in one input, drawn on that input: a drawer per kind of mark, whatever the task."""
+"""Predictions of a network drawn on its input, by a function for each kind of mark, for every task."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ from flcav.report.pictures.clouds import draw_boxes, on_page
 from flcav.report.pictures.predicted_paths import paths_key, paths_on_map
 
 WIDTH_IN = 8.0
-ABOVE_IN = 6.5  # side of a cloud from above
+ABOVE_IN = 6.5  # side of a cloud seen from above
 MAP_IN = 7.2  # side of a map
-BARS_IN = 3.6  # width of bars beside what was seen
-COLOURS = {  # of classes that people know by a colour
+BARS_IN = 3.6  # width of bars beside the input
+COLOURS = {  # of classes with a customary colour
     "Car": style.BLUE,
     "Pedestrian": style.VERMILLION,
     "Cyclist": style.GREEN,
@@ -37,7 +37,7 @@ BOX: dict[str, Any] = {"facecolor": "none", "linewidth": 1.4}
 
 @dataclass(frozen=True)
 class Panels:
-    """Where marks are drawn."""
+    """The axes that marks are drawn into."""
 
     seen: Axes  # the picture, the cloud from above, or the map
     ahead: tuple[Axes, CameraView] | None  # above a cloud: a camera's picture of the same scene
@@ -45,10 +45,10 @@ class Panels:
 
 @style.styled
 def draw(finding: Finding) -> Figure:
-    """Return what was seen with all its marks: shares beside it, above a cloud a camera's picture where there is one.
+    """Return the network's input with all marks; bars are beside it, a camera's picture of the scene above a cloud.
 
-    Clouds and maps are drawn from above, ahead of the observer up. On a camera's picture above it the cloud is coloured
-    by distance, and boxes have their edges.
+    Clouds and maps are seen from above, ahead of the observer is up. In a camera's picture the cloud is coloured by
+    distance, and boxes are drawn by their edges.
     """
     shares = [mark for mark in finding.marks if isinstance(mark, Bars)]
     view = finding.view() if finding.seen.ndim == 2 else None
@@ -74,7 +74,7 @@ def draw(finding: Finding) -> Figure:
 
 
 def _size(seen: NDArray[Any], view: CameraView | None) -> tuple[float, float]:
-    """Return width and height [inch] of what was seen, with its title."""
+    """Return width and height [inch] of the drawn input, with its title."""
     if seen.ndim == 2:
         if view is None:
             return ABOVE_IN, ABOVE_IN + 0.6
@@ -85,7 +85,7 @@ def _size(seen: NDArray[Any], view: CameraView | None) -> tuple[float, float]:
 
 
 def _show(page: FigureBase, seen: NDArray[Any], view: CameraView | None, title: str) -> Panels:
-    """Show what was seen; of a map, which its marks show, only the axes."""
+    """Show the input; for a map, which its mark draws, only add the axes."""
     if view is None:
         axes = page.subplots()
         axes.set_title(title)
@@ -126,7 +126,7 @@ def _cloud_from_above(axes: Axes, points: NDArray[np.float32]) -> None:
 
 
 def _frame_from_above(axes: Axes, marks: Iterable[Mark]) -> None:
-    """Set the axes of a cloud so that all boxes are seen, and put a scale bar into them."""
+    """Set the limits of a cloud's axes so that all boxes are inside, and add a scale bar."""
     boxes = [mark.boxes for mark in marks if isinstance(mark, CloudBoxes)]
     corners = [on_page(each.corners()[..., :2]).reshape(-1, 2) for each in boxes]
     across, up = np.concatenate([np.zeros((0, 2)), *corners]).T
@@ -136,7 +136,7 @@ def _frame_from_above(axes: Axes, marks: Iterable[Mark]) -> None:
 
 
 def show_bars(axes: Axes, bars: Bars) -> None:
-    """Draw a bar per name, the largest share in colour."""
+    """Draw a bar per class, that of the predicted class in colour."""
     names, best = list(bars.share), bars.caption
     colours = [style.BLUE if name == best else style.RULE for name in names]
     drawn = axes.barh(names, list(bars.share.values()), color=colours)
@@ -183,7 +183,7 @@ def _draw_cloud_boxes(panels: Panels, seen: NDArray[Any], mark: CloudBoxes) -> l
 
 
 def _by_class(boxes: Boxes) -> dict[str, Boxes]:
-    """Return the boxes of each class that there is, those with a colour of their own first."""
+    """Return the boxes by class, classes with a colour in `COLOURS` first."""
     found = set(boxes.label.tolist())
     names = [name for name in COLOURS if name in found] + sorted(found - COLOURS.keys())
     return {name: boxes[boxes.label == name] for name in names}

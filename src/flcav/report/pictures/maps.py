@@ -1,4 +1,4 @@
-"""A town from above, with what a placement is about."""
+"""The map of a town with registered errors, candidate poles and the chosen ones."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -32,18 +32,18 @@ KINDS = {
     "false_positive": ("false positive", FALSE_POSITIVE),
     "final_error": ("final error", FINAL_ERROR),
 }
-NOTE_M = 15.0  # about where a note stands above its pole
-WIDE = 3.0  # a note is so much wider than high
+NOTE_M = 15.0  # approximate distance of a note from its pole
+WIDE = 3.0  # width of a note, divided by its height
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Where a network erred in a town, and where a roadside sensor is put for it."""
+    """Registered errors of a network in a town, and the placement of roadside sensors for them."""
 
     town: Town
     errors: Array  # (E, 3) world [m]
-    kind: NDArray[np.str_]  # (E,) a key of KINDS, or what the user calls it
+    kind: NDArray[np.str_]  # (E,) a key of KINDS, or a kind of a user's own
     poles: Mapping[str, Array]  # candidate sites by id: (3,) world [m]
     chosen: Collection[str] = ()  # ids of the poles that were placed
     densest: str | None = None  # id of the pole with most actors within range
@@ -72,7 +72,7 @@ def draw_town(axes: Axes, town: Town) -> None:
 
 
 def draw_errors(axes: Axes, scene: ErrorMap) -> None:
-    """Draw the town, its registered errors, and its poles: the chosen with what they cover, the densest marked."""
+    """Draw the town, its registered errors and its poles: the chosen ones with their range, the densest as a square."""
     draw_town(axes, scene.town)
     for number in scene.chosen:
         at = scene.poles[number]
@@ -85,7 +85,7 @@ def draw_errors(axes: Axes, scene: ErrorMap) -> None:
         if not len(xyz):
             continue
         axes.plot(*xyz[:, :2].T, linestyle="none", label=f"{label} ({len(xyz)})", **look)
-    notes: list[Array] = []  # where they stand
+    notes: list[Array] = []  # their positions (2,)
     for number, (x, y, _) in scene.poles.items():
         chosen, densest = number in scene.chosen, number == scene.densest
         face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)

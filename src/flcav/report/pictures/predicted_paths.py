@@ -1,6 +1,6 @@
-"""Predicted paths on the map: each mode as faint as it is unlikely, the truth, and where nobody would turn or brake.
+"""Predicted paths on the map: modes with their probability as opacity, ground truth, and constant velocity.
 
-The mode for who wants a single one is the thickest.
+The first mode, the single prediction, is the thickest.
 """
 
 from typing import Any
@@ -17,12 +17,12 @@ from flcav.report import style
 Array = NDArray[np.float64]
 
 MAP_COLOURS = ((0.93, 0.93, 0.92), (0.85, 0.85, 0.84), (0.96, 0.93, 0.84))  # road, lane, crossing
-FAINTEST = 0.15
+FAINTEST = 0.15  # least opacity of a mode
 PREDICTED, TRUTH, PLAIN = style.BLUE, style.INK, style.ORANGE
 
 
 def paths_on_map(axes: Axes, layers: NDArray[np.bool_], paths: Paths) -> None:
-    """Draw the map (layers, H, W) around the observer, and the predicted paths on it; ahead of the observer is up."""
+    """Draw the map (layers, H, W) around the observer with the predicted paths; ahead of the observer is up."""
     reach, observer = paths.reach_m, np.array(paths.observer)
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     axes.imshow(_ground(layers), extent=(-reach, reach, -reach, reach), interpolation="antialiased")
@@ -67,14 +67,14 @@ def _draw_user(axes: Axes, user: RoadUser, observer: Array) -> None:
 
 
 def _on_page(points: Array, observer: Array) -> Array:
-    """Return the points (N, 2) of the world to the right of the observer and ahead of it."""
+    """Return the points (N, 2) of the world as distances to the right of the observer and ahead of it."""
     x, y = (points - observer[:2]).T
     cos, sin = np.cos(observer[2]), np.sin(observer[2])
     return np.stack((sin * x - cos * y, cos * x + sin * y), axis=1)
 
 
 def paths_key(paths: Paths) -> list[Line2D]:
-    """Return legend entries of what `paths_on_map` draws."""
+    """Return the legend of `paths_on_map`."""
     horizon_s = paths.times_s[-1]
     handles = [
         Line2D([], [], linestyle="none", marker="^", markersize=6, color=style.INK, label="observer"),

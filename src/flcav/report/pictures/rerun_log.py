@@ -1,7 +1,7 @@
-"""A scene as a Rerun recording: map, agents and their sensors' data, actors and the tracks they leave.
+"""A scene as a Rerun recording: map, agents with their sensors' data, actors and their tracks.
 
-Everything lies below `world` (ENU, z up); an agent at `world/agents/<agent>`, its sensors below it. There are two time
-lines: `spin`, and `time` of the simulation.
+All spatial entities are below `world` (ENU, z up): an agent is `world/agents/<agent>`, its sensors are below it. There
+are two timelines: `spin`, and `time` of the simulation.
 """
 
 from collections import defaultdict
@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 
 LIDAR_COLOURS = colormaps["turbo"]
 RADAR_COLOURS = colormaps["coolwarm"]
-RADAR_M_S = 15.0  # Doppler at which the colours end
-BEHIND_M = (-28.0, 0.0, 16.0)  # where the eye is at first, in the agent's frame
+RADAR_M_S = 15.0  # radial speed at the ends of the colour scale
+BEHIND_M = (-28.0, 0.0, 16.0)  # initial viewpoint, agent's frame
 AGENTS = "world/agents"
 
 
@@ -61,7 +61,7 @@ def log_scene(
 
 
 def blueprint(spin: Sequence[Frame]) -> Any:
-    """Return the layout in which a scene opens: the world seen from above and behind one agent, beside it its cameras.
+    """Return the initial layout of the viewer: the world from above and behind an agent, with its cameras beside.
 
     The agent is the first of the frames `spin` that has cameras, or the first of all.
     """
@@ -168,7 +168,7 @@ def _log_boxes(recording: Any, path: str, boxes: Array, labels: list[str], colou
 
 
 def _log_actors(recording: Any, spin: list[Frame], tracks: dict[str, list[Array]]) -> None:
-    """Log every actor that any agent's labels hold, and its track as a line up to here."""
+    """Log the actors that any agent's annotations hold, and the track of each up to this spin."""
     actors = {}
     for frame in spin:
         boxes = frame.annotations.boxes

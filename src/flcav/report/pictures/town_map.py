@@ -1,4 +1,4 @@
-"""A town as a map: streets with their markings, houses, trees, signs, lights, and the numbered poles."""
+"""The map of a town: streets with their markings, buildings, trees, signs, lights, and numbered poles."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -21,13 +21,13 @@ Array = NDArray[np.float64]
 GRASS = "#e7ecdf"
 ROAD, KERB, PAVEMENT = "#8d8f92", "#b9b6ae", "#dcd9d2"
 PAINTED = "#ffffff"
-HOUSES = ("#e3cfb8", "#d9b99a", "#c99f7d")  # low to high
+HOUSES = ("#e3cfb8", "#d9b99a", "#c99f7d")  # by height, low to high
 HOUSE_EDGE, SHADE = "#a5876c", "#00000022"
 TREES, CROWN = "#9fb98a", "#86a371"
 CLUTTER = "#b3a999"
 LAMP = "#f2c94c"
 WIDE_IN = 10.0
-SUN = np.array([0.35, -0.5])  # metres of shadow for a metre of height, divided by SHADOW
+SUN = np.array([0.35, -0.5])  # offset of a shadow [m] for SHADOW metres of height
 SHADOW = 5.0
 
 
@@ -44,7 +44,7 @@ def town_map(town: Town) -> bytes:
 
 
 def draw_map(axes: Axes, town: Town) -> None:
-    """Draw a town into axes in metres."""
+    """Draw a town into axes; world frame [m]."""
     layers = map_layers(town)
     x_low, y_low, x_high, y_high = town.bounds
     axes.set(xlim=(x_low, x_high), ylim=(y_low, y_high), aspect="equal", facecolor=GRASS)
@@ -76,7 +76,7 @@ def draw_map(axes: Axes, town: Town) -> None:
 
 
 def symbols(town: Town) -> list[tuple[str, dict[str, Any], Array]]:
-    """Return label, looks and positions (N, 2) of the signs and lights of a town."""
+    """Return label, marker and positions (N, 2) of each kind of sign and light in a town."""
     kinds = np.array(town.signs.kind)
     at = town.signs.position[:, :2]
     speed = np.char.startswith(kinds, "speed") if len(kinds) else np.zeros(0, np.bool_)
@@ -94,20 +94,20 @@ def symbols(town: Town) -> list[tuple[str, dict[str, Any], Array]]:
 
 
 def shadow(house: Array, height: float) -> Array:
-    """Return the ground (K, 2) in the shadow of a house, with the house."""
+    """Return the outline (K, 2) of a house and its shadow on the ground: their convex hull."""
     both = MultiPoint(np.concatenate((house, house + SUN * height / SHADOW)))
     return shapely.get_coordinates(both.convex_hull)
 
 
 def footprint(x: float, y: float, yaw: float, length: float, width: float) -> Array:
-    """Return the corners (4, 2) of a rectangle."""
+    """Return the corners (4, 2) of a rectangle with centre (x, y) and heading `yaw` [m, rad]."""
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2 * (length, width)
     cos, sin = np.cos(yaw), np.sin(yaw)
     return corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
 
 
 def discs(axes: Axes, at: Array, diameter: Array, colour: str, edge: str = "none") -> None:
-    """Draw discs (N, 2) of these diameters (N,) [m]."""
+    """Draw discs at (N, 2) with diameters (N,) [m]."""
     axes.add_collection(
         EllipseCollection(
             diameter, diameter, np.zeros(len(at)), units="x", offsets=at, transOffset=axes.transData,
