@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""What commands print, and what Ctrl-C leaves."""
-=======
-"""Terminal output: a plain console, live progress of steps, and messages for Ctrl-C."""
->>>>>>> w_system
+"""Terminal output: a plain console, JSON, and messages for Ctrl-C."""
 
 import contextlib
 import json
@@ -20,15 +16,10 @@ if TYPE_CHECKING:
 GOES_ON = "the same command goes on where it stopped"
 
 
-<<<<<<< HEAD
 def plain_console() -> "Console":
-    """Return stdout's console; brackets and colons in what is printed are neither markup nor emoji."""
+    """Return a console on stdout without markup and emoji, since users' names may hold brackets and colons."""
     from rich.console import Console
 
-=======
-def plain_console() -> Console:
-    """Return a console on stdout without markup and emoji, since users' names may hold brackets and colons."""
->>>>>>> w_system
     return Console(highlight=False, markup=False, emoji=False)
 
 
