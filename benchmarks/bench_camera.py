@@ -9,7 +9,7 @@ from cpu_time import cpu_ms
 
 from flcav.geometry import pose
 from flcav.sensors.camera.camera import Camera, photograph
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, directions
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, compute_pixel_rays
 from flcav.sensors.rendering.render import FAR_M
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
@@ -23,7 +23,7 @@ def measure(scene: Scene, agent: str, names: list[str], repeats: int) -> dict[st
     """Return the median CPU-ms of the bare trace ("bare") and of an image in each weather, taken in turns."""
     own, camera = int(np.flatnonzero(scene.trace.actor == agent)[0]), Camera()
     at = scene.world_from_actor(own) @ pose(0.8, 0.0, 1.5) @ BODY_FROM_OPTICAL
-    works: list[Callable[[], object]] = [lambda: scene.cast(at, directions(camera), far_m=FAR_M, hidden=own)]
+    works: list[Callable[[], object]] = [lambda: scene.cast(at, compute_pixel_rays(camera), far_m=FAR_M, hidden=own)]
     for name in names:
         works.append(
             lambda weather=WEATHERS[name]: photograph(scene, at, camera, weather, np.random.default_rng(0), hidden=own)

@@ -18,7 +18,7 @@ from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import sample_from_frame
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays
-from flcav.seeds import child_seed
+from flcav.seeds import derive_seed
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
@@ -28,7 +28,7 @@ STEPS, REPEATS = 20, 3
 def bare(clients: dict[str, TaskClient], weights, schedule: Schedule) -> None:
     work = schedule.work(1)
     updates = [
-        client.train(weights, steps=work.steps, learning_rate=work.learning_rate, seed=child_seed(work.seed, name))
+        client.train(weights, steps=work.steps, learning_rate=work.learning_rate, seed=derive_seed(work.seed, name))
         for name, client in clients.items()
     ]
     average([update.weights for update in updates], [update.samples for update in updates])

@@ -11,7 +11,7 @@ import json
 import numpy as np
 from cpu_time import cpu_ms
 
-from flcav.sensors.lidar.lidar import cast, draw_passes, ray_pattern, scan
+from flcav.sensors.lidar.lidar import build_ray_pattern, cast, draw_passes, scan
 from flcav.sensors.lidar.returns import AFTER_PANE_M, PANES
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import RIGS
@@ -29,7 +29,7 @@ def measure(scene: Scene, rig_name: str, agent: str, repeats: int) -> dict[str, 
     at = observe(scene, rig, agent, index, scene_name="bench", seed=0).world_from_sensor("lidar")
     hidden = np.flatnonzero(scene.trace.actor == agent)
     own = int(hidden[0]) if len(hidden) else None
-    rays, rng = ray_pattern(lidar), np.random.default_rng(0)
+    rays, rng = build_ray_pattern(lidar), np.random.default_rng(0)
     passes = draw_passes(lidar, rng)
 
     def trace(directions: np.ndarray, near_m: np.ndarray | None) -> object:

@@ -28,7 +28,7 @@ from flcav.dataset.payloads import encode_plane
 from flcav.dataset.recording.jobs import Part, Traffic, perform
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
-from flcav.sensors.lidar.lidar import ray_pattern
+from flcav.sensors.lidar.lidar import build_ray_pattern
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.embedded import EmbeddedSource
@@ -98,7 +98,7 @@ def _bare(scene: Scene, source: EmbeddedSource) -> None:
             rig = source.recipe.pole_rig if hidden is None else source.recipe.vehicle_rig
             lidar = rig.lidars["lidar"]
             at = _agent(scene, agent, hidden) @ lidar.mount.agent_from_sensor()
-            scene.cast(at, ray_pattern(lidar.settings), far_m=lidar.settings.range_m, hidden=hidden)
+            scene.cast(at, build_ray_pattern(lidar.settings), far_m=lidar.settings.range_m, hidden=hidden)
 
 
 def _agent(scene: Scene, agent: str, actor: int | None) -> NDArray[np.float64]:

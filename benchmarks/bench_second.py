@@ -20,7 +20,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from flcav.perception.device import device_named
+from flcav.perception.device import select_device
 from flcav.perception.objects import Sample, Second, detect, sample_from_frame
 from flcav.perception.objects.loss import predict
 from flcav.perception.objects.task import OBJECTS
@@ -63,7 +63,7 @@ def time_on_cpu(names: tuple[str, ...]) -> None:
 
 
 def time_on_gpu() -> None:
-    device = device_named("cuda")
+    device = select_device("cuda")
     print(f"paper on {torch.cuda.get_device_name(device)}, torch {torch.__version__}, batches of {GPU_BATCH}")
     for bfloat16 in (False, True):
         config = replace(OBJECTS.configurations["paper"], bfloat16=bfloat16)

@@ -15,7 +15,7 @@ from flcav.perception.signs.config import CONFIGURATIONS
 from flcav.perception.signs.detect import detect
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.outcomes import LOWEST_SCORE
-from flcav.perception.signs.samples import Sample, sample_of
+from flcav.perception.signs.samples import Sample, sample_from_frame
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import fresh
 from flcav.perception.training import adamw, step
@@ -35,7 +35,7 @@ def main() -> None:
     batch = SIGNS.practice.batch
     works: list[Callable[[], object]] = []
     for config in CONFIGURATIONS.values():
-        samples = [sample_of(frame, "camera", frame.images["camera"].rgb, config) for frame in frames]
+        samples = [sample_from_frame(frame, "camera", frame.images["camera"].rgb, config) for frame in frames]
         works += [training(fresh(SIGNS, config, 0), samples, batch), inference(fresh(SIGNS, config, 0), samples)]
     taken = cpu_ms(works, REPEATS)
     height, width = frames[0].images["camera"].rgb.shape[:2]

@@ -15,7 +15,7 @@ from flcav.perception.trajectory.config import CONFIGURATIONS, FUTURE, PAST, Tra
 from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.rasters import LAYERS
 from flcav.perception.trajectory.roads import road_map
-from flcav.perception.trajectory.samples import Sample, Surround, present_at
+from flcav.perception.trajectory.samples import Sample, Surround, extract_columns
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.world.map.town import load_town
 from flcav.world.traffic.traffic import simulate
@@ -48,8 +48,8 @@ def extraction_ms() -> float:
     trace = simulate(town, seed=1, cavs=1, times_s=np.arange(60.0, 70.1, 0.5))
     roads, patch = road_map(town), CONFIGURATIONS["tiny"].patch
     wanted = np.ones(len(trace.actor), np.bool_)
-    count = len(present_at(trace, 65.0, roads, patch, wanted)["past"])
-    return cpu_ms((lambda: present_at(trace, 65.0, roads, patch, wanted),), REPEATS)[0] / count
+    count = len(extract_columns(trace, 65.0, roads, patch, wanted)["past"])
+    return cpu_ms((lambda: extract_columns(trace, 65.0, roads, patch, wanted),), REPEATS)[0] / count
 
 
 def made_sample(config: TrajectoryConfig) -> Sample:

@@ -37,7 +37,7 @@ def seen_from_above(frame: Frame) -> View:
     """Return the frame in its agent's coordinates, heights above the ground."""
     points = transform_points(frame.agent_from_sensor["lidar"], frame.lidar["lidar"][:, :3].astype(np.float64))
     points[:, 2] += frame.world_from_agent[2, 3]
-    boxes = frame.annotations.boxes.transformed(inverse(frame.world_from_agent))
+    boxes = frame.annotations.boxes.transform(inverse(frame.world_from_agent))
     return View(points, boxes, frame.annotations.returns, f"{frame.key} in the town {RECIPE['town']!r}")
 
 

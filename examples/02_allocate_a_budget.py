@@ -1,7 +1,7 @@
 """Split 4 GB of wireless and 4 GB of wireline uplink over the three training stages of one task, then double both."""
 
 from flcav.optimization.allocation.allocate import allocate
-from flcav.optimization.allocation.problem import Budgets, Limits, Problem, Task
+from flcav.optimization.allocation.problem import AllocationTask, Budgets, Limits, Problem
 from flcav.optimization.curves.curves import Additive, Decay
 
 CURVE = Additive(
@@ -13,7 +13,7 @@ CURVE = Additive(
 
 
 def problem(budget_mb: float) -> Problem:
-    task = Task(
+    task = AllocationTask(
         name="objects",
         sample_mb=1.6,
         model_mb=60,

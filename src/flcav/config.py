@@ -27,7 +27,7 @@ class Config(BaseModel):
 
     @field_validator("*", mode="after")
     @classmethod
-    def _of_a_magnitude(cls, value: Any) -> Any:
+    def _check_magnitude(cls, value: Any) -> Any:
         least, most = cls.magnitudes
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, float) and number and not least <= abs(number) <= most:
@@ -49,7 +49,7 @@ def parse_config(model: type[ConfigT], values: object, origin: str) -> ConfigT:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise InputError(f"{origin}: {tell(error, model)}") from None
+        raise InputError(f"{origin}: {describe_error(error, model)}") from None
 
 
 def read_config(model: type[ConfigT], path: Path) -> ConfigT:
@@ -86,7 +86,7 @@ def shorten(value: object) -> str:
     return text if len(text) <= SHOWN else f"{text[: SHOWN // 2]} ... {text[-SHOWN // 4 :]}"
 
 
-def tell(error: ValidationError, model: type[BaseModel]) -> str:
+def describe_error(error: ValidationError, model: type[BaseModel]) -> str:
     """Return a validation error of `model` as a clause for an error message.
 
     It tells the first of the most deeply nested faults and counts the others: an outer field is reported as wrong

@@ -5,7 +5,7 @@ import sys
 from importlib.metadata import requires
 
 
-def installation(extra: str) -> str:
+def format_install_command(extra: str) -> str:
     """Return the pip command that installs the packages of `extra`, as flcav's metadata list them, for this Python."""
     lines = (line.partition(";") for line in requires("flcav") or ())
     wanted = f"extra == '{extra}'"  # a build back end may write either quotes

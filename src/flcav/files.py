@@ -51,10 +51,10 @@ def check_writable(folder: Path) -> None:
 def write_bytes(path: Path, data: bytes) -> None:
     """Write `data` to `path` atomically."""
     with atomic_path(path) as temporary:
-        fill(temporary, data)
+        write_in_pieces(temporary, data)
 
 
-def fill(path: Path, data: bytes | memoryview) -> None:
+def write_in_pieces(path: Path, data: bytes | memoryview) -> None:
     """Write `data` to `path` in pieces of PIECE_BYTES.
 
     For one large write the kernel looks for contiguous free memory, which takes six times as long.

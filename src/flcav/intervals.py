@@ -24,7 +24,7 @@ class Estimate:
     low: float | None
     high: float | None
 
-    def told(self, *, sign: bool = False) -> str:
+    def describe(self, *, sign: bool = False) -> str:
         """Return the text "mean (low to high)" with three decimals; only the mean where there is no interval.
 
         With `sign`, positive numbers have a plus.
@@ -43,7 +43,7 @@ class MeanOverSeeds(Estimate):
     high: float
 
 
-def over_scenes(
+def bootstrap_over_scenes(
     measure: Callable[[NDArray[np.int64]], NDArray[np.float64]],
     scene_of_frame: ArrayLike,
     n: int = REDRAWS,

@@ -35,7 +35,9 @@ def load_own(kind: str, name: str, known: Iterable[str], wanted: type) -> Any:
         try:
             found = found()
         except Exception as error:
-            raise InputError(f"{told}: makes nothing without arguments ({_said(error)}); name an instance") from None
+            raise InputError(
+                f"{told}: makes nothing without arguments ({_describe_exception(error)}); name an instance"
+            ) from None
     if lacking := [name for name in vars(wanted) if not name.startswith("_") and not hasattr(found, name)]:
         raise InputError(f"{told}: is no {kind}, it has no {', '.join(lacking)}")
     return found
@@ -50,12 +52,12 @@ def _imported(place: str, told: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name is not None and f"{place}.".startswith(f"{error.name}."):
             raise InputError(f"{told}: no module '{error.name}' in {here} or among what is installed") from None
-        raise InputError(f"{told}: cannot be imported ({_said(error)})") from None
+        raise InputError(f"{told}: cannot be imported ({_describe_exception(error)})") from None
     except (Exception, SystemExit) as error:
-        raise InputError(f"{told}: cannot be imported ({_said(error)})") from None
+        raise InputError(f"{told}: cannot be imported ({_describe_exception(error)})") from None
 
 
-def _said(error: BaseException) -> str:
+def _describe_exception(error: BaseException) -> str:
     """Return the type and message of an exception, and the file and line that raised it."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:

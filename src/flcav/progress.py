@@ -9,12 +9,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 Report = Callable[[int, int, str], None]  # done, total, note (e.g. "loss 0.31")
 
 
-def silent(done: int, total: int, note: str = "") -> None:
+def ignore_progress(done: int, total: int, note: str = "") -> None:
     """Do nothing: the default `Report`, without a display."""
 
 
 @contextlib.contextmanager
-def live(title: str) -> Iterator[Report]:
+def show_progress(title: str) -> Iterator[Report]:
     """Yield a `Report` that draws a progress bar with the estimated time left on stderr, if stderr is a terminal.
 
     The `done` of the first call is taken as finished earlier and does not count towards the speed.

@@ -22,9 +22,9 @@ class Record:
         return to_json(self, type(self))
 
     @classmethod
-    def of_json(cls, values: Json, origin: str) -> Self:
+    def from_json(cls, values: Json, origin: str) -> Self:
         """Return the record that `as_json` made `values` of; raises `InputError` naming `origin` if they do not fit."""
-        return of_json(cls, values, origin)
+        return from_json(cls, values, origin)
 
 
 def to_json(record: RecordT, kind: type[RecordT]) -> dict[str, Json]:
@@ -32,7 +32,7 @@ def to_json(record: RecordT, kind: type[RecordT]) -> dict[str, Json]:
     return _adapter(kind).dump_python(record, mode="json", by_alias=True)
 
 
-def of_json(kind: type[RecordT], values: Json, origin: str) -> RecordT:
+def from_json(kind: type[RecordT], values: Json, origin: str) -> RecordT:
     """Return the `kind` that `to_json` made `values` of; raises `InputError` naming `origin` if they do not fit."""
     try:
         return _adapter(kind).validate_python(values)

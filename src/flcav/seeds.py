@@ -14,6 +14,6 @@ def stream(seed: int, *keys: str | int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=tuple(words)))
 
 
-def child_seed(seed: int, *keys: str | int) -> int:
+def derive_seed(seed: int, *keys: str | int) -> int:
     """Return a 31-bit integer seed for a library that needs one (SUMO, torch), drawn from `stream(seed, *keys)`."""
     return int(stream(seed, *keys).integers(2**31 - 1))

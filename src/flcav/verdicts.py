@@ -17,7 +17,7 @@ def verdict(low: float | None, high: float | None) -> str:
     return NOT_HELD if high < 0 else UNDECIDED
 
 
-def verdict_words(decided: str, runs: int = 1) -> str:
+def explain_verdict(decided: str, runs: int = 1) -> str:
     """Return a clause that explains the verdict `decided` of `verdict`, for one run or several (`runs`)."""
     where = " in this run" if runs == 1 else ""
     who = "this run does" if runs == 1 else "these runs do"
@@ -28,7 +28,7 @@ def verdict_words(decided: str, runs: int = 1) -> str:
     }[decided]
 
 
-def aim_sentence(aim: str, wanted: float, reached: MeanOverSeeds, seeds: int, *, at_most: bool = False) -> str:
+def describe_aim(aim: str, wanted: float, reached: MeanOverSeeds, seeds: int, *, at_most: bool = False) -> str:
     """Return the sentence "*aim*: **verdict**, mean (low to high) over n seeds" in Markdown, without a full stop.
 
     The aim is a mean of at least `wanted`, or with `at_most` of at most `wanted`. The verdict is "reached" or "not
@@ -37,7 +37,7 @@ def aim_sentence(aim: str, wanted: float, reached: MeanOverSeeds, seeds: int, *,
     low, high = reached.low, reached.high
     good, bad = (high <= wanted, low > wanted) if at_most else (low >= wanted, high < wanted)
     said = "reached" if good else "not reached" if bad else UNDECIDED
-    over = f"{reached.told()} over {seeds} seeds" if seeds > 1 else f"{reached.mean:.3f} of one seed"
+    over = f"{reached.describe()} over {seeds} seeds" if seeds > 1 else f"{reached.mean:.3f} of one seed"
     return f"*{aim}*: **{said}**, {over}"
 
 

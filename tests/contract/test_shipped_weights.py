@@ -9,10 +9,10 @@ from flcav import perception
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.perception.card import LICENCE
-from flcav.perception.networks import network_of
+from flcav.perception.networks import resolve_network
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.training.checkpoint import settings_of
-from flcav.perception.weights import SHIPPED, read_card, shipped, to_arrays
+from flcav.perception.weights import SHIPPED, find_shipped, read_card, to_arrays
 
 EACH_MB, ALL_MB = 4.0, 12.0
 FOLDER = Path(next(iter(perception.__path__)))
@@ -33,8 +33,8 @@ def shapes(network):
 
 @pytest.mark.parametrize("task", SENT.values(), ids=SENT)
 def test_they_load_and_their_card_says_how_they_came_about(task):
-    path = shipped(task)
-    network, card = network_of(task, None), read_card(path)
+    path = find_shipped(task)
+    network, card = resolve_network(task, None), read_card(path)
     assert card.task == task.name
     assert shapes(network) == shapes(task.build(task.configurations[card.network]))
     assert card.parameters == sum(parameter.numel() for parameter in network.parameters())
@@ -52,7 +52,7 @@ def test_they_load_and_their_card_says_how_they_came_about(task):
 @pytest.mark.parametrize("task", NOT_SENT.values(), ids=NOT_SENT)
 def test_where_there_are_none_one_sentence_says_so(task, tmp_path, capsys):
     with pytest.raises(InputError, match=f"no weights for '{task.name}' come with the package"):
-        shipped(task)
+        find_shipped(task)
     with pytest.raises(SystemExit, match="2"):
         run(["infer", task.name, str(tmp_path)])
     assert capsys.readouterr().err.count("\n") == 1

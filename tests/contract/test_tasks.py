@@ -19,20 +19,20 @@ from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.fig1b.columns import show_layers
-from flcav.experiments.fig1b.layers import LAYERS, watched
+from flcav.experiments.fig1b.layers import LAYERS, capture_outputs
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import Trainable
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.card import CARD_KEY
 from flcav.perception.client import TaskClient
-from flcav.perception.device import device_named
+from flcav.perception.device import select_device
 from flcav.perception.signs.task import SIGNS
-from flcav.perception.task import Task, configuration, fresh
+from flcav.perception.task import Task, find_configuration, fresh
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.training import Checkpointing, Validation, train
 from flcav.perception.training.run import Request, train_network
-from flcav.perception.weather.task import WEATHER, over_the_whole_space
+from flcav.perception.weather.task import WEATHER, evaluate_whole_space
 from flcav.perception.weights import load_network, save_network, to_arrays
 from flcav.report import style
 from flcav.report.pictures.inference import draw
@@ -40,13 +40,13 @@ from flcav.sensors.frame import Frame
 from flcav.world.weather import Weather
 
 each_task = pytest.mark.parametrize("task", [task_named(name) for name in TASKS], ids=TASKS)
-CONFIGS = {"signs": replace(configuration(SIGNS, "n"), window_px=(96, 64))}
+CONFIGS = {"signs": replace(find_configuration(SIGNS, "n"), window_px=(96, 64))}
 LACKING = {"objects": ({"lidar": False}, "no LiDAR"), "trajectory": ({"traffic": False}, "no traffic")}
 FILES = {"weather": "front/*.webp", "signs": "front/*.webp", "objects": "top/*.bin"}
 
 
 def small(task: Task) -> Any:
-    return CONFIGS.get(task.name, configuration(task, None))
+    return CONFIGS.get(task.name, find_configuration(task, None))
 
 
 def shown(data: Dataset) -> list[str]:
@@ -98,7 +98,7 @@ def test_a_seed_names_a_training(task, samples):
 @each_task
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_a_gpu_trains_evaluates_and_goes_on_to_the_same_weights(task, data, samples, tmp_path):
-    network, again = (fresh(task, small(task), 1).to(device_named("cuda")) for _ in range(2))
+    network, again = (fresh(task, small(task), 1).to(select_device("cuda")) for _ in range(2))
     checkpointing = Checkpointing(tmp_path / "checkpoint.pt", every=2)
     history = train(task, network, samples[task.name], steps=2, batch=2, seed=3, checkpointing=checkpointing)
     train(task, again, samples[task.name], steps=2, batch=2, seed=3, checkpointing=checkpointing)
@@ -207,7 +207,7 @@ def test_evaluations_and_findings_are_json_and_words_and_pictures(task, data):
 def test_the_layers_that_fig1b_shows_are_all_seen(task, data):
     network = fresh(task, small(task), 1).eval()
     layers = LAYERS[task.name](network)
-    with watched(layers) as seen:
+    with capture_outputs(layers) as seen:
         list(task.infer(network, data.folder, 0.9))
     assert set(seen) == set(layers)
     assert all(layer.values.ndim in (1, 3) and np.isfinite(layer.values).all() for layer in seen.values())
@@ -338,5 +338,5 @@ def test_a_picture_of_the_whole_space_counts_as_of_the_nearest_class(tmp_path):
     data, network = Dataset.open(tmp_path), fresh(WEATHER, small(WEATHER), 1)
     with pytest.raises(InputError, match="no picture in any of the weathers clear"):
         WEATHER.evaluate(network, data)
-    nearest = over_the_whole_space(network, data)
+    nearest = evaluate_whole_space(network, data)
     assert nearest.pictures == sum(nearest.confusion[1]) == 6

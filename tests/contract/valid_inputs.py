@@ -17,7 +17,7 @@ import flcav.world
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
 from flcav.perception.signs.task import SIGNS
-from flcav.perception.task import configuration, fresh
+from flcav.perception.task import find_configuration, fresh
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import save_network
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
@@ -175,8 +175,8 @@ def make_inputs(folder: Path) -> None:
     """Write the inputs into the new `folder`."""
     folder.mkdir(parents=True)
     record(AllSensors(spins=2), folder / "data")
-    networks = {name: configuration(task_named(name), None) for name in TASKS}
-    networks["signs"] = replace(configuration(SIGNS, "n"), window_px=(WIDTH, HEIGHT))
+    networks = {name: find_configuration(task_named(name), None) for name in TASKS}
+    networks["signs"] = replace(find_configuration(SIGNS, "n"), window_px=(WIDTH, HEIGHT))
     for name in TASKS:
         task = task_named(name)
         save_network(task, fresh(task, networks[name], 1), folder / "weights" / f"{name}.safetensors")

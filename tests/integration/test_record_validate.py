@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flcav.config import InputError
-from flcav.dataset.checks.validate import check_order, leaks, validate
+from flcav.dataset.checks.validate import check_order, find_leaks, validate
 from flcav.dataset.layout import FrameKey, Manifest
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
@@ -212,7 +212,7 @@ def test_leakage_between_splits(recorded: Path, edit: Callable[[dict], None], me
     manifest = json.loads((recorded / "manifest.json").read_text())
     other = json.loads((recorded / "manifest.json").read_text())
     edit(other)
-    found = leaks({"one": Manifest.model_validate(manifest), "two": Manifest.model_validate(other)})
+    found = find_leaks({"one": Manifest.model_validate(manifest), "two": Manifest.model_validate(other)})
     assert found == [] if message is None else message in only(found)
 
 

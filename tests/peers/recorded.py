@@ -10,7 +10,7 @@ from flcav.sensors.frame import Frame
 
 def in_lidar(frame: Frame) -> Boxes:
     """Return the boxes of a frame in its LiDAR's frame."""
-    return frame.annotations.boxes.transformed(inverse(frame.world_from_sensor(next(iter(frame.lidar)))))
+    return frame.annotations.boxes.transform(inverse(frame.world_from_sensor(next(iter(frame.lidar)))))
 
 
 def points_in(frame: Frame) -> NDArray[np.int64]:

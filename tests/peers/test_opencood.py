@@ -47,7 +47,7 @@ def test_its_datasets_find_what_was_recorded(together: Dataset, peer: Callable[[
                 shared = [own] if fusion == "late" else heard
                 lidar_from_world = inverse(own.world_from_sensor("lidar"))
                 truth = {
-                    str(frame.annotations.track[i]): frame.annotations.boxes.transformed(lidar_from_world)[[i]]
+                    str(frame.annotations.track[i]): frame.annotations.boxes.transform(lidar_from_world)[[i]]
                     for frame in shared
                     for i in np.flatnonzero(points_in(frame) > 0)
                     if str(frame.annotations.boxes.label[i]) in VEHICLES

@@ -11,7 +11,7 @@ from conftest import PEERS, Peer
 
 from flcav.dataset.formats.export import export
 from flcav.dataset.formats.exporter import ExportOptions
-from flcav.dataset.rectangles import CLASSES, rectangles
+from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
 
 # it fetches nothing, and leaves no settings behind
@@ -23,7 +23,7 @@ def _expected(dataset: Dataset, labels: str) -> dict[str, list[list[float]]]:
     for frame in (dataset.frame(i) for i in range(len(dataset))):
         for camera, picture in frame.images.items():
             height, width = picture.rgb.shape[:2]
-            found = rectangles(frame, camera, labels, 1)
+            found = select_rectangles(frame, camera, labels, 1)
             left, top, right, bottom = (found.box / (width, height, width, height)).T
             boxes = np.stack((found.label, (left + right) / 2, (top + bottom) / 2, right - left, bottom - top), axis=1)
             rows[f"{frame.key}_{camera}"] = sorted(boxes.tolist())

@@ -11,7 +11,7 @@ from packaging.requirements import Requirement
 
 from flcav.config import InputError
 from flcav.dataset.recording import ray_engine
-from flcav.extras import installation
+from flcav.extras import format_install_command
 from flcav.world.opendrive import importing as netconvert
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
@@ -19,7 +19,7 @@ PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text
 
 @pytest.mark.parametrize("extra", ["ray", "view", "towns"])
 def test_it_names_the_packages_that_the_project_asks_for(extra):
-    command = shlex.split(installation(extra))
+    command = shlex.split(format_install_command(extra))
     assert command[:4] == [sys.executable, "-m", "pip", "install"]
     asked = {Requirement(line) for line in PROJECT["optional-dependencies"][extra]}
     assert {Requirement(word) for word in command[4:]} == asked
@@ -28,13 +28,13 @@ def test_it_names_the_packages_that_the_project_asks_for(extra):
 
 def test_ray_says_how_to_get_it(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(InputError) as told, ray_engine.ray_cluster(None, tmp_path, 1, lambda count: None):  # type: ignore
+    with pytest.raises(InputError) as told, ray_engine.start_ray_engine(None, tmp_path, 1, lambda count: None):  # type: ignore
         pass
-    assert str(told.value).endswith(installation("ray"))
+    assert str(told.value).endswith(format_install_command("ray"))
 
 
 def test_importing_towns_says_how_to_get_netconvert(monkeypatch, tmp_path):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError) as told:
-        netconvert.take_apart(tmp_path / "map.xodr", tmp_path / "parts")
-    assert str(told.value).endswith(installation("towns"))
+        netconvert.split_map(tmp_path / "map.xodr", tmp_path / "parts")
+    assert str(told.value).endswith(format_install_command("towns"))

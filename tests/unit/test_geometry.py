@@ -39,7 +39,7 @@ def test_boxes_move_as_their_corners_do(x, y, yaw):
     target_from_source = pose(x, y, 1.0, yaw)
     box = Boxes.from_array([[3, -2, 0.8, 4.2, 1.8, 1.6, 0.3]], "Car")
     expected = transform_points(target_from_source, box.corners()[0])
-    np.testing.assert_allclose(box.transformed(target_from_source).corners()[0], expected, atol=1e-9)
+    np.testing.assert_allclose(box.transform(target_from_source).corners()[0], expected, atol=1e-9)
 
 
 @pytest.mark.filterwarnings("error")

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds, over_scenes
+from flcav.intervals import Estimate, MeanOverSeeds, bootstrap_over_scenes, mean_over_seeds
 
 
 def test_the_interval_over_scenes_is_that_of_redrawing_them_one_by_one():
     rng = np.random.default_rng(0)
     scenes, right = np.repeat(["b", "a", "c", "d"], [5, 8, 2, 9]), rng.random(24) < 0.7
-    low, high = over_scenes(lambda times: times @ right / times.sum(axis=1), scenes, 400, rng=np.random.default_rng(3))
+    low, high = bootstrap_over_scenes(
+        lambda times: times @ right / times.sum(axis=1), scenes, 400, rng=np.random.default_rng(3)
+    )
     own, one_by_one = np.random.default_rng(3), []
     for counts in own.multinomial(4, np.full(4, 0.25), size=400):
         drawn = np.concatenate([np.tile(right[scenes == name], count) for name, count in zip("abcd", counts)])
@@ -20,7 +22,9 @@ def test_the_interval_over_scenes_is_that_of_redrawing_them_one_by_one():
 
 def test_scenes_of_one_frame_give_the_bootstrap_of_scipy():
     values = np.random.default_rng(1).normal(size=60)
-    found = over_scenes(lambda times: times @ values / len(values), np.arange(60), 20_000, rng=np.random.default_rng(2))
+    found = bootstrap_over_scenes(
+        lambda times: times @ values / len(values), np.arange(60), 20_000, rng=np.random.default_rng(2)
+    )
     theirs = stats.bootstrap(
         (values,), np.mean, n_resamples=20_000, method="percentile", rng=np.random.default_rng(4)
     ).confidence_interval
@@ -29,8 +33,8 @@ def test_scenes_of_one_frame_give_the_bootstrap_of_scipy():
 
 def test_what_no_redrawing_knows_has_no_interval_and_unknown_ones_are_left_out():
     rng = np.random.default_rng(0)
-    assert np.isnan(over_scenes(lambda times: np.full(len(times), np.nan), "ab", 50, rng=rng)).all()
-    known = over_scenes(lambda times: np.where(times[:, 0] > 0, 1.0, np.nan), list("ab"), 50, rng=rng)
+    assert np.isnan(bootstrap_over_scenes(lambda times: np.full(len(times), np.nan), "ab", 50, rng=rng)).all()
+    known = bootstrap_over_scenes(lambda times: np.where(times[:, 0] > 0, 1.0, np.nan), list("ab"), 50, rng=rng)
     assert known == (1.0, 1.0)
 
 
@@ -43,6 +47,6 @@ def test_means_over_seeds_have_the_interval_of_a_t_test():
 
 
 def test_an_estimate_is_told_with_its_interval_where_it_has_one():
-    assert Estimate(0.1, -0.2, 0.4).told() == "0.100 (-0.200 to 0.400)"
-    assert Estimate(0.1, -0.2, 0.4).told(sign=True) == "+0.100 (-0.200 to +0.400)"
-    assert Estimate(0.1, None, None).told() == "0.100"
+    assert Estimate(0.1, -0.2, 0.4).describe() == "0.100 (-0.200 to 0.400)"
+    assert Estimate(0.1, -0.2, 0.4).describe(sign=True) == "+0.100 (-0.200 to +0.400)"
+    assert Estimate(0.1, None, None).describe() == "0.100"

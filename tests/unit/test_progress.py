@@ -18,7 +18,7 @@ def shown(monkeypatch):
 
 
 def test_work_done_before_does_not_shorten_the_time_left(shown):
-    with progress.live("train") as report:
+    with progress.show_progress("train") as report:
         for done in range(900, 906):
             report(done, 2000, "loss 0.31")
             time.sleep(0.05)
@@ -31,6 +31,6 @@ def test_work_done_before_does_not_shorten_the_time_left(shown):
 def test_nothing_is_drawn_where_nobody_looks(monkeypatch):
     out = io.StringIO()
     monkeypatch.setattr(progress, "Console", lambda **_: Console(file=out))
-    with progress.live("train") as report:
+    with progress.show_progress("train") as report:
         report(1, 2, "loss 0.31")
     assert out.getvalue() == ""

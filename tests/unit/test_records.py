@@ -28,10 +28,10 @@ def test_a_record_comes_back_from_its_json() -> None:
         "by_town": {"grid": {"class": "Car", "ap": 1.0}},
     }
     assert told.as_json() == values
-    assert Told.of_json(values, "told") == told
+    assert Told.from_json(values, "told") == told
     assert Told((), {}, Row("Car", 0.5)).as_json()["more"] == {"class": "Car", "ap": 0.5}
 
 
 def test_what_is_no_such_record_is_one_sentence() -> None:
     with pytest.raises(InputError, match=r"result\.json: not a result .*field 'rows\.0\.ap'"):
-        Told.of_json({"rows": [{"class": "Car", "ap": "high"}], "by_town": {}}, "result.json")
+        Told.from_json({"rows": [{"class": "Car", "ap": "high"}], "by_town": {}}, "result.json")

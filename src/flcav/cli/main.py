@@ -11,7 +11,7 @@ from flcav.cli import (
     run as run_command,
 )
 from flcav.cli.data import birdseye, camera, export, record, validate, view
-from flcav.cli.options import literal
+from flcav.cli.options import escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
 from flcav.cli.planning import allocate, fit, place
 from flcav.cli.terminal import Interrupted
@@ -67,7 +67,7 @@ for command in (
 def run(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its code; only here are exceptions turned into exit codes."""
     try:
-        code = literal(typer.main.get_command(app))(args=arguments, standalone_mode=False)
+        code = escape_markup(typer.main.get_command(app))(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # typer's exit code for Ctrl-C
             raise KeyboardInterrupt
     except Interrupted as kept:

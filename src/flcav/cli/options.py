@@ -55,13 +55,13 @@ class Method(StrEnum):
     greedy = "greedy"
 
 
-def listed(choices: Iterable[str]) -> str:
+def join_choices(choices: Iterable[str]) -> str:
     """Return the choices in words: "a, b or c"."""
     *others, last = choices
     return f"{', '.join(others)} or {last}"
 
 
-ANY_TASK = f"{listed(TASKS)}, or one of your own as module:NAME"
+ANY_TASK = f"{join_choices(TASKS)}, or one of your own as module:NAME"
 
 
 THREADS = typer.Option(
@@ -86,7 +86,7 @@ STALE = typer.Option(
 )
 
 
-def finite(parameter: click.Parameter, value: float | None) -> float | None:
+def check_finite(parameter: click.Parameter, value: float | None) -> float | None:
     """Callback of a number's option: return the value; raises `InputError` for nan, which passes any limits."""
     if value is not None and not math.isfinite(value):
         raise InputError(f"{parameter.opts[0]} {value}: a finite number is wanted")
@@ -102,7 +102,7 @@ def refuse_unused(what: str, *names: str) -> None:
             raise InputError(f"{what}: has no use for {parameter.opts[0]}")
 
 
-def literal(command: click.Command) -> click.Command:
+def escape_markup(command: click.Command) -> click.Command:
     """Escape Rich's markup in the help of a command, its parameters and its subcommands; return the command.
 
     Typer would read "[m]" as a style. Lines of a paragraph are joined, to be wrapped at the width of the terminal.
@@ -111,5 +111,5 @@ def literal(command: click.Command) -> click.Command:
         text = inspect.cleandoc(getattr(owner, "help", None) or "")
         owner.help = "\n\n".join(escape(" ".join(paragraph.split())) for paragraph in text.split("\n\n"))  # type: ignore
     for subcommand in getattr(command, "commands", {}).values():
-        literal(subcommand)
+        escape_markup(subcommand)
     return command

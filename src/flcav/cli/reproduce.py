@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import typer
 
-from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale, listed, refuse_unused
+from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale, join_choices, refuse_unused
 from flcav.cli.terminal import when_interrupted
 from flcav.experiments.studies import STUDIES
 from flcav.threads import use_threads
@@ -58,7 +58,7 @@ def reproduce(
         ...,
         metavar="TARGET",
         click_type=Reproducible(TARGETS),
-        help=f"What to reproduce: {listed(TARGETS)}, or {OWN}.",
+        help=f"What to reproduce: {join_choices(TARGETS)}, or {OWN}.",
     ),
     out: Path = typer.Option(..., "--out", help="Folder of the runs; the same command goes on after a stop."),
     seeds: int | None = typer.Option(
@@ -102,7 +102,7 @@ def _fig1b(out: Path) -> None:
     from flcav.experiments.fig1b.run import fig1b
     from flcav.files import write_bytes
 
-    with progress.live("record") as report:
+    with progress.show_progress("record") as report:
         picture = fig1b(out, report)
     write_bytes(out / "fig1b.png", picture)
     typer.echo(f"{out / 'fig1b.png'}: four tasks on one scene")
@@ -156,7 +156,7 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int,
     from flcav.config import InputError
     from flcav.experiments.sim_to_real.run import draw_frame, run_sim_to_real
     from flcav.files import write_bytes, write_json
-    from flcav.perception.networks import network_of
+    from flcav.perception.networks import resolve_network
     from flcav.perception.objects.task import OBJECTS
     from flcav.report import style
     from flcav.report.pictures.clouds import compare
@@ -164,7 +164,7 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int,
     if kitti is None:
         raise InputError("--kitti is missing: sim-to-real needs a folder of real frames in KITTI's layout")
     with live_steps(Target.sim_to_real.value) as notify:
-        network = network_of(OBJECTS, weights)
+        network = resolve_network(OBJECTS, weights)
         results = run_sim_to_real(network, kitti, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "clouds.png", style.png(compare(results.clouds)))
@@ -190,7 +190,7 @@ def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: E
     write_bytes(out / f"{study.task.name}.png", study.draw(results))
     for test, numbers in results.summary.items():
         for name, value in numbers.items():
-            typer.echo(f"{test}, {name}: {value.told()}")
+            typer.echo(f"{test}, {name}: {value.describe()}")
 
 
 def register(app: typer.Typer) -> None:

@@ -23,11 +23,11 @@ def register(app: typer.Typer) -> None:
 @towns.command("list")
 def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead.")) -> None:
     """List the towns that come with flcav, and what they have."""
-    from flcav.world.map.census import census
+    from flcav.world.map.census import summarise_town
     from flcav.world.map.town import TOWNS, load_town
 
     found = {name: load_town(name) for name in TOWNS}
-    counts = {name: census(town) for name, town in found.items()}
+    counts = {name: summarise_town(town) for name, town in found.items()}
     if as_json:
         rows = [{"name": name, "description": found[name].parameters.description, **counts[name]} for name in TOWNS]
         print_json({"towns": rows})
@@ -51,7 +51,7 @@ def show(
     from flcav.dataset.exchange import write_table
     from flcav.files import write_bytes
     from flcav.report.pictures.town_map import town_map
-    from flcav.world.map.census import census
+    from flcav.world.map.census import summarise_town
     from flcav.world.map.town import load_town
 
     loaded = load_town(town)
@@ -61,7 +61,7 @@ def show(
     if out is not None:
         write_bytes(out, town_map(loaded))
         typer.echo(f"{out}: map of {loaded.name}")
-    typer.echo(f"{loaded.name}: {summary(census(loaded))}")
+    typer.echo(f"{loaded.name}: {summary(summarise_town(loaded))}")
 
 
 @towns.command("import")
@@ -70,11 +70,11 @@ def import_(
     out: Path = typer.Option(..., "--out", help="New folder of the town; recipes name it as `town: DIR`."),
 ) -> None:
     """Make a town from an OpenDRIVE map, CARLA's included: streets as in the map, furnished like the other towns."""
-    from flcav.world.map.census import census
+    from flcav.world.map.census import summarise_town
     from flcav.world.opendrive.importing import import_town
 
     imported = import_town(xodr, out)
-    typer.echo(f"{out}: {summary(census(imported.town))}")
+    typer.echo(f"{out}: {summary(summarise_town(imported.town))}")
     for note in imported.notes:
         typer.echo(f"    {note}")
 

@@ -23,7 +23,7 @@ class Calibrations(NamedTuple):
     assumed: Calibration
 
 
-def to_json(frame: Frame) -> dict[str, Any]:
+def encode_calibration(frame: Frame) -> dict[str, Any]:
     """Return the entry of the frame's agent in the calibration file: {"true": ..., "assumed": ...}."""
     return {"true": _sensors(frame.calibration), "assumed": _sensors(frame.assumed)}
 

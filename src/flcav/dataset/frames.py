@@ -21,7 +21,7 @@ from flcav.sensors.frame import Annotations, SignViews, Views
 from flcav.world.weather import Weather
 
 
-def annotations_of(
+def decode_annotations(
     rows: pa.Table, points: pa.Table, views: pa.Table, signs: pa.Table, ranging: Iterable[str], cameras: Iterable[str]
 ) -> Annotations:
     """Return the annotations of one frame from its rows in the tables `annotations`, `points`, `views` and `signs`.
@@ -43,12 +43,12 @@ def annotations_of(
     )
 
 
-def vectors_of(rows: pa.Table, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def decode_vectors(rows: pa.Table, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     """Return sensor -> (C,) values of its row in the C `columns`."""
     return dict(zip(rows["sensor"].to_pylist(), _numbers(rows, columns)))
 
 
-def weather_of(rows: pa.Table) -> Weather | None:
+def decode_weather(rows: pa.Table) -> Weather | None:
     """Return the weather of a frame from its row, None without a row; raises `InputError` for values out of range."""
     if not len(rows):
         return None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from flcav.config import InputError, read_json, tell
+from flcav.config import InputError, describe_error, read_json
 from flcav.files import Json
 
 FORMAT = 2
@@ -20,20 +20,20 @@ WORK = ".recording"  # folder of an unfinished recording; removed at its end
 PACKAGES = ("flcav", "embreex", "libsumo", "numba", "numpy", "pillow", "pyarrow")  # those that determine the bytes
 
 
-class Strict(BaseModel):
+class StrictModel(BaseModel):
     """Base class of the records of a manifest: types are not coerced, and additional fields are allowed."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
 
-class TableFile(Strict):
+class TableFile(StrictModel):
     """Size [bytes] and SHA-256 checksum of a file listed in the manifest."""
 
     bytes: int
     sha256: str
 
 
-class Counts(Strict):
+class Counts(StrictModel):
     """Counts of the contents of a dataset."""
 
     frames: int
@@ -44,7 +44,7 @@ class Counts(Strict):
     payload_bytes: int
 
 
-class Manifest(Strict):
+class Manifest(StrictModel):
     """The manifest of a dataset: format version, resolved recipe, package versions, counts, scenes, files of tables."""
 
     format: int
@@ -112,4 +112,4 @@ def read_manifest(folder: Path) -> Manifest:
     try:
         return Manifest.model_validate(manifest)
     except ValidationError as error:
-        raise InputError(f"{path}: not a dataset manifest: {tell(error, Manifest)}") from None
+        raise InputError(f"{path}: not a dataset manifest: {describe_error(error, Manifest)}") from None

@@ -32,7 +32,7 @@ class Payload(NamedTuple):
     data: bytes | memoryview
 
 
-def payloads(frame: Frame) -> Iterator[Payload]:
+def encode_payloads(frame: Frame) -> Iterator[Payload]:
     """Yield the encoded measurement files of a frame: of its LiDARs, cameras, infrared cameras and radars."""
     for name, points in frame.lidar.items():
         yield Payload(payload_path(name, frame.key, POINTS), encode_rows(points))

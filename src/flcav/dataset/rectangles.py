@@ -27,7 +27,7 @@ class Rectangles:
         return len(self.label)
 
 
-def rectangles(frame: Frame, camera: str, labels: str, min_pixels: int) -> Rectangles:
+def select_rectangles(frame: Frame, camera: str, labels: str, min_pixels: int) -> Rectangles:
     """Return the 2D labels of objects with at least `min_pixels` visible pixels in the image of `camera`.
 
     `labels` is a key of CLASSES. A light that shows red and amber counts as red. Lights that are off, and signs of

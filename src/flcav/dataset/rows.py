@@ -23,7 +23,7 @@ from flcav.sensors.frame import Frame, SignViews, Views
 Columns = Mapping[str, Any]
 
 
-def rows_of(frame: Frame) -> dict[str, Columns]:
+def encode_frame(frame: Frame) -> dict[str, Columns]:
     """Return table -> columns of the rows of `frame`; tables of sensors that the frame lacks are left out.
 
     Columns are lists or arrays of equal length by column name, see `flcav.dataset.tables.SCHEMAS`.
@@ -33,7 +33,7 @@ def rows_of(frame: Frame) -> dict[str, Columns]:
     return {name: columns(frame) for name, columns in COLUMNS.items() if parts.get(name, True)}
 
 
-def table_of(name: str, parts: Sequence[Columns]) -> pa.Table:
+def build_table(name: str, parts: Sequence[Columns]) -> pa.Table:
     """Return the Arrow table `name` with the rows of all `parts`, in order."""
     schema = SCHEMAS[name]
     return pa.table({column: _stack([part[column] for part in parts]) for column in schema.names}, schema=schema)

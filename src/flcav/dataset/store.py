@@ -16,7 +16,7 @@ from flcav.dataset.calibration import Calibrations, read_calibrations
 from flcav.dataset.checks.calibration import check_calibration
 from flcav.dataset.checks.frames import check_measurements, check_values
 from flcav.dataset.checks.images import check_planes, check_signs, check_views
-from flcav.dataset.frames import annotations_of, vectors_of, weather_of
+from flcav.dataset.frames import decode_annotations, decode_vectors, decode_weather
 from flcav.dataset.layout import (
     CALIBRATION,
     FrameKey,
@@ -101,10 +101,10 @@ class Dataset:
         calibrations = read_calibrations(folder / CALIBRATION, _sensors(frames))
         _check_frames(frames, folder / table_path("frames"))
         if checked:
-            _refuse(folder / table_path("frames"), _other_names(frames))
+            _raise_first(folder / table_path("frames"), _find_wrong_names(frames))
             for agent, both in calibrations.items():
                 for calibration in both:
-                    _refuse(folder / CALIBRATION, check_calibration(f"the calibration of {agent}", calibration))
+                    _raise_first(folder / CALIBRATION, check_calibration(f"the calibration of {agent}", calibration))
         return cls(folder, manifest, calibrations, tables, first, checked=checked)
 
     def __len__(self) -> int:
@@ -134,26 +134,26 @@ class Dataset:
             calibration=calibration.true,
             assumed=calibration.assumed,
             lidar=self._rows_of(i, self._lidar[i], POINTS),
-            annotations=annotations_of(
+            annotations=decode_annotations(
                 *(self._rows(name, i) for name in ("annotations", "points", "views", "signs")),
                 ranging=(*self._lidar[i], *self._radar[i]),
                 cameras=(*self._cameras[i], *self._infrared[i]),
             ),
             point_times=self._point_times(i),
-            images=ReadWhenAsked(self._cameras[i], lambda camera: self._image(i, camera)),
-            infrared=ReadWhenAsked(self._infrared[i], lambda camera: self._thermal(i, camera)),
+            images=LazyMapping(self._cameras[i], lambda camera: self._image(i, camera)),
+            infrared=LazyMapping(self._infrared[i], lambda camera: self._thermal(i, camera)),
             radar=self._rows_of(i, self._radar[i], RADAR),
-            gnss=vectors_of(self._rows("gnss", i), GNSS_COLUMNS),
-            imu=vectors_of(self._rows("imu", i), IMU_COLUMNS),
-            weather=weather_of(self._rows("weather", i)),
+            gnss=decode_vectors(self._rows("gnss", i), GNSS_COLUMNS),
+            imu=decode_vectors(self._rows("imu", i), IMU_COLUMNS),
+            weather=decode_weather(self._rows("weather", i)),
             agent_at_trigger=dict(zip(poses["triggered"], then)),
         )
         if self._checked:
-            _refuse(self.folder, check_values(frame))
-            _refuse(self.folder, check_measurements(frame))
+            _raise_first(self.folder, check_values(frame))
+            _raise_first(self.folder, check_measurements(frame))
             for camera, views in frame.annotations.views.items():
-                _refuse(self.folder, check_views(frame.key, camera, views))
-                _refuse(self.folder, check_signs(frame.key, camera, frame.annotations.signs[camera]))
+                _raise_first(self.folder, check_views(frame.key, camera, views))
+                _raise_first(self.folder, check_signs(frame.key, camera, frame.annotations.signs[camera]))
         return frame
 
     def plane(self, i: int, camera: str, plane: str) -> NDArray:
@@ -247,14 +247,14 @@ class Dataset:
         image = CameraImage(**{plane: self.plane(i, camera, plane) for plane in PLANES})
         if self._checked:
             actors = int(np.diff(self._first["annotations"])[i])
-            _refuse(self.folder, check_planes(self._name[i], camera, image, actors))
+            _raise_first(self.folder, check_planes(self._name[i], camera, image, actors))
         return image
 
     def _thermal(self, i: int, camera: str) -> NDArray[np.uint16]:
         return read_image(self.folder / payload_path(camera, self._name[i], INFRARED), np.uint16)
 
 
-class ReadWhenAsked(Mapping[str, Value], Generic[Value]):
+class LazyMapping(Mapping[str, Value], Generic[Value]):
     """A mapping whose values are read on first access and cached."""
 
     def __init__(self, names: Collection[str], read: Callable[[str], Value]) -> None:
@@ -275,7 +275,7 @@ class ReadWhenAsked(Mapping[str, Value], Generic[Value]):
         return len(self._names)
 
 
-def _refuse(where: Path, problems: Iterable[str]) -> None:
+def _raise_first(where: Path, problems: Iterable[str]) -> None:
     """Raise `InputError` with the first of `problems`, if any."""
     for problem in problems:
         raise InputError(f"{where}: {problem}")
@@ -292,7 +292,7 @@ def _check_frames(frames: pa.Table, path: Path) -> None:
                 raise InputError(f"{path}: '{row['key']}' needs one number of {counts} for each of its {sensors}s")
 
 
-def _other_names(frames: pa.Table) -> Iterator[str]:
+def _find_wrong_names(frames: pa.Table) -> Iterator[str]:
     """Yield a sentence for each frame whose key does not match its row, or whose time is not finite."""
     for row in frames.to_pylist():
         if row["key"] != f"{row['scene']}_{row['index']:04d}_{row['agent']}":

@@ -1,8 +1,8 @@
 """Markdown tables of a run's results."""
 
-from flcav.markdown import bullets, table
+from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
-from flcav.pipeline.findings import in_words
+from flcav.pipeline.findings import name_stage
 from flcav.pipeline.recipe import MAIN
 from flcav.pipeline.results import Run
 
@@ -10,7 +10,7 @@ from flcav.pipeline.results import Run
 def tables(run: Run) -> dict[str, str]:
     """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors."""
     return {
-        "findings": bullets(f"*{each.question}* **{each.verdict}**. {each.sentence}" for each in run.findings),
+        "findings": format_bullets(f"*{each.question}* **{each.verdict}**. {each.sentence}" for each in run.findings),
         "tests": _tests(run),
         "differences": _differences(run),
         "plan": _plan(run),
@@ -21,21 +21,21 @@ def tables(run: Run) -> dict[str, str]:
 
 def _tests(run: Run) -> str:
     """Return each task's measure with its interval in every region, a column per arm and stage."""
-    columns = list(dict.fromkeys(in_words(test.arm, test.stage) for test in run.tested))
+    columns = list(dict.fromkeys(name_stage(test.arm, test.stage) for test in run.tested))
     rows = []
     for task in run.recipe.tasks:
         for region, own in run.recipe.regions.items():
             tests = [test for test in run.tested if (test.task, test.region) == (task, region)]
-            reached = {in_words(test.arm, test.stage): test.result.estimate.told() for test in tests}
+            reached = {name_stage(test.arm, test.stage): test.result.estimate.describe() for test in tests}
             one = tests[0].result
             place = [task, f"{region} ({own.role})", one.measure, f"{one.frames} / {one.scenes}"]
             rows.append([*place, *(reached.get(column, "") for column in columns)])
-    return table(("task", "region (role)", "measure", "frames / scenes", *columns), rows)
+    return format_table(("task", "region (role)", "measure", "frames / scenes", *columns), rows)
 
 
 def _differences(run: Run) -> str:
-    rows = [[each.name, each.estimate.told(sign=True)] for each in run.differences]
-    return table(("region, task: after - before", "difference"), rows)
+    rows = [[each.name, each.estimate.describe(sign=True)] for each in run.differences]
+    return format_table(("region, task: after - before", "difference"), rows)
 
 
 def _plan(run: Run) -> str:
@@ -46,7 +46,7 @@ def _plan(run: Run) -> str:
         sizes = (f"{mb:.3f}" for mb in (own.sample_mb, own.model_mb))
         rows.append([task, *counts, *sizes, f"{own.wireless_mb:.1f}", f"{own.wireline_mb:.1f}", source])
     header = ("samples", "edge rounds", "cloud rounds", "sample MB", "network MB", "wireless MB", "wireline MB")
-    return table(("task", *header, "predicted"), rows)
+    return format_table(("task", *header, "predicted"), rows)
 
 
 def _budgets(run: Run) -> str:
@@ -56,7 +56,7 @@ def _budgets(run: Run) -> str:
         use = main.links[link]
         whole = (f"{mb:.1f}" for mb in (use.budget_mb, use.planned_mb, use.used_mb))
         rows.append([link, *whole, *(f"{main.sent_mb(task, link):.1f}" for task in main.plan.tasks)])
-    return table(("uplink", "budget MB", "planned MB", "used MB", *main.plan.tasks), rows)
+    return format_table(("uplink", "budget MB", "planned MB", "used MB", *main.plan.tasks), rows)
 
 
 def _sensors(run: Run) -> str:
@@ -70,4 +70,4 @@ def _sensors(run: Run) -> str:
         ]
         for each in run.arms[MAIN].placed
     ]
-    return table(("region", "candidate poles", "chosen", "errors covered", "densest traffic"), rows)
+    return format_table(("region", "candidate poles", "chosen", "errors covered", "densest traffic"), rows)

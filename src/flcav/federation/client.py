@@ -7,7 +7,7 @@ from flwr.clientapp import ClientApp
 
 from flcav.federation.records import ARRAYS, CONFIG, LocalWork, reply, to_weights
 from flcav.federation.trainable import Trainable
-from flcav.seeds import child_seed
+from flcav.seeds import derive_seed
 
 CLIENT = "client"  # node config key: the client's registered name
 
@@ -27,7 +27,7 @@ def client_app(trainables: Mapping[str, Trainable]) -> ClientApp:
             to_weights(message.content.array_records[ARRAYS]),
             steps=work.steps,
             learning_rate=work.learning_rate,
-            seed=child_seed(work.seed, name),
+            seed=derive_seed(work.seed, name),
         )
         return reply(message, update)
 

@@ -18,7 +18,7 @@ from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
-from flcav.seeds import child_seed
+from flcav.seeds import derive_seed
 
 logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each round; a stage reports its own
 
@@ -37,7 +37,7 @@ class Schedule:
         """Return the local work of round `round_`, counted from 1."""
         progress = (round_ - 1) / max(self.rounds - 1, 1)
         rate = self.learning_rate * (self.final_learning_rate / self.learning_rate) ** progress
-        return LocalWork(round_, self.steps, rate, child_seed(self.seed, "round", round_))
+        return LocalWork(round_, self.steps, rate, derive_seed(self.seed, "round", round_))
 
 
 def _ignore(round_: int, weights: Weights, loss: float) -> None:

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.fusion.road import CELL_M, GROUND_M, TOP_M, RoadView, free_cells
+from flcav.fusion.road import CELL_M, GROUND_M, TOP_M, RoadView, find_free_cells
 from flcav.geometry import Boxes, concatenate, inverse, points_in_boxes, transform_points
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.samples import Sample, near_range
+from flcav.perception.objects.samples import Sample, crop_to_range
 from flcav.perception.objects.truth import detection_labels, is_lookalike
 from flcav.sensors.frame import Frame
 
@@ -37,9 +37,9 @@ def label_sample(
     cell centres that the vehicle saw as free ground or a roadside sensor observed; `exact` marks the roadside boxes.
     """
     world_from_lidar = frame.world_from_sensor(lidar)
-    points = near_range(frame.lidar[lidar], config)
+    points = crop_to_range(frame.lidar[lidar], config)
     told = concatenate([view.boxes for view in views])
-    told = told[_distinct(told)].transformed(inverse(world_from_lidar))
+    told = told[_distinct(told)].transform(inverse(world_from_lidar))
     label = detection_labels(told.label, config.classes)
     road = Boxes(told.center, told.size, told.yaw, label)
     targets = (label != "") & (points_in_boxes(points, told, margin_m=0.1).sum(axis=1) > 0)
@@ -105,4 +105,4 @@ def _free_ground(points: NDArray[np.float32], height: float, cells: NDArray[np.f
         return grid
 
     ground, standing = hit((z > GROUND_M[0]) & (z < GROUND_M[1])), hit((z >= GROUND_M[1]) & (z < TOP_M))
-    return free_cells(ground, standing).ravel()
+    return find_free_cells(ground, standing).ravel()

@@ -53,7 +53,7 @@ class RoadView:
         return save(arrays)
 
 
-def road_view(frame: Frame, lidar: str = "lidar") -> RoadView:
+def build_road_view(frame: Frame, lidar: str = "lidar") -> RoadView:
     """Return the view of an ideal detector at the roadside sensor that recorded `frame`, from its LiDAR `lidar`.
 
     The grids cover the returns of the sweep.
@@ -68,9 +68,9 @@ def road_view(frame: Frame, lidar: str = "lidar") -> RoadView:
     high = (points[:, 2] >= GROUND_M[1]) & (points[:, 2] < TOP_M)
     ground[x[low], y[low]] = True
     occupied[x[high], y[high]] = True
-    return RoadView(frame.annotations.boxes[labelled], origin, free_cells(ground, occupied), occupied)
+    return RoadView(frame.annotations.boxes[labelled], origin, find_free_cells(ground, occupied), occupied)
 
 
-def free_cells(ground: NDArray[np.bool_], standing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def find_free_cells(ground: NDArray[np.bool_], standing: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the cells (X, Y) within two cells of one in `ground` and not within two cells of one in `standing`."""
     return np.asarray(binary_dilation(ground, REACH)) & ~np.asarray(binary_dilation(standing, REACH), dtype=bool)

@@ -75,7 +75,7 @@ class Boxes:
         """Return (N, 7) rows x, y, z, length, width, height [m], yaw [rad]."""
         return np.concatenate((self.center, self.size, self.yaw[:, None]), axis=1)
 
-    def transformed(self, target_from_source: Array) -> "Boxes":
+    def transform(self, target_from_source: Array) -> "Boxes":
         """Return the boxes in the target frame of a rigid (4, 4) transform.
 
         Its roll and pitch move the centres but do not tilt the boxes. Variances are left as they are.

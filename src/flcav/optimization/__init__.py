@@ -6,7 +6,7 @@ from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
     from flcav.optimization.allocation.allocate import Allocation, allocate
-    from flcav.optimization.allocation.problem import Budgets, Limits, Problem, Task
+    from flcav.optimization.allocation.problem import AllocationTask, Budgets, Limits, Problem
     from flcav.optimization.curves.fitting import Fit, fit
     from flcav.optimization.curves.history import History, article_histories
     from flcav.optimization.graph import load_problem
@@ -25,7 +25,7 @@ PLACES = {
     "Budgets": "flcav.optimization.allocation.problem",
     "Limits": "flcav.optimization.allocation.problem",
     "Problem": "flcav.optimization.allocation.problem",
-    "Task": "flcav.optimization.allocation.problem",
+    "AllocationTask": "flcav.optimization.allocation.problem",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)

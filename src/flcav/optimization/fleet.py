@@ -2,7 +2,7 @@
 
 The budgets constrain the fleet as a whole, and the optimum within them may ask more of slow links than `horizon_s`
 allows. Then two relaxations are solved, each with one budget reduced by bisection until the plan can be split over the
-vehicles (`vehicle_shares`):
+vehicles (`split_plan`):
 
 - *all join*: every vehicle joins every round, as the budgets are priced; the wireless budget is reduced.
 - *one joins*: one vehicle per edge group joins each round, the least that a split needs; the wireless budget is
@@ -22,14 +22,14 @@ from flcav.optimization.allocation.allocate import (
     Allocation,
     Infeasible,
     allocate,
-    described,
+    build_task_plans,
+    evaluate_objective,
     relative_gap,
-    resolved,
-    score,
-    used,
+    resolve_problem,
+    sum_prices,
 )
-from flcav.optimization.allocation.problem import Problem, Task
-from flcav.optimization.vehicles import BITS_PER_BYTE, Shares, TooSlow, vehicle_shares
+from flcav.optimization.allocation.problem import AllocationTask, Problem
+from flcav.optimization.vehicles import BITS_PER_BYTE, Shares, TooSlow, split_plan
 
 HALVINGS = 9  # steps of the bisection over the share of a budget
 ROUNDING = 1e-9  # relative tolerance of budgets and objectives
@@ -37,7 +37,7 @@ OPTIMAL = 1e-4  # largest gap of a plan that is called optimal
 CARRIED = "the vehicles' own links, within horizon_s, limit this plan"
 
 Carried = tuple[Allocation, Shares]  # a plan and its split over the vehicles
-Relaxed = Callable[[float], Problem]  # the relaxation by the share of its budget, 0 to 1
+Relaxation = Callable[[float], Problem]  # the relaxation by the share of its budget, 0 to 1
 
 
 def allocate_fleet(problem: Problem) -> Carried:
@@ -49,7 +49,7 @@ def allocate_fleet(problem: Problem) -> Carried:
     asked = problem.model_copy(update={"tasks": tuple(_within_held(task) for task in problem.tasks)})
     plan = allocate(asked)
     try:
-        return plan, vehicle_shares(asked, plan.tasks)
+        return plan, split_plan(asked, plan.tasks)
     except TooSlow as error:
         relaxations, bounds = [_all_join(asked, plan)], [plan.lower_bound]
         if all(task.uplink_mbps for task in asked.tasks):
@@ -67,7 +67,7 @@ def allocate_fleet(problem: Problem) -> Carried:
         return _certified(asked, found, lower)
 
 
-def _within_held(task: Task) -> Task:
+def _within_held(task: AllocationTask) -> AllocationTask:
     """Return the task with its upper limit of samples at most what its vehicles hold.
 
     Raises `Infeasible` if its lower limit is more.
@@ -85,11 +85,11 @@ def _within_held(task: Task) -> Task:
     return task.model_copy(update={"limits": limits})
 
 
-def _all_join(asked: Problem, plan: Allocation) -> Relaxed:
+def _all_join(asked: Problem, plan: Allocation) -> Relaxation:
     return lambda share: _with_wireless(asked, share * plan.used_mb.wireless_mb, asked.tasks)
 
 
-def _one_joins(asked: Problem) -> Relaxed:
+def _one_joins(asked: Problem) -> Relaxation:
     assert asked.horizon_s is not None
     links = {name: link.wireless for task in asked.tasks for name, link in (task.uplink_mbps or {}).items()}
     carried_mb = min(sum(links.values()) * asked.horizon_s / BITS_PER_BYTE, asked.budgets_mb.wireless)
@@ -97,12 +97,12 @@ def _one_joins(asked: Problem) -> Relaxed:
     return lambda share: _with_wireless(asked, share * carried_mb, tasks)
 
 
-def _with_wireless(asked: Problem, wireless_mb: float, tasks: tuple[Task, ...]) -> Problem:
+def _with_wireless(asked: Problem, wireless_mb: float, tasks: tuple[AllocationTask, ...]) -> Problem:
     budgets = asked.budgets_mb.model_copy(update={"wireless": wireless_mb})
     return asked.model_copy(update={"budgets_mb": budgets, "tasks": tasks})
 
 
-def _largest(asked: Problem, relaxed: Relaxed) -> Carried | None:
+def _largest(asked: Problem, relaxed: Relaxation) -> Carried | None:
     """Return the plan of the largest share of the budget that can be carried, by bisection; None if none was found."""
     low, high, share, found = 0.0, 1.0, 1.0, None
     for _ in range(HALVINGS + 1):
@@ -121,15 +121,17 @@ def _largest(asked: Problem, relaxed: Relaxed) -> Carried | None:
 def _carried(asked: Problem, plan: Allocation) -> Carried:
     """Return the plan priced in `asked` and split over the vehicles; raises `TooSlow` beyond the links or budgets."""
     counts = [count for row in plan.tasks for count in (row.samples, row.edge_rounds, row.cloud_rounds)]
-    tasks = described(asked, np.array(counts, dtype=np.float64))
-    spent = used(tasks)
+    tasks = build_task_plans(asked, np.array(counts, dtype=np.float64))
+    spent = sum_prices(tasks)
     if spent.wireless_mb > asked.budgets_mb.wireless * (1 + ROUNDING):
         raise TooSlow("the wireless budget does not carry the rounds of every vehicle")
-    shares = vehicle_shares(asked, tasks)
-    return replace(plan, tasks=tasks, used_mb=spent, objective=score(resolved(asked), tasks)), shares
+    shares = split_plan(asked, tasks)
+    return replace(
+        plan, tasks=tasks, used_mb=spent, objective=evaluate_objective(resolve_problem(asked), tasks)
+    ), shares
 
 
-def _bound(relaxed: Relaxed) -> float | None:
+def _bound(relaxed: Relaxation) -> float | None:
     try:
         return allocate(relaxed(1.0)).lower_bound
     except Infeasible:

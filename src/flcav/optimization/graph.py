@@ -50,7 +50,7 @@ class ModalityNode(Quantities):
     sample_mb: Positive  # one labelled sample
 
 
-class Held(Quantities):
+class Holding(Quantities):
     """Number and quality of the samples that a vehicle holds of a modality."""
 
     samples: Count | None = None  # None: not limited
@@ -62,7 +62,7 @@ class VehicleNode(Quantities):
 
     edge: str
     uplink_mbps: Uplink | None = None  # None: not known
-    holds: Annotated[Mapping[str, Held], Field(min_length=1)]
+    holds: Annotated[Mapping[str, Holding], Field(min_length=1)]
 
 
 class Layers(Quantities):
@@ -104,7 +104,7 @@ def _known(field: str, name: str, among: Mapping[str, Any]) -> None:
         raise ValueError(f"{field} = {name!r} is none of {', '.join(among)}")
 
 
-def build(layers: Layers) -> nx.Graph:
+def build_graph(layers: Layers) -> nx.Graph:
     """Return the graph of `layers`: nodes (kind, name), edges with attribute `layer` 1, 2 or 3.
 
     Node attributes are `kind` and the node's own numbers; edge attributes `weight` (layer 1), `sample_mb` (layer 2),
@@ -133,8 +133,8 @@ def build(layers: Layers) -> nx.Graph:
     return graph
 
 
-def describe(graph: nx.Graph) -> Layers:
-    """Return the configuration of a graph: the inverse of `build`; raises `InputError` for any other graph."""
+def extract_layers(graph: nx.Graph) -> Layers:
+    """Return the configuration of a graph: the inverse of `build_graph`; raises `InputError` for any other graph."""
     nodes = {kind: [key for key, found in graph.nodes(data="kind") if found == kind] for kind in KINDS}
     for key in nodes["task"]:
         if graph.degree[key] != 1:
@@ -160,7 +160,7 @@ def describe(graph: nx.Graph) -> Layers:
         vehicles = {
             key[1]: {
                 **{name: graph.nodes[key][name] for name in ("edge", "uplink_mbps")},
-                "holds": {m[1]: {name: graph.edges[m, key][name] for name in Held.model_fields} for m in graph[key]},
+                "holds": {m[1]: {name: graph.edges[m, key][name] for name in Holding.model_fields} for m in graph[key]},
             }
             for key in nodes["vehicle"]
         }
@@ -170,18 +170,18 @@ def describe(graph: nx.Graph) -> Layers:
     return parse_config(Layers, {**graph.graph, **values}, "graph")
 
 
-def save(graph: nx.Graph, path: Path) -> None:
+def save_graph(graph: nx.Graph, path: Path) -> None:
     """Write the graph as node-link JSON."""
     write_json(path, nx.node_link_data(graph, edges="links"))
 
 
-def load(path: Path) -> nx.Graph:
+def load_graph(path: Path) -> nx.Graph:
     """Return the graph in the file at `path`: node-link JSON or `Layers` in YAML; raises `InputError` for another."""
     values = read_yaml(path)
     if not (isinstance(values, dict) and "nodes" in values):
-        return build(parse_config(Layers, values, str(path)))
+        return build_graph(parse_config(Layers, values, str(path)))
     try:
-        return build(describe(nx.node_link_graph(values, edges="links")))
+        return build_graph(extract_layers(nx.node_link_graph(values, edges="links")))
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, nx.NetworkXError) as error:
@@ -205,10 +205,10 @@ def load_problem(path: Path | str) -> Problem:
 def read_graph(path: Path) -> nx.Graph | None:
     """Return the graph in the file at `path`, None where it holds a list of tasks; raises `InputError`."""
     values = read_yaml(path)
-    return load(path) if isinstance(values, dict) and ("networks" in values or "nodes" in values) else None
+    return load_graph(path) if isinstance(values, dict) and ("networks" in values or "nodes" in values) else None
 
 
-def clusters(graph: nx.Graph) -> dict[str, dict[str, float]]:
+def group_tasks(graph: nx.Graph) -> dict[str, dict[str, float]]:
     """Return the clusters: for each network the weights of its tasks, by name."""
     found: dict[str, dict[str, float]] = {}
     for task, network, weight in (
@@ -226,11 +226,11 @@ def to_problem(graph: nx.Graph) -> Problem:
     A cluster's name joins those of its tasks, and its weight is the sum of theirs. A sample is one of each modality of
     its network. Its edge groups are the vehicles, by edge server, that hold all these modalities; a vehicle's number of
     samples, and their quality, is the least over them. Vehicles are named only where all their links are known. Raises
-    `InputError` where `graph` is none that `build` returns.
+    `InputError` where `graph` is none that `build_graph` returns.
     """
-    layers = describe(graph)
+    layers = extract_layers(graph)
     tasks = []
-    for name, tasks_of in clusters(graph).items():
+    for name, tasks_of in group_tasks(graph).items():
         network = layers.networks[name]
         fleet = {key: each for key, each in layers.vehicles.items() if set(network.modalities) <= set(each.holds)}
         edges = list(dict.fromkeys(each.edge for each in fleet.values()))
@@ -266,7 +266,7 @@ def _cluster_curve(layers: Layers, network: str, tasks: Mapping[str, float]) -> 
     return {"model": "shared", "members": members}
 
 
-def _named(fleet: Mapping[str, VehicleNode], held: Mapping[str, Sequence[Held]]) -> dict[str, Any]:
+def _named(fleet: Mapping[str, VehicleNode], held: Mapping[str, Sequence[Holding]]) -> dict[str, Any]:
     """Return the fields of a cluster that name its vehicles; none where a link is not known."""
     links = {key: each.uplink_mbps.model_dump() for key, each in fleet.items() if each.uplink_mbps is not None}
     if len(links) < len(fleet):

@@ -23,7 +23,7 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array, csr_array
 
 from flcav.optimization.allocation.allocate import Infeasible, TaskPlan
-from flcav.optimization.allocation.problem import Problem, Task, Uplink
+from flcav.optimization.allocation.problem import AllocationTask, Problem, Uplink
 
 Array = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ Shares = dict[str, tuple[VehicleShare, ...]]  # by task
 class _Part:
     """One task on one vehicle: two consecutive variables of the program, samples and rounds."""
 
-    task: Task
+    task: AllocationTask
     group: int  # index of its edge group
     vehicle: str
     link: Uplink
@@ -64,7 +64,7 @@ class _Part:
     quality: float
 
 
-def vehicle_shares(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
+def split_plan(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
     """Return the split of `plans` (one per task, in their order) over the vehicles: by task, a share per vehicle.
 
     Tasks that do not name their vehicles are left out. Raises `Infeasible` where the vehicles hold too few samples,
@@ -95,11 +95,11 @@ def vehicle_shares(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
     return shares
 
 
-def _held(task: Task, plan: TaskPlan, vehicle: str) -> int:
+def _held(task: AllocationTask, plan: TaskPlan, vehicle: str) -> int:
     return min(task.samples_held.get(vehicle, plan.samples), plan.samples)
 
 
-def _parts(problem: Problem, task: Task, plan: TaskPlan) -> list[_Part]:
+def _parts(problem: Problem, task: AllocationTask, plan: TaskPlan) -> list[_Part]:
     groups = np.repeat(np.arange(len(task.edge_groups)), task.edge_groups)
     rounds = plan.edge_rounds + problem.edge_rounds_per_cloud_round * plan.cloud_rounds
     return [

@@ -13,7 +13,7 @@ POLE = "pole"  # prefix of the names of roadside agents; all other agents are ve
 
 
 @dataclass(frozen=True)
-class Chosen:
+class FrameSelection:
     """The selected frames of a dataset, and counts of the selected and of the other frames."""
 
     frames: tuple[int, ...]  # frame numbers
@@ -32,7 +32,7 @@ class Chosen:
         return {"agents": list(self.agents), "used": dict(self.used), "left_out": dict(self.left_out)}
 
 
-def choose_frames(task: Task, config: Any, data: Dataset, wanted: str | None = None) -> Chosen:
+def choose_frames(task: Task, config: Any, data: Dataset, wanted: str | None = None) -> FrameSelection:
     """Select the frames of the agents `wanted`: "all", "vehicles", "poles" or names, separated by commas.
 
     None selects the frames whose sensors are mounted as a network of `config` expects them (`RigBound.fitting`), and
@@ -45,7 +45,7 @@ def choose_frames(task: Task, config: Any, data: Dataset, wanted: str | None = N
         frames = task.fitting(data, config) if isinstance(task, RigBound) else range(len(data))
     every, own = ([data.keys[i].agent for i in numbers] for numbers in (range(len(data)), frames))
     used = Counter(map(kind_of, own))
-    return Chosen(tuple(frames), tuple(dict.fromkeys(own)), used, Counter(map(kind_of, every)) - used)
+    return FrameSelection(tuple(frames), tuple(dict.fromkeys(own)), used, Counter(map(kind_of, every)) - used)
 
 
 def kind_of(agent: str) -> str:

@@ -10,8 +10,8 @@ from flcav.config import Config
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import Json, sha256, write_bytes
-from flcav.markdown import bullets, table
-from flcav.perception.agents import Chosen
+from flcav.markdown import format_bullets, format_table
+from flcav.perception.agents import FrameSelection
 from flcav.records import LEFT_OUT, Record
 from flcav.sensors.rig import RIGS
 
@@ -74,12 +74,12 @@ class Card(Config):
     @property
     def learning(self) -> Learning:
         """Return the record of the training; raises `InputError` if `training` lacks its fields."""
-        return Learning.of_json(self.training, f"card of {self.task}, {self.network}")
+        return Learning.from_json(self.training, f"card of {self.task}, {self.network}")
 
     def markdown(self) -> str:
         """Return the card as Markdown, numbers rounded to 4 decimals; the metadata keeps all digits."""
         facts = {name: value for name in FACTS if (value := getattr(self, name)) is not None}
-        held = [] if self.validation is None else [bullets([_entry(self.validation)])]
+        held = [] if self.validation is None else [format_bullets([_entry(self.validation)])]
         blocks = [
             f"# {self.task}: {self.network}",
             f"A network for `flcav infer {self.task}`, trained on frames of simulated streets.",
@@ -87,7 +87,7 @@ class Card(Config):
             "## Training",
             *_blocks(self.training),
             "## Data",
-            bullets(_entry(entry) for entry in self.data),
+            format_bullets(_entry(entry) for entry in self.data),
             "## Validation",
             *held,
             *(_blocks(self.metrics) or ["- none"]),
@@ -95,7 +95,7 @@ class Card(Config):
         return "\n\n".join(blocks) + "\n"
 
 
-def data_entry(data: Dataset, chosen: Chosen) -> DataEntry:
+def data_entry(data: Dataset, chosen: FrameSelection) -> DataEntry:
     """Return the card's entry of a dataset and the frames selected from it."""
     recipe = data.manifest.recipe
     rigs = {name: _rig_name(recipe[name]) for name in RIG_FIELDS if name in recipe}
@@ -129,7 +129,7 @@ def _blocks(values: Mapping[str, Any]) -> list[str]:
     tables = {name: _table(value, values.get("classes")) for name, value in values.items()}
     plain = [f"{name}: {_text(value)}" for name, value in values.items() if tables[name] is None]
     named = [f"### {name}\n\n{text}" for name, text in tables.items() if text is not None]
-    return ([bullets(plain)] if plain else []) + named
+    return ([format_bullets(plain)] if plain else []) + named
 
 
 def _table(value: Any, classes: Any) -> str | None:
@@ -144,7 +144,7 @@ def _table(value: Any, classes: Any) -> str | None:
     if not all(isinstance(row, Mapping) for row in rows):
         return None
     header = list(dict.fromkeys(name for row in rows for name in row))
-    return table(header, [[_text(row.get(name)) for name in header] for row in rows])
+    return format_table(header, [[_text(row.get(name)) for name in header] for row in rows])
 
 
 def _text(value: Any) -> str:

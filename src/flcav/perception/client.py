@@ -46,7 +46,7 @@ class WholeFrames:
         return [data.payload_bytes(i) + picture_bytes(data, i) for i in frames]
 
 
-def shared(task: Task) -> Shared:
+def as_shared(task: Task) -> Shared:
     """Return the task's settings for federated training: its own, or `WholeFrames`."""
     return task if isinstance(task, Shared) else WholeFrames()
 
@@ -66,7 +66,7 @@ def camera_ahead(width: int, height: int, fov_deg: float) -> Mapping[str, Any]:
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedWeights:
     """Result of local training."""
 
     weights: dict[str, NDArray[np.number]]  # by name of parameter or buffer
@@ -96,7 +96,7 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
 
     def train(
         self, weights: Mapping[str, NDArray[np.number]], *, steps: int, learning_rate: float, seed: int
-    ) -> Trained:
+    ) -> TrainedWeights:
         """Train for `steps` steps from `weights` at a constant learning rate; deterministic in its arguments.
 
         Raises `InputError` if `weights` do not fit the network.
@@ -107,4 +107,4 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
             self.task, network, self.samples, steps=steps, batch=self.batch, learning_rate=learning_rate, seed=seed
         )
         seen = min(len(self.samples), steps * min(self.batch, len(self.samples)))
-        return Trained(to_arrays(network), seen, loss)
+        return TrainedWeights(to_arrays(network), seen, loss)

@@ -10,7 +10,7 @@ from flcav.config import InputError
 CPU = torch.device("cpu")
 
 
-def device_named(name: str) -> torch.device:
+def select_device(name: str) -> torch.device:
     """Return the torch device "cpu" or "cuda"; "auto" is the GPU if torch can use one, otherwise the CPU.
 
     For a GPU, cuDNN is set to deterministic algorithms. Raises `InputError` for another name, and for "cuda" if torch
@@ -37,7 +37,7 @@ def processor_of(device: torch.device) -> str:
     return f"{kind} bfloat16" if multiplies_bfloat16(device) else kind
 
 
-def bfloat16(device: torch.device, wanted: bool) -> AbstractContextManager[object]:
+def autocast_bfloat16(device: torch.device, wanted: bool) -> AbstractContextManager[object]:
     """Return a context of bfloat16 autocast, if `wanted` and if the hardware supports it.
 
     Otherwise the context changes nothing.

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from flcav.dataset.exchange import write_table
 from flcav.dataset.store import Dataset
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 
 if TYPE_CHECKING:
     from torch import nn
 
-    from flcav.perception.agents import Chosen
+    from flcav.perception.agents import FrameSelection
 
 SAME_PLACE_M = 2.0  # false positives of one scene this near to one another are duplicates
 
@@ -52,7 +52,7 @@ class Registry:
 
     errors: tuple[PerceptionError, ...]
     dropped: int = 0  # number of false positives without a position in the town
-    chosen: "Chosen | None" = None  # the frames that were tested, if known
+    chosen: "FrameSelection | None" = None  # the frames that were tested, if known
 
     def __len__(self) -> int:
         return len(self.errors)
@@ -86,7 +86,7 @@ class RegistersErrors(Protocol):
         data: Dataset,
         frames: Sequence[int] | None,
         threshold: float,
-        progress: Report = silent,
+        progress: Report = ignore_progress,
     ) -> Registry:
         """Return the mistakes of `network` in the frames (None: all); detections scoring below `threshold` are ignored.
 

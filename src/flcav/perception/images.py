@@ -17,7 +17,7 @@ from flcav.dataset.formats.kitti import Calibration, read_calibration
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, transform_points
-from flcav.sensors.camera.lens import projected
+from flcav.sensors.camera.lens import project_points
 from flcav.sensors.frame import Frame
 
 Picture = NDArray[np.uint8]  # (H, W, 3) sRGB
@@ -26,14 +26,14 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 SMALLEST_PX, LARGEST_PX = 32, 8192  # bounds of an image's width and height
 
 
-def pictures(path: Path, frames: Sequence[int] | None = None) -> Iterator[tuple[Path, Picture]]:
+def read_pictures(path: Path, frames: Sequence[int] | None = None) -> Iterator[tuple[Path, Picture]]:
     """Yield path and image of a PNG, JPEG or WebP file, a folder of such files, or `frames` of a dataset (None: all).
 
     Raises `InputError` for any other path, and for an image that is damaged, not RGB or of a size out of bounds.
     """
     if (path / MANIFEST).is_file():
         data = Dataset.open(path)
-        return ((path / f"{frame.key}/{camera}", rgb) for frame, camera, rgb in recorded(data, frames))
+        return ((path / f"{frame.key}/{camera}", rgb) for frame, camera, rgb in read_recorded(data, frames))
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
         if not files:
@@ -44,10 +44,10 @@ def pictures(path: Path, frames: Sequence[int] | None = None) -> Iterator[tuple[
     return iter([(path, read_picture(path))])
 
 
-def recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterator[tuple[Frame, str, Picture]]:
+def read_recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterator[tuple[Frame, str, Picture]]:
     """Yield frame, camera name and image of a dataset's frames (None: all); raises `InputError` if there is no image.
 
-    Also raises `InputError` as `checked_picture` does.
+    Also raises `InputError` as `check_picture` does.
     """
     seen = False
     for number in data.numbers(frames):
@@ -55,7 +55,7 @@ def recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterator[tup
         for camera in data.cameras(number):
             seen = True
             rgb = data.plane(number, camera, "rgb")  # the image's other planes are not read
-            yield frame, camera, checked_picture(rgb, f"{data.folder} {frame.key}/{camera}")
+            yield frame, camera, check_picture(rgb, f"{data.folder} {frame.key}/{camera}")
     if not seen:
         raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
 
@@ -72,10 +72,10 @@ def read_picture(path: Path) -> Picture:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: not a picture, or a damaged one") from None
-    return checked_picture(pixels, path)
+    return check_picture(pixels, path)
 
 
-def checked_picture(pixels: NDArray[np.uint8], origin: str | Path) -> Picture:
+def check_picture(pixels: NDArray[np.uint8], origin: str | Path) -> Picture:
     """Return the image as it is; raises `InputError` unless it is (H, W, 3) with sides of 32 to 8192 pixels."""
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise InputError(f"{origin}: a picture of shape {pixels.shape}; (H, W, 3) red, green, blue is wanted")
@@ -86,7 +86,7 @@ def checked_picture(pixels: NDArray[np.uint8], origin: str | Path) -> Picture:
     return pixels
 
 
-def resized(picture: Picture, width: int, height: int) -> Picture:
+def resize_picture(picture: Picture, width: int, height: int) -> Picture:
     """Return the image resampled bilinearly to `width` x `height` pixels, with antialiasing when it shrinks."""
     return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR))
 
@@ -120,10 +120,10 @@ class CameraView:
         """Return pixel coordinates (N, 2) u, v of points (N, 3) [m]; NaN behind the near plane or far off the image."""
         seen = transform_points(self.camera_from_points, np.asarray(points, np.float64))
         seen[seen[:, 2] < NEAREST_M] = np.nan
-        straight = projected(self.intrinsics, np.zeros(5), seen)
+        straight = project_points(self.intrinsics, np.zeros(5), seen)
         size = np.array(self.picture.shape[1::-1])
         near = np.all((straight > -BESIDE * size) & (straight < (1 + BESIDE) * size), axis=1)
-        return projected(self.intrinsics, self.distortion, np.where(near[:, None], seen, np.nan))
+        return project_points(self.intrinsics, self.distortion, np.where(near[:, None], seen, np.nan))
 
     def shows(self, points: NDArray) -> NDArray[np.bool_]:
         """Return (N,) whether each point (N, 3) [m] projects into the image; occlusion is not considered."""

@@ -15,19 +15,19 @@ from flcav.config import InputError
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import Json
-from flcav.perception.agents import Chosen, choose_frames
+from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card
-from flcav.perception.device import device_named
+from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
-from flcav.perception.objects.area import narrowed
+from flcav.perception.objects.area import narrow_range
 from flcav.perception.objects.results import ObjectsEvaluation
 from flcav.perception.objects.task import ObjectsTask
 from flcav.perception.task import ConfigT, Finding, NetworkT, SampleT, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
-from flcav.perception.tracking.evaluate import evaluate_tracks, sequences
+from flcav.perception.tracking.evaluate import evaluate_tracks, group_sequences
 from flcav.perception.training.run import WEIGHTS, Request, train_network
-from flcav.perception.weights import load_network, read_card, shipped
-from flcav.progress import Report, silent
+from flcav.perception.weights import find_shipped, load_network, read_card
+from flcav.progress import Report, ignore_progress
 
 Named = str | Task
 Data = Dataset | Path | str
@@ -49,7 +49,7 @@ class Evaluation:
 
     task: str  # its name
     score: float  # the metric that validation maximises, in [0, 1]: accuracy, mAP, AP or another, by task
-    chosen: Chosen  # the frames that were tested
+    chosen: FrameSelection  # the frames that were tested
     numbers: Mapping[str, Json]  # all metrics of the task as JSON values: docs/tasks.md
     lines: tuple[str, ...]  # the metrics in words
 
@@ -61,7 +61,7 @@ class Evaluation:
 class Inference:
     """Findings of a network, computed lazily input by input; they can be iterated once."""
 
-    chosen: Mapping[Path, Chosen]  # the selected frames of each input that is a dataset
+    chosen: Mapping[Path, FrameSelection]  # the selected frames of each input that is a dataset
     findings: Iterator[Finding]
 
     def __iter__(self) -> Iterator[Finding]:
@@ -80,7 +80,7 @@ def train(
     seed: int = 0,
     device: str = "auto",
     agents: str | None = None,
-    progress: Report = silent,
+    progress: Report = ignore_progress,
 ) -> TrainedNetwork:
     """Train a network on recorded frames with their ground truth; weights, card and curves are written to `out`.
 
@@ -96,10 +96,10 @@ def train(
     (4, 'weights.safetensors')
     """
     folders = data if isinstance(data, Sequence) and not isinstance(data, str) else [data]
-    held = None if validation is None else opened(validation)
-    place = device_named(device)
-    request = Request([opened(each) for each in folders], held, network, epochs, patience, seed, place, agents)
-    learned, weights = task_of(task), Path(out) / WEIGHTS
+    held = None if validation is None else open_data(validation)
+    place = select_device(device)
+    request = Request([open_data(each) for each in folders], held, network, epochs, patience, seed, place, agents)
+    learned, weights = resolve_task(task), Path(out) / WEIGHTS
     card = train_network(learned, request, Path(out), progress)
     return TrainedNetwork(load_network(learned, weights).to(place), card, weights)
 
@@ -113,7 +113,7 @@ def evaluate(
     within: str | None = None,
     tracks: bool = False,
     device: str = "auto",
-    progress: Report = silent,
+    progress: Report = ignore_progress,
 ) -> Evaluation:
     """Evaluate a network on recorded frames by the metrics of its task.
 
@@ -125,17 +125,17 @@ def evaluate(
     >>> found.chosen.sentence, 0 <= found.score <= 1
     ('4 vehicle frames', True)
     """
-    learned = task_of(task)
+    learned = resolve_task(task)
     if tracks and not isinstance(learned, ObjectsTask):
         raise InputError(f"--tracks: only objects have tracks, not '{learned.name}'")
     if within is not None and not isinstance(learned, ObjectsTask):
         raise InputError(f"--range: only objects lie in a range, not '{learned.name}'")
-    dataset = opened(data)
-    tested = network_of(learned, network, device)
+    dataset = open_data(data)
+    tested = resolve_network(learned, network, device)
     chosen = choose_frames(learned, tested.config, dataset, agents)
-    narrow = {} if within is None else {"asked": narrowed(tested.config, within)}
+    narrow = {} if within is None else {"asked": narrow_range(tested.config, within)}
     if tracks:
-        sequences(dataset, chosen.frames)  # said before the long work
+        group_sequences(dataset, chosen.frames)  # said before the long work
     found = learned.evaluate(tested, dataset, chosen.frames, **narrow, progress=progress)
     if isinstance(found, ObjectsEvaluation) and tracks:
         followed = evaluate_tracks(tested, dataset, chosen.frames, **narrow, progress=progress)
@@ -162,9 +162,9 @@ def infer(
     >>> first.path.name, type(first.marks[0].boxes).__name__  # in the LiDAR's frame
     ('grid-0-000_0000_cav0', 'Boxes')
     """
-    learned = task_of(task)
+    learned = resolve_task(task)
     paths = [Path(inputs)] if isinstance(inputs, Path | str) else list(map(Path, inputs))
-    looking = network_of(learned, network, device)
+    looking = resolve_network(learned, network, device)
     recorded = [path for path in paths if (path / MANIFEST).is_file()]
     if agents is not None and not recorded:
         raise InputError(f"--agents {agents}: only datasets have agents, and none is among the inputs")
@@ -182,7 +182,7 @@ def register_errors(
     threshold: float | None = None,
     agents: str | None = None,
     device: str = "auto",
-    progress: Report = silent,
+    progress: Report = ignore_progress,
 ) -> Registry:
     """Return the mistakes of a network on recorded frames with their positions in the town, each once.
 
@@ -196,34 +196,34 @@ def register_errors(
     >>> set(errors.kinds) <= {"miss", "false_positive"}
     True
     """
-    learned, dataset = task_of(task), opened(data)
+    learned, dataset = resolve_task(task), open_data(data)
     if not isinstance(learned, RegistersErrors):
         able = [name for name in TASKS if isinstance(task_named(name), RegistersErrors)]
         raise InputError(f"task '{learned.name}': its mistakes have no place in a town; choose {', '.join(able)}")
-    tested = network_of(learned, network, device)
+    tested = resolve_network(learned, network, device)
     chosen = choose_frames(learned, tested.config, dataset, agents)
     lowest = threshold_of(learned, threshold)
     return replace(learned.register_errors(tested, dataset, chosen.frames, lowest, progress), chosen=chosen)
 
 
-def task_of(task: Named) -> Task:
+def resolve_task(task: Named) -> Task:
     """Return the task, looked up if a name is given; raises `InputError` for an unknown name."""
     return task_named(task) if isinstance(task, str) else task
 
 
-def opened(data: Data) -> Dataset:
+def open_data(data: Data) -> Dataset:
     """Return the dataset, opened if a folder is given; raises `InputError` as `Dataset.open` does."""
     return data if isinstance(data, Dataset) else Dataset.open(data)
 
 
-def network_of(task: Task[ConfigT, NetworkT, SampleT], network: Weights, device: str = "cpu") -> NetworkT:
+def resolve_network(task: Task[ConfigT, NetworkT, SampleT], network: Weights, device: str = "cpu") -> NetworkT:
     """Return a network in memory as it is; otherwise load the file of weights (None: the task's own) on `device`.
 
     Raises `InputError` for a file that is not of the task, and for None if the task has no weights in the package.
     """
     if isinstance(network, nn.Module):
         return cast(NetworkT, network)  # the caller answers for its type
-    return load_network(task, Path(network or shipped(task))).to(device_named(device))
+    return load_network(task, Path(network or find_shipped(task))).to(select_device(device))
 
 
 def threshold_of(task: Task, threshold: float | None) -> float:
@@ -250,7 +250,7 @@ def origin_of(task: Task, weights: Path | None) -> Origin:
 
     Raises `InputError` for None if the task has no weights in the package.
     """
-    path = weights or shipped(task)
+    path = weights or find_shipped(task)
     try:
         card = read_card(path)
     except InputError:

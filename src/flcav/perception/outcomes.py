@@ -17,9 +17,9 @@ from torch import nn
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.files import atomic_path
-from flcav.intervals import REDRAWS, over_scenes
+from flcav.intervals import REDRAWS, bootstrap_over_scenes
 from flcav.perception.task import Task
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 from flcav.seeds import stream
 
 SCENE = "scene"
@@ -64,7 +64,9 @@ class Measurable(Protocol):
         """Return the number of bootstrap samples."""
         ...
 
-    def outcomes(self, network: nn.Module, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
+    def outcomes(
+        self, network: nn.Module, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
+    ) -> Outcomes:
         """Return the outcomes of `network` on the frames; raises `InputError` if there is nothing to measure."""
         ...
 
@@ -86,7 +88,9 @@ class SceneScores:
     def __init__(self, task: Task) -> None:
         self._task = task
 
-    def outcomes(self, network: nn.Module, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
+    def outcomes(
+        self, network: nn.Module, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
+    ) -> Outcomes:
         """Return the score of each scene, under the name "score"."""
         scenes = list(dict.fromkeys(data.keys[i].scene for i in frames))
         scores = []
@@ -105,33 +109,35 @@ class SceneScores:
         return {}
 
 
-def measurable(task: Task) -> Measurable:
+def as_measurable(task: Task) -> Measurable:
     """Return the task itself if it is `Measurable`, otherwise its `SceneScores`."""
     return task if isinstance(task, Measurable) else SceneScores(task)
 
 
-def measured(task: Task, outcomes: Outcomes) -> float:
+def compute_measure(task: Task, outcomes: Outcomes) -> float:
     """Return the task's measure, each unit counted once; NaN if it is undefined: nothing was to be found."""
-    return float(measurable(task).measure(outcomes, np.ones((1, len(outcomes.scene)), dtype=np.int64))[0])
+    return float(as_measurable(task).measure(outcomes, np.ones((1, len(outcomes.scene)), dtype=np.int64))[0])
 
 
-def score_on(task: Task, network: nn.Module, data: Dataset, frames: Sequence[int] | None = None) -> float:
+def score_network(task: Task, network: nn.Module, data: Dataset, frames: Sequence[int] | None = None) -> float:
     """Return the measure of `network` on frames (None: all); 0 if it is undefined: nothing was to be found."""
-    found = measured(task, measurable(task).outcomes(network, data, data.numbers(frames)))
+    found = compute_measure(task, as_measurable(task).outcomes(network, data, data.numbers(frames)))
     return 0.0 if np.isnan(found) else found
 
 
-def interval(task: Task, outcomes: Outcomes, seed: int = 0) -> tuple[float | None, float | None]:
+def compute_interval(task: Task, outcomes: Outcomes, seed: int = 0) -> tuple[float | None, float | None]:
     """Return low and high of the measure's 95 % bootstrap interval over scenes.
 
     Both are None if the measure is defined on fewer than two scenes.
     """
-    own = measurable(task)
+    own = as_measurable(task)
     counted = [scene for scene in np.unique(outcomes.scene) if not np.isnan(_alone(own, outcomes, scene))]
     if len(counted) < 2:
         return None, None
     rng = stream(seed, "bootstrap")
-    return _known(over_scenes(lambda times: own.measure(outcomes, times), outcomes.scene, own.redraws, rng=rng))
+    return _known(
+        bootstrap_over_scenes(lambda times: own.measure(outcomes, times), outcomes.scene, own.redraws, rng=rng)
+    )
 
 
 def difference(
@@ -144,8 +150,8 @@ def difference(
     """
     if not np.array_equal(before.scene, after.scene):
         raise InputError("two tests are not of the same frames: there is no paired difference")
-    own = measurable(task)
-    mean = measured(task, after) - measured(task, before)
+    own = as_measurable(task)
+    mean = compute_measure(task, after) - compute_measure(task, before)
     if len(np.unique(before.scene)) < 2:
         return mean, None, None
     rng = stream(seed, "bootstrap")
@@ -153,7 +159,7 @@ def difference(
     def change(times: Times) -> Values:
         return own.measure(after, times) - own.measure(before, times)
 
-    return mean, *_known(over_scenes(change, before.scene, own.redraws, rng=rng))
+    return mean, *_known(bootstrap_over_scenes(change, before.scene, own.redraws, rng=rng))
 
 
 def weighted_mean(values: NDArray[np.float64], times: Times) -> Values:

@@ -19,9 +19,9 @@ from typing_extensions import TypeVar  # of typing from Python 3.13 on: with def
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.perception.marks import Mark
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 from flcav.records import Record
-from flcav.seeds import child_seed
+from flcav.seeds import derive_seed
 
 if TYPE_CHECKING:
     from flcav.perception.images import CameraView
@@ -122,7 +122,12 @@ class Task(Protocol[ConfigT, NetworkT, SampleT]):
         ...
 
     def evaluate(
-        self, network: NetworkT, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
+        self,
+        network: NetworkT,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        *,
+        progress: Report = ignore_progress,
     ) -> Evaluated:
         """Return the task's metrics on frames of a dataset (None: all)."""
         ...
@@ -165,7 +170,7 @@ class RigBound(Protocol):
         ...
 
 
-def configuration(task: Task[ConfigT, NetworkT, SampleT], name: str | None) -> ConfigT:
+def find_configuration(task: Task[ConfigT, NetworkT, SampleT], name: str | None) -> ConfigT:
     """Return the configuration of that name (None: the default); raises `InputError` for an unknown name."""
     known = task.configurations
     if name is None:
@@ -178,5 +183,5 @@ def configuration(task: Task[ConfigT, NetworkT, SampleT], name: str | None) -> C
 def fresh(task: Task[ConfigT, NetworkT, SampleT], config: ConfigT, seed: int) -> NetworkT:
     """Return a network with random initial weights drawn from `seed`; torch's global generator is left as it was."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(child_seed(seed, "weights"))
+        torch.manual_seed(derive_seed(seed, "weights"))
         return task.build(config)

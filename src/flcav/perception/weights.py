@@ -25,7 +25,7 @@ SHIPPED = "shipped/weights.safetensors"  # relative to the folder of a task's mo
 COUNTER = "num_batches_tracked"  # buffer of batch normalisation, unused with a fixed momentum
 
 
-def shipped(task: Task) -> Path:
+def find_shipped(task: Task) -> Path:
     """Return the path of the task's weights in the package; raises `InputError` if there are none."""
     module = sys.modules.get(type(task).__module__)
     path = Path(getattr(module, "__file__", None) or "").parent / SHIPPED

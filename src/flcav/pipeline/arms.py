@@ -26,7 +26,7 @@ class Setting:
     stages: tuple[str, ...]  # after pretraining
 
 
-def settings_of(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:
+def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:
     """Return the settings of the run itself and of its arms by name, the run first; `labels`: the run's, by task."""
     return {name: _setting(recipe, labels, name, arm) for name, arm in {MAIN: Arm(), **recipe.arms}.items()}
 

@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results import ArmResult, Difference, Finding, Test
-from flcav.verdicts import UNDECIDED, signed, verdict, verdict_words
+from flcav.verdicts import UNDECIDED, explain_verdict, signed, verdict
 
 WORDS = {PRETRAIN: "pretrained", EDGE: "edge FL", CLOUD: "edge + cloud FL", CENTRAL: "central training"}
 
 
-def in_words(arm: str, stage: str) -> str:
+def name_stage(arm: str, stage: str) -> str:
     """Return the name of an arm's stage in reports, such as "edge FL (densest)"."""
     return WORDS[stage] if arm == MAIN else f"{WORDS[stage]} ({arm})"
 
@@ -58,15 +58,15 @@ def _finding(
     mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
     told = (
         f"On {each.region}, {after.measure} of {each.task} was {before.estimate.mean:.3f} "
-        f"({in_words(each.before_arm, each.before_stage)}) and {after.estimate.mean:.3f} "
-        f"({in_words(each.arm, each.stage)}): {signed(mean)}"
+        f"({name_stage(each.before_arm, each.before_stage)}) and {after.estimate.mean:.3f} "
+        f"({name_stage(each.arm, each.stage)}): {signed(mean)}"
     )
     over = f"{after.frames} test frames of {after.scenes} scenes"
     if low is None or high is None:
         return Finding(place, question, UNDECIDED, f"{told}, over {over}: too few scenes for an interval.")
     decided = verdict(low, high)
     rests = f" ({caveat})" if caveat else ""
-    sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over}; {verdict_words(decided)}{rests}."
+    sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over}; {explain_verdict(decided)}{rests}."
     return Finding(place, question, decided, sentence)
 
 

@@ -14,18 +14,18 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.files import sha256
 from flcav.perception.agents import POLE, kind_of
-from flcav.perception.client import shared
+from flcav.perception.client import as_shared
 from flcav.perception.tasks import task_named
 from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName
 from flcav.pipeline.results import Recorded
 from flcav.progress import Report
-from flcav.seeds import child_seed, stream
+from flcav.seeds import derive_seed, stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.world.map.town import TOWNS
 
 
-def find_place(name: str, beside: Path) -> Path | None:
+def find_path(name: str, beside: Path) -> Path | None:
     """Return the file or folder `name` in the folder `beside`, or else in the working directory; None for neither."""
     sought = (beside / name, Path.cwd() / name)
     return next((path for path in sought if os.path.exists(path)), None)  # noqa: PTH110 - which takes any name
@@ -65,7 +65,7 @@ def recording_fields(recipe: RunRecipe, region: str, split: SplitName, task: str
     Settings of the task, the run, the region, and the run's entry of the task override each other in this order.
     """
     place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
-    changes = [shared(task_named(task)).recording, recipe.recording.fields(), place.recording.fields()]
+    changes = [as_shared(task_named(task)).recording, recipe.recording.fields(), place.recording.fields()]
     how: dict[str, Any] = {"every_s": frames.every_s}
     for more in (*changes, recipe.tasks[task].recording.fields()):
         how |= more
@@ -76,7 +76,7 @@ def recording_fields(recipe: RunRecipe, region: str, split: SplitName, task: str
         **how,
         "town": place.town or region,
         "split": split,
-        "seed": child_seed(recipe.seed, region, split),
+        "seed": derive_seed(recipe.seed, region, split),
         "scenes": frames.scenes,
         "spins_per_scene": spins,
         "cavs": recipe.vehicles(region) if split == "edge" else frames.cavs,
@@ -88,7 +88,7 @@ def record_frames(fields: Fields, poles: Sequence[int], beside: Path, folder: Pa
     asked = parse_config(Recipe, {**fields, "poles": sorted(set(poles))}, folder.name)
     source = EmbeddedSource(asked, beside)
     record(source, folder / DATA, progress=report)
-    return describe(Dataset.open(folder / DATA), DATA)
+    return group_frames(Dataset.open(folder / DATA), DATA)
 
 
 def deal_frames(path: Path, split: SplitName, role: Role, seed: int, whole: bool) -> Recorded:
@@ -98,13 +98,13 @@ def deal_frames(path: Path, split: SplitName, role: Role, seed: int, whole: bool
     """
     data = Dataset.open(path)
     if whole:
-        return describe(data, str(path))
+        return group_frames(data, str(path))
     scenes = sorted({key.scene for key in data.keys})
     least = len(SPLITS_OF[role]) + 1  # one of each split, and two of test
     if len(scenes) < least:
         raise InputError(f"{path}: {len(scenes)} scenes; at least {least} are wanted to deal to a region to {role}")
     order = stream(seed, "deal").permutation(len(scenes))
-    return describe(data, str(path), {scenes[number] for number in order[_own_part(split, role, len(scenes))]})
+    return group_frames(data, str(path), {scenes[number] for number in order[_own_part(split, role, len(scenes))]})
 
 
 def _own_part(split: SplitName, role: Role, scenes: int) -> slice:
@@ -119,7 +119,7 @@ def _own_part(split: SplitName, role: Role, scenes: int) -> slice:
     return slice(start, start + counts[split])
 
 
-def describe(data: Dataset, folder: str, scenes: set[str] | None = None) -> Recorded:
+def group_frames(data: Dataset, folder: str, scenes: set[str] | None = None) -> Recorded:
     """Group the frames of these scenes (None: all) by who recorded them; raises `InputError` for no vehicle's."""
     frames = data.select(scenes=scenes)
     vehicles = tuple(i for i in frames if kind_of(data.keys[i].agent) != POLE)
@@ -134,14 +134,14 @@ def describe(data: Dataset, folder: str, scenes: set[str] | None = None) -> Reco
     return Recorded(folder, vehicles, {pole: tuple(own) for pole, own in poles.items()}, count)
 
 
-def town_hashes(town: str, beside: Path) -> dict[str, str]:
+def hash_town(town: str, beside: Path) -> dict[str, str]:
     """Return the SHA-256 of each file of a user's own town, by file name; nothing for a town of the package.
 
     Raises `InputError` where there is no such town.
     """
     if town in TOWNS:
         return {}
-    folder = find_place(town, beside)
+    folder = find_path(town, beside)
     if folder is None:
         raise InputError(
             f"region's town {shorten(town)}: none of flcav, and there is no folder of that name in {beside}"
@@ -149,7 +149,7 @@ def town_hashes(town: str, beside: Path) -> dict[str, str]:
     return {path.name: sha256(path) for path in sorted(folder.iterdir()) if path.is_file()}
 
 
-def data_hash(path: Path) -> str:
+def hash_manifest(path: Path) -> str:
     """Return the SHA-256 of a dataset's manifest, which names its version; raises `InputError` where there is none."""
     read_manifest(path)
     return sha256(path / "manifest.json")

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError, shorten
-from flcav.pipeline.arms import Names, Setting, settings_of
-from flcav.pipeline.frames import data_hash, find_place, recording_fields, town_hashes
-from flcav.pipeline.labels import KINDS, labels_of
-from flcav.pipeline.planning import history_text
+from flcav.pipeline.arms import Names, Setting, resolve_settings
+from flcav.pipeline.frames import find_path, hash_manifest, hash_town, recording_fields
+from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
+from flcav.pipeline.planning import read_history
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, SPLITS_OF, Region, RunRecipe, SplitName
 from flcav.pipeline.steps import Step
 from flcav.pipeline.work import (
@@ -41,11 +41,11 @@ class Graph:
 
     def __init__(self, recipe: RunRecipe, beside: Path) -> None:
         self.recipe, self.beside = recipe, beside.absolute()
-        labels = {task: labels_of(task, own.labels) for task, own in recipe.tasks.items()}
-        self.settings = settings_of(recipe, labels)
+        labels = {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()}
+        self.settings = resolve_settings(recipe, labels)
         for setting in self.settings.values():
             for task, kind in setting.labels.items():
-                labels_of(task, kind)
+                choose_labels(task, kind)
         self.names = Names(self.settings)
         self.federating = recipe.with_role("federate")
         self._steps: dict[str, Step] = {}
@@ -111,18 +111,18 @@ class Graph:
             path = self._folder_of(own, split)
             dealt = {"path": str(path), "split": split, "role": own.role, "seed": self.recipe.seed}
             whole = isinstance(own.data, Mapping)
-            return _step(name, deal_step, dealt | {"whole": whole, "version": data_hash(path)}, ())
+            return _step(name, deal_step, dealt | {"whole": whole, "version": hash_manifest(path)}, ())
         fields = recording_fields(self.recipe, region, split, task)
-        helped = any(KINDS[arm.labels[task]].from_poles for arm in self.settings.values())
+        helped = any(LABEL_SOURCES[arm.labels[task]].from_poles for arm in self.settings.values())
         seen = list(places) if helped else []
-        version = town_hashes(fields["town"], self.beside)
+        version = hash_town(fields["town"], self.beside)
         beside = str(self.beside) if version else ""  # a town of the package depends on no folder
         arguments = {"fields": fields, "beside": beside, "places": seen, "version": version}
         return _step(name, record_step, arguments, seen)
 
     def _folder_of(self, region: Region, split: SplitName) -> Path:
         named = region.data[split] if isinstance(region.data, Mapping) else str(region.data)
-        found = find_place(named, self.beside)
+        found = find_path(named, self.beside)
         if found is None or not found.is_dir():
             raise InputError(f"regions: there is no dataset folder {shorten(named)} in {self.beside}")
         return found.absolute()
@@ -130,7 +130,7 @@ class Graph:
     def _histories(self) -> dict[str, str]:
         """Return the learning history (CSV) of each task that has one, as text: another text, another plan."""
         own = {name: task.history for name, task in self.recipe.tasks.items()}
-        return {name: history_text(name, history, self.beside) for name, history in own.items() if history is not None}
+        return {name: read_history(name, history, self.beside) for name, history in own.items() if history is not None}
 
     def _learning(self, task: str) -> dict[str, Any]:
         own = self.recipe.tasks[task]
@@ -155,7 +155,7 @@ class Graph:
         for task in recipe.tasks:
             own = {region: names.recording(region, "pool", task) for region in starts}
             validation = [names.recording(region, "validation", task) for region in starts]
-            thresholded = any(KINDS[each.labels[task]].from_detections for each in self.settings.values())
+            thresholded = any(LABEL_SOURCES[each.labels[task]].from_detections for each in self.settings.values())
             arguments = {"plan": plan, "pools": own, "validation": validation, "budget_mb": self._budget_mb}
             step = names.pretrain(arm.name, task)
             arguments |= {"thresholded": thresholded, **self._learning(task)}
@@ -190,7 +190,7 @@ class Graph:
     def _rests_on(self, arm: Setting, region: str, task: str) -> dict[str, Any]:
         """Return the steps and settings that a vehicle's labelled samples depend on, see `flcav.pipeline.work`."""
         names = self.names
-        helped = any(KINDS[each.labels[task]].from_poles for each in self.settings.values())
+        helped = any(LABEL_SOURCES[each.labels[task]].from_poles for each in self.settings.values())
         return {
             "plan": names.plan(arm.name),
             "pretrain": names.pretrain(arm.name, task),

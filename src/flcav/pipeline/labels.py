@@ -8,16 +8,16 @@ import numpy as np
 
 from flcav.config import InputError
 from flcav.fusion.labels import label_sample
-from flcav.fusion.road import RoadView, road_view
+from flcav.fusion.road import RoadView, build_road_view
 from flcav.network.ledger import Ledger, LedgerEntry
-from flcav.perception.client import shared
+from flcav.perception.client import as_shared
 from flcav.perception.metrics import match
 from flcav.perception.objects.detect import detect_all
 from flcav.perception.objects.evaluate import asked_of
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.truth import only_lidar
+from flcav.perception.objects.truth import choose_lidar
 from flcav.perception.task import Task
 from flcav.perception.tasks import task_named
 from flcav.pipeline.frames import Frames
@@ -27,7 +27,7 @@ PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
 
 
 @dataclass(frozen=True)
-class Kind:
+class LabelSource:
     """A source of labels."""
 
     from_detections: bool = False  # pseudo-labels of the frozen stage I network
@@ -35,30 +35,32 @@ class Kind:
     caveat: str = ""  # stated with every result that depends on them
 
 
-KINDS: Mapping[str, Kind] = {
-    "own-detections": Kind(from_detections=True),
-    "ideal-road": Kind(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
-    "annotated": Kind(caveat="ground truth as labels, upper bound"),
-    "future": Kind(caveat="every vehicle knows all tracks around it, upper bound"),  # the recorded future of each track
+LABEL_SOURCES: Mapping[str, LabelSource] = {
+    "own-detections": LabelSource(from_detections=True),
+    "ideal-road": LabelSource(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
+    "annotated": LabelSource(caveat="ground truth as labels, upper bound"),
+    "future": LabelSource(
+        caveat="every vehicle knows all tracks around it, upper bound"
+    ),  # the recorded future of each track
 }
 
 
-def labels_of(task: str, asked: str | None) -> str:
+def choose_labels(task: str, asked: str | None) -> str:
     """Return the kind of labels of a task (None: its first); raises `InputError` for one the task does not have."""
-    known = shared(task_named(task)).labels
+    known = as_shared(task_named(task)).labels
     if asked is not None and asked not in known:
         raise InputError(f"labels of '{task}': '{asked}' is none of {', '.join(known)}")
     return asked or known[0]
 
 
-def own_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
+def fit_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
     """Return the score threshold of pseudo-labels: the lowest with a precision of `PRECISION` on validation frames.
 
     Detections are right that match a target at IoU 0.5. Where no score has that precision, the threshold is 1.
     """
     frames = [split.data.frame(i) for split in splits for i in split.vehicles]
     truths = [asked_of(frame, network.config) for frame in frames]
-    found = detect_all(network, [frame.lidar[only_lidar(frame)] for frame in frames])
+    found = detect_all(network, [frame.lidar[choose_lidar(frame)] for frame in frames])
     matches = match(found, [t.targets for t in truths], [t.neutral for t in truths], 0.5)
     precision = np.cumsum(matches.hit) / np.arange(1, len(matches.hit) + 1)
     good = np.flatnonzero(precision >= PRECISION)
@@ -75,7 +77,7 @@ def annotated_samples(
     return {name: task.samples(split.data, config, numbers) for name, numbers in own.items()}
 
 
-def self_labelled_samples(
+def pseudo_label_samples(
     network: Second,
     threshold: float,
     split: Frames,
@@ -95,7 +97,7 @@ def self_labelled_samples(
     samples: dict[str, list[Sample]] = {}
     for done, i in enumerate(frames):
         key, frame = data.keys[i], data.frame(i)
-        lidar = only_lidar(frame)
+        lidar = choose_lidar(frame)
         detections = detect_all(network, [frame.lidar[lidar]], score_threshold=threshold)[0]
         told = views.get((key.scene, key.index), [])
         name = f"{region}/{key.agent}"
@@ -112,11 +114,11 @@ def _views(split: Frames, poles: Sequence[int]) -> dict[tuple[str, int], list[Ro
     for pole in poles:
         for i in split.poles.get(pole, ()):
             key, frame = split.data.keys[i], split.data.frame(i)
-            views.setdefault((key.scene, key.index), []).append(road_view(frame, only_lidar(frame)))
+            views.setdefault((key.scene, key.index), []).append(build_road_view(frame, choose_lidar(frame)))
     return views
 
 
-def frames_near(split: Frames, sites: np.ndarray, range_m: float) -> tuple[int, ...]:
+def select_frames_near(split: Frames, sites: np.ndarray, range_m: float) -> tuple[int, ...]:
     """Return the vehicles' frames taken within `range_m` of one of the sites (P, 2), world [m]; without sites, all."""
     if not len(sites):
         return split.vehicles

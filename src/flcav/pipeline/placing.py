@@ -13,44 +13,44 @@ from flcav.optimization.placement import coverage, place
 from flcav.perception.errors import PerceptionError
 from flcav.perception.metrics.matching import assign_targets, on_neutral
 from flcav.perception.objects.detect import detect
-from flcav.perception.objects.evaluate import Asked, asked_of
+from flcav.perception.objects.evaluate import FrameTruth, asked_of
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.truth import only_lidar
+from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import Placement
-from flcav.pipeline.results import Looked, Placed, Pole, Seen
-from flcav.pipeline.stages import stage_network
-from flcav.world.map.census import mean_actors
+from flcav.pipeline.results import Placed, Pole, SweepComparison, SweepDetections
+from flcav.pipeline.stages import load_stage_network
+from flcav.world.map.census import measure_traffic_density
 from flcav.world.trace import Trace
 
 SHOWN_SCORE = 0.3  # lowest score of a detection that is shown
 
 
-def look(before: Path, after: Path, split: Frames) -> Looked:
+def detect_before_after(before: Path, after: Path, split: Frames) -> SweepComparison:
     """Return the detections of two networks in the test frame with the most targets.
 
     `before`, `after`: folders of the steps that trained the networks. Detections score `SHOWN_SCORE` or more.
     """
-    networks = {name: stage_network(OBJECTS, folder) for name, folder in (("before", before), ("after", after))}
+    networks = {name: load_stage_network(OBJECTS, folder) for name, folder in (("before", before), ("after", after))}
     config = networks["before"].config
     truths = [asked_of(split.data.frame(i), config) for i in split.vehicles]
     best = int(np.argmax([len(truth.targets) for truth in truths]))
     frame, truth = split.data.frame(split.vehicles[best]), truths[best]
-    points = frame.lidar[only_lidar(frame)]
+    points = frame.lidar[choose_lidar(frame)]
     seen = {
         name: _matched(detect(network, points, score_threshold=SHOWN_SCORE), truth)
         for name, network in networks.items()
     }
-    return Looked(split.vehicles[best], _rows(truth.targets), seen["before"], seen["after"])
+    return SweepComparison(split.vehicles[best], _rows(truth.targets), seen["before"], seen["after"])
 
 
-def _matched(found: Boxes, truth: Asked) -> Seen:
+def _matched(found: Boxes, truth: FrameTruth) -> SweepDetections:
     """Match detections to targets at IoU 0.5; detections of neutral objects are left out."""
     target = assign_targets(found, truth.targets, 0.5)
     counts = (target >= 0) | ~on_neutral(found, truth.neutral)
     hits = target[counts]
     reached = np.isin(np.arange(len(truth.targets)), hits)
-    return Seen(_rows(found[counts]), tuple((hits >= 0).tolist()), tuple(reached.tolist()))
+    return SweepDetections(_rows(found[counts]), tuple((hits >= 0).tolist()), tuple(reached.tolist()))
 
 
 def _rows(boxes: Boxes) -> tuple[tuple[float, ...], ...]:
@@ -65,7 +65,7 @@ class Sites:
     position: NDArray[np.float64]  # (P, 3) of the sensor's mount, world [m]
 
 
-def sites_of(drive: Frames, edge: Frames | None) -> Sites:
+def find_sites(drive: Frames, edge: Frames | None) -> Sites:
     """Return the candidate sites: the town's poles or, of recorded data (`edge`), the poles whose sweeps it holds."""
     town = drive.data.town()
     if edge is None:
@@ -92,7 +92,7 @@ def place_sensors(
     weight = np.array([error.weight for error in every])
     if not len(sites.number):
         return Placed(region, "none", (), len(xyz), 0, how.range_m, ())
-    actors = mean_actors(sites.position, traces, how.range_m)
+    actors = measure_traffic_density(sites.position, traces, how.range_m)
     within = coverage(xyz, sites.position, how.range_m)
     count = min(how.count, len(sites.number))
     chosen: list[int] = []
@@ -114,7 +114,7 @@ def place_sensors(
     )
 
 
-def traces_of(data: Dataset, frames: Sequence[int]) -> list[Trace]:
+def read_traces(data: Dataset, frames: Sequence[int]) -> list[Trace]:
     """Return the recorded traffic of the frames' scenes; scenes without a trace are left out."""
     scenes = sorted({data.keys[i].scene for i in frames})
     return [trace for scene in scenes if (trace := data.trace(scene)) is not None]

@@ -21,11 +21,11 @@ from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.baselines import baseline
 from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.fitting import fit_additive
-from flcav.optimization.curves.history import JOINT, History, histories
-from flcav.perception.task import Task, configuration, fresh
+from flcav.optimization.curves.history import JOINT, History, parse_histories
+from flcav.perception.task import Task, find_configuration, fresh
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.frames import find_place
+from flcav.pipeline.frames import find_path
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
 from flcav.pipeline.results import Plan, TaskPlan
 
@@ -34,7 +34,7 @@ POINT: tuple[str, ...] = ("task", *JOINT, "weight", "run")  # columns of a histo
 
 
 @dataclass(frozen=True)
-class Asked:
+class PlanRequest:
     """One task as the planner sees it: weight, message sizes, and its learning history or fixed plan."""
 
     name: str
@@ -46,7 +46,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Frame:
+class PlanSettings:
     """What the plans of all tasks have in common: budgets, bounds, and the topology of the federation."""
 
     budgets_mb: Price
@@ -60,7 +60,7 @@ class Frame:
         return StagePlan(samples, edge_rounds, cloud_rounds, self.edge_groups, self.edge_rounds_per_cloud_round)
 
 
-def make_plan(tasks: tuple[Asked, ...], frame: Frame, rule: PlanRule) -> tuple[Plan, Problem | None]:
+def make_plan(tasks: tuple[PlanRequest, ...], frame: PlanSettings, rule: PlanRule) -> tuple[Plan, Problem | None]:
     """Return the plan of all tasks, and the allocation problem that was solved for those without a fixed plan.
 
     Fixed plans are paid first; the problem is None where all are fixed. Raises `InputError` where the budgets do not
@@ -86,7 +86,7 @@ def make_plan(tasks: tuple[Asked, ...], frame: Frame, rule: PlanRule) -> tuple[P
     return Plan(rule, {task.name: plans[task.name] for task in tasks}), problem
 
 
-def _problem(tasks: list[Asked], frame: Frame, budgets_mb: np.ndarray) -> Problem:
+def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarray) -> Problem:
     """Return the allocation problem, as `flcav allocate` reads it."""
     wireless, wireline = budgets_mb.tolist()
     values = {
@@ -97,7 +97,7 @@ def _problem(tasks: list[Asked], frame: Frame, budgets_mb: np.ndarray) -> Proble
     return parse_config(Problem, values, "the run's allocation problem")
 
 
-def _task(task: Asked, frame: Frame) -> dict[str, Any]:
+def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
     assert task.history is not None
     samples, edge_rounds, cloud_rounds = task.history.resources.T
     fit = fit_additive(samples, edge_rounds, cloud_rounds, task.history.accuracy, task.history.weight)
@@ -118,7 +118,7 @@ def _task(task: Asked, frame: Frame) -> dict[str, Any]:
     }
 
 
-def _fixed(task: Asked, fixed: FixedPlan, frame: Frame) -> TaskPlan:
+def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan:
     if fixed.samples > task.pool:
         raise InputError(f"tasks.{task.name}.plan: {fixed.samples} samples; the pools hold {task.pool}")
     counts = (fixed.samples, fixed.edge_rounds, fixed.cloud_rounds)
@@ -126,7 +126,7 @@ def _fixed(task: Asked, fixed: FixedPlan, frame: Frame) -> TaskPlan:
     return TaskPlan(*counts, cost.wireless_mb, cost.wireline_mb, task.sizes.sample_mb, task.sizes.model_mb, None)
 
 
-def _planned(task: Asked, own: Allotted, problem: Problem) -> TaskPlan:
+def _planned(task: PlanRequest, own: Allotted, problem: Problem) -> TaskPlan:
     curve = next(each.curve for each in problem.tasks if each.name == task.name)
     k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
     spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
@@ -137,10 +137,10 @@ def _planned(task: Asked, own: Allotted, problem: Problem) -> TaskPlan:
 
 def model_mb(task: Task, network: str | None) -> float:
     """Return the serialised size of one model update [MB], by a dry run of the message."""
-    return update_bytes(to_arrays(fresh(task, configuration(task, network), 0))) / BYTES_PER_MB
+    return update_bytes(to_arrays(fresh(task, find_configuration(task, network), 0))) / BYTES_PER_MB
 
 
-def history_text(task: str, name: str, beside: Path) -> str:
+def read_history(task: str, name: str, beside: Path) -> str:
     """Return the text of a task's learning history (CSV): one of the package by its name, or a file below `beside`.
 
     Raises `InputError` where there is no such table, or it has no rows of the task.
@@ -149,7 +149,7 @@ def history_text(task: str, name: str, beside: Path) -> str:
     if name in known:
         text = (HISTORIES / f"{name}.csv").read_text(encoding="utf-8")
     else:
-        path = find_place(name, beside)
+        path = find_path(name, beside)
         if path is None or not path.is_file():
             raise InputError(
                 f"tasks.{task}.history: {shorten(name)} is no history of the package ({', '.join(known)}), and no file "
@@ -169,15 +169,15 @@ def parse_history(task: str, text: str, origin: str) -> History:
         table = pyarrow.csv.read_csv(io.BytesIO(text.encode()))
     except pyarrow.ArrowInvalid as error:
         raise InputError(f"{origin}: not a CSV table ({error})") from None
-    found = histories(table.to_pydict(), origin, task)
+    found = parse_histories(table.to_pydict(), origin, task)
     if task not in found:
         raise InputError(f"tasks.{task}.history: {origin} has no rows of '{task}', but of {', '.join(found)}")
     return found[task]
 
 
-def history_of(name: str) -> History:
+def load_history(name: str) -> History:
     """Return the package's learning history of the task `name`."""
-    return parse_history(name, history_text(name, name, Path()), name)
+    return parse_history(name, read_history(name, name, Path()), name)
 
 
 def append_points(path: Path, points: list[Mapping[str, Any]]) -> None:

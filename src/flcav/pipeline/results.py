@@ -26,7 +26,7 @@ class Saved(Record):
     @classmethod
     def load(cls, folder: Path, name: str = RESULT) -> Self:
         """Return what `save` wrote; raises `InputError` where it is not there, or of another version."""
-        return cls.of_json(read_json(folder / name), str(folder / name))
+        return cls.from_json(read_json(folder / name), str(folder / name))
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SweepDetections:
     """Detections of one network in a sweep, matched to the targets; boxes are in the LiDAR frame."""
 
     boxes: tuple[tuple[float, ...], ...]  # x y z length width height yaw [m, rad]; without those of neutral objects
@@ -211,13 +211,13 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Looked(Saved):
+class SweepComparison(Saved):
     """Detections of two networks in the same test sweep."""
 
     frame: int  # number in its dataset
-    targets: tuple[tuple[float, ...], ...]  # boxes as in `Seen`
-    before: Seen
-    after: Seen
+    targets: tuple[tuple[float, ...], ...]  # boxes as in `SweepDetections`
+    before: SweepDetections
+    after: SweepDetections
 
 
 @dataclass(frozen=True)

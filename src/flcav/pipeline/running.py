@@ -13,9 +13,9 @@ from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting
-from flcav.pipeline.findings import findings, in_words
+from flcav.pipeline.findings import findings, name_stage
 from flcav.pipeline.graph import Graph
-from flcav.pipeline.labels import KINDS
+from flcav.pipeline.labels import LABEL_SOURCES
 from flcav.pipeline.planning import POINT, append_points
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
@@ -89,7 +89,7 @@ def run(
         notify(step, done, total, note)
 
     run_steps(graph.steps, out / WORK, jobs=jobs, notify=timed, stale=stale, engine=engine)
-    return _kept(graph, out, out / HISTORY, clock())
+    return _save_results(graph, out, out / HISTORY, clock())
 
 
 def run_seeds(
@@ -115,16 +115,16 @@ def run_seeds(
     steps = {folder / WORK: graph.steps for folder, graph in graphs.items()}
     names = {folder / WORK: folder.name for folder in graphs}
     run_side_by_side(steps, jobs=jobs, notify=notify, stale=stale, engine=engine, names=names)
-    runs = tuple(_kept(graph, folder, out / HISTORY, 0.0) for folder, graph in graphs.items())
+    runs = tuple(_save_results(graph, folder, out / HISTORY, 0.0) for folder, graph in graphs.items())
     summary = summarise(runs)
     summary.save(out, SUMMARY)
     return runs, summary
 
 
-def _kept(graph: Graph, out: Path, history: Path, elapsed_s: float) -> Run:
+def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float) -> Run:
     """Collect the results of finished steps, write them to `out`, and add their points to the history."""
-    result = replace(collect(graph, out / WORK), elapsed_s=round(elapsed_s, 1))
-    append_points(history, points_of(result, f"seed{graph.recipe.seed}"))
+    result = replace(collect_results(graph, out / WORK), elapsed_s=round(elapsed_s, 1))
+    append_points(history, make_history_points(result, f"seed{graph.recipe.seed}"))
     result.save(out, RESULTS)
     return result
 
@@ -145,7 +145,7 @@ def summarise(runs: Sequence[Run]) -> Summary:
 
 
 def _measure_name(test: Test) -> str:
-    return f"{test.region}, {test.task}: {in_words(test.arm, test.stage)}"
+    return f"{test.region}, {test.task}: {name_stage(test.arm, test.stage)}"
 
 
 def seed_folders(folder: Path) -> dict[int, Path]:
@@ -157,7 +157,7 @@ def seed_folders(folder: Path) -> dict[int, Path]:
     return found
 
 
-def collect(graph: Graph, work: Path) -> Run:
+def collect_results(graph: Graph, work: Path) -> Run:
     """Collect the results of the finished steps in `work`, and write each arm's ledger to `ledgers` beside it."""
     recipe, names, main = graph.recipe, graph.names, graph.settings[MAIN]
     tests = []
@@ -173,7 +173,7 @@ def collect(graph: Graph, work: Path) -> Run:
     differences = _differences(graph, work)
     rules = {name: arm.placement.rule for name, arm in graph.settings.items()}
     roles = {name: region.role for name, region in recipe.regions.items()}
-    rests = {task: KINDS[kind].caveat for task, kind in main.labels.items()}
+    rests = {task: LABEL_SOURCES[kind].caveat for task, kind in main.labels.items()}
     return Run(
         recipe=recipe,
         arms=arms,
@@ -248,8 +248,8 @@ def _differences(graph: Graph, work: Path) -> list[Difference]:
     for after, before, region, task in pairs:
         steps = test_folder(graph, *after, region, task), test_folder(graph, *before, region, task)
         if steps[0] != steps[1] and steps not in found:
-            estimate = paired(task, work / steps[1], work / steps[0], graph.recipe.seed)
-            told = [in_words(_owner(graph, *each, region, task), each[1]) for each in (after, before)]
+            estimate = compare_tests(task, work / steps[1], work / steps[0], graph.recipe.seed)
+            told = [name_stage(_owner(graph, *each, region, task), each[1]) for each in (after, before)]
             name = f"{region}, {task}: {' - '.join(told)}"
             found[steps] = Difference(name, *after, *before, region, task, estimate)
     return list(found.values())
@@ -261,7 +261,7 @@ def _owner(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:
     return next(name for name in graph.settings if graph.names.stage(name, stage, region, task) == step)
 
 
-def paired(task: str, before: Path, after: Path, seed: int) -> Estimate:
+def compare_tests(task: str, before: Path, after: Path, seed: int) -> Estimate:
     """Return the paired difference `after` - `before` of two test folders' measure, by bootstrap over scenes."""
     first, second = (Outcomes.load(folder / OUTCOMES) for folder in (before, after))
     return Estimate(*difference(task_named(task), first, second, seed))
@@ -284,11 +284,11 @@ def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
         end = values.get((oracle or "", CENTRAL, region, task))
         if end is not None and stage != PRETRAIN and arm != oracle:
             start = values.get((arm, PRETRAIN, region, task), values[MAIN, PRETRAIN, region, task])
-            closed[f"{region}, {task}: {in_words(arm, stage)}"] = gap_closed(start, reached, end)
+            closed[f"{region}, {task}: {name_stage(arm, stage)}"] = gap_closed(start, reached, end)
     return closed
 
 
-def points_of(result: Run, run: str) -> list[Mapping[str, Any]]:
+def make_history_points(result: Run, run: str) -> list[Mapping[str, Any]]:
     """Return a run's points of the learning history, named by `POINT`: samples, rounds, and the score they reached.
 
     The score is the mean over regions on validation frames, weighted by frames.

@@ -21,16 +21,16 @@ from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable, Weights
 from flcav.files import write_bytes, write_json
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
-from flcav.perception.client import TaskClient, shared
-from flcav.perception.outcomes import score_on
-from flcav.perception.task import Task, configuration, fresh
+from flcav.perception.client import TaskClient, as_shared
+from flcav.perception.outcomes import score_network
+from flcav.perception.task import Task, find_configuration, fresh
 from flcav.perception.training import train_steps
 from flcav.perception.weights import from_arrays, load_network, load_weights, save_network, to_arrays
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, Training
 from flcav.pipeline.results import LEDGER, WEIGHTS, Block
 from flcav.progress import Report
-from flcav.seeds import child_seed, stream
+from flcav.seeds import derive_seed, stream
 
 BLOCKS, ROUND = "blocks.json", "round.json"
 
@@ -52,9 +52,9 @@ class Learning:
     @property
     def config(self) -> Any:
         """Return the network's configuration."""
-        return configuration(self.task, self.network)
+        return find_configuration(self.task, self.network)
 
-    def fresh(self) -> Any:
+    def build_network(self) -> Any:
         """Return a network with initial weights drawn from the seed."""
         return fresh(self.task, self.config, self.seed)
 
@@ -62,7 +62,7 @@ class Learning:
         """Return the clients' schedule of `rounds` rounds with `steps` local steps; `names` seed the stream."""
         rate, training = self.task.practice.learning_rate, self.training
         rates = training.local_rate * rate, training.final_rate * rate
-        return Schedule(rounds, steps, *rates, child_seed(self.seed, *names))
+        return Schedule(rounds, steps, *rates, derive_seed(self.seed, *names))
 
 
 def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) -> dict[str, tuple[int, ...]]:
@@ -78,7 +78,7 @@ def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) 
 
 def book_uploads(book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int]) -> None:
     """Enter each sample in the ledger twice: vehicle to edge server (wireless), edge server to cloud (wireline)."""
-    sizes = shared(task).sample_bytes(pool.data, config, chosen)
+    sizes = as_shared(task).sample_bytes(pool.data, config, chosen)
     for frame, size in zip(chosen, sizes, strict=True):
         key = pool.data.keys[frame]
         book.enter(LedgerEntry(PRETRAIN, task.name, "wireless", "up", 0, f"{key.scene}/{key.agent}", size))
@@ -95,7 +95,7 @@ def train_until_level(
     """
     training, task = learning.training, learning.task
     blocks: list[Block] = []
-    network = learning.fresh()
+    network = learning.build_network()
     if (folder / BLOCKS).exists():
         blocks = [Block(**row) for row in json.loads((folder / BLOCKS).read_text())]
         load_weights(task, network, folder / f"block{len(blocks)}.safetensors")
@@ -108,7 +108,7 @@ def train_until_level(
             steps=training.block_steps,
             batch=learning.batch,
             learning_rate=rate * task.practice.learning_rate,
-            seed=child_seed(learning.seed, PRETRAIN, number),
+            seed=derive_seed(learning.seed, PRETRAIN, number),
         )
         score = mean_score(task, network, validation)
         blocks.append(Block(rate, loss, score))
@@ -121,7 +121,7 @@ def train_until_level(
 
 def mean_score(task: Task, network: Any, splits: Sequence[Frames]) -> float:
     """Return the task's measure on the vehicles' frames, as the mean over `splits`."""
-    return float(np.mean([score_on(task, network, split.data, split.vehicles) for split in splits]))
+    return float(np.mean([score_network(task, network, split.data, split.vehicles) for split in splits]))
 
 
 def next_rate(scores: Sequence[float], training: Training) -> float | None:
@@ -170,7 +170,7 @@ def train_centrally(
     return tuple(losses)
 
 
-def clients_of(learning: Learning, config: Any, samples: Mapping[str, Sequence[Any]]) -> dict[str, TaskClient]:
+def make_clients(learning: Learning, config: Any, samples: Mapping[str, Sequence[Any]]) -> dict[str, TaskClient]:
     """Return a federation's clients by vehicle; vehicles without samples are left out."""
     return {
         name: TaskClient(learning.task, config, samples[name], batch=learning.batch)
@@ -179,7 +179,7 @@ def clients_of(learning: Learning, config: Any, samples: Mapping[str, Sequence[A
     }
 
 
-class Federating:
+class FederationCheckpoints:
     """Checkpoints of a federation: weights, loss and ledger after each round, to resume from."""
 
     def __init__(self, task: Task, folder: Path, book: Ledger, report: Report) -> None:
@@ -197,7 +197,7 @@ class Federating:
         self.losses = state["losses"]
         return load_file(round_path(self._folder, state["round"])), state["round"]
 
-    def keeping(self, rounds: int) -> OnRound:
+    def make_saver(self, rounds: int) -> OnRound:
         """Return the callback that saves a checkpoint after each of `rounds` rounds."""
 
         def keep(round_: int, weights: Weights, loss: float) -> None:
@@ -213,7 +213,7 @@ class Federating:
     def finish(self, network: Any, rounds: int) -> None:
         """Write the final weights (without rounds, those of `network`) and the ledger."""
         if rounds:
-            network = round_network(self._task, network.config, self._folder, rounds)
+            network = load_round_network(self._task, network.config, self._folder, rounds)
         save_network(self._task, network, self._folder / WEIGHTS)
         self._book.save(self._folder / LEDGER)
 
@@ -230,11 +230,11 @@ def federate_edge(
     report: Report,
 ) -> tuple[float, ...]:
     """Run stage II of a region from the pretrained `network`; write weights and ledger, return each round's loss."""
-    federating = Federating(learning.task, folder, book, report)
+    federating = FederationCheckpoints(learning.task, folder, book, report)
     start, done = federating.resume(to_arrays(network))
     schedule = learning.schedule(rounds, learning.training.local_steps, EDGE, region)
     account = Account(book, EDGE, learning.task.name, "wireless")
-    keep = federating.keeping(rounds)
+    keep = federating.make_saver(rounds)
     federate(clients, start, schedule, account, strategy=strategy, done=done, on_round=keep)
     federating.finish(network, rounds)
     return tuple(federating.losses)
@@ -255,7 +255,7 @@ def federate_cloud(
 
     An edge server runs `edge_rounds` rounds in a cloud round. Writes weights and ledger, returns each round's loss.
     """
-    federating = Federating(learning.task, folder, book, report)
+    federating = FederationCheckpoints(learning.task, folder, book, report)
     start, done = federating.resume(to_arrays(network))
     wireless, wireline = (Account(book, CLOUD, learning.task.name, link) for link in ("wireless", "wireline"))
     servers: dict[str, Trainable] = {
@@ -263,13 +263,13 @@ def federate_cloud(
         for region, (clients, own) in regions.items()
     }
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
-    keep = federating.keeping(rounds)
+    keep = federating.make_saver(rounds)
     federate(servers, start, schedule, wireline, strategy=strategy, done=done, on_round=keep)
     federating.finish(network, rounds)
     return tuple(federating.losses)
 
 
-def purse(budget: Budget, planned: Mapping[str, tuple[float, float]], task: str) -> Budget:
+def share_budget(budget: Budget, planned: Mapping[str, tuple[float, float]], task: str) -> Budget:
     """Return a task's share of both budgets, in proportion to its planned traffic [MB wireless, wireline].
 
     Shares are rounded down to bytes, so that their sum never exceeds the budget.
@@ -293,13 +293,13 @@ def round_path(folder: Path, round_: int) -> Path:
     return folder / f"round{round_}.safetensors"
 
 
-def round_network(task: Task, config: Any, folder: Path, round_: int) -> Any:
+def load_round_network(task: Task, config: Any, folder: Path, round_: int) -> Any:
     """Return a network with a federation's weights after a round."""
     network = task.build(config)
     from_arrays(network, load_file(round_path(folder, round_)))
     return network.eval()
 
 
-def stage_network(task: Task, folder: Path) -> Any:
+def load_stage_network(task: Task, folder: Path) -> Any:
     """Return the trained network of the stage in `folder`."""
     return load_network(task, folder / WEIGHTS)

@@ -16,23 +16,23 @@ from flcav.files import write_json
 from flcav.intervals import Estimate
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.network.plan import MessageSizes, Price
-from flcav.perception.client import shared
+from flcav.perception.client import as_shared
 from flcav.perception.errors import THRESHOLD, RegistersErrors, load_errors, save_errors
-from flcav.perception.outcomes import interval, measurable, measured, score_on
-from flcav.perception.task import configuration
+from flcav.perception.outcomes import as_measurable, compute_interval, compute_measure, score_network
+from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.frames import Frames, data_hash, deal_frames, record_frames, town_hashes
+from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
-    KINDS,
+    LABEL_SOURCES,
     annotated_samples,
-    frames_near,
-    own_label_threshold,
-    self_labelled_samples,
+    fit_label_threshold,
+    pseudo_label_samples,
+    select_frames_near,
 )
-from flcav.pipeline.placing import look, place_sensors, sites_of, traces_of
-from flcav.pipeline.planning import Asked, Frame, make_plan, model_mb, parse_history
+from flcav.pipeline.placing import detect_before_after, find_sites, place_sensors, read_traces
+from flcav.pipeline.planning import PlanRequest, PlanSettings, make_plan, model_mb, parse_history
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, Federation, Placement, Role, RunRecipe, SplitName, Training
 from flcav.pipeline.results import (
     ERRORS,
@@ -52,13 +52,13 @@ from flcav.pipeline.stages import (
     Learning,
     book_uploads,
     choose_uploads,
-    clients_of,
     federate_cloud,
     federate_edge,
-    purse,
+    load_round_network,
+    load_stage_network,
+    make_clients,
     region_budget,
-    round_network,
-    stage_network,
+    share_budget,
     train_centrally,
     train_until_level,
 )
@@ -75,7 +75,7 @@ def record_step(work: Work, fields: Fields, beside: str, places: Sequence[str], 
 
     Raises `InputError` where the files have changed.
     """
-    if town_hashes(fields["town"], Path(beside)) != version:
+    if hash_town(fields["town"], Path(beside)) != version:
         raise InputError(f"{fields['town']}: the town was changed while the run was under way")
     poles = [pole for step in places for pole in Placed.load(work.inputs[step]).chosen]
     record_frames(fields, poles, Path(beside), work.folder, work.report).save(work.folder)
@@ -86,7 +86,7 @@ def deal_step(work: Work, path: str, split: SplitName, role: Role, seed: int, wh
 
     Raises `InputError` where the manifest has changed.
     """
-    if data_hash(Path(path)) != version:
+    if hash_manifest(Path(path)) != version:
         raise InputError(f"{path}: the dataset was changed while the run was under way")
     deal_frames(Path(path), split, role, seed, whole).save(work.folder)
 
@@ -99,20 +99,20 @@ def plan_step(
     asked, groups = [], _edge_groups(asked_for)
     for name in asked_for.tasks:
         task, network = task_named(name), asked_for.tasks[name].network
-        config = configuration(task, network)
+        config = find_configuration(task, network)
         sizes = [
             size
             for step in pools[name]
             for split in (Frames.open(work.inputs[step]),)
-            for size in shared(task).sample_bytes(split.data, config, split.vehicles)
+            for size in as_shared(task).sample_bytes(split.data, config, split.vehicles)
         ]
         messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network))
         own = asked_for.tasks[name]
         history = parse_history(name, histories[name], name) if name in histories else None
-        asked.append(Asked(name, own.weight, messages, len(sizes), history, own.plan))
+        asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan))
     budgets = Price(asked_for.budgets_mb.wireless, asked_for.budgets_mb.wireline)
     k = asked_for.federation.edge_rounds_per_cloud_round
-    frame = Frame(budgets, asked_for.headroom, asked_for.limits, groups, k)
+    frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k)
     plan, problem = make_plan(tuple(asked), frame, rule)
     if problem is not None:
         write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
@@ -138,7 +138,7 @@ def pretrain_step(
     watched = [Frames.open(work.inputs[step]) for step in validation]
     config = learning.config
     chosen = choose_uploads({region: split.vehicles for region, split in opened.items()}, own.tasks[task].samples, seed)
-    book = Ledger(_purse(own, budget_mb, task))
+    book = Ledger(_share_budget(own, budget_mb, task))
     samples: list[Any] = []
     for region, frames in chosen.items():
         if frames:
@@ -146,14 +146,14 @@ def pretrain_step(
             samples += _each(learning.task.samples(opened[region].data, config, frames))
     book.save(work.folder / LEDGER)
     blocks = train_until_level(learning, samples, watched, work.folder, work.report)
-    trained = stage_network(learning.task, work.folder)
+    trained = load_stage_network(learning.task, work.folder)
     Pretrained(
         task=task,
         network=network or next(iter(learning.task.configurations)),
         uploaded=chosen,
         blocks=blocks,
         steps=learning.training.block_steps * len(blocks),
-        threshold=own_label_threshold(trained, watched) if thresholded else None,
+        threshold=fit_label_threshold(trained, watched) if thresholded else None,
     ).save(work.folder)
 
 
@@ -166,7 +166,7 @@ def errors_step(work: Work, task: str, region: str, pretrained: str, registry: s
     if not isinstance(learned, RegistersErrors):
         raise InputError(f"placement.tasks: the errors of '{task}' have no place in a town")
     drive = Frames.open(work.inputs[registry])
-    network = stage_network(learned, work.inputs[pretrained])
+    network = load_stage_network(learned, work.inputs[pretrained])
     threshold = Pretrained.load(work.inputs[pretrained]).threshold
     lowest = THRESHOLD if threshold is None else threshold
     found = learned.register_errors(network, drive.data, drive.vehicles, lowest, work.report)
@@ -190,9 +190,9 @@ def place_step(
     `edge`: step of the recorded training data, if any, whose poles are the only candidates.
     """
     drive = Frames.open(work.inputs[registry])
-    sites = sites_of(drive, None if edge is None else Frames.open(work.inputs[edge]))
+    sites = find_sites(drive, None if edge is None else Frames.open(work.inputs[edge]))
     found = {task: load_errors(work.inputs[step] / ERRORS) for task, step in errors.items()}
-    traces = traces_of(drive.data, drive.vehicles)
+    traces = read_traces(drive.data, drive.vehicles)
     place_sensors(region, Placement.model_validate(how), sites, found, weights, traces).save(work.folder)
 
 
@@ -208,14 +208,14 @@ def edge_step(
     federation: Fields,
     steps: Mapping[str, Any],
 ) -> None:
-    """Run stage II of a task in a region; `steps`: what its samples depend on, see `_labelled`."""
+    """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`."""
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     own = Plan.load(work.inputs[steps["plan"]]).tasks[task]
     stage_one = Ledger.load(work.inputs[steps["pretrain"]] / LEDGER)
     book = Ledger(region_budget(stage_one, vehicles, region))
-    samples, poles = _labelled(work, learning, region, labels, steps, book)
-    start = stage_network(learning.task, work.inputs[steps["pretrain"]])
-    clients = clients_of(learning, start.config, samples)
+    samples, poles = _label_samples(work, learning, region, labels, steps, book)
+    start = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
+    clients = make_clients(learning, start.config, samples)
     strategy = strategy_named(Federation.model_validate(federation).strategy)
     losses = federate_edge(learning, start, clients, own.edge_rounds, region, strategy, book, work.folder, work.report)
     held = sum(len(client.samples) for client in clients.values())
@@ -237,15 +237,15 @@ def cloud_step(
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     first = next(iter(regions.values()))
     own, how = Plan.load(work.inputs[first["plan"]]), Federation.model_validate(federation)
-    start = stage_network(learning.task, work.inputs[first["pretrain"]])
+    start = load_stage_network(learning.task, work.inputs[first["pretrain"]])
     book = Ledger(
-        _purse(own, budget_mb, task), _entries(work, first["pretrain"], *(s["edge"] for s in regions.values()))
+        _share_budget(own, budget_mb, task), _entries(work, first["pretrain"], *(s["edge"] for s in regions.values()))
     )
     servers, held, count, helped = {}, 0, 0, []
     for region, steps in regions.items():
-        samples, poles = _labelled(work, learning, region, labels, steps)
-        clients = clients_of(learning, start.config, samples)
-        servers[region] = clients, to_arrays(stage_network(learning.task, work.inputs[steps["edge"]]))
+        samples, poles = _label_samples(work, learning, region, labels, steps)
+        clients = make_clients(learning, start.config, samples)
+        servers[region] = clients, to_arrays(load_stage_network(learning.task, work.inputs[steps["edge"]]))
         held += sum(len(client.samples) for client in clients.values())
         count, helped = count + len(clients), [*helped, *poles]
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
@@ -270,13 +270,13 @@ def central_step(
     `source` "pretrain": on the uploaded samples. "federate": on the training frames of the region's vehicles.
     """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
-    trained = stage_network(learning.task, work.inputs[steps["pretrain"]])
+    trained = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
     if source == "pretrain":
         uploaded = Pretrained.load(work.inputs[steps["pretrain"]]).uploaded
         parts = [(Frames.open(work.inputs[steps["pools"][name]]), frames) for name, frames in uploaded.items()]
     else:
         split = Frames.open(work.inputs[steps["frames"]])
-        parts = [(split, _grouped(work, split, steps))]
+        parts = [(split, _select_group(work, split, steps))]
     samples = [
         sample for split, frames in parts for sample in _each(learning.task.samples(split.data, trained.config, frames))
     ]
@@ -292,10 +292,10 @@ def test_step(work: Work, task: str, region: str, trained: str, frames: str, see
     Raises `InputError` where the frames hold no target, so that the measure is undefined.
     """
     learned, split = task_named(task), Frames.open(work.inputs[frames])
-    network, how = stage_network(learned, work.inputs[trained]), measurable(learned)
+    network, how = load_stage_network(learned, work.inputs[trained]), as_measurable(learned)
     outcomes = how.outcomes(network, split.data, split.vehicles, work.report)
     outcomes.save(work.folder / OUTCOMES)
-    mean = measured(learned, outcomes)
+    mean = compute_measure(learned, outcomes)
     if np.isnan(mean):
         raise InputError(f"{region}: its {len(split.vehicles)} test frames hold nothing to find; take more scenes")
     scenes = len({split.data.keys[i].scene for i in split.vehicles})
@@ -303,7 +303,7 @@ def test_step(work: Work, task: str, region: str, trained: str, frames: str, see
         region=region,
         task=task,
         measure=how.measure_name,
-        estimate=Estimate(mean, *interval(learned, outcomes, seed)),
+        estimate=Estimate(mean, *compute_interval(learned, outcomes, seed)),
         numbers=how.numbers(outcomes),
         frames=len(split.vehicles),
         scenes=scenes,
@@ -319,41 +319,41 @@ def rounds_step(work: Work, task: str, region: str, trained: str, start: str, fr
     stage = StageResult.load(work.inputs[trained])
     count = min(WATCHED_FRAMES, len(split.vehicles))
     some = [split.vehicles[i] for i in np.linspace(0, len(split.vehicles) - 1, count).astype(int)]
-    first = stage_network(learned, work.inputs[start])
+    first = load_stage_network(learned, work.inputs[start])
     config = first.config
-    rounds = [Round(0, score_on(learned, first, split.data, some))] if stage.stage == EDGE else []
+    rounds = [Round(0, score_network(learned, first, split.data, some))] if stage.stage == EDGE else []
     for number in range(1, stage.rounds + 1):
-        network = round_network(learned, config, work.inputs[trained], number)
-        rounds.append(Round(number, score_on(learned, network, split.data, some)))
+        network = load_round_network(learned, config, work.inputs[trained], number)
+        rounds.append(Round(number, score_network(learned, network, split.data, some)))
         work.report(number, stage.rounds, "")
     Watched(stage.stage, task, region, count, tuple(rounds)).save(work.folder)
 
 
 def look_step(work: Work, before: str, after: str, frames: str) -> None:
     """Detect objects in one test sweep with the networks of two steps."""
-    look(work.inputs[before], work.inputs[after], Frames.open(work.inputs[frames])).save(work.folder)
+    detect_before_after(work.inputs[before], work.inputs[after], Frames.open(work.inputs[frames])).save(work.folder)
 
 
-def _labelled(
+def _label_samples(
     work: Work, learning: Learning, region: str, labels: str, steps: Mapping[str, Any], book: Ledger | None = None
 ) -> tuple[Mapping[str, Sequence[Any]], tuple[int, ...]]:
     """Return each vehicle's labelled samples, and the poles that contributed labels.
 
     `steps`: "pretrain", the recorded "frames", the arm's "place", and "sites", the placements of all arms.
     """
-    split, kind = Frames.open(work.inputs[steps["frames"]]), KINDS[labels]
-    frames = _grouped(work, split, steps)
+    split, kind = Frames.open(work.inputs[steps["frames"]]), LABEL_SOURCES[labels]
+    frames = _select_group(work, split, steps)
     if not kind.from_detections:
-        config = stage_network(learning.task, work.inputs[steps["pretrain"]]).config
+        config = load_stage_network(learning.task, work.inputs[steps["pretrain"]]).config
         return annotated_samples(learning.task, config, split, frames, region), ()
     poles = Placed.load(work.inputs[steps["place"]]).chosen if kind.from_poles else ()
-    frozen = stage_network(learning.task, work.inputs[steps["pretrain"]])
+    frozen = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
     threshold = Pretrained.load(work.inputs[steps["pretrain"]]).threshold
     assert threshold is not None  # fixed wherever labels come from detections
-    return self_labelled_samples(frozen, threshold, split, frames, poles, region, work.report, book), poles
+    return pseudo_label_samples(frozen, threshold, split, frames, poles, region, work.report, book), poles
 
 
-def _grouped(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[int, ...]:
+def _select_group(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[int, ...]:
     """Return the vehicles' frames near a roadside sensor of any arm, so that all arms have the same frames.
 
     Raises `InputError` where there are none.
@@ -362,8 +362,8 @@ def _grouped(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[int, 
     numbers = {pole for each in placed for pole in each.chosen}
     if not numbers:
         return split.vehicles
-    sites = sites_of(split, split if steps["recorded"] else None)
-    near = frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], steps["group_range_m"])
+    sites = find_sites(split, split if steps["recorded"] else None)
+    near = select_frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], steps["group_range_m"])
     if not near:
         raise InputError(
             f"{split.data.folder.parent.name}: no vehicle comes within {steps['group_range_m']:g} m "
@@ -377,9 +377,9 @@ def _edge_groups(recipe: RunRecipe) -> tuple[int, ...]:
     return tuple(recipe.vehicles(region) for region in recipe.with_role("federate"))
 
 
-def _purse(plan: Plan, budget_mb: tuple[float, float], task: str) -> Budget:
+def _share_budget(plan: Plan, budget_mb: tuple[float, float], task: str) -> Budget:
     planned = {name: (own.wireless_mb, own.wireline_mb) for name, own in plan.tasks.items()}
-    return purse(Budget(*budget_mb), planned, task)
+    return share_budget(Budget(*budget_mb), planned, task)
 
 
 def _entries(work: Work, *steps: str) -> list[LedgerEntry]:

@@ -70,7 +70,7 @@ def canvas(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
-def bare(axes: Axes) -> None:
+def hide_axes(axes: Axes) -> None:
     """Remove ticks and frame, for maps and pictures."""
     axes.set_xticks([])
     axes.set_yticks([])

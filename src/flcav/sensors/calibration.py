@@ -27,7 +27,7 @@ class CalibrationError(Config):
     time_ms: float = Field(default=0.0, ge=0, le=1000)  # of the trigger time
 
 
-def calibration_of(rig: Rig) -> Calibration:
+def build_calibration(rig: Rig) -> Calibration:
     """Return the true calibration of `rig`, by sensor name.
 
     Of all sensors: the mount (4, 4), with optical axes for cameras, and the trigger time [ms] after the LiDAR spin. Of
@@ -47,7 +47,7 @@ def calibration_of(rig: Rig) -> Calibration:
     )
 
 
-def assume(true: Calibration, error: CalibrationError, *, seed: int, agent: str) -> Calibration:
+def perturb_calibration(true: Calibration, error: CalibrationError, *, seed: int, agent: str) -> Calibration:
     """Return the calibration that `agent` assumes: `true` with Gaussian errors; `true` itself where `error` is zero.
 
     Each sensor gets a rigid error of its mount (translation, rotation vector; in the sensor's axes), one of both focal

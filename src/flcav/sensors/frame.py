@@ -54,7 +54,7 @@ class Views:
 class SignViews:
     """Image annotations of K traffic signs and signal heads whose front one camera shows; pixels as in `Views`."""
 
-    kind: NDArray[np.str_]  # (K,) class: see `flcav.world.static.Things`
+    kind: NDArray[np.str_]  # (K,) class: see `flcav.world.static.SignsAndSignals`
     state: NDArray[np.str_]  # (K,) of a signal: "red", "red_amber", "amber", "green", "off"; of a sign ""
     box: Array  # (K, 4) x1 y1 x2 y2 around its visible pixels, to their outer edges
     pixels: NDArray[np.int64]  # (K,) number of visible pixels

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 STEP_S = 0.1  # of the grid on which biases are simulated
 
 
-def wander(rng: np.random.Generator, time_s: float, deviation: Array, correlation_s: float) -> Array:
+def draw_gauss_markov(rng: np.random.Generator, time_s: float, deviation: Array, correlation_s: float) -> Array:
     """Return (K,) values of independent first-order Gauss-Markov processes at `time_s` >= 0.
 
     Each is stationary, with the standard deviation `deviation` (K,) and the autocorrelation exp(-t / `correlation_s`).
@@ -39,7 +39,7 @@ def wander(rng: np.random.Generator, time_s: float, deviation: Array, correlatio
     return deviation * _read(np.asarray(lfilter([1.0], [1.0, -kept], normal, axis=0)), time_s)
 
 
-def walk(rng: np.random.Generator, time_s: float, start: Array, per_root_s: Array) -> Array:
+def draw_random_walk(rng: np.random.Generator, time_s: float, start: Array, per_root_s: Array) -> Array:
     """Return (K,) values of independent random walks at `time_s` >= 0.
 
     The initial values have the standard deviations `start` (K,), increments over t seconds `per_root_s` (K,) * sqrt(t).
@@ -66,7 +66,7 @@ ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)  # first eccentricity, squared
 ITERATIONS = 4  # of Bowring's method
 
 
-def geodetic(origin: GeoReference, enu: Array) -> Array:
+def convert_to_geodetic(origin: GeoReference, enu: Array) -> Array:
     """Return (..., 3) latitude [deg], longitude [deg], altitude [m], WGS 84, of points (..., 3) east, north, up [m]."""
     return _from_earth(_to_earth(origin) + enu @ _earth_from_enu(origin).T)
 
@@ -115,7 +115,7 @@ class Gnss(Config):
     bias_s: float = Field(default=60.0, ge=0.001, le=1e6)  # time in which the bias is forgotten
 
 
-def fix(
+def measure_position(
     scene: Scene, world_from_gnss: Array, gnss: Gnss, rng: np.random.Generator, bias_rng: np.random.Generator
 ) -> Array:
     """Return one GNSS fix at the scene's time: (3,) latitude [deg], longitude [deg], altitude [m], WGS 84.
@@ -126,8 +126,8 @@ def fix(
     """
     time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
     noise = rng.standard_normal(3) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
-    bias = wander(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
-    return geodetic(scene.town.geo, world_from_gnss[:3, 3] + noise + bias)
+    bias = draw_gauss_markov(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
+    return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + noise + bias)
 
 
 GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
@@ -145,7 +145,7 @@ class Imu(Config):
     rate_walk: float = Field(default=5.0e-6, ge=0, le=1000)  # the same of the angular rate [rad/s / sqrt(s)]
 
 
-def reading(
+def measure_inertia(
     scene: Scene,
     world_from_imu: Array,
     carrier: int | None,
@@ -166,7 +166,7 @@ def reading(
     noise = np.repeat((imu.force_noise, imu.rate_noise), 3) * np.sqrt(imu.rate_hz / 2)
     start = np.repeat((imu.force_bias, imu.rate_bias), 3)
     growth = np.repeat((imu.force_walk, imu.rate_walk), 3)
-    return true + noise * rng.standard_normal(6) + walk(bias_rng, time_s, start, growth)
+    return true + noise * rng.standard_normal(6) + draw_random_walk(bias_rng, time_s, start, growth)
 
 
 def _motion(scene: Scene, at: Array, carrier: int | None) -> tuple[Array, Array]:

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.geometry import pose
 from flcav.seeds import stream
-from flcav.sensors.calibration import CalibrationError, assume, calibration_of
+from flcav.sensors.calibration import CalibrationError, build_calibration, perturb_calibration
 from flcav.sensors.camera.camera import photograph
-from flcav.sensors.camera.infrared import thermal_image
-from flcav.sensors.camera.lens import Lens, directions
+from flcav.sensors.camera.infrared import render_thermal
+from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
 from flcav.sensors.labels.annotate import Sight, Sweep, annotate
 from flcav.sensors.lidar.lidar import Lidar, cast, draw_passes, measure, point_times_s
-from flcav.sensors.navigation import fix, reading
-from flcav.sensors.radar.radar import radar_sweep
+from flcav.sensors.navigation import measure_inertia, measure_position
+from flcav.sensors.radar.radar import sweep_radar
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
 from flcav.world.scene import Scene
 from flcav.world.weather import WEATHERS, Weather
@@ -44,7 +44,7 @@ def observe(
     sensors. `error` changes the frame's assumed calibration alone.
     Raises `InputError` for an agent that the run does not have, or not at that instant.
     """
-    carrier = _Carrier(scene, agent, index, _actor_of(scene, agent, index), calibration_of(rig))
+    carrier = _Carrier(scene, agent, index, _actor_of(scene, agent, index), build_calibration(rig))
 
     def rng(sensor: str) -> np.random.Generator:
         return stream(seed, scene_name, index, agent, sensor)
@@ -61,18 +61,20 @@ def observe(
         sights[name] = Sight(mounted.settings, at, scene.offset_s, exposures[name].instance)
     for name, mounted in rig.infrareds.items():
         at = carrier.go_to(name)
-        infrared[name] = thermal_image(scene, at, mounted.settings, weather, rng(name), hidden=carrier.own)
+        infrared[name] = render_thermal(scene, at, mounted.settings, weather, rng(name), hidden=carrier.own)
         sights[name] = Sight(mounted.settings, at, scene.offset_s, _actors_seen(carrier, at, mounted.settings))
     for name, mounted in rig.radars.items():
         at = carrier.go_to(name)
-        radar[name], actor = radar_sweep(
+        radar[name], actor = sweep_radar(
             scene, at, carrier.velocity(at), mounted.settings, rng(name), hidden=carrier.own, weather=weather
         )
         echoes[name] = np.bincount(actor + 1, minlength=len(scene.trace.actor) + 1)[1:]
     for name, mounted in rig.gnss.items():
-        gnss[name] = fix(scene, carrier.go_to(name), mounted.settings, rng(name), bias_rng(name))
+        gnss[name] = measure_position(scene, carrier.go_to(name), mounted.settings, rng(name), bias_rng(name))
     for name, mounted in rig.imus.items():
-        imu[name] = reading(scene, carrier.go_to(name), carrier.own, mounted.settings, rng(name), bias_rng(name))
+        imu[name] = measure_inertia(
+            scene, carrier.go_to(name), carrier.own, mounted.settings, rng(name), bias_rng(name)
+        )
 
     scene.move_to(index)
     annotations, actors = annotate(
@@ -87,7 +89,7 @@ def observe(
         agent=agent,
         world_from_agent=carrier.pose(),
         calibration=carrier.calibration,
-        assumed=assume(carrier.calibration, error, seed=seed, agent=agent),
+        assumed=perturb_calibration(carrier.calibration, error, seed=seed, agent=agent),
         lidar=lidar,
         annotations=annotations,
         point_times={
@@ -192,7 +194,7 @@ def _sweep(
 
 def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> NDArray[np.int32]:
     """Return an instance image (H, W) by one ray for each pixel: a + 1 at the trace's actor a, else 0."""
-    hits = carrier.scene.cast(world_from_camera, directions(lens), hidden=carrier.own)
+    hits = carrier.scene.cast(world_from_camera, compute_pixel_rays(lens), hidden=carrier.own)
     return np.maximum(hits.instance, 0).reshape(lens.height, lens.width)
 
 

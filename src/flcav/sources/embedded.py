@@ -7,7 +7,7 @@ from typing import Any
 
 from flcav.config import InputError
 from flcav.files import Json, sha256
-from flcav.seeds import child_seed, stream
+from flcav.seeds import derive_seed, stream
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
@@ -103,7 +103,7 @@ class EmbeddedSource:
     def trace(self, scene: str) -> Trace:
         """Return the simulated traffic of the scene, sampled at the times of its spins."""
         if self._last_trace is None or self._last_trace[0] != scene:
-            seed = child_seed(self.recipe.seed, "traffic", self.scenes().index(scene))
+            seed = derive_seed(self.recipe.seed, "traffic", self.scenes().index(scene))
             warmup = stream(self.recipe.seed, scene, "warmup").integers(*self.recipe.warmup_steps, endpoint=True)
             times_s, scenarios = self.recipe.times_s(int(warmup)), self.recipe.scenarios
             trace = simulate(self.town, seed=seed, cavs=self.recipe.cavs, times_s=times_s, scenarios=scenarios)

@@ -49,7 +49,7 @@ class Replayable(Source, Protocol):
 
 
 @runtime_checkable
-class Located(Source, Protocol):
+class TownSource(Source, Protocol):
     """A source whose town's files are copied into the dataset, for readers that do not have the town."""
 
     def town_files(self) -> Mapping[str, bytes]:

@@ -15,7 +15,7 @@ from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Mater
 from flcav.world.meshes import Mesh, actor_mesh
 from flcav.world.rays.embree import Embree, Solid
 from flcav.world.rays.raycaster import Hits
-from flcav.world.static import Things, town_mesh, town_things
+from flcav.world.static import SignsAndSignals, build_town_mesh, list_signs_and_signals
 from flcav.world.trace import Trace
 
 OFFSET_S = 0.1  # largest extrapolation from an instant of the trace: one step of the traffic
@@ -58,9 +58,9 @@ class Scene:
         self._place()
 
     @cached_property
-    def things(self) -> Things:
+    def things(self) -> SignsAndSignals:
         """The town's signs and signal heads."""
-        return town_things(self.town)
+        return list_signs_and_signals(self.town)
 
     def move_to(self, index: int, offset_s: float = 0.0) -> None:
         """Move every actor to its pose at instant `index` of the trace, or `offset_s` later.
@@ -89,7 +89,7 @@ class Scene:
 
     def world_from_instance(self) -> NDArray[np.float64]:
         """Return the rotations of the instances (I, 3, 3); the identity for the town and for absent actors."""
-        return _turned(np.concatenate(([0.0], np.nan_to_num(self.poses()[:, 3]))))
+        return _rotate_about_z(np.concatenate(([0.0], np.nan_to_num(self.poses()[:, 3]))))
 
     def cast(
         self,
@@ -105,7 +105,7 @@ class Scene:
         self._hide(hidden)
         return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m, threads=threads)
 
-    def blocked(
+    def find_occluded(
         self,
         origins: NDArray[np.float32],
         directions: NDArray[np.float32],
@@ -119,7 +119,7 @@ class Scene:
         `far_m` is not positive is never occluded.
         """
         self._hide(hidden)
-        return self._assembly.blocked(origins, directions, far_m)
+        return self._assembly.find_occluded(origins, directions, far_m)
 
     def cast_each(
         self,
@@ -153,7 +153,7 @@ class Scene:
         moved = np.flatnonzero(~same.all(axis=1))
         nowhere = set(moved[np.isnan(wanted[moved, 0])].tolist())
         world_from_actor = np.tile(np.eye(4), (len(moved), 1, 1))
-        world_from_actor[:, :3, :3] = _turned(wanted[moved, 3])
+        world_from_actor[:, :3, :3] = _rotate_about_z(wanted[moved, 3])
         world_from_actor[:, :3, 3] = wanted[moved, :3]
         for actor, matrix in zip(moved.tolist(), world_from_actor):
             self._assembly.place(actor + 1, None if actor in nowhere else matrix)
@@ -161,7 +161,7 @@ class Scene:
         self._assembly.commit()
 
 
-def _turned(yaw: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotate_about_z(yaw: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotations (K, 3, 3) by `yaw` (K,) [rad] about z."""
     cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
     return np.array([[cos, -sin, zero], [sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
@@ -209,5 +209,5 @@ def _town_model(town: Town) -> _Model:
     if key not in _TOWNS:
         while len(_TOWNS) >= TOWNS_KEPT:
             del _TOWNS[next(iter(_TOWNS))]
-        _TOWNS[key] = _model(town_mesh(town))
+        _TOWNS[key] = _model(build_town_mesh(town))
     return _TOWNS[key]

@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 from flcav.seeds import stream
 from flcav.world.map.town import KERB_M, Town
 from flcav.world.materials import Material
-from flcav.world.meshes.buildings import building
+from flcav.world.meshes.buildings import make_building
 from flcav.world.meshes.furniture import (
-    clutter,
-    lamp,
+    make_clutter,
+    make_lamp,
+    make_tree,
     sensor_mast,
     sign_plate,
     sign_post,
     signal_head,
     signal_mast,
-    tree,
 )
-from flcav.world.meshes.mesh import Mesh, join, moved, sheet
+from flcav.world.meshes.mesh import Mesh, join_meshes, sheet, transform_mesh
 
 GROUND_M = -0.03  # height of open ground, a little below the road
 LAND_M = 150.0  # width of open ground beyond the town's bounds
@@ -56,7 +56,7 @@ class StaticWorld(NamedTuple):
     row: NDArray[np.int32]  # (F,) the object's row in its field of `Town`; clutter is numbered through all kinds
 
 
-class Things(NamedTuple):
+class SignsAndSignals(NamedTuple):
     """The K traffic signs and signal heads of a town: first the signs, then the heads, in the town's order."""
 
     kind: tuple[str, ...]  # (K,) stop | yield | speed_30 | speed_60 | speed_90 | signal
@@ -69,18 +69,18 @@ class Things(NamedTuple):
         return len(self.kind)
 
 
-def town_mesh(town: Town) -> Mesh:
+def build_town_mesh(town: Town) -> Mesh:
     """Return the static mesh of a town, world frame. The same town gives the same mesh."""
-    return static_world(town).mesh
+    return build_static_world(town).mesh
 
 
-def town_things(town: Town) -> Things:
-    """Return the signs and signal heads of a town, with their faces in `town_mesh`; posts and masts do not count."""
-    world, signs, signals = static_world(town), town.signs, town.signals
+def list_signs_and_signals(town: Town) -> SignsAndSignals:
+    """Return the signs and signal heads of a town, with their faces in `build_town_mesh`; posts and masts do not count."""
+    world, signs, signals = build_static_world(town), town.signs, town.signals
     face = np.full(len(world.part), -1, np.int32)
     for part, first in ((Part.SIGN, 0), (Part.SIGNAL, len(signs.kind))):
         face[world.part == part] = first + world.row[world.part == part]
-    return Things(
+    return SignsAndSignals(
         kind=(*signs.kind, *("signal" for _ in signals.link)),
         position=np.concatenate((signs.position, signals.position)),
         yaw=np.concatenate((signs.yaw, signals.yaw)),
@@ -92,7 +92,7 @@ def town_things(town: Town) -> Things:
 _WORLDS: dict[str, StaticWorld] = {}  # by hash of the town: the last TOWNS_KEPT
 
 
-def static_world(town: Town) -> StaticWorld:
+def build_static_world(town: Town) -> StaticWorld:
     """Return the static mesh of a town with the object of each face; the last `TOWNS_KEPT` are cached."""
     key = sha256(pickle.dumps(town)).hexdigest()
     if key not in _WORLDS:
@@ -101,7 +101,7 @@ def static_world(town: Town) -> StaticWorld:
         owned = list(_parts(town))
         faces = [len(mesh.faces) for _, _, mesh in owned]
         _WORLDS[key] = StaticWorld(
-            join([mesh for _, _, mesh in owned]),
+            join_meshes([mesh for _, _, mesh in owned]),
             np.repeat([part for part, _, _ in owned], faces).astype(np.uint8),
             np.repeat([row for _, row, _ in owned], faces).astype(np.int32),
         )
@@ -151,27 +151,27 @@ def _plate(polygon: NDArray[np.float64], z: float, material: Material) -> Mesh:
 def _buildings(town: Town) -> Iterator[Owned]:
     rng = stream(0, "facades", town.name)
     for row, (x, y, yaw, length, width, height) in enumerate(town.buildings):
-        yield Part.BUILDING, row, moved(building(length, width, height, rng), x, y, 0.0, yaw)
+        yield Part.BUILDING, row, transform_mesh(make_building(length, width, height, rng), x, y, 0.0, yaw)
 
 
 def _plants(town: Town) -> Iterator[Owned]:
     rng = stream(0, "leaves", town.name)
     for row, (x, y, height, radius) in enumerate(town.trees):
-        yield Part.TREE, row, moved(tree(height, radius, rng), x, y)
+        yield Part.TREE, row, transform_mesh(make_tree(height, radius, rng), x, y)
 
 
 def _furniture(town: Town) -> Iterator[Owned]:
     """Yield clutter, lamps, signs with their posts, sensor masts and signals."""
     pieces = [(kind, *values) for kind, rows in town.clutter for values in rows]
     for row, (kind, x, y, yaw, length, width, height) in enumerate(pieces):
-        yield Part.CLUTTER, row, moved(clutter(kind, length, width, height), x, y, 0.0, yaw)
+        yield Part.CLUTTER, row, transform_mesh(make_clutter(kind, length, width, height), x, y, 0.0, yaw)
     for row, (x, y, height) in enumerate(town.lamps):
-        yield Part.LAMP, row, moved(lamp(height), x, y)
+        yield Part.LAMP, row, transform_mesh(make_lamp(height), x, y)
     for row, ((x, y, z), yaw, kind) in enumerate(zip(town.signs.position, town.signs.yaw, town.signs.kind)):
-        yield Part.SIGN, row, moved(sign_plate(kind, z), x, y, 0.0, yaw)
-        yield Part.POST, row, moved(sign_post(z), x, y, 0.0, yaw)
+        yield Part.SIGN, row, transform_mesh(sign_plate(kind, z), x, y, 0.0, yaw)
+        yield Part.POST, row, transform_mesh(sign_post(z), x, y, 0.0, yaw)
     for row, ((x, y, z), yaw) in enumerate(zip(town.poles.position, town.poles.yaw)):
-        yield Part.MAST, row, moved(sensor_mast(z), x, y, 0.0, yaw)
+        yield Part.MAST, row, transform_mesh(sensor_mast(z), x, y, 0.0, yaw)
     yield from _signals(town)
 
 
@@ -181,5 +181,5 @@ def _signals(town: Town) -> Iterator[Owned]:
     for row, ((x, y, z), yaw, foot) in enumerate(zip(signals.position, signals.yaw, signals.foot)):
         left = np.array((-np.sin(yaw), np.cos(yaw)))
         reach = float(left @ ((x, y) - foot))
-        yield Part.SIGNAL, row, moved(signal_head(z), x, y, 0.0, yaw)
-        yield Part.POST, row, moved(signal_mast(z, reach), foot[0], foot[1], 0.0, yaw)
+        yield Part.SIGNAL, row, transform_mesh(signal_head(z), x, y, 0.0, yaw)
+        yield Part.POST, row, transform_mesh(signal_mast(z, reach), foot[0], foot[1], 0.0, yaw)

@@ -78,12 +78,12 @@ MARGINS: dict[str, float] = {
     "rain_mm_h": 1.0,
     "visibility_m": 5000.0,
 }
-# The same gaps as units of `nearest_class`: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H) and visibility.
+# The same gaps as units of `find_nearest_class`: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H) and visibility.
 SEPARATION: dict[str, float] = {"sun_elevation_deg": 10.0, "cloud_cover": 0.2, "rain_mm_h": 0.59, "visibility_m": 0.85}
 DRIZZLE_MM_H = 0.1  # added to the rain rate before its logarithm
 
 
-def weather_class(weather: Weather) -> str | None:
+def classify_weather(weather: Weather) -> str | None:
     """Return the class of `WEATHER_CLASSES` whose region contains `weather`; None outside all regions."""
     for name, region in WEATHER_CLASSES.items():
         if all(low <= getattr(weather, parameter) <= high for parameter, (low, high) in region.items()):
@@ -91,7 +91,7 @@ def weather_class(weather: Weather) -> str | None:
     return None
 
 
-def nearest_class(weather: Weather) -> str:
+def find_nearest_class(weather: Weather) -> str:
     """Return the class whose region is nearest to `weather`; inside a region, its class.
 
     The distance is Euclidean over the gaps between each parameter of `SEPARATION` and the region, in units of the
@@ -127,7 +127,7 @@ def interpolate(one: Weather, other: Weather, share: float) -> Weather:
     return Weather(**mixed)
 
 
-def _named(value: Any) -> Any:
+def _expand_preset(value: Any) -> Any:
     """Return the fields of a weather given by its preset's name or by `preset` and fields; other values as they are."""
     if isinstance(value, dict) and "preset" in value:
         return _preset(value["preset"]) | {field: given for field, given in value.items() if field != "preset"}
@@ -145,7 +145,7 @@ class Keyframe(Config):
     """The weather at one time of a scene."""
 
     at_s: float = Field(ge=0)  # after the scene's first spin
-    weather: Annotated[Weather, BeforeValidator(_named)]  # the name of a preset, or values
+    weather: Annotated[Weather, BeforeValidator(_expand_preset)]  # the name of a preset, or values
 
 
 class WeatherSchedule(Config):
@@ -172,7 +172,7 @@ class WeatherSchedule(Config):
                 )
             return {"keyframes": value}
         if isinstance(value, str | Weather) or (isinstance(value, dict) and not {"keyframes", "classes"} & set(value)):
-            return {"keyframes": [{"at_s": 0.0, "weather": _named(value)}]}
+            return {"keyframes": [{"at_s": 0.0, "weather": _expand_preset(value)}]}
         if not isinstance(value, dict | WeatherSchedule):
             raise ValueError("must be the name of a weather, its fields, or a list of keyframes")
         return value

@@ -91,7 +91,7 @@ class PaintedSource:
         rng = stream(0, scene, index, agent)
         x, y = rng.uniform(-50, 50, 2)
         world_from_agent = pose(float(x), float(y), yaw=float(rng.uniform(-3, 3)))
-        boxes = Boxes.from_array(LOCAL, CATEGORIES).transformed(world_from_agent)[: 0 if self.deserted else None]
+        boxes = Boxes.from_array(LOCAL, CATEGORIES).transform(world_from_agent)[: 0 if self.deserted else None]
         cameras = ["front", "back"] if self.cameras and agent == "cav0" else []
         optical = [*cameras, *(["thermal"] if cameras else [])]
         then = world_from_agent @ pose(0.4, 0.03, yaw=0.02)
@@ -203,7 +203,7 @@ def _points(boxes: Boxes, world_from_lidar: NDArray[np.float64], rng: np.random.
 
 
 def _echoes(boxes: Boxes, world_from_radar: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return echoes from anywhere, after those from the middle of the boxes that `ECHOES` names."""
+    """Return echoes from anywhere, after those from the middle of the boxes that `ACTOR_RCS` names."""
     echoes = np.column_stack([rng.uniform(low, high, 4) for low, high in RADAR_RANGES])
     middle = boxes.center[[row for row, count in ECHOES.items() for _ in range(count) if row < len(boxes)]]
     x, y, z = ((middle - world_from_radar[:3, 3]) @ world_from_radar[:3, :3]).T

@@ -87,7 +87,7 @@ def test_boxes_names_and_counts_are_the_source_s(name: str, dataset: Dataset, se
     assert seen[name].keys() == expected.keys()
     for key, frame in expected.items():
         kept, boxes = _kept(name, frame), seen[name][key].boxes
-        source = frame.annotations.boxes.transformed(inverse(frame.world_from_sensor("lidar")))[kept]
+        source = frame.annotations.boxes.transform(inverse(frame.world_from_sensor("lidar")))[kept]
         assert sorted(boxes.label.tolist()) == sorted(NAMES[name][i] for i in kept)
         away = np.abs(boxes.center[:, None] - source.center[None]).max(axis=2)
         match = away.argmin(axis=1)
@@ -105,7 +105,7 @@ def test_points_are_the_source_s_and_lie_in_their_boxes(name: str, dataset: Data
         cloud = source.lidar["lidar"]
         np.testing.assert_allclose(frame.points[:, :3], cloud[:, :3], atol=1e-5)
         np.testing.assert_allclose(frame.points[:, 3], cloud[:, 3], atol=max(INTENSITY[name], 1e-9))
-        truth = source.annotations.boxes.transformed(inverse(source.world_from_sensor("lidar")))
+        truth = source.annotations.boxes.transform(inverse(source.world_from_sensor("lidar")))
         rows = np.linalg.norm(frame.boxes.center[:, None] - truth.center[None], axis=2).argmin(axis=1)
         inside = points_in_boxes(frame.points, frame.boxes, 1e-3).sum(axis=1)
         np.testing.assert_array_equal(inside, IN_BOX[rows])
@@ -117,7 +117,7 @@ def test_boxes_project_onto_their_pixels(name: str, dataset: Dataset, seen: dict
     painted, expected = 0, 0
     for key, frame in seen[name].items():
         source = dataset.frame(dataset.number(key))
-        truth = source.annotations.boxes.transformed(inverse(source.world_from_sensor("lidar")))
+        truth = source.annotations.boxes.transform(inverse(source.world_from_sensor("lidar")))
         rows = np.linalg.norm(frame.boxes.center[:, None] - truth.center[None], axis=2).argmin(axis=1)
         cameras = [camera for camera in source.images if camera == "front" or name != "kitti"]
         assert len(frame.images) == len(cameras)

@@ -13,7 +13,7 @@ from painted_source import CATEGORIES, PaintedSource
 from flcav.cli.main import run
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.extras import installation
+from flcav.extras import format_install_command
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.town import load_town
 
@@ -101,7 +101,7 @@ def test_a_scene_can_be_chosen(dataset: Dataset, tmp_path: Path, capsys: pytest.
 @pytest.mark.skipif(not WITHOUT_RERUN, reason="rerun-sdk is installed")
 def test_without_rerun_one_sentence_says_how_to_get_it(dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     assert _view(dataset) == 2
-    assert installation("view") in capsys.readouterr().err
+    assert format_install_command("view") in capsys.readouterr().err
 
 
 @needs_rerun

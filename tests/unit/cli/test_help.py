@@ -13,7 +13,7 @@ from flcav.cli.main import app, run
 from flcav.cli.options import Device, Engine, Format, Method
 from flcav.dataset.formats.export import FORMATS
 from flcav.dataset.recording.recorder import ENGINES
-from flcav.perception.device import device_named
+from flcav.perception.device import select_device
 from flcav.perception.tasks import TASKS, task_named
 
 Commands = Iterator[tuple[tuple[str, ...], click.Command]]
@@ -85,7 +85,7 @@ def test_choices_are_those_that_there_are():
         assert [*listed] == [*known]
     for device in Device:
         if device != Device.cuda:
-            device_named(device)
+            select_device(device)
 
 
 def test_tasks_and_networks_are_named(shown):

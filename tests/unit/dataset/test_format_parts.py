@@ -12,15 +12,15 @@ from scipy.spatial.transform import Rotation
 from toy_source import ToySource
 
 from flcav.cli.main import run
-from flcav.dataset.formats.coco import run_lengths
-from flcav.dataset.formats.mounts import channels, front_camera, quaternion
-from flcav.dataset.formats.nuscenes.files import RADAR, RESOLUTION_M, lidar_bin, map_mask, radar_pcd
-from flcav.dataset.formats.nuscenes.tables import CAMERAS, attribute, chain, token, visibility
-from flcav.dataset.formats.opv2v import agent_numbers, carla_pose, pcd
+from flcav.dataset.formats.coco import encode_run_lengths
+from flcav.dataset.formats.mounts import assign_channels, find_front_camera, quaternion
+from flcav.dataset.formats.nuscenes.files import RADAR, RESOLUTION_M, encode_lidar, encode_radar, map_mask
+from flcav.dataset.formats.nuscenes.tables import CAMERAS, attribute, link_rows, token, visibility
+from flcav.dataset.formats.opv2v import agent_numbers, carla_pose, encode_pcd
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
-from flcav.sensors.lidar.lidar import Lidar, ray_pattern
+from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.world.map.town import load_town
 
 angles = st.floats(-3.1, 3.1)
@@ -29,7 +29,7 @@ angles = st.floats(-3.1, 3.1)
 @settings(max_examples=60, deadline=None)
 @given(arrays(np.bool_, st.tuples(st.integers(1, 9), st.integers(1, 9))))
 def test_run_lengths_are_coco_s(mask: np.ndarray):
-    runs = run_lengths(mask)
+    runs = encode_run_lengths(mask)
     theirs = coco_mask.encode(np.asfortranarray(mask, np.uint8))
     assert runs == {"size": theirs["size"], "counts": str(theirs["counts"], "ascii")}  # pyright: ignore[reportArgumentType, reportCallIssue]
 
@@ -37,16 +37,16 @@ def test_run_lengths_are_coco_s(mask: np.ndarray):
 @pytest.mark.parametrize("beams", [{"beams": "hdl64e"}, {"channels": 16, "up_deg": 15.0, "down_deg": -15.0}])
 def test_a_ring_is_the_channel_of_its_ray(beams: dict):
     lidar = Lidar(**beams)
-    rays = ray_pattern(lidar)
+    rays = build_ray_pattern(lidar)
     distance = np.random.default_rng(0).uniform(2, 60, len(rays)).astype(np.float32)
     points = np.column_stack((rays * distance[:, None], np.full(len(rays), 0.5))).astype(np.float32)
     elevations = np.arcsin(rays[:: lidar.azimuth_steps, 2].astype(np.float64))[::-1]
-    theirs = np.frombuffer(lidar_bin(points, elevations), np.float32).reshape(-1, 5)
+    theirs = np.frombuffer(encode_lidar(points, elevations), np.float32).reshape(-1, 5)
     ring = np.repeat(np.arange(lidar.channels)[::-1], lidar.azimuth_steps)
     np.testing.assert_array_equal(theirs[:, 4], ring)
     np.testing.assert_array_equal(theirs[:, :3], np.column_stack((-points[:, 1], points[:, 0], points[:, 2])))
     assert set(theirs[:, 3].tolist()) == {127.5}
-    assert not np.frombuffer(lidar_bin(points, np.zeros(0)), np.float32).reshape(-1, 5)[:, 4].any()
+    assert not np.frombuffer(encode_lidar(points, np.zeros(0)), np.float32).reshape(-1, 5)[:, 4].any()
 
 
 def _read_pcd(data: bytes) -> np.ndarray:
@@ -67,7 +67,7 @@ def test_what_stands_still_has_no_velocity_over_ground():
     doppler = -(direction @ velocity)
     doppler[:5] += 4.0  # recede on their own
     echoes = np.column_stack((distance, azimuth, elevation, doppler, rng.uniform(-5, 20, 20))).astype(np.float32)
-    read = _read_pcd(radar_pcd(echoes, velocity))
+    read = _read_pcd(encode_radar(echoes, velocity))
     xyz = np.column_stack([read[axis] for axis in "xyz"])
     np.testing.assert_allclose(xyz, distance[:, None] * direction, rtol=1e-4, atol=1e-4)
     own = np.column_stack((read["vx_comp"], read["vy_comp"]))
@@ -75,7 +75,7 @@ def test_what_stands_still_has_no_velocity_over_ground():
     np.testing.assert_allclose(own[5:], 0, atol=1e-3)
     assert (read["dyn_prop"] == [0] * 5 + [1] * 15).all()
     np.testing.assert_allclose(read["rcs"], echoes[:, 4])
-    empty = _read_pcd(radar_pcd(np.zeros((0, 5), np.float32), velocity))
+    empty = _read_pcd(encode_radar(np.zeros((0, 5), np.float32), velocity))
     assert len(empty) == 1
     assert np.isnan(empty["x"][0])
 
@@ -113,7 +113,7 @@ def test_carla_s_angles_have_the_signs_people_know():
 
 def test_a_pcd_s_red_is_the_intensity():
     points = np.array([[1.0, 2, 3, 0.0], [4, -5, 6, 1.0], [0, 0, 0, 0.5]], np.float32)
-    header, _, data = pcd(points).partition(b"DATA binary\n")
+    header, _, data = encode_pcd(points).partition(b"DATA binary\n")
     assert b"WIDTH 3\nHEIGHT 1\n" in header
     rows = np.frombuffer(data, "<f4").reshape(3, 4)
     np.testing.assert_array_equal(rows[:, :3], points[:, :3] * (1, -1, 1))
@@ -132,20 +132,20 @@ def _camera(yaw_deg: float, pitch_deg: float = 0.0) -> np.ndarray:
 
 
 def test_the_front_camera_is_level_and_looks_ahead():
-    assert front_camera({"left": _camera(25), "ahead": _camera(-4), "back": _camera(180)}) == "ahead"
-    assert front_camera({"down": _camera(0, 10), "left": _camera(20)}) == "left"
-    assert front_camera({"side": _camera(90), "down": _camera(0, 10)}) is None
-    assert front_camera({}) is None
+    assert find_front_camera({"left": _camera(25), "ahead": _camera(-4), "back": _camera(180)}) == "ahead"
+    assert find_front_camera({"down": _camera(0, 10), "left": _camera(20)}) == "left"
+    assert find_front_camera({"side": _camera(90), "down": _camera(0, 10)}) is None
+    assert find_front_camera({}) is None
 
 
 def test_channels_go_to_the_sensors_that_look_their_way():
     six = {name: direction + 0.1 for name, direction in CAMERAS.items()}
-    assert channels(six, CAMERAS) == {name: name for name in CAMERAS}
-    assert channels({"a": 0.05, "b": 3.1}, CAMERAS) == {"a": "CAM_FRONT", "b": "CAM_BACK"}
-    assert channels({"a": 0.0, "b": 0.1}, CAMERAS) == {"a": "CAM_FRONT", "b": "CAM_FRONT_LEFT"}
-    seven = channels({f"c{i}": i for i in range(7)}, CAMERAS)
+    assert assign_channels(six, CAMERAS) == {name: name for name in CAMERAS}
+    assert assign_channels({"a": 0.05, "b": 3.1}, CAMERAS) == {"a": "CAM_FRONT", "b": "CAM_BACK"}
+    assert assign_channels({"a": 0.0, "b": 0.1}, CAMERAS) == {"a": "CAM_FRONT", "b": "CAM_FRONT_LEFT"}
+    seven = assign_channels({f"c{i}": i for i in range(7)}, CAMERAS)
     assert len(seven) == 6
-    assert channels({}, CAMERAS) == {}
+    assert assign_channels({}, CAMERAS) == {}
 
 
 @settings(max_examples=30, deadline=None)
@@ -171,7 +171,7 @@ def test_nuscenes_levels_and_attributes():
     for (category, track, speed), name in names.items():
         assert attribute(category, track, speed) == token("attribute", name)
     rows = [{"token": name} for name in "abc"]
-    chain(rows)
+    link_rows(rows)
     assert [(row["prev"], row["next"]) for row in rows] == [("", "b"), ("a", "c"), ("b", "")]
 
 

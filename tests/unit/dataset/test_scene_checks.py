@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flcav.dataset.checks.scenes import Sight, check_motion
+from flcav.dataset.checks.scenes import BlockedViews, check_motion
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import lidar_pole
 from flcav.world.map.town import TOWNS, load_town
@@ -42,7 +42,7 @@ def test_speeds_at_the_ends_of_long_steps_say_nothing(traffic: Trace):
 def test_every_pole_of_our_towns_sees(name: str):
     town = load_town(name)
     world = Scene(town, simulate(town, seed=1, cavs=0, times_s=np.array([30.0])))
-    sight, seen = Sight(), []
+    sight, seen = BlockedViews(), []
     for pole in town.poles.id:
         frame = observe(world, lidar_pole(), f"pole{pole}", 0, scene_name="scene", seed=1)
         sight.add(frame)
@@ -55,7 +55,7 @@ def test_a_sensor_behind_something_is_named(traffic: Trace):
     town = load_town("ring")
     lamps = np.append(town.lamps, [[*town.poles.position[0, :2] + 0.02, 7.0]], axis=0)
     world = Scene(replace(town, lamps=lamps), traffic)
-    sight = Sight()
+    sight = BlockedViews()
     for pole in (1, 2):
         sight.add(observe(world, lidar_pole(), f"pole{pole}", 0, scene_name="scene", seed=1))
     (problem,) = sight.problems()

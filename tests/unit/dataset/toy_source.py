@@ -64,7 +64,7 @@ def toy_frame(seed: int, scene: str, index: int, agent: str) -> Frame:
     local = np.array(
         [[8.0, 2, 1, 4, 2, 2, 0.3], [20, -5, 1, 4, 2, 2, 2], [-9, 9, 1, 0.6, 0.6, 2, 0], [30, 9, 1, 4, 2, 2, 1]]
     )
-    truth = Boxes.from_array(local, ["car", "van", "pedestrian", "car"]).transformed(world_from_agent)
+    truth = Boxes.from_array(local, ["car", "van", "pedestrian", "car"]).transform(world_from_agent)
     returns = np.array([40, 20, 5, 0])
     corners = Boxes.from_array(local, "car")
     inside = np.concatenate(

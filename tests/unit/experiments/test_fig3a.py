@@ -5,7 +5,7 @@ import pytest
 
 from flcav.experiments.fig3a.run import Fig3a, article_graph, draw_fig3a, fig3a
 from flcav.optimization.graph import to_problem
-from flcav.pipeline.planning import history_of
+from flcav.pipeline.planning import load_history
 
 pytestmark = pytest.mark.slow
 
@@ -33,11 +33,11 @@ def test_bands_hold_their_curve_and_curves_rise(results: Fig3a) -> None:
 
 def test_every_point_of_our_own_history_is_drawn(results: Fig3a) -> None:
     drawn = sum(len(line.points) for line in results.own.lines)
-    assert drawn == len(history_of("objects").accuracy)
+    assert drawn == len(load_history("objects").accuracy)
 
 
 def test_the_figure_is_drawn_from_what_the_file_holds(results: Fig3a) -> None:
-    assert draw_fig3a(Fig3a.of_json(json.loads(json.dumps(results.as_json())), "result.json")) == draw_fig3a(results)
+    assert draw_fig3a(Fig3a.from_json(json.loads(json.dumps(results.as_json())), "result.json")) == draw_fig3a(results)
 
 
 def test_the_articles_graph_is_its_problem() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from flcav.experiments.sim_to_real import tables as sim_to_real_tables
-from flcav.experiments.sim_to_real.run import LabelledCar, RealScore, SimToReal, Story
+from flcav.experiments.sim_to_real.run import FrameResult, LabelledCar, RealScore, SimToReal
 from flcav.experiments.studies import objects as objects_tables
 from flcav.experiments.studies.objects import STUDY
 from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
@@ -52,8 +52,8 @@ def study(aps):
             n,
             Card.model_validate(card),
             {
-                "suburb": ObjectsEvaluation.of_json(result(ap), "suburb"),
-                "tracks": ObjectsEvaluation.of_json(tracked(ap), "tracks"),
+                "suburb": ObjectsEvaluation.from_json(result(ap), "suburb"),
+                "tracks": ObjectsEvaluation.from_json(tracked(ap), "tracks"),
             },
         )
         for n, ap in enumerate(aps)
@@ -99,7 +99,7 @@ def cloud():
 
 def test_clouds_and_real_cars_stand_beside_each_other():
     score = RealScore("Car", "3d", 0.5, targets=1, found=1, false_positives=0, ap=1.0)
-    story = Story("000008", (), (LabelledCar(5.0, (0.5,)),))
+    story = FrameResult("000008", (), (LabelledCar(5.0, (0.5,)),))
     tables = sim_to_real_tables.tables(SimToReal({"KITTI": cloud(), "simulated": cloud()}, (score,), (story,)))
     assert "| 000008 | 5.0 | 0.5 |" in tables["cars"]
     assert "| Car | 3d at 0.5 | 1 | 1 | 0 | 1.000 |" in tables["detections"]

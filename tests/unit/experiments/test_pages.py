@@ -4,7 +4,7 @@ import pytest
 from reproduction_pages import TABLES, fill, fill_folder, tables_of
 
 from flcav.config import InputError
-from flcav.markdown import table
+from flcav.markdown import format_table
 
 REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"
 RUNS = sorted((REPRODUCTIONS / "runs").glob("*"))
@@ -42,4 +42,4 @@ def test_filling_replaces_what_stood_there_and_names_what_is_not_known() -> None
 
 
 def test_markdown() -> None:
-    assert table(("x", "y"), [[1, ""], ["b", 2]]) == "| x | y |\n|---|---|\n| 1 | |\n| b | 2 |"
+    assert format_table(("x", "y"), [[1, ""], ["b", 2]]) == "| x | y |\n|---|---|\n| 1 | |\n| b | 2 |"

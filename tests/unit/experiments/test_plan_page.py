@@ -8,7 +8,7 @@ import pytest
 
 from flcav.experiments.fig3a.run import article_graph
 from flcav.optimization.allocation.allocate import allocate
-from flcav.optimization.allocation.budget_sweep import savings
+from flcav.optimization.allocation.budget_sweep import compute_savings
 from flcav.optimization.allocation.problem import Budgets, Limits, Problem, Uplink
 from flcav.optimization.allocation.problem_file import STEPS, TERMS
 from flcav.optimization.fleet import allocate_fleet
@@ -23,12 +23,12 @@ FLEET = ONE.model_copy(update={"tasks": (ONE.tasks[0].model_copy(update={"uplink
 
 def results_of(problem: Problem) -> dict[str, Any]:
     plan, shares = allocate_fleet(problem)
-    return plan_results(problem, plan, shares, savings(problem, plan))
+    return plan_results(problem, plan, shares, compute_savings(problem, plan))
 
 
 def page_of(problem: Problem, graph: nx.Graph | None = None) -> str:
     plan, shares = allocate_fleet(problem)
-    return plan_page(problem, plan, shares, savings(problem, plan), graph)
+    return plan_page(problem, plan, shares, compute_savings(problem, plan), graph)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 
 from flcav.dataset.formats.kitti.read import Calibration, KittiFrame, Objects
 from flcav.experiments.sim_to_real import run as sim_to_real
-from flcav.experiments.sim_to_real.clouds import describe
+from flcav.experiments.sim_to_real.clouds import summarise_clouds
 from flcav.geometry import Boxes
 from flcav.perception.objects.model import second, small_config
 
@@ -29,7 +29,7 @@ def test_numbers_of_a_cloud_are_counts():
     street = [(x, 0.0, -1.7, 0.3) for x in (6.2, 6.5, 7, 7.5)]
     on_car = [(20.0, 0.0, -1.0, i) for i in (0.0, 0.0, 0.2)]
     behind = [(-10.0, 0.0, -1.7, 0.9)]
-    said = describe([(np.array(street + on_car + behind, np.float32), boxes((20, 0), (40, 0)))])
+    said = summarise_clouds([(np.array(street + on_car + behind, np.float32), boxes((20, 0), (40, 0)))])
     assert said.returns == 7
     assert said.returns_per_range["5-10 m"] == 4
     assert said.returns_per_range["20-25 m"] == 3

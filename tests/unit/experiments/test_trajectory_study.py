@@ -11,7 +11,7 @@ from flcav.experiments.studies.trajectory import CAMERAS, STUDY, tables
 from flcav.intervals import mean_over_seeds
 from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST
-from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, metrics
+from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
 
 
 @pytest.mark.parametrize("study", [STUDY, CAMERAS])
@@ -29,7 +29,7 @@ def evaluated(off_m: float) -> TrajectoryEvaluation:
     paths = np.stack((future, future), axis=1)
     paths[:, 0, :, 1] = off_m
     columns = {"future": future, "past": past, "at_junction": np.ones(2, np.bool_), "scene": np.array(["a", "b"])}
-    return metrics(paths, np.tile((0.9, 0.1), (2, 1)), columns)
+    return evaluate_paths(paths, np.tile((0.9, 0.1), (2, 1)), columns)
 
 
 def results(*off_m: float) -> StudyResult[TrajectoryEvaluation]:

@@ -11,7 +11,7 @@ from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.strategies.fedavg import FedAvg, average
 from flcav.network.ledger import BudgetExceeded
 from flcav.network.plan import MessageSizes, StagePlan, price
-from flcav.seeds import child_seed
+from flcav.seeds import derive_seed
 
 SCHEDULE = Schedule(rounds=4, steps=20, learning_rate=0.05, final_learning_rate=0.01, seed=3)
 
@@ -25,7 +25,7 @@ def bare_fedavg(clients, weights, schedule):
     for round_ in range(1, schedule.rounds + 1):
         work = schedule.work(round_)
         updates = [
-            client.train(weights, steps=work.steps, learning_rate=work.learning_rate, seed=child_seed(work.seed, name))
+            client.train(weights, steps=work.steps, learning_rate=work.learning_rate, seed=derive_seed(work.seed, name))
             for name, client in clients.items()
         ]
         total = sum(update.samples for update in updates)

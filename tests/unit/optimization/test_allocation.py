@@ -13,8 +13,8 @@ from made_problems import SMALL, parsed, searched, written
 
 from flcav.config import InputError
 from flcav.optimization.allocation.allocate import Allocation, Infeasible, allocate, weighted_error
-from flcav.optimization.solvers.instance import instance
-from flcav.optimization.solvers.separable import Relaxed, Separable, relax
+from flcav.optimization.solvers.instance import build_instance
+from flcav.optimization.solvers.separable import ContinuousOptimum, Separable, relax
 
 
 @pytest.mark.parametrize(("model", "seed", "k"), itertools.product(("additive", "effective"), range(4), (0, 1, 2)))
@@ -80,7 +80,7 @@ def test_several_powers_of_one_quantity_have_the_optimum_of_a_convex_solver():
     assert ours.multipliers == pytest.approx(multipliers, rel=1e-3, abs=1e-9)
 
 
-def both_solvers(wireline: float, members: int) -> tuple[Relaxed, float, np.ndarray]:
+def both_solvers(wireline: float, members: int) -> tuple[ContinuousOptimum, float, np.ndarray]:
     """Return our optimum, that of Clarabel, and its multipliers, with `members` powers of every quantity."""
     rng = np.random.default_rng(3)
     n = 60
@@ -104,7 +104,7 @@ def both_solvers(wireline: float, members: int) -> tuple[Relaxed, float, np.ndar
 def test_marginal_values_are_the_slope_of_the_relaxed_optimum():
     values = written(2, 30, "additive", budget=700.0)
     values["budgets_mb"]["wireline"] = 0.25 * values["budgets_mb"]["wireless"]
-    powers, plan = instance(parsed(values)).separable, allocate(parsed(values))
+    powers, plan = build_instance(parsed(values)).separable, allocate(parsed(values))
     rates = (plan.marginal_error_per_gb.wireless_mb, plan.marginal_error_per_gb.wireline_mb)
     for link, rate in enumerate(rates):
         step = 1e-3 * powers.budget[link] * np.eye(2)[link]

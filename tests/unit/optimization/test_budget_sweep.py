@@ -11,7 +11,7 @@ from test_fleet import best_carried, fleet, problem
 
 from flcav.cli.main import run
 from flcav.optimization.allocation.allocate import allocate
-from flcav.optimization.allocation.budget_sweep import budget_sweep, savings
+from flcav.optimization.allocation.budget_sweep import compute_savings, sweep_budgets
 from flcav.optimization.fleet import allocate_fleet
 
 
@@ -26,7 +26,7 @@ def with_more(values: dict[str, Any], link: str, added: float) -> dict[str, Any]
 def test_what_more_of_a_budget_saves_is_what_trying_every_plan_finds(model: str, seed: int, objective: str) -> None:
     values: dict[str, Any] = written(seed, 2, model, SMALL, budget=150.0) | {"objective": objective}
     now = searched(values)
-    found = savings(parsed(values), allocate(parsed(values)))
+    found = compute_savings(parsed(values), allocate(parsed(values)))
     assert [(each.link, each.added) for each in found] == [
         *(("wireless", added) for added in (0.1, 0.5)),
         *(("wireline", added) for added in (0.1, 0.5)),
@@ -67,7 +67,7 @@ def test_links_that_limit_plans_limit_what_more_budget_saves() -> None:
     asked = problem([{"uplink_mbps": fleet(3, 3, 3), "limits": limits}], horizon_s=12)
     plan, _ = allocate_fleet(asked)
     assert "own links" in (plan.note or "")
-    found = [each for each in savings(asked, plan) if each.added == 0.5]
+    found = [each for each in compute_savings(asked, plan) if each.added == 0.5]
     for each, budgets in zip(found, ({"wireless": 135.0}, {"wireline": 90.0}), strict=True):
         more = asked.model_copy(update={"budgets_mb": asked.budgets_mb.model_copy(update=budgets)})
         assert each.objective == pytest.approx(plan.objective - each.saved)
@@ -79,16 +79,16 @@ def test_links_that_limit_plans_limit_what_more_budget_saves() -> None:
 def test_a_larger_budget_errs_no_more_and_its_own_budget_is_the_plan() -> None:
     asked = parsed(written(1, 1, "additive"))
     plan = allocate(asked)
-    sweep = budget_sweep(asked, plan, factors=(0.5, 1.0, 2.0))
+    sweep = sweep_budgets(asked, plan, factors=(0.5, 1.0, 2.0))
     errors = [point.objective for point in sweep]
     assert errors == sorted(errors, reverse=True)
     assert sweep[1].objective == plan.objective
     assert sweep[2].budgets_mb.wireless_mb == 2 * asked.budgets_mb.wireless
-    (alone,) = budget_sweep(asked, plan, ("wireline",), factors=(2.0,))
+    (alone,) = sweep_budgets(asked, plan, ("wireline",), factors=(2.0,))
     assert alone.budgets_mb.wireless_mb == asked.budgets_mb.wireless
     assert alone.budgets_mb.wireline_mb == 2 * asked.budgets_mb.wireline
 
 
 def test_budgets_that_allow_no_plan_are_left_out() -> None:
     asked = parsed(written(1, 1, "additive"))
-    assert [point.factor for point in budget_sweep(asked, allocate(asked), factors=(0.01, 1.0))] == [1.0]
+    assert [point.factor for point in sweep_budgets(asked, allocate(asked), factors=(0.01, 1.0))] == [1.0]

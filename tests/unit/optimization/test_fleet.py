@@ -8,8 +8,8 @@ from flcav.config import parse_config
 from flcav.optimization.allocation.allocate import Infeasible, TaskPlan, allocate
 from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.fleet import allocate_fleet
-from flcav.optimization.solvers.instance import cost_of
-from flcav.optimization.vehicles import vehicle_shares
+from flcav.optimization.solvers.instance import price_counts
+from flcav.optimization.vehicles import split_plan
 
 
 def problem(tasks: list[dict[str, Any]], **values: Any) -> Problem:
@@ -44,12 +44,12 @@ def best_carried(asked: Problem) -> float:
     errors = []
     limits = (task.limits.samples, task.limits.edge_rounds, task.limits.cloud_rounds)
     for samples, edge_rounds, cloud_rounds in product(*(range(low, high + 1) for low, high in limits)):
-        cost = cost_of(asked, task, (samples, edge_rounds, cloud_rounds))
+        cost = price_counts(asked, task, (samples, edge_rounds, cloud_rounds))
         if cost.wireless_mb > asked.budgets_mb.wireless or cost.wireline_mb > asked.budgets_mb.wireline:
             continue
         error = float(task.curve.error(samples, edge_rounds, cloud_rounds, asked.edge_rounds_per_cloud_round))
         try:
-            vehicle_shares(asked, [TaskPlan(task.name, samples, edge_rounds, cloud_rounds, error, 0.0, 0.0)])
+            split_plan(asked, [TaskPlan(task.name, samples, edge_rounds, cloud_rounds, error, 0.0, 0.0)])
         except Infeasible:
             continue
         errors.append(error)

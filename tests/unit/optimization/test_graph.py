@@ -7,8 +7,17 @@ import yaml
 
 from flcav.config import InputError, parse_config
 from flcav.optimization.allocation.allocate import allocate
-from flcav.optimization.graph import Layers, build, clusters, describe, load, load_problem, save, to_problem
-from flcav.optimization.vehicles import vehicle_shares
+from flcav.optimization.graph import (
+    Layers,
+    build_graph,
+    extract_layers,
+    group_tasks,
+    load_graph,
+    load_problem,
+    save_graph,
+    to_problem,
+)
+from flcav.optimization.vehicles import split_plan
 
 RECIPE = Path(__file__).parents[3] / "recipes" / "graphs" / "three_layers.yaml"
 
@@ -22,7 +31,7 @@ def layers(**changes: Any) -> Layers:
 
 
 def test_each_layer_joins_neighbouring_kinds() -> None:
-    graph = build(layers())
+    graph = build_graph(layers())
     order = {"task": 0, "network": 1, "modality": 2, "vehicle": 3}
     for (one, _), (other, _), layer in graph.edges(data="layer"):
         assert sorted((order[one], order[other])) == [layer - 1, layer]
@@ -32,17 +41,17 @@ def test_each_layer_joins_neighbouring_kinds() -> None:
 
 
 def test_a_graph_comes_back_from_its_file(tmp_path: Path) -> None:
-    graph = build(layers())
-    save(graph, tmp_path / "graph.json")
-    again = load(tmp_path / "graph.json")
+    graph = build_graph(layers())
+    save_graph(graph, tmp_path / "graph.json")
+    again = load_graph(tmp_path / "graph.json")
     assert nx.utils.graphs_equal(again, graph)
-    assert describe(again) == layers()
+    assert extract_layers(again) == layers()
     assert load_problem(tmp_path / "graph.json") == load_problem(RECIPE) == to_problem(graph)
 
 
 def test_a_cluster_shares_one_resource_and_weighs_what_its_tasks_weigh() -> None:
-    graph = build(layers())
-    assert clusters(graph)["classifier"] == {"weather": 0.2, "lights": 0.133}
+    graph = build_graph(layers())
+    assert group_tasks(graph)["classifier"] == {"weather": 0.2, "lights": 0.133}
     problem = to_problem(graph)
     shared = problem.tasks[0]
     assert (shared.name, shared.weight) == ("weather + lights", pytest.approx(0.333))
@@ -59,13 +68,13 @@ def test_tasks_of_a_cluster_may_have_curves_of_their_own() -> None:
         curve = {"model": "additive", "floor": floor, "pretrain": {"a": 2.0, "b": 0.5}, "edge": {"a": 0.1, "x0": 1}}
         changed["tasks"][task]["curve"] = curve
     del changed["networks"]["classifier"]["curve"]
-    graph = build(parse_config(Layers, changed, "test"))
+    graph = build_graph(parse_config(Layers, changed, "test"))
     plan = allocate(to_problem(graph)).tasks[0]
     errors = {member.name: member.predicted_error for member in plan.members}
     assert errors["lights"] - errors["weather"] == pytest.approx(0.08)
     mean = (0.2 * errors["weather"] + 0.133 * errors["lights"]) / 0.333
     assert plan.predicted_error == pytest.approx(mean)
-    assert describe(graph).tasks["lights"].curve is not None
+    assert extract_layers(graph).tasks["lights"].curve is not None
 
 
 def test_groups_are_the_vehicles_that_hold_every_modality_of_the_network() -> None:
@@ -74,7 +83,7 @@ def test_groups_are_the_vehicles_that_hold_every_modality_of_the_network() -> No
     del changed["vehicles"]["car 5"]["holds"]["lidar"]
     changed["vehicles"]["car 1"]["holds"]["camera"] = {"samples": 300, "quality": 0.5}
     (fused,) = (
-        task for task in to_problem(build(parse_config(Layers, changed, "test"))).tasks if task.name == "objects"
+        task for task in to_problem(build_graph(parse_config(Layers, changed, "test"))).tasks if task.name == "objects"
     )
     assert fused.edge_groups == (4, 2)
     assert fused.sample_mb == pytest.approx(0.7 + 1.6)
@@ -86,7 +95,7 @@ def test_groups_are_the_vehicles_that_hold_every_modality_of_the_network() -> No
 def test_the_vehicles_of_a_graph_carry_its_plan() -> None:
     problem = load_problem(RECIPE)
     plan = allocate(problem)
-    shares = vehicle_shares(problem, plan.tasks)
+    shares = split_plan(problem, plan.tasks)
     for task in plan.tasks:
         assert sum(share.samples for share in shares[task.name]) == task.samples
     assert all(share.samples == 0 for share in shares["signs"] if share.vehicle in ("car 3", "car 4"))  # poorer data
@@ -117,16 +126,16 @@ def test_what_does_not_join_is_one_sentence(path: tuple[str, ...], value: Any, s
 
 
 def test_other_graphs_are_refused(tmp_path: Path) -> None:
-    graph = build(layers())
+    graph = build_graph(layers())
     graph.add_edge(("task", "signs"), ("network", "classifier"), layer=1, weight=1.0)
     with pytest.raises(InputError, match="task 'signs' is joined to 2 networks"):
-        describe(graph)
-    graph = build(layers())
+        extract_layers(graph)
+    graph = build_graph(layers())
     del graph.nodes[("network", "classifier")]["model_mb"]
     with pytest.raises(InputError, match="no 'model_mb'"):
-        describe(graph)
+        extract_layers(graph)
     (tmp_path / "graph.json").write_text('{"nodes": [], "links": [{"layer": 1}]}')
     with pytest.raises(InputError, match="node-link"):
-        load(tmp_path / "graph.json")
+        load_graph(tmp_path / "graph.json")
     with pytest.raises(InputError, match="no such file"):
-        load(tmp_path / "none.json")
+        load_graph(tmp_path / "none.json")

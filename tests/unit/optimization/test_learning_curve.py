@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.config import InputError
-from flcav.optimization.curves.bands import bands, upper_curve
+from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
 from flcav.optimization.curves.fitting import fit_additive, fit_effective, fit_power
-from flcav.optimization.curves.history import article_histories, histories, resources_in_order
+from flcav.optimization.curves.history import accumulate_resources, article_histories, parse_histories
 
 PRINTED = {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}  # a and b of the article
 
@@ -55,7 +55,7 @@ def test_bands_hold_the_truth_about_as_often_as_they_say():
     inside = []
     for _ in range(25):
         fit = fit_additive(x, 0 * x, 0 * x, 1 - 0.9 * x**-0.3 + rng.normal(0, 0.01, len(x)))
-        found = bands(fit, level=0.8, repeats=40)
+        found = bootstrap_bands(fit, level=0.8, repeats=40)
         assert found is not None
         low, high = found.between(asked)
         truth = 0.9 * asked[:, 0] ** -0.3
@@ -67,25 +67,25 @@ def test_bands_are_seeded_and_the_upper_curve_is_above_them():
     points = article_histories()["objects"]
     samples, edge_rounds, cloud_rounds = points.resources.T
     fit = fit_additive(samples, edge_rounds, cloud_rounds, points.accuracy)
-    found, again, other = (bands(fit, repeats=60, seed=seed) for seed in (3, 3, 4))
+    found, again, other = (bootstrap_bands(fit, repeats=60, seed=seed) for seed in (3, 3, 4))
     assert found == again != other
     assert found is not None
     _, high = found.between(points.resources)
-    assert np.all(upper_curve(fit, found).error(samples, 0, 0) >= high - 1e-12)
+    assert np.all(fit_upper_curve(fit, found).error(samples, 0, 0) >= high - 1e-12)
     assert np.all(high > fit.curve.error(samples, 0, 0))
 
 
 def test_two_points_have_no_band_and_say_so():
     fit = fit_additive([10, 100], [0, 0], [0, 0], [0.5, 0.7])
-    assert bands(fit) is None
+    assert bootstrap_bands(fit) is None
     assert "nothing is left to check" in fit.warnings[0]
 
 
 def test_what_lies_beyond_the_history_is_said():
     fit = fit_additive([10, 100, 1000], [0, 0, 0], [0, 0, 0], [0.5, 0.7, 0.8])
-    assert fit.beyond(900, 0, 0) is None
-    assert "2000 samples (measured up to 1000)" in str(fit.beyond(2000, 0, 0))
-    assert "3 edge rounds (measured up to 0)" in str(fit.beyond(10, 3, 0))
+    assert fit.explain_extrapolation(900, 0, 0) is None
+    assert "2000 samples (measured up to 1000)" in str(fit.explain_extrapolation(2000, 0, 0))
+    assert "3 edge rounds (measured up to 0)" in str(fit.explain_extrapolation(10, 3, 0))
     assert fit.measured == {"samples": 1000}
 
 
@@ -134,7 +134,7 @@ def test_more_never_predicts_worse():
 
 
 def test_later_stages_stand_on_all_of_the_earlier_ones():
-    rows = resources_in_order(["pretrain", "pretrain", "edge", "cloud"], [10, 20, 3, 2])
+    rows = accumulate_resources(["pretrain", "pretrain", "edge", "cloud"], [10, 20, 3, 2])
     assert rows.tolist() == [[10, 0, 0], [20, 0, 0], [20, 3, 0], [20, 3, 2]]
 
 
@@ -151,25 +151,25 @@ def test_both_forms_of_a_history_say_the_same():
         "accuracy": [0.5, 0.6, 0.7],
     }
     joint = {"samples": [80, 80, 80], "edge_rounds": [0, 6, 6], "cloud_rounds": [0, 0, 2], "accuracy": [0.5, 0.6, 0.7]}
-    one, other = histories(long, "long", "")["a"], histories(joint, "joint", "runs")["runs"]
+    one, other = parse_histories(long, "long", "")["a"], parse_histories(joint, "joint", "runs")["runs"]
     np.testing.assert_array_equal(one.resources, other.resources)
     np.testing.assert_array_equal(one.accuracy, other.accuracy)
 
 
 def test_an_error_is_one_minus_an_accuracy():
     joint = {"samples": [20, 100], "edge_rounds": [0, 0], "cloud_rounds": [0, 0]}
-    told = histories(joint | {"error": [0.5, 0.3]}, "t", "a")["a"]
+    told = parse_histories(joint | {"error": [0.5, 0.3]}, "t", "a")["a"]
     assert told.accuracy == pytest.approx([0.5, 0.7])
     long = {"task": ["a", "a"], "stage": ["pretrain", "pretrain"], "resource": [20, 100]}
-    assert histories(long | {"error": ["0.5", "0.3"]}, "t", "")["a"].accuracy == pytest.approx(told.accuracy)
+    assert parse_histories(long | {"error": ["0.5", "0.3"]}, "t", "")["a"].accuracy == pytest.approx(told.accuracy)
     both = joint | {"error": [0.5, 0.342], "accuracy": [0.5, 0.659]}  # rounded .6585 and .3415
-    assert histories(both, "t", "a")["a"].accuracy.tolist() == [0.5, 0.659]
+    assert parse_histories(both, "t", "a")["a"].accuracy.tolist() == [0.5, 0.659]
     with pytest.raises(InputError, match=r"row 2: accuracy = 0.3 and error = 0.3 do not sum to 1"):
-        histories(joint | {"error": [0.5, 0.3], "accuracy": [0.5, 0.3]}, "t", "a")
+        parse_histories(joint | {"error": [0.5, 0.3], "accuracy": [0.5, 0.3]}, "t", "a")
     with pytest.raises(InputError, match=r"row 1: error = 1.5 must be"):
-        histories(joint | {"error": [1.5, 0.3]}, "t", "a")
+        parse_histories(joint | {"error": [1.5, 0.3]}, "t", "a")
     with pytest.raises(InputError, match=r"'accuracy' is missing.*error may stand for accuracy"):
-        histories(joint, "t", "a")
+        parse_histories(joint, "t", "a")
 
 
 def test_a_curve_too_small_to_compute_with_is_refused_in_a_sentence():
@@ -183,7 +183,7 @@ def test_a_curve_too_small_to_compute_with_is_refused_in_a_sentence():
 @pytest.mark.filterwarnings("error")
 def test_bands_are_infinite_where_the_error_is():
     found = fit_additive([10, 20, 40, 80, 160], [0] * 5, [0] * 5, [0.3, 0.42, 0.5, 0.61, 0.66])
-    band = bands(found, repeats=20)
+    band = bootstrap_bands(found, repeats=20)
     assert band is not None
     low, high = band.between(np.array([[0.0, 0, 0], [100.0, 0, 0]]))
     assert (low[0], high[0]) == (np.inf, np.inf)

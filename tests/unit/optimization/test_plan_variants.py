@@ -9,10 +9,17 @@ from made_problems import parsed, written
 from flcav.config import InputError, parse_config
 from flcav.network.ledger import LINKS, Budget, Ledger, LedgerEntry
 from flcav.network.plan import MessageSizes, price
-from flcav.optimization.allocation.allocate import Infeasible, TaskPlan, allocate, resolved, stage_plan, weighted_error
+from flcav.optimization.allocation.allocate import (
+    Infeasible,
+    TaskPlan,
+    allocate,
+    resolve_problem,
+    stage_plan,
+    weighted_error,
+)
 from flcav.optimization.allocation.area import area
 from flcav.optimization.allocation.baselines import BASELINES, baseline
-from flcav.optimization.allocation.replanning import Progress, going_on, replan
+from flcav.optimization.allocation.replanning import PlanState, condition_problem, replan
 
 LIMITS = {"samples": [20, 900], "edge_rounds": [0, 12], "cloud_rounds": [0, 8]}
 
@@ -94,7 +101,7 @@ def test_weights_from_importance_are_what_is_lost_without_a_task():
     values["performance"] = 0.8
     for number, without in enumerate((0.5, 0.7, 0.9)):
         values["tasks"][number]["performance_without"] = without
-    weights = [task.weight for task in resolved(parsed(values)).tasks]
+    weights = [task.weight for task in resolve_problem(parsed(values)).tasks]
     assert weights == pytest.approx([0.75, 0.25, 0.0])
     plan = allocate(parsed(values))
     least = plan.tasks[2]
@@ -150,7 +157,7 @@ def test_replanning_keeps_within_the_budgets_whatever_is_observed():
                 | {"accuracy": 1 - min(1.0, float(task.curve.error(*done[task.name])) * rng.uniform(0.5, 1.5))}
                 for task in problem.tasks
             }
-            plan = replan(problem, parse_config(Progress, {"tasks": observed}, "progress"))
+            plan = replan(problem, parse_config(PlanState, {"tasks": observed}, "progress"))
     for planned in plan.tasks:
         assert [getattr(planned, field) for field in stages] == done[planned.name]
     assert ledger.used_mb("wireless") <= problem.budgets_mb.wireless
@@ -159,13 +166,13 @@ def test_replanning_keeps_within_the_budgets_whatever_is_observed():
 
 def test_curves_pass_through_what_was_observed_and_stages_that_are_over_stay():
     problem = parsed(written(1, 2, "shared", LIMITS))
-    progress = Progress.model_validate(
+    progress = PlanState.model_validate(
         {
             "tasks": {"t0": {"samples": 300, "edge_rounds": 2, "accuracy": 0.6}},
             "used_mb": {"wireless": 900, "wireline": 500},
         }
     )
-    left = going_on(problem, progress)
+    left = condition_problem(problem, progress)
     assert float(left.tasks[0].curve.error(300, 2, 0)) == pytest.approx(0.4)
     assert left.tasks[1] == problem.tasks[1]
     assert left.tasks[0].limits.samples == (300, 300)
@@ -184,9 +191,9 @@ def test_progress_that_cannot_be_is_refused():
         ({"tasks": {"t0": {"samples": 30}}, "used_mb": {"wireless": 1e9, "wireline": 0}}, "progress.used_mb.wireless"),
     ):
         with pytest.raises(InputError, match=said):
-            going_on(problem, Progress.model_validate(values))
+            condition_problem(problem, PlanState.model_validate(values))
     with pytest.raises(Infeasible, match="wireless"):
-        replan(problem, Progress.model_validate({"tasks": {"t0": {"samples": 10**6}}}))
+        replan(problem, PlanState.model_validate({"tasks": {"t0": {"samples": 10**6}}}))
 
 
 def test_the_weighted_error_of_a_cluster_is_the_mean_of_its_members_by_weight():

@@ -10,7 +10,12 @@ import yaml
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.optimization.allocation.allocate import allocate
-from flcav.optimization.allocation.problem_file import Learned, learned, new_problem, with_curves
+from flcav.optimization.allocation.problem_file import (
+    FittedFields,
+    collect_fitted_fields,
+    format_problem,
+    insert_curves,
+)
 from flcav.optimization.curves.curves import Additive, Decay, Effective
 from flcav.optimization.curves.fitting import fit_additive
 from flcav.optimization.graph import load_problem
@@ -19,7 +24,7 @@ RECIPES = Path(__file__).parents[3] / "recipes"
 CURVE = Additive(floor=0.01, pretrain=Decay(a=0.7123456789, b=0.25), edge=Decay(a=2e-5, b=0.5, x0=1))
 UPPER = CURVE.model_copy(update={"floor": 0.02})
 LIMITS = {"samples": [50, 800], "edge_rounds": [0, 8], "cloud_rounds": [0, 0]}
-OWN = Learned(CURVE, UPPER, LIMITS, {"samples": 800.0, "edge_rounds": 8.0})
+OWN = FittedFields(CURVE, UPPER, LIMITS, {"samples": 800.0, "edge_rounds": 8.0})
 EFFECTIVE = Effective(model="effective", a=1.5, b=0.4, alpha=0.1, beta=0.3, group_samples=700)
 WRITTEN = {
     "limits": LIMITS,
@@ -53,19 +58,19 @@ horizon_s: 900
 
 
 def test_what_the_user_wrote_stays_and_the_curves_get_there() -> None:
-    text = with_curves(BLOCK, {"objects": OWN, "signs": OWN}, 1, "p.yaml")
+    text = insert_curves(BLOCK, {"objects": OWN, "signs": OWN}, 1, "p.yaml")
     for comment in ("# mine", "# both", "# of a sweep", "# between", "# vehicles", "# after"):
         assert comment in text
     before, after = yaml.safe_load(BLOCK), yaml.safe_load(text)
     assert after == before | {"tasks": [task | WRITTEN for task in before["tasks"]]}
-    assert with_curves(text, {"objects": OWN, "signs": OWN}, 1, "p.yaml") == text
+    assert insert_curves(text, {"objects": OWN, "signs": OWN}, 1, "p.yaml") == text
 
 
 def test_limits_stand_and_a_band_of_older_points_does_not() -> None:
     given = (
         "budgets_mb: {wireless: 1, wireline: 1}\ntasks:\n- name: a\n  limits: {samples: [1, 2]}\n  upper: {floor: 1}"
     )
-    text = with_curves(given, {"a": Learned(CURVE, None, LIMITS, {})}, 1, "p.yaml")
+    text = insert_curves(given, {"a": FittedFields(CURVE, None, LIMITS, {})}, 1, "p.yaml")
     (task,) = yaml.safe_load(text)["tasks"]
     assert task["limits"] == {"samples": [1, 2]}
     assert task["upper"] is None
@@ -78,7 +83,7 @@ def test_limits_stand_and_a_band_of_older_points_does_not() -> None:
 def test_every_problem_of_the_recipes_takes_curves(recipe: Path, tmp_path: Path) -> None:
     if "tasks" not in yaml.safe_load(recipe.read_text()):
         pytest.skip("no allocation problem")
-    text = with_curves(recipe.read_text(), {"objects": OWN}, 1, "p.yaml")
+    text = insert_curves(recipe.read_text(), {"objects": OWN}, 1, "p.yaml")
     (tmp_path / "problem.yaml").write_text(text)
     found = {task.name: task.curve for task in load_problem(tmp_path / "problem.yaml").tasks}["objects"]
     assert isinstance(found, Additive)
@@ -103,20 +108,20 @@ def test_every_problem_of_the_recipes_takes_curves(recipe: Path, tmp_path: Path)
 )
 def test_what_cannot_take_curves_is_refused_in_a_sentence(text: str, named: str) -> None:
     with pytest.raises(InputError, match=named):
-        with_curves(text, {"objects": OWN}, 1, "p.yaml")
+        insert_curves(text, {"objects": OWN}, 1, "p.yaml")
 
 
 def test_effective_samples_are_of_one_number_of_edge_rounds_per_cloud_round() -> None:
-    own = Learned(EFFECTIVE, None, LIMITS, {})
+    own = FittedFields(EFFECTIVE, None, LIMITS, {})
     text = "edge_rounds_per_cloud_round: 2\ntasks: [{name: a}]\n"
-    assert yaml.safe_load(with_curves(text, {"a": own}, 2, "p.yaml"))["tasks"][0]["curve"]["beta"] == 0.3
+    assert yaml.safe_load(insert_curves(text, {"a": own}, 2, "p.yaml"))["tasks"][0]["curve"]["beta"] == 0.3
     with pytest.raises(InputError, match="edge_rounds_per_cloud_round = 2, and the curves are fitted with 1"):
-        with_curves(text, {"a": own}, 1, "p.yaml")
+        insert_curves(text, {"a": own}, 1, "p.yaml")
 
 
 def test_a_new_problem_says_what_is_missing_and_is_one_once_it_is_there(tmp_path: Path) -> None:
     path = tmp_path / "problem.yaml"
-    path.write_text(new_problem({"a: #1": OWN, "b": OWN}, 1, "history.csv"))
+    path.write_text(format_problem({"a: #1": OWN, "b": OWN}, 1, "history.csv"))
     with pytest.raises(InputError, match=r"'budgets_mb.wireless' is empty \(and 7 more\)"):
         load_problem(path)
     filled = path.read_text().replace("wireless: , wireline: ", "wireless: 4000, wireline: 4000")
@@ -133,7 +138,7 @@ def test_limits_are_what_the_history_covers() -> None:
     x = np.array([20.0, 100, 500, 500.5, 2000.9])
     zero = np.zeros_like(x)
     fit = fit_additive(x, zero + 3, zero, 1 - 0.9 * x**-0.3)
-    found = learned(fit, np.column_stack((x, zero + 3, zero)), None)
+    found = collect_fitted_fields(fit, np.column_stack((x, zero + 3, zero)), None)
     assert found.limits == {"samples": [20, 2000], "edge_rounds": [3, 3], "cloud_rounds": [0, 0]}
     assert found.measured == {"samples": 2000.9}
 

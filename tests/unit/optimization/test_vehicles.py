@@ -7,8 +7,8 @@ import pytest
 
 from flcav.config import parse_config
 from flcav.optimization.allocation.allocate import Infeasible, TaskPlan
-from flcav.optimization.allocation.problem import Problem, Task
-from flcav.optimization.vehicles import VehicleShare, vehicle_shares
+from flcav.optimization.allocation.problem import AllocationTask, Problem
+from flcav.optimization.vehicles import VehicleShare, split_plan
 
 
 def problem(tasks: list[dict[str, Any]], horizon_s: float | None = None, k: int = 1) -> Problem:
@@ -66,7 +66,7 @@ def values(asked: Problem, shares: dict[str, tuple[VehicleShare, ...]]) -> tuple
 def every_split(asked: Problem, plans: list[TaskPlan]) -> Iterator[tuple[float, float, float]]:
     """Yield the aims of every split that is allowed, by trying all numbers."""
 
-    def own(task: Task, each: TaskPlan) -> list[list[tuple[int, int]]]:
+    def own(task: AllocationTask, each: TaskPlan) -> list[list[tuple[int, int]]]:
         names = list(task.uplink_mbps or {})
         rounds = each.edge_rounds + asked.edge_rounds_per_cloud_round * each.cloud_rounds
         groups = np.repeat(np.arange(len(task.edge_groups)), task.edge_groups)
@@ -116,16 +116,16 @@ def test_no_split_is_better(seed: int) -> None:
     best = max(every_split(asked, plans), default=None)
     if best is None:
         with pytest.raises(Infeasible, match="horizon_s"):
-            vehicle_shares(asked, plans)
+            split_plan(asked, plans)
         return
-    joined, worth, end = values(asked, vehicle_shares(asked, plans))
+    joined, worth, end = values(asked, split_plan(asked, plans))
     assert (joined, worth) == pytest.approx(best[:2], rel=1e-6)
     assert end == pytest.approx(best[2], rel=2e-4)
 
 
 def test_without_a_horizon_all_join_and_throughput_alone_decides_who_uploads() -> None:
     asked = problem([{"uplink_mbps": links(10, 20, 40)}])
-    shares = vehicle_shares(asked, [plan(70, 2, 1)])["objects"]
+    shares = split_plan(asked, [plan(70, 2, 1)])["objects"]
     assert [share.rounds for share in shares] == [(1, 2, 3)] * 3
     assert sum(share.samples for share in shares) == 70
     busy = busy_s(asked, {"objects": shares}, with_rounds=False).values()
@@ -135,13 +135,13 @@ def test_without_a_horizon_all_join_and_throughput_alone_decides_who_uploads() -
 def test_quality_beats_throughput_up_to_what_is_held() -> None:
     quality = {"cav0": 0.5, "cav1": 0.9, "cav2": 0.5}
     task = {"uplink_mbps": links(50, 5, 50), "samples_held": {"cav1": 8}, "data_quality": quality}
-    shares = vehicle_shares(problem([task]), [plan(20)])["objects"]
+    shares = split_plan(problem([task]), [plan(20)])["objects"]
     assert shares[1].samples == 8
 
 
 def test_a_straggler_leaves_out_rounds_and_every_round_is_still_joined() -> None:
     asked = problem([{"edge_groups": [3], "uplink_mbps": links(20, 2, 2)}], horizon_s=100.0, k=2)
-    shares = vehicle_shares(asked, [plan(1, 4, 3)])["objects"]
+    shares = split_plan(asked, [plan(1, 4, 3)])["objects"]
     assert len(shares[0].rounds) == 10
     assert [len(share.rounds) for share in shares[1:]] == [5, 5]  # 200 Mbit each: 5 models of 40 Mbit
     assert {number for share in shares[1:] for number in share.rounds} == set(range(1, 11))
@@ -150,27 +150,27 @@ def test_a_straggler_leaves_out_rounds_and_every_round_is_still_joined() -> None
 
 def test_full_participation_costs_what_the_plan_costs() -> None:
     asked = problem([{"uplink_mbps": links(10, 20, 40)}])
-    shares = vehicle_shares(asked, [plan(30, 2, 3)])["objects"]
+    shares = split_plan(asked, [plan(30, 2, 3)])["objects"]
     assert sum(share.wireless_mb for share in shares) == pytest.approx(30 * 2.0 + 5 * 3 * 5.0)
 
 
 def test_wireline_limits_what_is_passed_on() -> None:
     task = {"edge_groups": [2], "uplink_mbps": {"a": {"wireless": 100, "wireline": 1.6}, "b": {"wireless": 2}}}
-    shares = vehicle_shares(problem([task], horizon_s=100.0), [plan(20)])["objects"]
+    shares = split_plan(problem([task], horizon_s=100.0), [plan(20)])["objects"]
     assert shares[0].samples <= 10  # 160 Mbit of 16 Mbit each
 
 
 def test_infeasible_is_one_sentence() -> None:
     held = {"uplink_mbps": links(10, 10, 10), "samples_held": {"cav0": 3, "cav1": 4, "cav2": 5}}
     with pytest.raises(Infeasible, match=r"'objects': its vehicles hold 12 samples .* the plan uploads 13"):
-        vehicle_shares(problem([held]), [plan(13)])
+        split_plan(problem([held]), [plan(13)])
     slow = problem([{"edge_groups": [1], "uplink_mbps": links(8)}], horizon_s=20)
     with pytest.raises(Infeasible, match=r"need 30 s .* 10 s more than horizon_s = 20"):
-        vehicle_shares(slow, [plan(10, 2)])
+        split_plan(slow, [plan(10, 2)])
 
 
 def test_tasks_without_links_have_no_shares() -> None:
-    assert vehicle_shares(problem([{}]), [plan(5)]) == {}
+    assert split_plan(problem([{}]), [plan(5)]) == {}
 
 
 @pytest.mark.parametrize(

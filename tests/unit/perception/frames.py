@@ -16,7 +16,7 @@ def frame(objects, *, points=None, scene="s0", index=0, agent="cav0", at=(0.0, 0
     boxes = Boxes.from_array(np.array(rows).reshape(-1, 7), [kind for _, kind, *_ in objects])
     annotations = Annotations(
         track=np.array([track for track, *_ in objects], dtype=np.str_),
-        boxes=boxes.transformed(world_from_agent),
+        boxes=boxes.transform(world_from_agent),
         velocity=np.zeros((len(objects), 3)),
         acceleration=np.zeros((len(objects), 3)),
         returns=np.array([returns for *_, returns in objects], dtype=np.int64),

@@ -15,7 +15,7 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames
 from flcav.perception.objects import evaluate as evaluation
-from flcav.perception.objects.area import narrowed
+from flcav.perception.objects.area import narrow_range
 from flcav.perception.objects.model import second_small, second_tiny, small_config, tiny_config
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.weights import save_network
@@ -189,7 +189,7 @@ def test_networks_of_different_ranges_are_asked_for_the_same_objects(street):
     tiny, small = second_tiny(), second_small(classes=("Car",))
     own, same = [], []
     for network in (tiny, small):
-        asked = narrowed(network.config, "48,24")
+        asked = narrow_range(network.config, "48,24")
         own.append(OBJECTS.evaluate(network, street).scores[0].targets)
         same.append(OBJECTS.evaluate(network, street, asked=asked).scores[0].targets)
     assert own == [6, 18]
@@ -202,7 +202,7 @@ def test_beyond_the_range_nothing_is_wrong(street, monkeypatch):
     network = second_small(classes=("Car",))
     ap = [
         OBJECTS.evaluate(network, street, street.select(agents=["cav0"]), asked=asked).scores[0].ap
-        for asked in (narrowed(network.config, "40,24"), narrowed(network.config, "51,28"))
+        for asked in (narrow_range(network.config, "40,24"), narrow_range(network.config, "51,28"))
     ]
     assert ap[0] == 1
     assert ap[1] is not None
@@ -212,13 +212,13 @@ def test_beyond_the_range_nothing_is_wrong(street, monkeypatch):
 @pytest.mark.parametrize("text", ["48", "48,24,1", "48;24", "nan,24", "48,inf", "0,24", "-48,24", "48,-24", ""])
 def test_a_range_that_is_none_is_refused(text):
     with pytest.raises(InputError, match="metres ahead and metres to either side are wanted, as in 48,24"):
-        narrowed(small_config(), text)
+        narrow_range(small_config(), text)
 
 
 @pytest.mark.parametrize("text", ["52,24", "48,29"])
 def test_a_range_beyond_the_network_s_is_refused(text):
     with pytest.raises(InputError, match=r"sees no further than 0 to 51\.2 m ahead and 28\.8 m to either side"):
-        narrowed(small_config(), text)
+        narrow_range(small_config(), text)
 
 
 def test_only_objects_lie_in_a_range(street, capsys):

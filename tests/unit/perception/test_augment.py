@@ -9,10 +9,19 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
 from flcav.geometry import Boxes, points_in_boxes
-from flcav.perception.objects.augment import augment, cut, free, in_view, pasted, resized, sheared, thinned
+from flcav.perception.objects.augment import (
+    augment,
+    cut_out_objects,
+    in_view,
+    keep_returns,
+    paste_objects,
+    resize_objects,
+    select_free,
+    tilt_sample,
+)
 from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.model import small_config
-from flcav.perception.objects.samples import Sample, near_range
+from flcav.perception.objects.samples import Sample, crop_to_range
 from flcav.perception.objects.truth import MIN_RETURNS
 
 
@@ -58,7 +67,7 @@ def test_every_object_that_is_to_be_found_keeps_returns_in_its_box(seed):
 def test_resized_objects_keep_their_returns_and_their_foot(seed):
     before = scene(seed)
     factor = np.random.default_rng(seed).uniform(0.8, 1.1, (len(before.boxes), 3))
-    after = resized(before, factor)
+    after = resize_objects(before, factor)
     np.testing.assert_allclose(after.boxes.size, before.boxes.size * factor)
     foot, same = (b.center[:, 2] - b.size[:, 2] / 2 for b in (before.boxes, after.boxes))
     np.testing.assert_allclose(foot, same)
@@ -69,14 +78,14 @@ def test_resized_objects_keep_their_returns_and_their_foot(seed):
 
 def test_resizing_by_one_changes_nothing():
     before = scene(3)
-    after = resized(before, np.ones((len(before.boxes), 3)))
+    after = resize_objects(before, np.ones((len(before.boxes), 3)))
     np.testing.assert_allclose(after.points, before.points, atol=1e-5)
     np.testing.assert_allclose(after.boxes.array(), before.boxes.array(), atol=1e-12)
 
 
 def test_a_tilt_raises_what_lies_up_the_slope():
     before = scene(4)
-    after = sheared(before, np.array((0.02, 0.0)), 0.1)
+    after = tilt_sample(before, np.array((0.02, 0.0)), 0.1)
     np.testing.assert_allclose(
         after.boxes.center[:, 2] - before.boxes.center[:, 2], 0.1 + 0.02 * before.boxes.center[:, 0]
     )
@@ -88,7 +97,7 @@ def test_thinning_leaves_out_objects_without_returns_and_ignores_those_with_few(
     kept = np.ones(len(sample.points), dtype=bool)
     kept[:20] = False  # all of the first
     kept[20:37] = False  # all but three of the second
-    thin = thinned(sample, kept)
+    thin = keep_returns(sample, kept)
     np.testing.assert_array_equal(thin.boxes.array(), sample.boxes[2:].array())
     np.testing.assert_array_equal(thin.ignore.array(), sample.boxes[1:2].array())
 
@@ -105,7 +114,9 @@ def footprint(box: Boxes) -> Polygon:
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_pasted_objects_meet_no_other_from_above(seed):
-    both = pasted(scene(seed), cut([scene(seed + 1), scene(seed + 2)], CONFIG), 17, np.random.default_rng(seed))
+    both = paste_objects(
+        scene(seed), cut_out_objects([scene(seed + 1), scene(seed + 2)], CONFIG), 17, np.random.default_rng(seed)
+    )
     shapes = [footprint(both.boxes[i : i + 1]) for i in range(len(both.boxes))]
     new = range(12, len(shapes))
     assert len(new) <= 5
@@ -117,7 +128,7 @@ def test_pasted_objects_meet_no_other_from_above(seed):
 def test_pasted_objects_bring_their_returns_and_push_the_scenes_out():
     donor = scene(7, objects=1)
     clutter = np.column_stack((donor.points[:5, :3], np.full(5, 9.0))).astype(np.float32)
-    both = pasted(Sample(clutter, Boxes.empty()), cut([donor], CONFIG), 1, np.random.default_rng(0))
+    both = paste_objects(Sample(clutter, Boxes.empty()), cut_out_objects([donor], CONFIG), 1, np.random.default_rng(0))
     assert len(both.boxes) == 1
     assert not (both.points[:, 3] == 9).any()
     np.testing.assert_array_equal(np.sort(both.points[:, 0]), np.sort(donor.points[:20, 0]))
@@ -125,18 +136,18 @@ def test_pasted_objects_bring_their_returns_and_push_the_scenes_out():
 
 def test_nothing_is_pasted_where_there_is_no_room():
     sample = scene(8)
-    assert not len(free(sample.boxes, sample.boxes))
-    nothing = cut([Sample(sample.points, Boxes.empty())], CONFIG)
-    assert len(pasted(sample, nothing, 50, np.random.default_rng(0)).boxes) == 12
+    assert not len(select_free(sample.boxes, sample.boxes))
+    nothing = cut_out_objects([Sample(sample.points, Boxes.empty())], CONFIG)
+    assert len(paste_objects(sample, nothing, 50, np.random.default_rng(0)).boxes) == 12
 
 
 def test_a_sample_is_filled_up_with_objects_of_known_pose():
     donor = replace(scene(7), exact=np.arange(12) < 4)
     empty = Sample(scene(8).points[-200:], Boxes.empty())
-    known = cut([donor], CONFIG)
+    known = cut_out_objects([donor], CONFIG)
     assert len(known.boxes) == 4
-    assert len(pasted(empty, known, 3, np.random.default_rng(0)).boxes) == 3
-    assert len(pasted(scene(8), known, 12, np.random.default_rng(0)).boxes) == 12  # full already
+    assert len(paste_objects(empty, known, 3, np.random.default_rng(0)).boxes) == 3
+    assert len(paste_objects(scene(8), known, 12, np.random.default_rng(0)).boxes) == 12  # full already
 
 
 def test_the_same_stream_changes_a_sample_the_same_way():
@@ -157,4 +168,4 @@ def test_no_point_is_left_out_that_augmentation_brings_into_the_range(seed):
     moved = augment(Sample(points, Boxes.empty()), how, rng).points
     low, high = np.array(config.range_m[:3]), np.array(config.range_m[3:])
     within = ((moved[:, :3] >= low) & (moved[:, :3] < high)).all(1)
-    assert set(moved[within, 3]) <= set(near_range(points, config)[:, 3])
+    assert set(moved[within, 3]) <= set(crop_to_range(points, config)[:, 3])

@@ -10,16 +10,16 @@ from PIL import Image
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration
-from flcav.dataset.formats.kitti.write import calibration_lines
+from flcav.dataset.formats.kitti.write import format_calibration
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.images import CameraView, kitti_view, recorded_view, view_beside
 from flcav.perception.marks import CloudBoxes
-from flcav.perception.objects.infer import ObjectsFound, box_rows, boxes_of_rows
+from flcav.perception.objects.infer import ObjectsFound, boxes_to_rows, rows_to_boxes
 from flcav.perception.task import Finding
 from flcav.report import style
 from flcav.report.pictures.camera import ALONG
 from flcav.report.pictures.inference import draw
-from flcav.sensors.calibration import CalibrationError, assume
+from flcav.sensors.calibration import CalibrationError, perturb_calibration
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
@@ -61,7 +61,7 @@ def test_points_fall_where_the_renderer_has_their_depth(seen, recorded, tmp_path
 
 def test_it_is_drawn_as_the_agent_believes_its_sensors_to_be(seen, recorded, tmp_path):
     frame = seen({"front": LOW})
-    believed = assume(frame.calibration, CalibrationError(rotation_deg=1.0), seed=1, agent="cav0")
+    believed = perturb_calibration(frame.calibration, CalibrationError(rotation_deg=1.0), seed=1, agent="cav0")
     view = recorded_view(recorded(replace(frame, assumed=believed), tmp_path), 0, "top")
     assert view is not None
     from_top = np.linalg.inv(believed.agent_from_sensor["front"]) @ believed.agent_from_sensor["top"]
@@ -102,7 +102,7 @@ def folder(tmp_path) -> Path:
     for name in ("velodyne", "image_2", "calib"):
         (tmp_path / name).mkdir()
     Image.fromarray(np.full((60, 200, 3), 90, np.uint8)).save(tmp_path / "image_2" / "000003.png")
-    lines = calibration_lines(np.array([[100.0, 0, 99.5], [0, 100, 29.5], [0, 0, 1]]), OPTICAL, np.eye(4))
+    lines = format_calibration(np.array([[100.0, 0, 99.5], [0, 100, 29.5], [0, 0, 1]]), OPTICAL, np.eye(4))
     (tmp_path / "calib" / "000003.txt").write_text("\n".join(lines))
     np.ones((9, 4), "<f4").tofile(tmp_path / "velodyne" / "000003.bin")
     return tmp_path
@@ -128,7 +128,11 @@ def finding(*places, view: CameraView | None) -> Finding:
     boxes = Boxes.from_array(rows, "Car", np.full(len(rows), 0.9))
     points = np.pad(np.random.default_rng(0).uniform((1, -9, -2), (40, 9, 1), (500, 3)), ((0, 0), (0, 1)))
     return Finding(
-        Path("000003.bin"), points.astype(np.float32), ObjectsFound(box_rows(boxes)), (CloudBoxes(boxes),), lambda: view
+        Path("000003.bin"),
+        points.astype(np.float32),
+        ObjectsFound(boxes_to_rows(boxes)),
+        (CloudBoxes(boxes),),
+        lambda: view,
     )
 
 
@@ -164,8 +168,8 @@ def test_far_boxes_are_within_the_picture_from_above():
 
 def test_rows_of_boxes_come_back():
     boxes = Boxes.from_array([[1, 2, 3, 4, 5, 6, 0.7]], "Cyclist", [0.4])
-    again = boxes_of_rows(box_rows(boxes))
+    again = rows_to_boxes(boxes_to_rows(boxes))
     np.testing.assert_allclose(again.array(), boxes.array())
     assert again.label.tolist() == ["Cyclist"]
     np.testing.assert_array_equal(again.score, [0.4])
-    assert len(boxes_of_rows([])) == 0
+    assert len(rows_to_boxes([])) == 0

@@ -10,13 +10,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.perception.device import CPU, device_named
+from flcav.perception.device import CPU, select_device
 from flcav.perception.objects import Sample
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import Second, second, tiny_config
 from flcav.perception.ops import norm
 from flcav.perception.ops import rulebook as rules
-from flcav.perception.ops.rulebook import keys_of, strided_rules, submanifold_rules
+from flcav.perception.ops.rulebook import build_strided_rulebook, build_submanifold_rulebook, encode_cells
 from flcav.perception.ops.sparse import sparse_convolution
 
 SHAPE, SAMPLES = (9, 14, 11), 2
@@ -28,7 +28,7 @@ without_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is the
 @pytest.fixture
 def keys():
     occupied = torch.rand(SAMPLES, *SHAPE, generator=torch.Generator().manual_seed(7)) < 0.2
-    return keys_of(occupied.nonzero(), SHAPE)
+    return encode_cells(occupied.nonzero(), SHAPE)
 
 
 def network(device: torch.device, bfloat16: bool = False) -> Second:
@@ -65,10 +65,10 @@ class SizesAsked(TorchDispatchMode):
 
 
 def test_a_device_has_a_name():
-    assert device_named("cpu") == CPU
-    assert device_named("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+    assert select_device("cpu") == CPU
+    assert select_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
     with pytest.raises(InputError, match="device 'gpu': choose one of auto, cpu, cuda"):
-        device_named("gpu")
+        select_device("gpu")
 
 
 @without_gpu
@@ -87,14 +87,14 @@ def test_the_tensor_rules_ask_for_all_sizes_at_once(keys, monkeypatch):
     with SizesAsked() as asked:
         keys.nonzero()
         assert asked.found == ["aten.nonzero.default"]
-        rules._submanifold_rules(keys, SHAPE[1] + 2, SHAPE[2] + 2)
-        rules._strided_rules(keys, SHAPE, *STRIDED, (5, 7, 6), SAMPLES)
+        rules._build_submanifold_rulebook(keys, SHAPE[1] + 2, SHAPE[2] + 2)
+        rules._build_strided_rulebook(keys, SHAPE, *STRIDED, (5, 7, 6), SAMPLES)
     assert asked.found == ["aten.nonzero.default"]
     assert len(waits) == 2
 
 
 def test_the_grouped_product_follows_autocast(keys):
-    made = rules._submanifold_rules(keys, SHAPE[1] + 2, SHAPE[2] + 2)
+    made = rules._build_submanifold_rulebook(keys, SHAPE[1] + 2, SHAPE[2] + 2)
     features = torch.randn(len(keys), 8, requires_grad=True)
     weight = torch.randn(27, 8, 6, requires_grad=True)
     full = sparse_convolution(features, weight, made)
@@ -120,11 +120,14 @@ def test_the_network_is_the_same_from_tensor_operations(sample, bfloat16, monkey
 
 @with_gpu
 def test_rules_are_those_of_the_cpu_after_one_wait(keys):
-    expected = [submanifold_rules(keys, SHAPE), *strided_rules(keys, SHAPE, *STRIDED, SAMPLES)[:1]]
+    expected = [build_submanifold_rulebook(keys, SHAPE), *build_strided_rulebook(keys, SHAPE, *STRIDED, SAMPLES)[:1]]
     there = keys.cuda()
     for one, make in zip(
         expected,
-        (lambda: submanifold_rules(there, SHAPE), lambda: strided_rules(there, SHAPE, *STRIDED, SAMPLES)[0]),
+        (
+            lambda: build_submanifold_rulebook(there, SHAPE),
+            lambda: build_strided_rulebook(there, SHAPE, *STRIDED, SAMPLES)[0],
+        ),
         strict=True,
     ):
         torch.cuda.synchronize()

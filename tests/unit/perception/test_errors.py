@@ -16,14 +16,14 @@ from flcav.perception.signs import errors as sign_errors
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
 from flcav.perception.signs.detect import Detections
 from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.samples import sample_of
+from flcav.perception.signs.samples import sample_from_frame
 from flcav.perception.trajectory import errors as path_errors
 from flcav.perception.trajectory.config import CONFIGURATIONS as PATHS
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.samples import samples_of
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.world.static import town_things
+from flcav.world.static import list_signs_and_signals
 
 CAMERA = {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 480, "height": 288, "fov_deg": 90.0}}
 
@@ -46,7 +46,7 @@ def seen(data: Dataset, config: SignsConfig) -> list[Detections]:
     out = []
     for number in range(len(data)):
         frame = data.frame(number)
-        sample = sample_of(frame, "front", data.plane(number, "front", "rgb"), config)
+        sample = sample_from_frame(frame, "front", data.plane(number, "front", "rgb"), config)
         out.append(Detections(sample.boxes, sample.label, np.ones(len(sample.label))))
     return out
 
@@ -68,7 +68,7 @@ def test_signs_that_were_missed_stand_where_they_stand_in_town_and_count_once(dr
     result = registered(drive, network, [nothing] * len(drive), monkeypatch)
     town = drive.town()
     assert town is not None
-    things = town_things(town)
+    things = list_signs_and_signals(town)
     places = {tuple(np.round(place, 6)) for place in things.position}
     assert {error.kind for error in result.errors} == {MISS}
     assert all(tuple(np.round((error.x, error.y, error.z), 6)) in places for error in result.errors)

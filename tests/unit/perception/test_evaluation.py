@@ -11,7 +11,7 @@ from flcav.perception.errors import load_errors, save_errors
 from flcav.perception.objects import sample_from_frame, second_paper, second_tiny
 from flcav.perception.objects.errors import register_errors
 from flcav.perception.objects.evaluate import Score, asked_of, score_detections
-from flcav.perception.objects.samples import checked_points
+from flcav.perception.objects.samples import validate_points
 from flcav.perception.objects.truth import ground_truth
 
 from .frames import cloud_in, detections, frame
@@ -125,7 +125,7 @@ def test_the_registry_is_a_parquet_table(tmp_path):
 )
 def test_bad_clouds_are_refused(points, sentence):
     with pytest.raises(InputError, match=sentence):
-        checked_points(points, "cloud")
+        validate_points(points, "cloud")
 
 
 def test_one_rule_says_which_objects_count():

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.perception.images import checked_picture, pictures, read_picture, recoloured, resized
+from flcav.perception.images import check_picture, read_picture, read_pictures, recoloured, resize_picture
 
 RANDOM = np.random.default_rng(0)
 RGB = RANDOM.integers(0, 256, (40, 60, 3), dtype=np.uint8)
@@ -23,10 +23,10 @@ def test_files_and_folders(tmp_path):
         saved(tmp_path / name, RGB, lossless=True)
     saved(tmp_path / "c.JPG", RGB, format="jpeg", quality=95)
     (tmp_path / "notes.txt").write_text("no picture")
-    seen = list(pictures(tmp_path))
+    seen = list(read_pictures(tmp_path))
     assert [path.name for path, _ in seen] == ["a.webp", "b.png", "c.JPG"]
     assert all(np.array_equal(picture, RGB) for _, picture in seen[:2])
-    ((path, picture),) = pictures(tmp_path / "b.png")
+    ((path, picture),) = read_pictures(tmp_path / "b.png")
     assert path == tmp_path / "b.png"
     assert np.array_equal(picture, RGB)
 
@@ -54,17 +54,17 @@ def test_what_is_no_picture(tmp_path):
         with pytest.raises(InputError, match=f"{name}: not a picture, or a damaged one"):
             read_picture(tmp_path / name)
     with pytest.raises(InputError, match="no such file"):
-        list(pictures(tmp_path / "none.png"))
+        list(read_pictures(tmp_path / "none.png"))
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="neither a dataset nor a folder"):
-        list(pictures(tmp_path / "empty"))
+        list(read_pictures(tmp_path / "empty"))
     with pytest.raises(InputError, match="shape"):
-        checked_picture(RGB[..., 0], "here")
+        check_picture(RGB[..., 0], "here")
 
 
 def test_shrinking_averages():
     board = np.indices((64, 64)).sum(0) % 2 * np.uint8(255)
-    small = resized(np.dstack([board.astype(np.uint8)] * 3), 32, 32)
+    small = resize_picture(np.dstack([board.astype(np.uint8)] * 3), 32, 32)
     assert np.abs(small.astype(int) - 127).max() <= 8
 
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from flcav.perception.ops.rectangles import complete_iou
-from flcav.perception.signs.augment import GREY, cut, draw, joined, window
+from flcav.perception.signs.augment import GREY, crop_sample, draw, draw_window, join_mosaic
 from flcav.perception.signs.config import CONFIGURATIONS, STRIDES, SignsConfig
 from flcav.perception.signs.detect import Detections, detect
-from flcav.perception.signs.evaluate import ClassPrecision, Truth, mean_average_precision
-from flcav.perception.signs.loss import BOX, CLASS, LEVELS, MOST_TIMES, OBJECT, assign, detection_loss
-from flcav.perception.signs.model import SignDetector, boxes_of, decode
+from flcav.perception.signs.evaluate import ClassPrecision, GroundTruth, mean_average_precision
+from flcav.perception.signs.loss import BOX, CLASS, LEVELS, MOST_TIMES, OBJECT, assign_anchors, detection_loss
+from flcav.perception.signs.model import SignDetector, decode, decode_boxes
 from flcav.perception.signs.samples import Sample
 from flcav.perception.signs.task import SIGNS, SignsTask
 from flcav.perception.task import fresh
@@ -96,13 +96,13 @@ def found_places(one):
 
 def test_targets_are_those_of_the_definition():
     samples = [painted(seed) for seed in range(4)]
-    for level, one in enumerate(assign(samples, TINY)):
+    for level, one in enumerate(assign_anchors(samples, TINY)):
         assert sorted(found_places(one)) == sorted(expected_places(samples, TINY, level))
-    assert sum(len(one.image) for one in assign(samples, TINY)) > 20
+    assert sum(len(one.image) for one in assign_anchors(samples, TINY)) > 20
 
 
 def test_every_target_can_be_reached_by_its_anchor():
-    for level, one in enumerate(assign([painted(seed) for seed in range(4)], TINY)):
+    for level, one in enumerate(assign_anchors([painted(seed) for seed in range(4)], TINY)):
         cell = torch.stack((one.column, one.row), 1)
         center = (one.box[:, :2] + one.box[:, 2:]) / 2 / STRIDES[level] - cell
         assert bool(((center >= -0.5) & (center <= 1.5)).all())
@@ -112,7 +112,7 @@ def test_the_loss_is_the_sum_of_its_parts():
     samples = [painted(0), replace(painted(1), ignore=np.array([[0.0, 0, 30, 30]]))]
     generator = torch.Generator().manual_seed(0)
     raw = [torch.randn(2, 3, 64 // s, 96 // s, 8, generator=generator) for s in STRIDES]
-    targets = assign(samples, TINY)
+    targets = assign_anchors(samples, TINY)
     expected = 0.0
     for level, (maps, one) in enumerate(zip(raw, targets, strict=True)):
         wanted, counted = torch.zeros(maps.shape[:4]), one.counted[:, None].repeat(1, 3, 1, 1)
@@ -120,7 +120,7 @@ def test_the_loss_is_the_sum_of_its_parts():
         for i, (image, anchor, row, column, label) in enumerate(found_places(one)):
             cell = maps[image, anchor, row, column]
             size = torch.tensor(TINY.anchors_px[level][anchor])
-            box = boxes_of(cell[:4], torch.tensor([column, row]), size, STRIDES[level])
+            box = decode_boxes(cell[:4], torch.tensor([column, row]), size, STRIDES[level])
             overlap = float(complete_iou(box[None], one.box[i : i + 1]))
             boxes.append(1 - overlap)
             right = torch.zeros(3)
@@ -142,7 +142,7 @@ def test_half_precision_hardly_changes_the_loss():
     samples = [painted(seed) for seed in range(4)]
     network = fresh(SIGNS, TINY, 0)
     pictures = torch.from_numpy(np.stack([sample.picture for sample in samples])).permute(0, 3, 1, 2).float() / 255
-    whole = detection_loss(network(pictures), assign(samples, TINY), TINY)
+    whole = detection_loss(network(pictures), assign_anchors(samples, TINY), TINY)
     loss = SIGNS.loss(network, samples)
     assert loss.dtype == torch.float32
     assert loss.item() == pytest.approx(whole.item(), rel=0.02)
@@ -165,8 +165,8 @@ def is_painted(sample: Sample, box, label: int) -> bool:
 def test_boxes_go_with_their_pixels_into_windows_and_mosaics():
     for seed in range(30):
         random = np.random.default_rng(seed)
-        parts = [(window(painted(seed + i), 48, 32, TINY, random), 48 * (i % 2), 32 * (i // 2)) for i in range(4)]
-        for sample in (window(painted(seed), 96, 64, TINY, random), joined(parts, 96, 64)):
+        parts = [(draw_window(painted(seed + i), 48, 32, TINY, random), 48 * (i % 2), 32 * (i // 2)) for i in range(4)]
+        for sample in (draw_window(painted(seed), 96, 64, TINY, random), join_mosaic(parts, 96, 64)):
             assert sample.picture.shape == (64, 96, 3)
             assert all(is_painted(sample, box, label) for box, label in zip(sample.boxes, sample.label, strict=True))
             assert (sample.boxes >= 0).all()
@@ -177,7 +177,7 @@ def test_a_cut_ignores_what_it_leaves_too_little_of():
     sample = Sample(
         np.zeros((40, 40, 3), np.uint8), np.array([[0.0, 0, 10, 10], [20, 20, 30, 30]]), np.array([0, 1]), NO_BOXES
     )
-    part = cut(sample, (6, 0, 40, 40), (80, 80), TINY)
+    part = crop_sample(sample, (6, 0, 40, 40), (80, 80), TINY)
     assert part.boxes.tolist() == [[28, 40, 48, 60]]
     assert part.label.tolist() == [1]
     assert part.ignore.tolist() == [[0, 0, 8, 20]]
@@ -206,9 +206,9 @@ def found(*rows) -> Detections:
     return Detections(box, array[:, 3].astype(np.int64), array[:, 4])
 
 
-def truth(*rows, neutral=NO_BOXES) -> Truth:
+def truth(*rows, neutral=NO_BOXES) -> GroundTruth:
     one = found(*((*row, 1.0) for row in rows))
-    return Truth(one.box, one.label, neutral)
+    return GroundTruth(one.box, one.label, neutral)
 
 
 def test_map_of_cases_by_hand():
@@ -269,7 +269,7 @@ def test_it_learns_eight_pictures():
 
     def map50() -> float:
         seen = [detect(network, sample.picture, threshold=0.01) for sample in samples]
-        truths = [Truth(s.boxes, s.label, s.ignore) for s in samples]
+        truths = [GroundTruth(s.boxes, s.label, s.ignore) for s in samples]
         return mean_average_precision(seen, truths, TINY.classes, 6).score
 
     assert map50() < 0.1

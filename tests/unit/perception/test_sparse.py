@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from flcav.perception.ops import rulebook as rules_module
-from flcav.perception.ops.rulebook import cells_of, keys_of, strided_rules, submanifold_rules
+from flcav.perception.ops.rulebook import build_strided_rulebook, build_submanifold_rulebook, decode_keys, encode_cells
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d, sparse_convolution
 
 GRIDS = [((9, 14, 11), 2, 0.15), ((5, 20, 7), 3, 0.4), ((4, 3, 3), 1, 1.0), ((6, 9, 8), 2, 0.01)]
@@ -22,7 +22,7 @@ def scene(shape, samples, share, channels=5):
     occupied = torch.rand(samples, *shape, generator=generator) < share
     cells = occupied.nonzero()
     features = torch.randn(len(cells), channels, dtype=torch.float64, generator=generator, requires_grad=True)
-    return occupied, cells, features, SparseTensor(features, keys_of(cells, shape), shape, samples)
+    return occupied, cells, features, SparseTensor(features, encode_cells(cells, shape), shape, samples)
 
 
 def dense_of(features, cells, shape, samples):
@@ -74,7 +74,7 @@ def test_birds_eye_stacks_layers_as_channels():
 
 def test_keys_and_cells_are_inverse():
     _, cells, _, x = scene((4, 5, 6), 3, 0.5)
-    assert torch.equal(cells_of(x.keys, x.shape), cells)
+    assert torch.equal(decode_keys(x.keys, x.shape), cells)
     assert (x.keys.diff() > 0).all()
 
 
@@ -87,12 +87,14 @@ def assert_same_pairs(compiled, plain):
 @pytest.mark.parametrize(("shape", "samples", "share"), GRIDS)
 def test_the_grouped_sum_of_other_devices_equals_the_compiled_one(shape, samples, share):
     x = scene(shape, samples, share)[3]
-    compiled = submanifold_rules(x.keys, shape)
-    plain = rules_module._submanifold_rules(x.keys, shape[1] + 2, shape[2] + 2)
+    compiled = build_submanifold_rulebook(x.keys, shape)
+    plain = rules_module._build_submanifold_rulebook(x.keys, shape[1] + 2, shape[2] + 2)
     pairs = [(compiled, plain)]
     for kernel, stride, padding in STRIDED:
-        one, _, out_shape = strided_rules(x.keys, shape, kernel, stride, padding, samples)
-        pairs.append((one, rules_module._strided_rules(x.keys, shape, kernel, stride, padding, out_shape, samples)[0]))
+        one, _, out_shape = build_strided_rulebook(x.keys, shape, kernel, stride, padding, samples)
+        pairs.append(
+            (one, rules_module._build_strided_rulebook(x.keys, shape, kernel, stride, padding, out_shape, samples)[0])
+        )
     for one, other in pairs:
         weight = torch.randn(len(one.counts), 5, 6, dtype=torch.float64, requires_grad=True)
         a, b = sparse_convolution(x.features, weight, one), sparse_convolution(x.features, weight, other)
@@ -106,12 +108,14 @@ def test_the_grouped_sum_of_other_devices_equals_the_compiled_one(shape, samples
 @pytest.mark.parametrize(("shape", "samples", "share"), GRIDS)
 def test_compiled_rules_equal_the_tensor_rules(shape, samples, share):
     x = scene(shape, samples, share)[3]
-    compiled = submanifold_rules(x.keys, shape)
-    plain = rules_module._submanifold_rules(x.keys, shape[1] + 2, shape[2] + 2)
+    compiled = build_submanifold_rulebook(x.keys, shape)
+    plain = rules_module._build_submanifold_rulebook(x.keys, shape[1] + 2, shape[2] + 2)
     assert_same_pairs(compiled, plain)
     for kernel, stride, padding in STRIDED:
-        compiled, keys, out_shape = strided_rules(x.keys, shape, kernel, stride, padding, samples)
-        plain, plain_keys = rules_module._strided_rules(x.keys, shape, kernel, stride, padding, out_shape, samples)
+        compiled, keys, out_shape = build_strided_rulebook(x.keys, shape, kernel, stride, padding, samples)
+        plain, plain_keys = rules_module._build_strided_rulebook(
+            x.keys, shape, kernel, stride, padding, out_shape, samples
+        )
         assert torch.equal(keys, plain_keys)
         assert_same_pairs(compiled, plain)
 

@@ -8,12 +8,12 @@ import torch
 
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects import Sample, second_tiny
-from flcav.perception.objects.augment import augment, transformed
+from flcav.perception.objects.augment import augment, transform_sample
 from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.loss import second_loss
 from flcav.perception.objects.model import head_shape
-from flcav.perception.objects.samples import near_range
-from flcav.perception.objects.targets import anchor_boxes, assign, decode, direction_of, encode, free_cells
+from flcav.perception.objects.samples import crop_to_range
+from flcav.perception.objects.targets import anchor_boxes, assign_anchors, decode, direction_of, encode, mark_free_cells
 
 CONFIG = second_tiny().config
 NO_POINTS = np.zeros((0, 4), dtype=np.float32)
@@ -24,7 +24,7 @@ def cars(*rows):
 
 
 def negatives(sample):
-    targets = assign(sample, CONFIG)
+    targets = assign_anchors(sample, CONFIG)
     mask = targets.weight.numpy() > 0
     mask[targets.positive.numpy()] = False
     return mask.reshape(*head_shape(CONFIG), 2)
@@ -43,7 +43,7 @@ def test_decode_inverts_encode():
 @pytest.mark.parametrize("yaw", [0.0, np.pi / 2, 2.8, -1.4])
 def test_every_object_in_range_gets_an_anchor_that_says_it(yaw):
     sample = Sample(NO_POINTS, cars((10.3, 5.1, yaw), (30.7, -12.2, yaw)))
-    targets = assign(sample, CONFIG)
+    targets = assign_anchors(sample, CONFIG)
     anchors = anchor_boxes(CONFIG)[targets.positive.numpy()]
     said = decode(targets.residual.double().numpy(), targets.direction.numpy(), anchors)
     truth = sample.boxes.array()
@@ -55,7 +55,7 @@ def test_every_object_in_range_gets_an_anchor_that_says_it(yaw):
 
 def test_an_object_out_of_range_is_neither_positive_nor_negative():
     outside = Sample(NO_POINTS, cars((48.5, 0.0, 0.0)))
-    assert not len(assign(outside, CONFIG).positive)
+    assert not len(assign_anchors(outside, CONFIG).positive)
     assert not negatives(outside)[30, 59].any()
     assert negatives(outside)[30, 40].all()
 
@@ -74,12 +74,12 @@ def test_negatives_only_where_the_ground_is_known_to_be_free():
     mask = negatives(Sample(NO_POINTS, cars((40.0, 0.0, 0.0)), free=free))
     assert mask[:, :30].all()
     assert not mask[:, 30:].any()
-    assert len(assign(Sample(NO_POINTS, cars((40.0, 0.0, 0.0)), free=free), CONFIG).positive)
+    assert len(assign_anchors(Sample(NO_POINTS, cars((40.0, 0.0, 0.0)), free=free), CONFIG).positive)
     assert not negatives(Sample(NO_POINTS, Boxes.empty(), free=free[:0])).any()
 
 
 def test_free_cells_are_row_y_column_x():
-    mask = free_cells(np.array([[0.1, -23.9], [47.9, 23.9], [-1, 0], [50, 0]], dtype=np.float32), CONFIG)
+    mask = mark_free_cells(np.array([[0.1, -23.9], [47.9, 23.9], [-1, 0], [50, 0]], dtype=np.float32), CONFIG)
     assert mask.sum() == 2
     assert mask[0, 0]
     assert mask[-1, -1]
@@ -102,7 +102,7 @@ def test_augmentation_moves_everything_together():
 
 def test_augmentation_is_undone_by_its_inverse():
     sample = Sample(np.array([[5, 2, -1, 0.3]], dtype=np.float32), cars((12.0, 4.0, 0.4)))
-    back = transformed(transformed(sample, 1, 0.25, 1.02), 1, -0.25, 1 / 1.02)
+    back = transform_sample(transform_sample(sample, 1, 0.25, 1.02), 1, -0.25, 1 / 1.02)
     assert np.allclose(back.points, sample.points, atol=1e-5)
     assert np.allclose(back.boxes.array(), sample.boxes.array())
 
@@ -115,7 +115,7 @@ def test_samples_are_immutable():
 def test_no_point_is_left_out_that_an_augmentation_brings_into_range():
     rng = np.random.default_rng(0)
     points = rng.uniform((-60, -60, -4, 0), (60, 60, 2, 1), (4000, 4)).astype(np.float32)
-    kept = {tuple(point) for point in near_range(points, CONFIG)}
+    kept = {tuple(point) for point in crop_to_range(points, CONFIG)}
     low, high = CONFIG.range_m[:3], CONFIG.range_m[3:]
     for seed in range(20):
         moved = augment(Sample(points, Boxes.empty()), Augmentation(), np.random.default_rng(seed)).points[:, :3]
@@ -127,7 +127,7 @@ def test_no_point_is_left_out_that_an_augmentation_brings_into_range():
 def test_a_box_that_is_not_exact_is_found_but_not_learned():
     boxes = cars((20.0, 4.0, 0.1), (30.0, -8.0, 0.2))
     inexact = Sample(NO_POINTS, boxes, exact=np.array([True, False]))
-    targets, everything = assign(inexact, CONFIG), assign(Sample(NO_POINTS, boxes), CONFIG)
+    targets, everything = assign_anchors(inexact, CONFIG), assign_anchors(Sample(NO_POINTS, boxes), CONFIG)
     assert torch.equal(targets.positive, everything.positive)
     assert 0 < targets.exact.sum() < everything.exact.sum() == len(everything.positive)
 

@@ -11,11 +11,11 @@ from flcav.config import InputError
 from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
-from flcav.perception.metrics.tracks import Moment, amota, clear
+from flcav.perception.metrics.tracks import TrackingFrame, amota, count_clear_mot
 from flcav.perception.objects import second_tiny
 from flcav.perception.tracking import Tracker, evaluate_tracks
 from flcav.perception.tracking import evaluate as tracking_evaluation
-from flcav.perception.tracking.tracker import State, first_state, predicted, updated
+from flcav.perception.tracking.tracker import State, predict_state, start_state, update_state
 
 from .frames import detections, frame
 
@@ -27,13 +27,13 @@ def cars(*places, yaw=0.0, score=None):
 
 def test_a_filter_is_the_textbooks_on_one_axis():
     variance = np.full(7, 0.25)
-    state = first_state(np.zeros(7), variance)
+    state = start_state(np.zeros(7), variance)
     mean, covariance = np.zeros(2), np.diag((0.25, 64.0))
     for number in range(1, 6):
         dt, seen = 0.5, 1.5 * number
         box = np.zeros(7)
         box[0] = seen
-        state = updated(predicted(state, dt), box, variance)
+        state = update_state(predict_state(state, dt), box, variance)
         step = np.array(((1, dt), (0, 1)))
         noise = 9.0 * np.array(((dt**4 / 4, dt**3 / 2), (dt**3 / 2, dt**2)))
         mean, covariance = step @ mean, step @ covariance @ step.T + noise
@@ -45,9 +45,9 @@ def test_a_filter_is_the_textbooks_on_one_axis():
 
 
 def test_a_filter_keeps_a_covariance_that_is_one():
-    state = first_state(np.zeros(7), np.ones(7))
+    state = start_state(np.zeros(7), np.ones(7))
     for _ in range(50):
-        state = updated(predicted(state, 0.1), np.zeros(7), np.ones(7))
+        state = update_state(predict_state(state, 0.1), np.zeros(7), np.ones(7))
     assert np.allclose(state.covariance, state.covariance.T)
     assert np.linalg.eigvalsh(state.covariance).min() > 0
 
@@ -56,7 +56,7 @@ def test_a_heading_seen_the_wrong_way_round_does_not_turn_the_track():
     state = State(np.zeros(9), np.eye(9))
     box = np.zeros(7)
     box[6] = np.pi - 0.1
-    assert abs(updated(state, box, np.full(7, 0.1)).mean[6]) < 0.2
+    assert abs(update_state(state, box, np.full(7, 0.1)).mean[6]) < 0.2
 
 
 def test_cars_that_pass_keep_their_numbers_and_get_their_velocities():
@@ -104,7 +104,7 @@ def test_time_does_not_run_backwards():
 
 def moment(objects, tracks, score=None, neutral=None):
     """Objects and tracks are {identity: x}."""
-    return Moment(
+    return TrackingFrame(
         objects=np.array(list(objects), dtype=np.str_),
         places=np.array([(x, 0.0) for x in objects.values()]).reshape(-1, 2),
         tracks=np.array(list(tracks), dtype=np.int64),
@@ -121,7 +121,7 @@ def test_clear_counts_by_hand():
         moment({"a": 2, "b": 12}, {3: 2, 2: 12}),  # a has another track: a switch
         moment({"a": 3, "b": 13}, {3: 3, 2: 13, 4: 40}),  # one false positive
     ]
-    counts = clear([sequence])
+    counts = count_clear_mot([sequence])
     assert (counts.objects, counts.misses, counts.false_positives, counts.switches) == (8, 1, 1, 1)
     assert counts.mota == pytest.approx(1 - 3 / 8)
     assert counts.motp_m == pytest.approx(0.5 / 7)
@@ -129,19 +129,19 @@ def test_clear_counts_by_hand():
 
 def test_a_pair_of_before_stays_though_another_track_comes_closer():
     sequence = [moment({"a": 0}, {1: 0}), moment({"a": 0}, {1: 1.5, 2: 0.1})]
-    counts = clear([sequence])
+    counts = count_clear_mot([sequence])
     assert (counts.switches, counts.false_positives, counts.misses) == (0, 1, 0)
 
 
 def test_tracks_of_what_is_neutral_are_not_wrong():
-    assert clear([[moment({"a": 0}, {1: 0, 2: 30}, neutral=(2,))]]).false_positives == 0
+    assert count_clear_mot([[moment({"a": 0}, {1: 0, 2: 30}, neutral=(2,))]]).false_positives == 0
 
 
 def test_sequences_do_not_share_identities():
     one = [moment({"a": 0}, {1: 0})]
     other = [moment({"a": 0}, {7: 0})]
-    assert clear([one, other]).switches == 0
-    assert clear([one + other]).switches == 1
+    assert count_clear_mot([one, other]).switches == 0
+    assert count_clear_mot([one + other]).switches == 1
 
 
 def test_amota_of_perfect_tracks_and_of_half_of_them():

@@ -8,10 +8,10 @@ from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.perception.client import TaskClient
 from flcav.perception.objects import detect_all
-from flcav.perception.objects.evaluate import Asked, score_detections
+from flcav.perception.objects.evaluate import FrameTruth, score_detections
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.task import configuration, fresh
+from flcav.perception.task import find_configuration, fresh
 from flcav.perception.training import Checkpointing, Validation, batches, train, train_steps
 from flcav.perception.training.loop import one_cycle
 from flcav.perception.weights import to_arrays
@@ -27,7 +27,7 @@ def samples():
 
 
 def tiny(seed=1):
-    return fresh(OBJECTS, configuration(OBJECTS, "tiny"), seed)
+    return fresh(OBJECTS, find_configuration(OBJECTS, "tiny"), seed)
 
 
 def same(one, other):
@@ -105,7 +105,7 @@ def test_validation_ends_a_training_and_leaves_its_best_weights(samples):
     ("scores", "over"), [([], False), ([0.3, 0.2], False), ([0.3, 0.2, 0.3], True), ([0.3, 0.2, 0.31], False)]
 )
 def test_patience_is_validations_without_a_new_best(scores, over):
-    assert Validation(len, every=1, patience=2).over(scores) is over
+    assert Validation(len, every=1, patience=2).is_over(scores) is over
 
 
 def test_batches_are_shuffled_passes():
@@ -148,7 +148,7 @@ def test_it_learns_the_toy():
     network = tiny(seed=0)
     losses = train(OBJECTS, network, [toy_sample(seed, rays) for seed in range(60)], steps=200, seed=0).losses
     test = [toy_sample(10**6 + seed, rays) for seed in range(24)]
-    truths = [Asked(f"s{i // 3}", sample.boxes, sample.ignore, Boxes.empty()) for i, sample in enumerate(test)]
+    truths = [FrameTruth(f"s{i // 3}", sample.boxes, sample.ignore, Boxes.empty()) for i, sample in enumerate(test)]
     found = detect_all(network, [sample.points for sample in test], score_threshold=0.05)
     assert losses[-20:].mean() < 0.5 * losses[:20].mean()
     (at_half, *_) = score_detections(found, truths, ("Car",))

@@ -12,7 +12,7 @@ from shapely.geometry import LineString, Polygon
 
 from flcav.config import InputError
 from flcav.geometry import inverse, pose
-from flcav.perception.task import configuration, fresh
+from flcav.perception.task import find_configuration, fresh
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S, CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.cross_view import (
     FAR_M,
@@ -21,17 +21,17 @@ from flcav.perception.trajectory.cross_view import (
     CrossAttention,
     CrossViewEncoder,
     Inputs,
-    met_ground,
+    cast_rays,
+    intersect_ground,
     pixel_grid,
     place_grid,
-    rays,
 )
-from flcav.perception.trajectory.evaluate import errors_of, metrics, turning
+from flcav.perception.trajectory.evaluate import compute_errors, evaluate_paths, is_turning
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
-from flcav.perception.trajectory.model import Forecast
+from flcav.perception.trajectory.model import ForecastTensors
 from flcav.perception.trajectory.rasters import LAYERS, STATIC, cell_of, centres
 from flcav.perception.trajectory.roads import BEFORE_M, road_map
-from flcav.perception.trajectory.samples import present_at, rescaled
+from flcav.perception.trajectory.samples import extract_columns, rescaled
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.trajectory.tracks import (
     check_instants,
@@ -117,7 +117,7 @@ def test_the_past_does_not_know_the_future(roads):
     assert np.array_equal(plain.position[: PAST + 1], other.position[: PAST + 1])
     assert not np.allclose(plain.position[PAST + 1 :], other.position[PAST + 1 :])
     wanted = np.ones(1, np.bool_)
-    one, two = (present_at(t, 5.0, roads, PATCH, wanted) for t in (trace, replace(trace, position=changed)))
+    one, two = (extract_columns(t, 5.0, roads, PATCH, wanted) for t in (trace, replace(trace, position=changed)))
     assert all(np.array_equal(one[name], two[name]) for name in one if name != "future")
     assert not np.array_equal(one["future"], two["future"])
 
@@ -138,7 +138,7 @@ def test_frames_are_those_of_the_matrices(at, point):
 
 
 def test_a_sample_of_the_circle(roads):
-    rows = present_at(circle(), 5.0, roads, PATCH, np.ones(1, np.bool_))
+    rows = extract_columns(circle(), 5.0, roads, PATCH, np.ones(1, np.bool_))
     turn = SPEED / RADIUS_M * STEP_S * np.arange(-PAST, FUTURE + 1)
     path = RADIUS_M * np.stack((np.sin(turn), 1 - np.cos(turn)), axis=1)
     assert np.allclose(rows["past"][0, :, :2], path[: PAST + 1], atol=0.06)  # one-sided tangents at the present
@@ -161,7 +161,7 @@ def test_others_are_marked_where_they_are(roads):
         np.repeat(trace.yaw, 2, axis=1),
         np.repeat(trace.velocity[..., :2], 2, axis=1),
     )
-    rows = present_at(both, 5.0, roads, PATCH, np.array([True, False]))
+    rows = extract_columns(both, 5.0, roads, PATCH, np.array([True, False]))
     bits = np.unpackbits(rows["raster"], axis=-1)[0].astype(bool)
     middle = centres(PATCH)[bits[LAYERS.index("others 0 s ago")].reshape(-1)].mean(axis=0)
     assert np.allclose(middle, (0, -RADIUS_M / 2), atol=0.7)  # outside on the same ray: to the right
@@ -209,7 +209,7 @@ def test_errors_by_hand():
     random = np.random.default_rng(3)
     paths, future = random.normal(size=(5, 4, FUTURE, 2)), random.normal(size=(5, FUTURE, 2))
     shares, plain = random.random((5, 4)), random.normal(size=(5, FUTURE, 2))
-    errors = errors_of(paths, shares, future, plain)
+    errors = compute_errors(paths, shares, future, plain)
     for i in range(5):
         off = [[np.hypot(*(paths[i, k, t] - future[i, t])) for t in range(FUTURE)] for k in range(4)]
         expected = [
@@ -228,7 +228,7 @@ def test_slices_and_misses():
     ahead[..., 0] = np.arange(1, FUTURE + 1) * 2.0
     turned = ahead.copy()
     turned[2] = np.stack((np.minimum(ahead[2, :, 0], 6), np.maximum(ahead[2, :, 0] - 6, 0)), axis=1)
-    assert turning(turned).tolist() == [False, False, True]
+    assert is_turning(turned).tolist() == [False, False, True]
     past = np.zeros((3, PAST + 1, 4))
     past[..., 3] = 8.0
     columns = {
@@ -237,7 +237,7 @@ def test_slices_and_misses():
         "at_junction": np.array([False, True, True]),
         "scene": np.array(["a"] * 3),
     }
-    result = metrics(ahead[:, None], np.ones((3, 1)), columns)
+    result = evaluate_paths(ahead[:, None], np.ones((3, 1)), columns)
     every, junctions, turned_there = result.slices.values()
     assert every is not None
     assert junctions is not None
@@ -245,7 +245,7 @@ def test_slices_and_misses():
     assert (every.samples, junctions.samples, turned_there.samples) == (3, 2, 1)
     assert every.miss_rate_1 == pytest.approx(1 / 3)
     assert turned_there.ratio_1 == pytest.approx(1.0)
-    nobody = metrics(ahead[:1, None], np.ones((1, 1)), {name: column[:1] for name, column in columns.items()})
+    nobody = evaluate_paths(ahead[:1, None], np.ones((1, 1)), {name: column[:1] for name, column in columns.items()})
     assert nobody.slices["at junctions"] is None
 
 
@@ -255,7 +255,7 @@ def test_only_the_nearest_mode_learns_much():
     paths[0, :, :, 0] = torch.tensor([5.0, 0.3, -8.0])[:, None]
     paths.requires_grad_()
     logits = torch.zeros(1, 3, requires_grad=True)
-    forecast_loss(Forecast(paths, logits, None), future).backward()
+    forecast_loss(ForecastTensors(paths, logits, None), future).backward()
     assert paths.grad is not None
     assert logits.grad is not None
     pull = paths.grad.abs().sum(dim=(0, 2, 3))
@@ -273,7 +273,7 @@ def test_a_map_is_judged_by_its_own_layers():
 
 
 def test_paths_begin_as_constant_velocity_and_look_where_they_are():
-    network = fresh(TRAJECTORY, configuration(TRAJECTORY, None), 1).eval()
+    network = fresh(TRAJECTORY, find_configuration(TRAJECTORY, None), 1).eval()
     past = torch.zeros(2, PAST + 1, 4)
     past[:, :, 3] = torch.tensor([6.0, 0.0])[:, None]
     forecast = network(Inputs(past, raster=torch.zeros(2, len(LAYERS), 64, 64)))
@@ -293,10 +293,10 @@ def test_rays_meet_the_ground_where_it_projects_from():
     frame_from_camera = pose(1.0, 0.5, 1.5, 0.6, 0.2) @ optical
     camera_from_frame = inverse(frame_from_camera)
     given = [torch.from_numpy(matrix)[None, None] for matrix in (intrinsics, camera_from_frame)]
-    looks, stands = rays(given[0], given[1], pixel_grid(settings).double())
+    looks, stands = cast_rays(given[0], given[1], pixel_grid(settings).double())
     assert np.allclose(stands[0, 0] * SCALE_M, (1.0, 0.5, 1.5))
     down = looks[0, 0, :, 2] < -0.05
-    met = SCALE_M * met_ground(looks, stands)[0, 0]
+    met = SCALE_M * intersect_ground(looks, stands)[0, 0]
     ground = torch.cat((met[down], torch.zeros(int(down.sum()), 1), torch.ones(int(down.sum()), 1)), dim=1)
     seen = ground.numpy() @ camera_from_frame.T
     pixel = seen[:, :3] @ intrinsics.T

@@ -6,9 +6,9 @@ from scipy.special import expit, logit
 
 from flcav.geometry import Boxes
 from flcav.perception.metrics import calibration_error, fit_logistic
-from flcav.perception.objects.calibrate import trust
-from flcav.perception.objects.evaluate import Asked, score_detections
-from flcav.perception.objects.results import slice_lines, sliced
+from flcav.perception.objects.calibrate import measure_reliability
+from flcav.perception.objects.evaluate import FrameTruth, score_detections
+from flcav.perception.objects.results import break_down, format_breakdown
 
 
 def cars(*xs, scores=None):
@@ -38,7 +38,7 @@ def test_nothing_changes_where_there_is_nothing_to_learn():
 
 
 def truth(*xs, occlusion, weather: str | None = "clear", neutral=()):
-    return Asked("s", cars(*xs), cars(*neutral), Boxes.empty(), np.array(occlusion, dtype=float), weather)
+    return FrameTruth("s", cars(*xs), cars(*neutral), Boxes.empty(), np.array(occlusion, dtype=float), weather)
 
 
 def row(rows, by, name, kind="3d", iou=0.5):
@@ -49,7 +49,7 @@ def row(rows, by, name, kind="3d", iou=0.5):
 def test_slices_ask_for_their_own_objects_and_for_no_others():
     truths = [truth(10, 30, 50, occlusion=(0, 0.5, 0.9))]
     found = [cars(10, 30, scores=[0.9, 0.8])]
-    rows = sliced(found, truths, ("Car",))
+    rows = break_down(found, truths, ("Car",))
     assert row(rows, "distance", "0-20 m") == (1, 1)
     assert row(rows, "distance", "20-40 m") == (1, 1)
     assert row(rows, "distance", "40-80 m") == (0, 1)
@@ -59,17 +59,17 @@ def test_slices_ask_for_their_own_objects_and_for_no_others():
 
 
 def test_a_false_positive_counts_in_the_slice_of_its_distance():
-    rows = sliced([cars(10, 15, scores=[0.8, 0.9])], [truth(10, 30, occlusion=(0, 0))], ("Car",))
+    rows = break_down([cars(10, 15, scores=[0.8, 0.9])], [truth(10, 30, occlusion=(0, 0))], ("Car",))
     assert row(rows, "distance", "0-20 m") == (0.5, 1)
     assert row(rows, "distance", "20-40 m") == (0, 1)
 
 
 def test_weathers_are_told_apart_where_there_are_several():
     truths = [truth(10, occlusion=(0,)), truth(10, occlusion=(0,), weather="fog")]
-    rows = sliced([cars(10, scores=[0.9]), cars()], truths, ("Car",))
+    rows = break_down([cars(10, scores=[0.9]), cars()], truths, ("Car",))
     assert row(rows, "weather", "clear") == (1, 1)
     assert row(rows, "weather", "fog") == (0, 1)
-    assert slice_lines(rows, 0.5)[-1] == "Car         weather    fog         AP 3d 0.000  bev 0.000  (objects: 1)"
+    assert format_breakdown(rows, 0.5)[-1] == "Car         weather    fog         AP 3d 0.000  bev 0.000  (objects: 1)"
 
 
 def test_a_weather_s_slice_is_the_evaluation_of_its_frames():
@@ -77,7 +77,7 @@ def test_a_weather_s_slice_is_the_evaluation_of_its_frames():
     places = [np.sort(rng.choice(np.arange(5, 60, 6), 4, replace=False)) for _ in range(12)]
     truths = [truth(*xs, occlusion=(0,) * 4, weather=names[i % 3]) for i, xs in enumerate(places)]
     found = [cars(*xs[:3] + rng.normal(0, 0.7, 3), 70.0, scores=rng.random(4)) for xs in places]
-    rows = sliced(found, truths, ("Car",))
+    rows = break_down(found, truths, ("Car",))
     for number, name in enumerate(names):
         alone = score_detections(found[number::3], truths[number::3], ("Car",))[0].ap
         assert alone is not None
@@ -87,7 +87,7 @@ def test_a_weather_s_slice_is_the_evaluation_of_its_frames():
 
 def test_weathers_come_in_the_order_of_their_classes():
     names = ("night", "heavy_rain", None, "clear")
-    rows = sliced([cars()] * 4, [truth(10, occlusion=(0,), weather=name) for name in names], ("Car",))
+    rows = break_down([cars()] * 4, [truth(10, occlusion=(0,), weather=name) for name in names], ("Car",))
     assert list(dict.fromkeys(r.slice for r in rows if r.by == "weather")) == ["clear", "heavy_rain", "night"]
 
 
@@ -95,7 +95,7 @@ def test_variances_are_judged_by_the_errors_they_foretell():
     found = cars(10.2, 30.2, scores=[0.9, 0.9])
     variance = np.full((2, 7), 0.02)
     found = Boxes(found.center, found.size, found.yaw, found.label, found.score, variance)
-    (said,) = trust([found], [truth(10, 30, occlusion=(0, 0))], ("Car",))
+    (said,) = measure_reliability([found], [truth(10, 30, occlusion=(0, 0))], ("Car",))
     assert said.variance_ratio == pytest.approx(0.04 / 0.04, abs=1e-6)
     assert said.ece == pytest.approx(0.1)
     assert said.detections == 2

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from flcav.perception.task import configuration, fresh
+from flcav.perception.task import find_configuration, fresh
 from flcav.perception.training import train
 from flcav.perception.weather.config import LeNetConfig
-from flcav.perception.weather.evaluate import classification
+from flcav.perception.weather.evaluate import evaluate_classes
 from flcav.perception.weather.model import SEEN_MAPS, LeNet, PartlyConnected, Subsampling
-from flcav.perception.weather.samples import Sample, augment, small
-from flcav.perception.weather.task import WEATHER, probabilities
+from flcav.perception.weather.samples import Sample, augment, reduce_picture
+from flcav.perception.weather.task import WEATHER, predict_probabilities
 from flcav.world.weather import WEATHER_CLASSES
 
 
@@ -64,9 +64,9 @@ def test_it_learns_colours(name):
     colours = random.integers(0, 256, (8, 3))
     noisy = [colours[i % 8] + random.normal(0, 12, (32, 32, 3)) for i in range(48)]
     samples = [Sample(np.clip(picture, 0, 255).astype(np.uint8), i % 8) for i, picture in enumerate(noisy)]
-    network = fresh(WEATHER, configuration(WEATHER, name), 0)
+    network = fresh(WEATHER, find_configuration(WEATHER, name), 0)
     train(WEATHER, network, samples, steps=120, batch=16, seed=0)
-    found = probabilities(network, [sample.picture for sample in samples])
+    found = predict_probabilities(network, [sample.picture for sample in samples])
     assert found.shape == (48, 8)
     assert found.sum(1) == pytest.approx(1, abs=1e-5)
     assert (found.argmax(1) == np.arange(48) % 8).mean() > 0.95
@@ -83,7 +83,7 @@ def test_augmentation_keeps_size_label_and_light():
 def test_a_picture_is_squeezed_to_its_means():
     picture = np.zeros((64, 128, 3), np.uint8)
     picture[:, 64:] = 200
-    seen = small(picture)
+    seen = reduce_picture(picture)
     assert seen.shape == (32, 32, 3)
     assert (seen[:, :14] == 0).all()
     assert (seen[:, 18:] == 200).all()
@@ -91,7 +91,7 @@ def test_a_picture_is_squeezed_to_its_means():
 
 def test_accuracy_recall_and_confusion_by_hand():
     truth, found = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 0, 1, 1, 1, 0])
-    result = classification(truth, found, list("aabbcc"), ["x", "y", "z", "w"])
+    result = evaluate_classes(truth, found, list("aabbcc"), ["x", "y", "z", "w"])
     assert result.accuracy == pytest.approx(4 / 6)
     assert result.confusion == ((2, 1, 0, 0), (0, 2, 0, 0), (1, 0, 0, 0), (0, 0, 0, 0))
     assert result.recall == {"x": pytest.approx(2 / 3), "y": 1, "z": 0, "w": None}
@@ -99,7 +99,7 @@ def test_accuracy_recall_and_confusion_by_hand():
     assert result.high is not None
     assert result.low <= result.accuracy <= result.high
     assert (result.pictures, result.scenes) == (6, 3)
-    alone = classification(truth, found, ["a"] * 6, ["x", "y", "z", "w"])
+    alone = evaluate_classes(truth, found, ["a"] * 6, ["x", "y", "z", "w"])
     assert (alone.low, alone.high) == (None, None)
     assert "accuracy 0.667 (no interval: one scene)" in alone.lines()[0]
 

@@ -20,10 +20,10 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.planning import (
     HISTORIES,
-    Asked,
-    Frame,
+    PlanRequest,
+    PlanSettings,
     append_points,
-    history_of,
+    load_history,
     make_plan,
     model_mb,
     parse_history,
@@ -34,8 +34,8 @@ SIZES = MessageSizes(sample_mb=0.4, model_mb=1.4)
 LIMITS = Limits(edge_rounds=(1, 12), cloud_rounds=(1, 6))
 
 
-def frame(wireless: float = 90.0, wireline: float = 60.0) -> Frame:
-    return Frame(Price(wireless, wireline), 0.02, LIMITS, (4, 3), 1)
+def frame(wireless: float = 90.0, wireline: float = 60.0) -> PlanSettings:
+    return PlanSettings(Price(wireless, wireline), 0.02, LIMITS, (4, 3), 1)
 
 
 def history() -> History:
@@ -45,8 +45,8 @@ def history() -> History:
     return History(counts, 1 - error.clip(0.01, 0.99), np.ones(len(counts)))
 
 
-def asked(name: str = "objects", pool: int = 400, weight: float = 1.0, fixed: FixedPlan | None = None) -> Asked:
-    return Asked(name, weight, SIZES, pool, None if fixed else history(), fixed)
+def asked(name: str = "objects", pool: int = 400, weight: float = 1.0, fixed: FixedPlan | None = None) -> PlanRequest:
+    return PlanRequest(name, weight, SIZES, pool, None if fixed else history(), fixed)
 
 
 def test_the_plans_price_leaves_the_headroom() -> None:
@@ -119,9 +119,9 @@ def test_a_models_size_is_what_flower_sends() -> None:
 
 @pytest.mark.parametrize("name", sorted(path.name.removesuffix(".csv") for path in HISTORIES.iterdir()))
 def test_a_history_of_the_package_falls_with_every_resource(name: str) -> None:
-    known = history_of(name)
+    known = load_history(name)
     assert len(known.accuracy) >= 6
-    problem = make_plan((Asked(name, 1.0, SIZES, 400, known, None),), frame(), "joint")[1]
+    problem = make_plan((PlanRequest(name, 1.0, SIZES, 400, known, None),), frame(), "joint")[1]
     assert problem is not None
     curve = problem.tasks[0].curve
     here = float(curve.error(200, 2, 1, 1))

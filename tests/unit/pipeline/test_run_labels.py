@@ -8,10 +8,10 @@ import pytest
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
-from flcav.perception.objects.evaluate import Asked
+from flcav.perception.objects.evaluate import FrameTruth
 from flcav.pipeline import labels
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels import KINDS, frames_near, labels_of, own_label_threshold
+from flcav.pipeline.labels import LABEL_SOURCES, choose_labels, fit_label_threshold, select_frames_near
 
 
 def cars(*places: tuple[float, float]) -> Boxes:
@@ -36,12 +36,12 @@ def test_own_labels_start_where_nine_of_ten_are_right(
 ) -> None:
     hits = [(10.0 * i, score) for i, score in enumerate(scores_of_hits, start=1)]
     misses = [(-10.0 * i, score) for i, score in enumerate(scores_of_misses, start=1)]
-    truth = Asked("s", cars(*hits), Boxes.empty(), Boxes.empty())
+    truth = FrameTruth("s", cars(*hits), Boxes.empty(), Boxes.empty())
     monkeypatch.setattr(labels, "asked_of", lambda frame, config: truth)
     monkeypatch.setattr(labels, "detect_all", lambda network, clouds: [cars(*hits, *misses)])
     data = SimpleNamespace(frame=lambda i: SimpleNamespace(lidar={"lidar": None}, key="k"))
     split = Frames(cast(Any, data), (0,), {})
-    assert own_label_threshold(cast(Any, SimpleNamespace(config=None)), [split]) == threshold
+    assert fit_label_threshold(cast(Any, SimpleNamespace(config=None)), [split]) == threshold
 
 
 def test_groups_are_the_vehicles_within_range_of_a_sensor() -> None:
@@ -52,14 +52,14 @@ def test_groups_are_the_vehicles_within_range_of_a_sensor() -> None:
 
     split = Frames(cast(Any, SimpleNamespace(frame=frame)), tuple(range(10)), {})
     sites = np.array([[0.0, 0.0], [70.0, 0.0]])
-    assert frames_near(split, sites, 15.0) == (0, 1, 6, 7, 8)
-    assert frames_near(split, sites[:1], 35.0) == (0, 1, 2, 3)
-    assert frames_near(split, sites[:0], 1.0) == split.vehicles
+    assert select_frames_near(split, sites, 15.0) == (0, 1, 6, 7, 8)
+    assert select_frames_near(split, sites[:1], 35.0) == (0, 1, 2, 3)
+    assert select_frames_near(split, sites[:0], 1.0) == split.vehicles
 
 
 def test_every_kind_but_a_vehicles_own_says_that_it_is_an_upper_bound() -> None:
-    assert all("upper bound" in kind.caveat for name, kind in KINDS.items() if name != "own-detections")
-    assert labels_of("objects", None) == "ideal-road"
-    assert labels_of("trajectory", None) == "future"
+    assert all("upper bound" in kind.caveat for name, kind in LABEL_SOURCES.items() if name != "own-detections")
+    assert choose_labels("objects", None) == "ideal-road"
+    assert choose_labels("trajectory", None) == "future"
     with pytest.raises(InputError, match="labels of 'weather': 'ideal-road' is none of annotated"):
-        labels_of("weather", "ideal-road")
+        choose_labels("weather", "ideal-road")

@@ -16,13 +16,13 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.pipeline import stages
 from flcav.pipeline.recipe import Training
 from flcav.pipeline.stages import (
-    Federating,
+    FederationCheckpoints,
     Learning,
     choose_uploads,
     next_rate,
-    purse,
     region_budget,
     round_path,
+    share_budget,
     train_centrally,
 )
 
@@ -72,11 +72,11 @@ def edge(folder: Path) -> tuple[Weights, Ledger]:
     """Federate as stage II does: the road's views are booked before the rounds."""
     book = Ledger(Budget(1.0, 0.0))
     book.enter(ROAD)
-    federating = Federating(OBJECTS, folder, book, lambda done, total, note="": None)
+    federating = FederationCheckpoints(OBJECTS, folder, book, lambda done, total, note="": None)
     start, done = federating.resume(START)
     clients = {f"grid/cav{i}": Walk() for i in range(2)}
     account = Account(book, "edge", "t", "wireless")
-    federate(clients, start, SCHEDULE, account, done=done, on_round=federating.keeping(SCHEDULE.rounds))
+    federate(clients, start, SCHEDULE, account, done=done, on_round=federating.make_saver(SCHEDULE.rounds))
     assert len(federating.losses) == SCHEDULE.rounds
     return load_file(round_path(folder, SCHEDULE.rounds)), book
 
@@ -84,7 +84,7 @@ def edge(folder: Path) -> tuple[Weights, Ledger]:
 def cloud(folder: Path) -> tuple[Weights, Ledger]:
     """Federate as stage III does: on top of what was spent before, edge servers nested below the cloud."""
     book = Ledger(Budget(10.0, 1.0), [STAGE_ONE, ROAD])
-    federating = Federating(OBJECTS, folder, book, lambda done, total, note="": None)
+    federating = FederationCheckpoints(OBJECTS, folder, book, lambda done, total, note="": None)
     start, done = federating.resume(START)
     servers: dict[str, Trainable] = {}
     for town, own in (("grid", 1.0), ("ring", -1.0)):
@@ -92,7 +92,7 @@ def cloud(folder: Path) -> tuple[Weights, Ledger]:
         model = {"w": np.full(3, own, dtype=np.float32), "count": START["count"]}
         servers[town] = EdgeServer(vehicles, 2, Account(book, "cloud", "t", "wireless"), model, cloud_rounds_done=done)
     account = Account(book, "cloud", "t", "wireline")
-    federate(servers, start, SCHEDULE, account, done=done, on_round=federating.keeping(SCHEDULE.rounds))
+    federate(servers, start, SCHEDULE, account, done=done, on_round=federating.make_saver(SCHEDULE.rounds))
     return load_file(round_path(folder, SCHEDULE.rounds)), book
 
 
@@ -146,9 +146,9 @@ def test_regions_share_what_stage_one_left_by_their_vehicles() -> None:
 
 def test_tasks_share_both_budgets_as_planned_and_never_more() -> None:
     whole = Budget(100.0, 50.0)
-    assert purse(whole, {"a": (30.0, 20.0)}, "a") == whole
+    assert share_budget(whole, {"a": (30.0, 20.0)}, "a") == whole
     planned = {"a": (10.0, 10.0), "b": (20.0, 0.0), "c": (7.1, 3.3)}
-    parts = [purse(whole, planned, task) for task in planned]
+    parts = [share_budget(whole, planned, task) for task in planned]
     assert sum(part.bytes_on("wireless") for part in parts) <= whole.bytes_on("wireless")
     assert sum(part.bytes_on("wireline") for part in parts) <= whole.bytes_on("wireline")
     assert parts[1].wireless_mb == pytest.approx(100 * 20 / 37.1, abs=1e-5)

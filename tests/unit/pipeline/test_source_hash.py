@@ -13,7 +13,7 @@ import pytest
 from flcav.experiments.studies import STUDIES, study_named
 from flcav.experiments.studies.run import record_split
 from flcav.pipeline import work
-from flcav.pipeline.steps.source_hash import PACKAGES, Sources, starts
+from flcav.pipeline.steps.source_hash import PACKAGES, Sources, find_definitions
 
 TOY = {
     "__init__.py": """
@@ -94,7 +94,7 @@ def test_a_step_reaches_definitions_through_packages_that_hand_them_on(toy):
     assert set(hashes(toy, "one")) == set(hashes(toy, "any_of_it")) == {"toy.work", "toy.whole"}
     assert set(hashes(toy, "circle")) == {"toy.work", "toy.shapes.round"}
     assert set(hashes(toy, "by_name")) == {"toy.work", "toy.other"}
-    assert list(starts({"strategy": "toy.other:Other", "note": "at 12:30"})) == [("toy.other", "Other")]
+    assert list(find_definitions({"strategy": "toy.other:Other", "note": "at 12:30"})) == [("toy.other", "Other")]
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ STEPS = {
 
 @pytest.mark.parametrize("run", STEPS.values(), ids=STEPS.keys())
 def test_no_step_reaches_the_drawing_of_results_or_the_command_line(run):
-    reached = Sources().hashes(starts(run))
+    reached = Sources().hashes(find_definitions(run))
     assert 50 < len(reached) < 250
     assert not [name for name in reached if name.startswith(("flcav.report", "flcav.cli"))]
     assert not [name for name in reached if name.startswith("flcav.pipeline.steps.run")]
@@ -171,9 +171,9 @@ def test_an_edit_of_flcav_makes_stale_what_it_should(tmp_path):
     def changed(file: str) -> set[str]:
         path = copy / file
         text = path.read_text()
-        before = {name: Sources({"flcav": copy}).hashes(starts(run)) for name, run in STEPS.items()}
+        before = {name: Sources({"flcav": copy}).hashes(find_definitions(run)) for name, run in STEPS.items()}
         path.write_text(text.replace("return ", "return 0 or "))
-        after = {name: Sources({"flcav": copy}).hashes(starts(run)) for name, run in STEPS.items()}
+        after = {name: Sources({"flcav": copy}).hashes(find_definitions(run)) for name, run in STEPS.items()}
         path.write_text(text)
         return {name for name in STEPS if before[name] != after[name]}
 
@@ -213,11 +213,11 @@ def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches
     assert done.returncode == 0, done.stderr
     ran = set(done.stdout.split())
     assert len(ran) > 30
-    assert ran <= Sources().hashes(starts(record_split)).keys()
+    assert ran <= Sources().hashes(find_definitions(record_split)).keys()
 
 
 def test_a_recording_reaches_what_drives_the_traffic_in_a_process_beside_it():
-    reached = Sources().hashes(starts(record_split))
+    reached = Sources().hashes(find_definitions(record_split))
     assert {
         "flcav.world.traffic.sumo_process",
         "flcav.world.scenarios.director",

@@ -13,7 +13,7 @@ from PIL import Image
 from flcav.cli.main import run
 from flcav.dataset.store import Dataset
 from flcav.report import style
-from flcav.report.pictures.camera import Shot, camera_sheet, in_rows, shot, thermal_grey
+from flcav.report.pictures.camera import Shot, arrange_cameras, camera_sheet, make_shot, thermal_grey
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import RIGS, Rig
@@ -70,7 +70,7 @@ def called(*arguments: object) -> int:
 
 @pytest.mark.parametrize("camera", ["front", "warm", "rear"])
 def test_a_box_is_around_the_rectangle_of_its_actor_when_the_camera_looks(frame: Frame, camera: str):
-    seen, views = shot(frame, camera), frame.annotations.views[camera]
+    seen, views = make_shot(frame, camera), frame.annotations.views[camera]
     drawn = dict(zip(seen.track.tolist(), seen.view.project(seen.boxes.corners().reshape(-1, 3)).reshape(-1, 8, 2)))
     tracks = frame.annotations.track.tolist()
     whole = [row for row, track in enumerate(tracks) if track in drawn and not views.truncation[row]]
@@ -87,12 +87,12 @@ def test_a_box_is_around_the_rectangle_of_its_actor_when_the_camera_looks(frame:
 def test_only_what_shows_is_drawn(frame: Frame):
     for camera, views in frame.annotations.views.items():
         shows = frame.annotations.track[views.pixels > 0]
-        np.testing.assert_array_equal(shot(frame, camera).track, shows)
-    assert set(shot(frame, "rear").track) == {"veh5"}
+        np.testing.assert_array_equal(make_shot(frame, camera).track, shows)
+    assert set(make_shot(frame, "rear").track) == {"veh5"}
 
 
 def test_a_tick_leaves_each_box_through_its_front(frame: Frame):
-    seen = shot(frame, "front")
+    seen = make_shot(frame, "front")
     axes = camera_sheet("a frame", [[seen]], boxes=True).axes[0]
     drawn = [line for lines in axes.collections if isinstance(lines, LineCollection) for line in lines.get_segments()]
     (row,) = np.flatnonzero(seen.track == "veh1")
@@ -105,8 +105,8 @@ def test_a_tick_leaves_each_box_through_its_front(frame: Frame):
 
 
 def test_cameras_stand_as_one_looks_at_them(frame: Frame):
-    assert in_rows(frame, [*RIG.cameras, "warm"]) == [["aside", "front", "warm"], ["rear"]]
-    assert in_rows(frame, ["rear", "warm", "front"]) == [["front", "warm", "rear"]]
+    assert arrange_cameras(frame, [*RIG.cameras, "warm"]) == [["aside", "front", "warm"], ["rear"]]
+    assert arrange_cameras(frame, ["rear", "warm", "front"]) == [["front", "warm", "rear"]]
 
 
 def test_a_car_s_six_cameras_are_in_two_rows(small_town, standing):
@@ -115,16 +115,18 @@ def test_a_car_s_six_cameras_are_in_two_rows(small_town, standing):
     for sensor in small.values():
         sensor["settings"] |= {"width": 32, "height": 16}
     seen = observe(scene, Rig.model_validate({"cameras": small}), "cav0", 0, scene_name="s", seed=1)
-    rows = in_rows(seen, sorted(small))
+    rows = arrange_cameras(seen, sorted(small))
     assert rows == [["front_left", "front", "front_right"], ["back_left", "back", "back_right"]]
 
 
 def test_the_picture_shows_what_it_is_asked_for(frame: Frame):
-    rows = [[shot(frame, name) for name in row] for row in in_rows(frame, [*frame.images, *frame.infrared])]
+    rows = [
+        [make_shot(frame, name) for name in row] for row in arrange_cameras(frame, [*frame.images, *frame.infrared])
+    ]
     plain, drawn = pixels(rows, boxes=False), pixels(rows, boxes=True)
     np.testing.assert_array_equal(pixels(rows, boxes=False), plain)
     assert drawn.shape[0] > plain.shape[0]  # the key
-    alone = pixels([[shot(frame, "front")]], boxes=False)
+    alone = pixels([[make_shot(frame, "front")]], boxes=False)
     picture = np.asarray(Image.fromarray(frame.images["front"].rgb).resize((16, 8), Image.Resampling.BOX)).astype(int)
     inside = Image.fromarray(alone[30:-4, 6:-6].astype(np.uint8)).resize((16, 8), Image.Resampling.BOX)
     assert np.abs(np.asarray(inside).astype(int) - picture).mean() < 12

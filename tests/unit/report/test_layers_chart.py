@@ -4,7 +4,7 @@ import networkx as nx
 import pytest
 
 from flcav.experiments.fig3a.run import article_graph
-from flcav.optimization.graph import load
+from flcav.optimization.graph import load_graph
 from flcav.report import style
 from flcav.report.charts.curves import COLUMNS, layout, three_layers
 
@@ -13,7 +13,7 @@ RECIPE = Path(__file__).parents[3] / "recipes" / "graphs" / "three_layers.yaml"
 
 @pytest.fixture(params=["article", "recipe"])
 def graph(request: pytest.FixtureRequest) -> nx.Graph:
-    return article_graph() if request.param == "article" else load(RECIPE)
+    return article_graph() if request.param == "article" else load_graph(RECIPE)
 
 
 def test_every_kind_has_its_column_and_every_node_its_place(graph: nx.Graph) -> None:

@@ -16,21 +16,21 @@ from flcav.sensors.lidar.air import (
     STEP_M,
     SURFACE_PER_SR,
     Air,
-    air_in,
-    drops,
+    add_air_returns,
+    compute_air,
+    compute_drops,
+    compute_fog_returns,
     rain_extinction,
     rain_range_noise,
-    soft_returns,
-    through_air,
 )
-from flcav.sensors.lidar.returns import under_water
+from flcav.sensors.lidar.returns import compute_wet_brightness
 from flcav.world.weather import Weather
 
 LEAST = 0.7 * 0.9 / 300.0**2
 
 
 def air_of(**weather: float) -> Air:
-    air = air_in(Weather(**weather), 0.003, LEAST)
+    air = compute_air(Weather(**weather), 0.003, LEAST)
     assert air is not None
     return air
 
@@ -54,7 +54,7 @@ def received(fog_per_m: float, at_m: float, surface_m: float) -> float:
 @pytest.mark.parametrize("surface_m", [2.0, 4.0, 9.0, 100.0])
 def test_fog_answers_as_the_integral_says(visibility_m: float, surface_m: float):
     fog = np.log(20) / visibility_m
-    power, range_m = soft_returns(fog, fog)
+    power, range_m = compute_fog_returns(fog, fog)
     entry = min(round(surface_m / STEP_M), len(power) - 1)
     candidates = np.arange(1.0, min(surface_m, 16.0) + 0.01, STEP_M)
     expected = [received(fog, at, surface_m) for at in candidates]
@@ -83,7 +83,7 @@ def test_brightest_drops_are_those_of_beams_drawn_drop_by_drop(rain_mm_h: float)
     best = np.zeros(beams)
     np.maximum.at(best, beam, power)
 
-    table = drops(rain_mm_h, extinction, divergence, LEAST)
+    table = compute_drops(rain_mm_h, extinction, divergence, LEAST)
     for level in (LEAST, 3 * LEAST, 20 * LEAST):
         expected = 1 - np.exp(-np.interp(-level, -table.power, table.number))
         assert np.mean(best > level) == pytest.approx(expected, abs=0.006)
@@ -96,7 +96,7 @@ def test_surfaces_get_dimmer_by_the_two_way_extinction():
     air = air_of(rain_mm_h=10.0, visibility_m=2000.0)
     distance = np.array([2.0, 10.0, 40.0], np.float32)
     extinction = 0.01 * 10**0.6 + np.log(20) / 2000
-    _, bright, aerial = through_air(distance, np.full(3, 0.5, np.float32), air, np.random.default_rng(1))
+    _, bright, aerial = add_air_returns(distance, np.full(3, 0.5, np.float32), air, np.random.default_rng(1))
     assert not aerial.any()
     np.testing.assert_allclose(bright, 0.5 * np.exp(-2 * extinction * distance), rtol=1e-5)
 
@@ -106,7 +106,7 @@ def test_dense_fog_hides_what_is_far_and_answers_nearby():
     distance = np.repeat(np.array([3.0, 60.0, np.inf], np.float32), 1000)
     bright = np.repeat(np.array([0.3, 0.3, 0.0], np.float32), 1000)
     seen, power, aerial = (
-        values.reshape(3, 1000) for values in through_air(distance, bright, air, np.random.default_rng(0))
+        values.reshape(3, 1000) for values in add_air_returns(distance, bright, air, np.random.default_rng(0))
     )
     assert aerial.mean(axis=1).tolist() == [0.0, 1.0, 1.0]
     assert (seen[0] == 3).all()
@@ -118,21 +118,21 @@ def test_the_air_answers_no_farther_than_the_surface_is():
     rng = np.random.default_rng(3)
     distance = rng.uniform(1.0, 30.0, 20_000).astype(np.float32)
     for air in (air_of(visibility_m=20.0), air_of(rain_mm_h=50.0)):
-        seen, _, aerial = through_air(distance, np.full(20_000, 1e-4, np.float32), air, rng)
+        seen, _, aerial = add_air_returns(distance, np.full(20_000, 1e-4, np.float32), air, rng)
         assert (seen <= distance).all()
         assert aerial.any()
         assert (seen[~aerial] == distance[~aerial]).all()
 
 
 def test_clear_air_is_no_air_at_all():
-    assert air_in(Weather(cloud_cover=1.0, sun_elevation_deg=-30.0, wetness=1.0), 0.003, LEAST) is None
+    assert compute_air(Weather(cloud_cover=1.0, sun_elevation_deg=-30.0, wetness=1.0), 0.003, LEAST) is None
     assert rain_range_noise(20.0) == pytest.approx(0.02)
     assert rain_range_noise(0.5) == pytest.approx(0.02 * 0.3935**2, rel=1e-3)
 
 
 def test_water_darkens_more_the_flatter_one_looks():
     cosine = np.cos(np.radians([0.0, 30, 60, 75, 85, 89]))
-    wet = [under_water(float(c), 0.17) for c in cosine]
+    wet = [compute_wet_brightness(float(c), 0.17) for c in cosine]
     assert wet[0] == pytest.approx((1 - 0.02006) ** 2 / 1.33**2 / (1 - 0.472 * 0.17), rel=1e-3)
     assert (np.diff(wet) < 0).all()
     assert wet[-1] < 0.02

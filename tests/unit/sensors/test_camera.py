@@ -7,8 +7,8 @@ from scipy.spatial import Delaunay
 
 from flcav.geometry import inverse, pose, transform_points
 from flcav.sensors.camera.camera import Camera, Exposure, photograph
-from flcav.sensors.camera.infrared import Infrared, thermal_image
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, directions, project
+from flcav.sensors.camera.infrared import Infrared, render_thermal
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, compute_pixel_rays, project
 from flcav.sensors.rendering.appearance import SEMANTICS
 from flcav.sensors.rendering.render import render
 from flcav.world.map.signals import Signals
@@ -35,7 +35,7 @@ def street(small_town: Callable[..., Town], standing: Callable[..., Trace]) -> S
 
 def test_depth_is_that_of_the_rays(street: Scene):
     camera = Camera(width=320, height=192, k1=-0.1, noise=0)
-    rays = directions(camera)
+    rays = compute_pixel_rays(camera)
     hits = street.cast(AHEAD, rays, far_m=1000.0)
     depth = shot(street, camera=camera).depth_m
     np.testing.assert_allclose(depth.ravel(), hits.distance * rays[:, 2], rtol=1e-6)
@@ -69,11 +69,11 @@ def test_a_car_throws_a_shadow_where_its_rays_to_the_sun_end(street: Scene):
     on_road = picture.semantic == SEMANTICS["road"]
     camera = Camera(width=320, height=192, noise=0)
     rows, columns = np.nonzero(on_road)
-    local = directions(camera).reshape(192, 320, 3)[rows, columns]
+    local = compute_pixel_rays(camera).reshape(192, 320, 3)[rows, columns]
     points = transform_points(AHEAD, local / local[:, 2:] * picture.depth_m[rows, columns, None])
     to_sun = np.array([[0.0, np.cos(np.radians(35)), np.sin(np.radians(35))]], np.float32)
     lifted = (points + np.array((0, 0, 0.02))).astype(np.float32)
-    dark = street.blocked(lifted, to_sun, np.full(len(points), 300.0, np.float32))
+    dark = street.find_occluded(lifted, to_sun, np.full(len(points), 300.0, np.float32))
     bright = picture.rgb[rows, columns].mean(axis=1)
     assert 20 < dark.sum() < len(dark)
     assert np.median(bright[dark]) < 0.7 * np.median(bright[~dark])
@@ -152,10 +152,10 @@ def test_heat_shows_people_and_engines_by_night(small_town: Callable[..., Town],
     actors.append(("ped0", "pedestrian", 0, 10.0, 3.0, np.pi))
     scene = Scene(small_town(), standing(actors))
     settings = Infrared(width=320, height=192)
-    image = thermal_image(scene, AHEAD, settings, WEATHERS["night"], np.random.default_rng(0)) / 100.0
+    image = render_thermal(scene, AHEAD, settings, WEATHERS["night"], np.random.default_rng(0)) / 100.0
     instance = shot(scene, camera=Camera(width=320, height=192)).instance
     driving, parked, person, rest = (image[instance == number] for number in (1, 2, 3, 0))
     assert np.percentile(person, 90) > np.median(rest) + 8
     assert np.percentile(driving, 90) > np.percentile(parked, 90) + 3
-    by_day = thermal_image(scene, AHEAD, settings, CLEAR, np.random.default_rng(0)) / 100.0
+    by_day = render_thermal(scene, AHEAD, settings, CLEAR, np.random.default_rng(0)) / 100.0
     assert np.median(by_day[120:]) > np.median(image[120:]) + 10  # the road in the sun

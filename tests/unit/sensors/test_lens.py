@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from flcav.sensors.camera.lens import Lens, directions, project, unproject
+from flcav.sensors.camera.lens import Lens, compute_pixel_rays, project, unproject
 
 
 def test_projection_is_a_pinhole_s():
@@ -33,8 +33,8 @@ def test_distortion_round_trip(k1: float, k2: float, p1: float, p2: float, data:
 
 def test_a_barrel_shows_more_than_a_pinhole():
     straight, barrel = Lens(fov_deg=80.0), Lens(fov_deg=80.0, k1=-0.15)
-    assert directions(barrel)[0, 2] < directions(straight)[0, 2]
-    np.testing.assert_allclose(np.linalg.norm(directions(barrel), axis=1), 1, atol=1e-6)
+    assert compute_pixel_rays(barrel)[0, 2] < compute_pixel_rays(straight)[0, 2]
+    np.testing.assert_allclose(np.linalg.norm(compute_pixel_rays(barrel), axis=1), 1, atol=1e-6)
 
 
 def test_a_folded_image_is_refused():

@@ -6,7 +6,7 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.geometry import pose
-from flcav.sensors.lidar.lidar import Lidar, cast, draw_passes, ray_pattern, scan
+from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern, cast, draw_passes, scan
 from flcav.sensors.rig import RIGS, Rig
 from flcav.world.map.town import Town
 from flcav.world.materials import REFLECTIVITY, Material
@@ -49,13 +49,13 @@ def test_bad_settings_get_one_sentence(values: dict[str, Any], message: str):
 
 def test_pattern_has_the_channels_and_steps_asked_for():
     lidar = Lidar(channels=5, azimuth_steps=12, up_deg=10.0, down_deg=-30.0)
-    rays = ray_pattern(lidar).reshape(5, 12, 3)
+    rays = build_ray_pattern(lidar).reshape(5, 12, 3)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=2), 1, atol=1e-6)
     elevation = np.degrees(np.arcsin(rays[..., 2]))
     np.testing.assert_allclose(elevation, np.repeat([[10.0], [0], [-10], [-20], [-30]], 12, axis=1), atol=1e-4)
     azimuth = np.degrees(np.arctan2(rays[2, :, 1], rays[2, :, 0])) % 360
     np.testing.assert_allclose(azimuth, np.arange(12) * 30, atol=1e-4)
-    uneven = ray_pattern(Lidar(channels=2, azimuth_steps=4, elevations_deg=(-8.0, 1.0)))
+    uneven = build_ray_pattern(Lidar(channels=2, azimuth_steps=4, elevations_deg=(-8.0, 1.0)))
     assert np.degrees(np.arcsin(uneven[[0, -1], 2])) == pytest.approx([1.0, -8.0], abs=1e-4)
 
 

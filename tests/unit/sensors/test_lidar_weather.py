@@ -9,7 +9,7 @@ import pytest
 from flcav.config import InputError, parse_config
 from flcav.geometry import pose, transform_points
 from flcav.sensors.lidar.beams import BEAMS, CarlaReturns
-from flcav.sensors.lidar.lidar import Lidar, point_times_s, ray_pattern, scan
+from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern, point_times_s, scan
 from flcav.sensors.lidar.rolling import Motion
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
@@ -95,7 +95,7 @@ def test_a_wet_road_is_darker_and_only_the_road(walled: Scene):
 def test_known_beams_by_name(name: str, channels: int, high: float, low: float):
     lidar = parse_config(Lidar, {"beams": name}, "rig.yaml")
     assert (lidar.channels, lidar.range_m) == (channels, BEAMS[name].range_m)
-    elevation = np.degrees(np.arcsin(ray_pattern(lidar).reshape(channels, lidar.azimuth_steps, 3)[:, 0, 2]))
+    elevation = np.degrees(np.arcsin(build_ray_pattern(lidar).reshape(channels, lidar.azimuth_steps, 3)[:, 0, 2]))
     assert (np.diff(elevation) < 0).all()
     assert (elevation[0], elevation[-1]) == (pytest.approx(high, abs=1e-3), pytest.approx(low, abs=1e-3))
     assert parse_config(Lidar, lidar.model_dump(mode="json"), "manifest") == lidar

@@ -9,7 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import pose
-from flcav.sensors.navigation import STEP_S, Gnss, Imu, fix, geodetic, reading, walk, wander
+from flcav.sensors.navigation import (
+    STEP_S,
+    Gnss,
+    Imu,
+    convert_to_geodetic,
+    draw_gauss_markov,
+    draw_random_walk,
+    measure_inertia,
+    measure_position,
+)
 from flcav.world.map.parameters import GeoReference
 from flcav.world.map.town import Town
 from flcav.world.scene import Scene
@@ -37,7 +46,7 @@ def test_places_on_earth_agree_with_proj(
     latitude: float, longitude: float, altitude: float, east: float, north: float, up: float
 ):
     origin = GeoReference(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude)
-    ours = geodetic(origin, np.array((east, north, up)))
+    ours = convert_to_geodetic(origin, np.array((east, north, up)))
     back = pyproj.Transformer.from_pipeline(
         "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 "
         f"+lat_0={latitude!r} +lon_0={longitude!r} +h_0={altitude!r} "
@@ -51,14 +60,17 @@ def test_places_on_earth_agree_with_proj(
 
 def test_many_points_at_once():
     enu = np.random.default_rng(0).uniform(-500, 500, (4, 5, 3))
-    many = geodetic(GeoReference(), enu)
-    np.testing.assert_allclose(many[2, 3], geodetic(GeoReference(), enu[2, 3]))
-    np.testing.assert_allclose(geodetic(GeoReference(), np.zeros(3)), (49.0, 8.4, 0.0), atol=1e-8)
+    many = convert_to_geodetic(GeoReference(), enu)
+    np.testing.assert_allclose(many[2, 3], convert_to_geodetic(GeoReference(), enu[2, 3]))
+    np.testing.assert_allclose(convert_to_geodetic(GeoReference(), np.zeros(3)), (49.0, 8.4, 0.0), atol=1e-8)
 
 
 def test_errors_are_the_same_in_whatever_order_times_are_asked():
     times = np.arange(0.0, 12.0, 0.35)
-    for error in (lambda t: wander(rng(3), t, np.ones(2), 5.0), lambda t: walk(rng(3), t, np.ones(2), np.ones(2))):
+    for error in (
+        lambda t: draw_gauss_markov(rng(3), t, np.ones(2), 5.0),
+        lambda t: draw_random_walk(rng(3), t, np.ones(2), np.ones(2)),
+    ):
         forwards = [error(t) for t in times]
         backwards = [error(t) for t in times[::-1]][::-1]
         np.testing.assert_array_equal(forwards, backwards)
@@ -67,7 +79,10 @@ def test_errors_are_the_same_in_whatever_order_times_are_asked():
 
 def test_what_wanders_has_its_spread_and_its_memory():
     at = np.array(
-        [[wander(rng(seed), t, np.array((2.0,)), 10.0)[0] for t in (0.0, 60.0, 70.0)] for seed in range(3000)]
+        [
+            [draw_gauss_markov(rng(seed), t, np.array((2.0,)), 10.0)[0] for t in (0.0, 60.0, 70.0)]
+            for seed in range(3000)
+        ]
     )
     np.testing.assert_allclose(at.std(axis=0), 2.0, rtol=0.05)
     assert np.corrcoef(at[:, 1], at[:, 2])[0, 1] == pytest.approx(np.exp(-1), abs=0.05)
@@ -76,11 +91,17 @@ def test_what_wanders_has_its_spread_and_its_memory():
 
 def test_a_walk_grows_with_the_root_of_time():
     at = np.array(
-        [[walk(rng(seed), t, np.array((0.5,)), np.array((0.3,)))[0] for t in (0.0, 25.0)] for seed in range(3000)]
+        [
+            [draw_random_walk(rng(seed), t, np.array((0.5,)), np.array((0.3,)))[0] for t in (0.0, 25.0)]
+            for seed in range(3000)
+        ]
     )
     assert at[:, 0].std() == pytest.approx(0.5, rel=0.05)
     assert (at[:, 1] - at[:, 0]).std() == pytest.approx(0.3 * 5, rel=0.05)
-    between = [walk(rng(1), t, np.array((0.5,)), np.array((0.3,)))[0] for t in (1.0, 1.0 + STEP_S / 2, 1.0 + STEP_S)]
+    between = [
+        draw_random_walk(rng(1), t, np.array((0.5,)), np.array((0.3,)))[0]
+        for t in (1.0, 1.0 + STEP_S / 2, 1.0 + STEP_S)
+    ]
     assert between[1] == pytest.approx((between[0] + between[2]) / 2)
 
 
@@ -92,8 +113,8 @@ def scene(small_town: Callable[..., Town], standing: Callable[..., Trace]) -> Sc
 
 def test_a_fix_is_where_the_antenna_is(scene: Scene):
     at = scene.world_from_actor(0) @ pose(1.0, 0.0, 1.5)
-    found = fix(scene, at, EXACT_GNSS, rng(), rng())
-    np.testing.assert_allclose(found, geodetic(scene.town.geo, at[:3, 3]))
+    found = measure_position(scene, at, EXACT_GNSS, rng(), rng())
+    np.testing.assert_allclose(found, convert_to_geodetic(scene.town.geo, at[:3, 3]))
     metres = (found - (49.0, 8.4, 0.0)) * (111_214.0, 73_174.0, 1.0)
     np.testing.assert_allclose(metres[[1, 0, 2]], at[:3, 3], atol=0.03)
 
@@ -101,23 +122,23 @@ def test_a_fix_is_where_the_antenna_is(scene: Scene):
 def test_fixes_scatter_as_asked_and_share_a_bias(scene: Scene):
     at = scene.world_from_actor(0)
     gnss = Gnss(noise_m=0.5, noise_up_m=1.0, bias_m=3.0, bias_up_m=6.0)
-    fixes = np.array([fix(scene, at, gnss, rng(seed), rng(99)) for seed in range(2000)])
+    fixes = np.array([measure_position(scene, at, gnss, rng(seed), rng(99)) for seed in range(2000)])
     metres = fixes * (111_214.0, 73_174.0, 1.0)
     np.testing.assert_allclose(metres.std(axis=0), (0.5, 0.5, 1.0), rtol=0.06)
-    bias = metres.mean(axis=0) - geodetic(scene.town.geo, at[:3, 3]) * (111_214.0, 73_174.0, 1.0)
+    bias = metres.mean(axis=0) - convert_to_geodetic(scene.town.geo, at[:3, 3]) * (111_214.0, 73_174.0, 1.0)
     assert np.abs(bias).max() > 1.0
-    later = fix(scene, at, gnss, rng(0), rng(99))
+    later = measure_position(scene, at, gnss, rng(0), rng(99))
     scene.move_to(2)
-    assert not np.array_equal(fix(scene, at, gnss, rng(0), rng(99)), later)
+    assert not np.array_equal(measure_position(scene, at, gnss, rng(0), rng(99)), later)
     scene.move_to(0)
-    np.testing.assert_array_equal(fix(scene, at, gnss, rng(0), rng(99)), later)
+    np.testing.assert_array_equal(measure_position(scene, at, gnss, rng(0), rng(99)), later)
 
 
 def test_at_rest_gravity_is_felt_upwards_in_the_units_own_axes(scene: Scene):
     for carrier in (None, 0):
-        level = reading(scene, pose(0, 0, 1, 0.7), carrier, EXACT_IMU, rng(), rng())
+        level = measure_inertia(scene, pose(0, 0, 1, 0.7), carrier, EXACT_IMU, rng(), rng())
         np.testing.assert_allclose(level, (0, 0, G, 0, 0, 0), atol=1e-12)
-    nose_down = reading(scene, pose(0, 0, 1, 0.7, pitch=0.3), None, EXACT_IMU, rng(), rng())
+    nose_down = measure_inertia(scene, pose(0, 0, 1, 0.7, pitch=0.3), None, EXACT_IMU, rng(), rng())
     np.testing.assert_allclose(nose_down[:3], (-G * np.sin(0.3), 0, G * np.cos(0.3)), atol=1e-12)
 
 
@@ -126,17 +147,17 @@ def test_a_turn_is_felt_to_the_inside_and_more_away_from_the_centre(scene: Scene
     forward, left = np.array((np.cos(0.4), np.sin(0.4), 0)), np.array((-np.sin(0.4), np.cos(0.4), 0))
     scene.trace.acceleration[0, 0], scene.trace.yaw_rate[0, 0] = 1.5 * forward + speed * rate * left, rate
     at = scene.world_from_actor(0)
-    felt = reading(scene, at, 0, EXACT_IMU, rng(), rng())
+    felt = measure_inertia(scene, at, 0, EXACT_IMU, rng(), rng())
     np.testing.assert_allclose(felt, (1.5, speed * rate, G, 0, 0, rate), atol=1e-12)
-    ahead = reading(scene, at @ pose(2.0, 0.0, 0.5), 0, EXACT_IMU, rng(), rng())
+    ahead = measure_inertia(scene, at @ pose(2.0, 0.0, 0.5), 0, EXACT_IMU, rng(), rng())
     np.testing.assert_allclose(ahead, (1.5 - rate**2 * 2.0, speed * rate, G, 0, 0, rate), atol=1e-12)
-    tilted = reading(scene, at @ pose(0, 0, 0, roll=np.pi / 2), 0, EXACT_IMU, rng(), rng())
+    tilted = measure_inertia(scene, at @ pose(0, 0, 0, roll=np.pi / 2), 0, EXACT_IMU, rng(), rng())
     np.testing.assert_allclose(tilted, (1.5, G, -speed * rate, 0, rate, 0), atol=1e-12)
 
 
 def test_an_imus_noise_is_that_of_its_data_sheet(scene: Scene):
     imu = Imu(rate_hz=200.0, force_noise=0.01, rate_noise=0.002)
-    readings = np.array([reading(scene, pose(0, 0, 1), None, imu, rng(seed), rng(5)) for seed in range(2000)])
+    readings = np.array([measure_inertia(scene, pose(0, 0, 1), None, imu, rng(seed), rng(5)) for seed in range(2000)])
     np.testing.assert_allclose(readings.std(axis=0), np.repeat((0.1, 0.02), 3), rtol=0.06)
     bias = readings.mean(axis=0) - (0, 0, G, 0, 0, 0)
     assert np.abs(bias[:3]).max() > 0.01

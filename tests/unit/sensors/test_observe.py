@@ -12,8 +12,8 @@ from flcav.geometry import inverse, points_in_boxes, pose
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.camera.camera import Camera
 from flcav.sensors.camera.lens import project
-from flcav.sensors.lidar.lidar import Lidar, cast, draw_passes, ray_pattern
-from flcav.sensors.lidar.visibility import rays_into_box
+from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern, cast, draw_passes
+from flcav.sensors.lidar.visibility import find_occluded_rays
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import RIGS, MountedLidar, Rig
 from flcav.world.map.town import Signs, Town
@@ -107,7 +107,7 @@ def test_returns_of_an_actor_lie_in_its_box(
     place = (distance * np.cos(bearing), distance * np.sin(bearing), yaw)
     trace = standing([("cav0", "car", 3, 0.0, 0.0, 0.0), ("it", *pair, *place)])
     frame = observe(Scene(small_town(), trace), RIGS["lidar32"], "cav0", 0, scene_name="s", seed=1)
-    boxes = frame.annotations.boxes.transformed(inverse(frame.world_from_sensor("lidar")))
+    boxes = frame.annotations.boxes.transform(inverse(frame.world_from_sensor("lidar")))
     inside = points_in_boxes(frame.lidar["lidar"], boxes, margin_m=0.1)[0]
     assert frame.annotations.returns[0] <= np.count_nonzero(inside)
     above_ground = points_in_boxes(frame.lidar["lidar"], boxes, margin_m=-0.0)[0]
@@ -157,10 +157,10 @@ def test_an_absent_agent_cannot_observe(small_town: Callable[..., Town], standin
 def test_rays_into_a_box_are_found_by_brute_force_too(seed: int):
     rng = np.random.default_rng(seed)
     lidar = Lidar(channels=8, azimuth_steps=60, up_deg=20.0, down_deg=-60.0)
-    rays, size = ray_pattern(lidar), rng.uniform(0.5, 8.0, 3)
+    rays, size = build_ray_pattern(lidar), rng.uniform(0.5, 8.0, 3)
     body_from_sensor = pose(*rng.uniform((-12, -12, -1, -0.3, -0.3, -0.3), (12, 12, 8, 0.3, 0.3, 0.3)))
     body_from_sensor[:3, :3] = pose(0, 0, 0, rng.uniform(-np.pi, np.pi))[:3, :3] @ body_from_sensor[:3, :3]
-    found = rays_into_box(rays, lidar.azimuth_steps, body_from_sensor, size, 0.0, np.zeros(len(rays), np.float32))
+    found = find_occluded_rays(rays, lidar.azimuth_steps, body_from_sensor, size, 0.0, np.zeros(len(rays), np.float32))
     steps = np.linspace(0, 40, 1001)[:, None, None]
     points = body_from_sensor[:3, 3] + steps * (rays.astype(float) @ body_from_sensor[:3, :3].T)
     low, high = np.array([-size[0] / 2, -size[1] / 2, 0]), np.array([size[0] / 2, size[1] / 2, size[2]])

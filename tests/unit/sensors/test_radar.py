@@ -5,8 +5,16 @@ import numpy as np
 import pytest
 
 from flcav.geometry import pose
-from flcav.sensors.radar.detector import ECHOES, Cells, actor_rcs, detect, false_alarms, silhouette, snr_per_m2
-from flcav.sensors.radar.radar import Radar, cross_sections, radar_sweep, rays_of
+from flcav.sensors.radar.detector import (
+    ACTOR_RCS,
+    Cells,
+    compute_actor_rcs,
+    detect,
+    false_alarms,
+    silhouette,
+    snr_per_m2,
+)
+from flcav.sensors.radar.radar import Radar, cross_sections, draw_rays, sweep_radar
 from flcav.world.map.town import Town
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
@@ -29,7 +37,7 @@ def world(small_town: Callable[..., Town], standing: Callable[..., Trace]) -> Ca
 def sweep(scene: Scene, seed: int = 0, velocity: tuple[float, ...] = (0.0, 0.0, 0.0), **settings: Any):
     options = {name: settings.pop(name) for name in ("hidden", "weather") if name in settings}
     rng = np.random.default_rng(seed)
-    return radar_sweep(scene, settings.pop("at", AT), np.array(velocity), Radar(**settings), rng, **options)
+    return sweep_radar(scene, settings.pop("at", AT), np.array(velocity), Radar(**settings), rng, **options)
 
 
 def test_a_car_is_where_it_is_and_as_fast_as_it_is(world: Callable[..., Scene]):
@@ -126,7 +134,7 @@ def total(scene: Scene, actor: int = 0) -> float:
     """Return the mean cross-section [m^2] of all patches of an actor that rays meet, over many sweeps."""
     radar, sums = Radar(azimuth_cell_deg=1.0, elevation_cell_deg=1.0), []
     for seed in range(8):
-        directions, solid_angle = rays_of(radar, np.random.default_rng(seed))
+        directions, solid_angle = draw_rays(radar, np.random.default_rng(seed))
         hits = scene.cast(AT, directions, far_m=100.0)
         met = np.flatnonzero(hits.instance == actor + 1)
         part = Hits(hits.distance[met], hits.instance[met], hits.face[met])
@@ -136,7 +144,7 @@ def total(scene: Scene, actor: int = 0) -> float:
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, np.pi / 2])
 def test_a_whole_car_has_its_cross_section_and_half_a_car_half(world: Callable[..., Scene], yaw: float):
-    expected = actor_rcs(np.array(["car"]), np.array([np.pi - yaw]))[0]
+    expected = compute_actor_rcs(np.array(["car"]), np.array([np.pi - yaw]))[0]
     assert total(world(("veh0", "car", 20.0, 0.0, yaw))) == pytest.approx(expected, rel=0.3)
 
 
@@ -147,13 +155,13 @@ def test_what_is_hidden_does_not_answer(world: Callable[..., Scene]):
 
 
 def test_classes_and_aspects_differ():
-    assert set(ECHOES) == set(CATEGORIES)
+    assert set(ACTOR_RCS) == set(CATEGORIES)
     aspect = np.linspace(0, 2 * np.pi, 73)
-    car = 10 * np.log10(actor_rcs(np.full(73, "car"), aspect))
+    car = 10 * np.log10(compute_actor_rcs(np.full(73, "car"), aspect))
     assert car.max() - car.min() > 8
     assert car[18] > car[9] + 5  # the side outshines the corner
     np.testing.assert_allclose(car, car[::-1], atol=1e-9)
-    mean = {name: actor_rcs(np.full(73, name), aspect).mean() for name in CATEGORIES}
+    mean = {name: compute_actor_rcs(np.full(73, name), aspect).mean() for name in CATEGORIES}
     assert mean["pedestrian"] < mean["bicycle"] < mean["motorcycle"] < mean["car"] < mean["van"] < mean["truck"]
     np.testing.assert_allclose(silhouette(np.array([[4.0, 2.0, 1.5]] * 2), np.array([0.0, np.pi / 2])), [3.0, 6.0])
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError, parse_config
-from flcav.sensors.calibration import CalibrationError, assume, calibration_of
+from flcav.sensors.calibration import CalibrationError, build_calibration, perturb_calibration
 from flcav.sensors.camera.lens import Lens, project
 from flcav.sensors.rig import RIGS, Rig
 
@@ -35,7 +35,7 @@ def test_the_cars_lidar_is_the_same_in_every_rig():
 
 
 def test_six_cameras_leave_no_direction_unseen():
-    calibration = calibration_of(RIGS["car_surround"])
+    calibration = build_calibration(RIGS["car_surround"])
     azimuth = np.radians(np.arange(0, 360, 1.0))
     seen = np.zeros(len(azimuth), bool)
     for name, camera in RIGS["car_surround"].cameras.items():
@@ -51,7 +51,7 @@ def test_kittis_lidar_projects_as_in_its_own_calibration_file():
 
     Their camera is pitched by 0.7 degrees against the LiDAR, which is 9 rows; ours is level.
     """
-    calibration = calibration_of(RIGS["kitti"])
+    calibration = build_calibration(RIGS["kitti"])
     mounts = calibration.agent_from_sensor
     camera_from_lidar = np.linalg.inv(mounts["image_2"]) @ mounts["velodyne"]
     ahead = camera_from_lidar @ (20.0, 2.0, -1.0, 1.0)
@@ -67,28 +67,31 @@ def test_kittis_lidar_projects_as_in_its_own_calibration_file():
 
 def test_a_camera_looks_along_its_mounts_x():
     look = rig(cameras={"left": {"mount": {"z": 2.0, "yaw_deg": 90.0, "pitch_deg": 10.0}}})
-    mount = calibration_of(look).agent_from_sensor["left"]
+    mount = build_calibration(look).agent_from_sensor["left"]
     np.testing.assert_allclose(mount[:3, 2], (0, np.cos(np.radians(10)), -np.sin(np.radians(10))), atol=1e-12)
     np.testing.assert_allclose(mount[:3, 0], (1, 0, 0), atol=1e-12)  # to its right is where the car goes
 
 
 def test_errors_are_drawn_once_per_sensor_agent_and_seed():
-    true = calibration_of(RIGS["car"])
+    true = build_calibration(RIGS["car"])
     error = CalibrationError(position_m=0.1, rotation_deg=1.0, focal_px=3.0, time_ms=4.0)
-    one, again = (assume(true, error, seed=1, agent="cav0") for _ in range(2))
-    others = (assume(true, error, seed=2, agent="cav0"), assume(true, error, seed=1, agent="cav1"))
+    one, again = (perturb_calibration(true, error, seed=1, agent="cav0") for _ in range(2))
+    others = (
+        perturb_calibration(true, error, seed=2, agent="cav0"),
+        perturb_calibration(true, error, seed=1, agent="cav1"),
+    )
     for name in true.agent_from_sensor:
         np.testing.assert_array_equal(one.agent_from_sensor[name], again.agent_from_sensor[name])
         assert not any(np.allclose(one.agent_from_sensor[name], other.agent_from_sensor[name]) for other in others)
     assert one.offset_ms == again.offset_ms != true.offset_ms
     np.testing.assert_array_equal(one.distortion["camera"], true.distortion["camera"])
-    assert assume(true, CalibrationError(), seed=1, agent="cav0") is true
+    assert perturb_calibration(true, CalibrationError(), seed=1, agent="cav0") is true
 
 
 def test_errors_have_the_size_asked_for():
-    true = calibration_of(rig(cameras={"front": {}}))
+    true = build_calibration(rig(cameras={"front": {}}))
     error = CalibrationError(position_m=0.1, rotation_deg=2.0, focal_px=3.0, time_ms=4.0)
-    drawn = [assume(true, error, seed=seed, agent="cav0") for seed in range(400)]
+    drawn = [perturb_calibration(true, error, seed=seed, agent="cav0") for seed in range(400)]
     between = np.array(
         [np.linalg.inv(true.agent_from_sensor["front"]) @ one.agent_from_sensor["front"] for one in drawn]
     )
@@ -103,5 +106,5 @@ def test_errors_have_the_size_asked_for():
 
 def test_intrinsics_are_the_lenss():
     lens = Lens(width=640, height=384, fov_deg=90.0)
-    matrix = calibration_of(rig(cameras={"front": {"settings": {"width": 640, "height": 384}}})).intrinsics["front"]
+    matrix = build_calibration(rig(cameras={"front": {"settings": {"width": 640, "height": 384}}})).intrinsics["front"]
     np.testing.assert_array_equal(matrix, lens.intrinsics())

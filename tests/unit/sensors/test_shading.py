@@ -10,19 +10,19 @@ from shapely.geometry import MultiPolygon, Point, Polygon
 
 from flcav.geometry import pose
 from flcav.sensors.camera.camera import Camera, photograph
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens, directions
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays
 from flcav.sensors.camera.tone import develop, grain
 from flcav.sensors.rendering import render as memory
 from flcav.sensors.rendering import supersampling as antialias
-from flcav.sensors.rendering.ambient_occlusion import DARKEST, openness
-from flcav.sensors.rendering.appearance import appearance_of
-from flcav.sensors.rendering.gbuffer import survey
+from flcav.sensors.rendering.ambient_occlusion import DARKEST, compute_ambient_occlusion
+from flcav.sensors.rendering.appearance import build_appearance
+from flcav.sensors.rendering.gbuffer import fill_gbuffer
 from flcav.sensors.rendering.glare import add_sun_glare
-from flcav.sensors.rendering.ground import markings_of, paint_at
-from flcav.sensors.rendering.light import light_of
+from flcav.sensors.rendering.ground import build_markings, find_paint
+from flcav.sensors.rendering.light import compute_light
 from flcav.sensors.rendering.rain import add_drops
 from flcav.world.map.layers import Arrow, Crossing, MapLayers, Marking
-from flcav.world.map.paint import painted
+from flcav.world.map.paint import outline_paint
 from flcav.world.map.town import Town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
@@ -68,13 +68,13 @@ def test_what_is_painted_is_what_the_map_says():
         ),
         arrows=(Arrow("straight_left", 12.0, -5.0, 0.7, ""), Arrow("right", 16.0, -3.0, -2.0, "")),
     )
-    markings = markings_of(layers)
-    shapes = shapely.union_all([Polygon(paint.outline) for paint in painted(layers)])
+    markings = build_markings(layers)
+    shapes = shapely.union_all([Polygon(paint.outline) for paint in outline_paint(layers)])
     assert isinstance(shapes, MultiPolygon)
     rng, narrow, found = np.random.default_rng(0), np.float32(1e-4), 0
     for x, y in rng.uniform((-1, -9), (21, 6), (2500, 2)):
         if shapes.boundary.distance(Point(x, y)) > 0.07:  # arrows are strips
-            share, _ = paint_at(x, y, np.float32(1), np.float32(0), narrow, narrow, markings)
+            share, _ = find_paint(x, y, np.float32(1), np.float32(0), narrow, narrow, markings)
             assert share == shapes.contains(Point(x, y))
             found += share
     assert found > 40
@@ -85,9 +85,9 @@ def test_half_the_sky_is_free_at_the_foot_of_a_wall(street: Scene):
     sees = []
     for y in (9.9, 4.0):
         at = pose(20.0, y, 2.0, 0.0, np.pi / 2) @ BODY_FROM_OPTICAL
-        hits = street.cast(at, directions(lens))
-        seen = survey(street, appearance_of(street), at, directions(lens), hits)
-        sees.append(openness(street, seen, lens, None).reshape(64, 64)[24:40, 24:40].mean())
+        hits = street.cast(at, compute_pixel_rays(lens))
+        seen = fill_gbuffer(street, build_appearance(street), at, compute_pixel_rays(lens), hits)
+        sees.append(compute_ambient_occlusion(street, seen, lens, None).reshape(64, 64)[24:40, 24:40].mean())
     assert sees[0] == pytest.approx(DARKEST + (1 - DARKEST) / 2, abs=0.08)
     assert sees[1] == 1.0
 
@@ -98,7 +98,7 @@ def test_the_sun_dazzles_only_where_it_is_in_sight(small_town: Callable[..., Tow
     lens, added = Lens(width=160, height=96), []
     for town in (small_town(), walled):
         image = np.zeros((96, 160, 3), np.float32)
-        add_sun_glare(image, Scene(town, standing([])), light_of(low), AHEAD, lens, None)
+        add_sun_glare(image, Scene(town, standing([])), compute_light(low), AHEAD, lens, None)
         added.append(image[..., 0])
     row, column = np.unravel_index(added[0].argmax(), added[0].shape)
     assert column == pytest.approx(79.5, abs=1)

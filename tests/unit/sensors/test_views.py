@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import inverse, pose, transform_points
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens, directions, project
-from flcav.sensors.labels.outlines import amodal_boxes, clipped, hull
-from flcav.sensors.labels.views import actor_regions, thing_regions, view_actors
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays, project
+from flcav.sensors.labels.outlines import clip_boxes, compute_amodal_boxes, hull
+from flcav.sensors.labels.views import find_actor_regions, find_thing_regions, view_actors
 from flcav.world.map.town import Town
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
@@ -28,7 +28,7 @@ def camera(x: float = 0.0, y: float = 0.0, z: float = 1.5, yaw: float = 0.0) -> 
 
 def picture(scene: Scene, at: np.ndarray, lens: Lens = LENS) -> np.ndarray:
     """Return the instance image by bare tracing."""
-    hits = scene.cast(at, directions(lens))
+    hits = scene.cast(at, compute_pixel_rays(lens))
     return np.maximum(hits.instance, 0).reshape(lens.height, lens.width)
 
 
@@ -63,7 +63,7 @@ def test_amodal_boxes_are_around_every_vertex(
 ):
     lens, at = Lens(width=160, height=96, fov_deg=80.0, k1=k1), camera()
     scene = Scene(small_town(), standing([("it", *pair, distance, aside * distance, yaw)]))
-    box = amodal_boxes(scene, at, lens, np.array([0]))[0]
+    box = compute_amodal_boxes(scene, at, lens, np.array([0]))[0]
     points = transform_points(inverse(at) @ scene.world_from_actor(0), actor_mesh(*pair).vertices.astype(np.float64))
     if points[:, 2].min() < 0.1:
         return
@@ -73,7 +73,7 @@ def test_amodal_boxes_are_around_every_vertex(
         if k1 == 0:
             np.testing.assert_allclose(box, expected, atol=1e-6)
         elif (np.abs(points[:, 0]) < points[:, 2]).all():  # where the lens is trusted
-            np.testing.assert_allclose(*clipped(np.stack((box, expected)), lens), atol=1.0)
+            np.testing.assert_allclose(*clip_boxes(np.stack((box, expected)), lens), atol=1.0)
     else:
         assert np.isnan(box).all()
 
@@ -81,7 +81,7 @@ def test_amodal_boxes_are_around_every_vertex(
 def test_an_actor_that_passes_the_camera_is_cut_at_it(small_town: Callable[..., Town], standing: Callable[..., Trace]):
     """A bus beside the camera reaches from behind it to ahead: its rectangle goes on to the image's edge and beyond."""
     scene = Scene(small_town(), standing([("it", "bus", 0, 1.0, 2.5, 0.0)]))
-    box = amodal_boxes(scene, camera(), LENS, np.array([0]))[0]
+    box = compute_amodal_boxes(scene, camera(), LENS, np.array([0]))[0]
     assert box[0] < -0.5
     assert box[2] < LENS.width / 2
     seen = picture(scene, camera()) == 1
@@ -91,7 +91,7 @@ def test_an_actor_that_passes_the_camera_is_cut_at_it(small_town: Callable[..., 
     assert (u <= box[2]).all()
     assert (v >= box[1]).all()
     assert (v <= box[3]).all()
-    behind = amodal_boxes(scene, camera(x=20.0), LENS, np.array([0]))[0]
+    behind = compute_amodal_boxes(scene, camera(x=20.0), LENS, np.array([0]))[0]
     assert np.isnan(behind).all()
 
 
@@ -99,7 +99,7 @@ def test_occlusion_and_truncation_of_a_row_of_cars(small_town: Callable[..., Tow
     cars = [("a", "car", 0, 10.0, 0.0, 0.0), ("b", "van", 1, 18.0, 0.6, 0.0), ("c", "car", 2, 8.0, 6.3, 0.0)]
     scene, at = Scene(small_town(), standing(cars)), camera()
     instance = picture(scene, at)
-    views = view_actors(scene, at, LENS, instance, actor_regions(instance, 3), np.arange(3))
+    views = view_actors(scene, at, LENS, instance, find_actor_regions(instance, 3), np.arange(3))
     for actor in range(3):
         alone = picture(Scene(small_town(), standing([cars[actor]])), at) == 1
         shown = np.count_nonzero(instance == actor + 1)
@@ -121,7 +121,7 @@ def test_a_large_actor_is_judged_by_some_of_its_pixels(small_town: Callable[...,
     cars = [("a", "pedestrian", 0, 3.0, 0.0, 0.0), ("b", "bus", 0, 11.0, 0.0, 1.2)]
     scene, at = Scene(small_town(), standing(cars)), camera()
     instance = picture(scene, at, lens)
-    views = view_actors(scene, at, lens, instance, actor_regions(instance, 2), np.arange(2))
+    views = view_actors(scene, at, lens, instance, find_actor_regions(instance, 2), np.arange(2))
     alone = np.count_nonzero(picture(Scene(small_town(), standing(cars[1:])), at, lens) == 1)
     assert alone > 20_000
     assert views.occlusion[1] == pytest.approx(1 - views.pixels[1] / alone, abs=0.02)
@@ -132,7 +132,7 @@ def test_a_large_actor_is_judged_by_some_of_its_pixels(small_town: Callable[...,
 def test_regions_are_those_of_a_mask(seed: int):
     rng = np.random.default_rng(seed)
     image = rng.choice([0, 0, 0, 1, 2, -1, -3], size=(7, 9)).astype(np.int32)
-    for regions, sign in ((actor_regions(image, 3), 1), (thing_regions(image, 3), -1)):
+    for regions, sign in ((find_actor_regions(image, 3), 1), (find_thing_regions(image, 3), -1)):
         for i in range(3):
             v, u = np.nonzero(image == sign * (i + 1))
             assert regions.pixels[i] == len(v)

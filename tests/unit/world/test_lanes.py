@@ -13,9 +13,9 @@ from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
 from flcav.geometry import pose
-from flcav.world.map.lanes import RASTER_LAYERS, fill, map_layers, rasterise
+from flcav.world.map.lanes import RASTER_LAYERS, fill_polygons, map_layers, rasterise
 from flcav.world.map.layers import MapLayers
-from flcav.world.map.paint import painted
+from flcav.world.map.paint import outline_paint
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.town import TOWNS, Town, load_town
 
@@ -47,7 +47,7 @@ def test_lanes_lead_on_from_where_they_end(mapped: tuple[Town, RoadNet, MapLayer
 def test_paint_is_on_the_road_and_lines_stay_off_the_crossings(mapped: tuple[Town, RoadNet, MapLayers]) -> None:
     town, _, layers = mapped
     roads = area(town.roads)
-    shapes = painted(layers)
+    shapes = outline_paint(layers)
     assert {shape.layer for shape in shapes} >= {"marking", "crossing"}
     for shape in shapes:
         polygon = Polygon(shape.outline)
@@ -63,7 +63,7 @@ def test_stripes_lie_in_their_crossing_and_run_along_the_road(mapped: tuple[Town
     _, net, layers = mapped
     assert len(layers.crossings) == sum(edge.function == "crossing" for edge in net.edges.values())
     crossings = area(tuple(crossing.outline for crossing in layers.crossings))
-    stripes = [Polygon(shape.outline) for shape in painted(layers) if shape.layer == "crossing"]
+    stripes = [Polygon(shape.outline) for shape in outline_paint(layers) if shape.layer == "crossing"]
     assert all(stripe.difference(crossings).area < 1e-6 for stripe in stripes)
     assert 0.4 < sum(stripe.area for stripe in stripes) / crossings.area < 0.65
 
@@ -135,7 +135,7 @@ def test_a_raster_says_what_shapely_says(mapped: tuple[Town, RoadNet, MapLayers]
     x, y = 20.0 - (rows + 0.5) * 0.4, 12.0 - (columns + 0.5) * 0.4
     points = np.stack((x, y, 0 * x, 1 + 0 * x)).reshape(4, -1)
     world = (world_from_patch @ points)[:2]
-    shapes = painted(layers)
+    shapes = outline_paint(layers)
     expected = {
         "road": list(town.roads),
         "sidewalk": list(town.sidewalks),
@@ -164,7 +164,7 @@ def test_filling_any_convex_polygons(outlines: list[list[tuple[float, float]]]) 
     if not hulls:
         return
     rings = [np.asarray(hull.exterior.coords)[:-1] for hull in hulls]
-    filled = fill(np.concatenate(rings), np.array([len(ring) for ring in rings]), (10, 9))
+    filled = fill_polygons(np.concatenate(rings), np.array([len(ring) for ring in rings]), (10, 9))
     rows, columns = np.mgrid[0:10, 0:9] + 0.5
     expected = shapely.contains_xy(shapely.union_all(hulls), rows, columns)
     near = shapely.dwithin(shapely.union_all([hull.boundary for hull in hulls]), shapely.points(rows, columns), 1e-7)

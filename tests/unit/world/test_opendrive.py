@@ -14,11 +14,11 @@ from flcav.sources.recipe import Recipe
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.parameters import TownParameters
 from flcav.world.map.roads import read_net
-from flcav.world.map.surfaces import footprint
+from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import Town, load_town
 from flcav.world.opendrive.document import read_document
-from flcav.world.opendrive.georeference import geo_reference, inverse_mercator
-from flcav.world.opendrive.importing import Imported, import_town
+from flcav.world.opendrive.georeference import inverse_mercator, locate_origin
+from flcav.world.opendrive.importing import ImportedTown, import_town
 from flcav.world.traffic.traffic import simulate
 
 CROSS = Path(__file__).parents[2] / "data" / "cross.xodr"
@@ -29,19 +29,19 @@ pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not inst
 
 
 @pytest.fixture(scope="module")
-def cross(tmp_path_factory: pytest.TempPathFactory) -> Imported:
+def cross(tmp_path_factory: pytest.TempPathFactory) -> ImportedTown:
     return import_town(CROSS, tmp_path_factory.mktemp("towns") / "cross")
 
 
 @pytest.fixture(scope="module", params=["Town02", "Town10HD"])
-def carla(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Imported:
+def carla(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ImportedTown:
     path = REAL / f"{request.param}.xodr"
     if not path.exists():
         pytest.skip(f"{path} is not there: CARLA's maps are not part of the project")
     return import_town(path, tmp_path_factory.mktemp("towns") / request.param)
 
 
-def test_the_cross_is_as_drawn(cross: Imported) -> None:
+def test_the_cross_is_as_drawn(cross: ImportedTown) -> None:
     net = read_net(cross.town.net)
     assert len(list(net.streets)) == 8
     junction = max(net.junctions.values(), key=lambda junction: len(junction.shape))
@@ -60,21 +60,21 @@ def test_the_cross_is_as_drawn(cross: Imported) -> None:
     assert any("sidewalks" in note for note in cross.notes)
 
 
-def test_the_origin_is_where_utm_says(cross: Imported) -> None:
+def test_the_origin_is_where_utm_says(cross: ImportedTown) -> None:
     geo = cross.town.geo
     assert (geo.latitude_deg, geo.longitude_deg) == pytest.approx((49.003466532, 8.425737458), abs=1e-8)  # by PROJ 9.4
     assert inverse_mercator(0.0, 0.0, 49.0, 8.4, 1.0) == pytest.approx((49.0, 8.4), abs=1e-12)
     metre = inverse_mercator(1.0, 1.0, 49.0, 8.4, 1.0)  # radii of curvature at 49 degrees: 6 372 031 m and 6 390 333 m
     assert metre[0] - 49.0 == pytest.approx(np.degrees(1 / 6_371_945), rel=1e-3)
     assert metre[1] - 8.4 == pytest.approx(np.degrees(1 / (6_390_333 * np.cos(np.radians(49.0)))), rel=1e-4)
-    south = geo_reference("+proj=utm +zone=33 +south +datum=WGS84", 500_000.0, 10_000_000.0)
+    south = locate_origin("+proj=utm +zone=33 +south +datum=WGS84", 500_000.0, 10_000_000.0)
     assert south is not None
     assert (south.latitude_deg, south.longitude_deg) == pytest.approx((0.0, 15.0), abs=1e-9)
-    assert geo_reference("+proj=lcc +lat_1=49", 0.0, 0.0) is None
-    assert geo_reference("", 0.0, 0.0) is None
+    assert locate_origin("+proj=lcc +lat_1=49", 0.0, 0.0) is None
+    assert locate_origin("", 0.0, 0.0) is None
 
 
-def test_a_recipe_names_the_folder(cross: Imported) -> None:
+def test_a_recipe_names_the_folder(cross: ImportedTown) -> None:
     folder = str(cross.town.net.parent)
     assert Recipe(town=folder).town == folder
     again = load_town(folder)
@@ -82,7 +82,7 @@ def test_a_recipe_names_the_folder(cross: Imported) -> None:
     np.testing.assert_array_equal(again.buildings, cross.town.buildings)
 
 
-def test_the_same_map_gives_the_same_town(cross: Imported, tmp_path: Path) -> None:
+def test_the_same_map_gives_the_same_town(cross: ImportedTown, tmp_path: Path) -> None:
     again = import_town(CROSS, tmp_path / "cross")
     for name in ("town.net.xml", "town.yaml"):
         assert (again.town.net.parent / name).read_bytes() == (cross.town.net.parent / name).read_bytes()
@@ -93,7 +93,7 @@ def furnished(town: Town) -> None:
     walks = shapely.union_all([Polygon(outline) for outline in town.sidewalks])
     assert roads.intersection(walks).area < 0.5
     for row in town.buildings:
-        assert not footprint(*row[:5]).intersects(roads.union(walks).buffer(-0.05))
+        assert not make_footprint(*row[:5]).intersects(roads.union(walks).buffer(-0.05))
     on_foot = shapely.contains_xy(walks.buffer(0.1), *town.poles.position[:, :2].T)
     assert on_foot.all()
     assert town.poles.id.tolist() == list(range(1, len(town.poles.id) + 1))
@@ -125,7 +125,7 @@ def flow(town: Town, until_s: int) -> Flow:
     )
 
 
-def test_the_cross_is_furnished_and_its_traffic_flows(cross: Imported) -> None:
+def test_the_cross_is_furnished_and_its_traffic_flows(cross: ImportedTown) -> None:
     furnished(cross.town)
     assert sorted(set(cross.town.poles.kind)) == ["cross", "straight"]
     got_on = flow(cross.town, 200)
@@ -134,7 +134,7 @@ def test_the_cross_is_furnished_and_its_traffic_flows(cross: Imported) -> None:
     assert 0.5 < got_on.walking < 1.7
 
 
-def test_carlas_town_is_furnished(carla: Imported) -> None:
+def test_carlas_town_is_furnished(carla: ImportedTown) -> None:
     town = carla.town
     furnished(town)
     assert len(town.buildings) > 60
@@ -150,7 +150,7 @@ def test_carlas_town_is_furnished(carla: Imported) -> None:
 
 
 @pytest.mark.slow
-def test_traffic_flows_in_carlas_town(carla: Imported) -> None:
+def test_traffic_flows_in_carlas_town(carla: ImportedTown) -> None:
     got_on = flow(carla.town, 660)
     assert got_on.slowest_third > 2.0
     assert got_on.gone > 0.8
@@ -179,7 +179,7 @@ def test_bad_maps_get_one_sentence_and_leave_nothing(text: str, message: str, tm
     assert [found.name for found in tmp_path.iterdir()] == ["map.xodr"]
 
 
-def test_nothing_is_overwritten(cross: Imported, tmp_path: Path) -> None:
+def test_nothing_is_overwritten(cross: ImportedTown, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is there already"):
         import_town(CROSS, cross.town.net.parent)
     with pytest.raises(InputError, match="no such file"):

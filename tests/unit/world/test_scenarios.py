@@ -13,7 +13,7 @@ from flcav.geometry import wrap_angle
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.world.map.roads import read_net
-from flcav.world.map.surfaces import footprint
+from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import Town, load_town
 from flcav.world.scenarios.director import SCRIPTS
 from flcav.world.scenarios.scenario import Scenario
@@ -37,7 +37,7 @@ def run(town: Town, kind: str, seed: int, until_s: float = UNTIL_S, **fields: ob
 
 def box(trace: Trace, instant: int, actor: int | np.intp) -> Polygon:
     x, y, _ = trace.position[instant, actor]
-    return footprint(x, y, trace.yaw[instant, actor], *trace.size[actor, :2])
+    return make_footprint(x, y, trace.yaw[instant, actor], *trace.size[actor, :2])
 
 
 def index(trace: Trace, name: str) -> int:

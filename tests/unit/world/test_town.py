@@ -14,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 from flcav.config import InputError
 from flcav.world.map.parameters import CLUTTER
 from flcav.world.map.roads import read_net
-from flcav.world.map.surfaces import footprint
+from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import TOWNS, Town, load_town
 
 
@@ -28,7 +28,7 @@ def area(polygons: tuple[np.ndarray, ...]) -> BaseGeometry:
 
 
 def footprints(rows: np.ndarray) -> np.ndarray:
-    return np.array([footprint(*row[:5]) for row in rows])
+    return np.array([make_footprint(*row[:5]) for row in rows])
 
 
 def test_ground_is_made_of_simple_disjoint_polygons(town: Town) -> None:

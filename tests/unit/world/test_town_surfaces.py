@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
-from flcav.world.map.surfaces import footprint, simple_polygons
+from flcav.world.map.surfaces import make_footprint, split_into_polygons
 
 holes = st.lists(st.tuples(st.floats(1, 16), st.floats(1, 16), st.floats(0.5, 3), st.floats(0, 3)), max_size=4)
 
@@ -17,18 +17,18 @@ holes = st.lists(st.tuples(st.floats(1, 16), st.floats(1, 16), st.floats(0.5, 3)
 def test_pieces_cover_the_area_without_holes_or_overlap(cuts: list[tuple[float, float, float, float]]) -> None:
     whole = box(0, 0, 20, 20)
     for x, y, extent, yaw in cuts:
-        whole = whole.difference(footprint(x, y, yaw, extent, extent / 2))
-    pieces = [Polygon(outline) for outline in simple_polygons(whole)]
+        whole = whole.difference(make_footprint(x, y, yaw, extent, extent / 2))
+    pieces = [Polygon(outline) for outline in split_into_polygons(whole)]
     assert all(piece.is_valid and piece.exterior.is_ccw for piece in pieces)
     assert sum(piece.area for piece in pieces) == pytest.approx(whole.area, rel=1e-9)
     assert shapely.union_all(pieces).symmetric_difference(whole).area < 1e-6
 
 
 def test_parts_stay_apart() -> None:
-    pieces = simple_polygons(MultiPolygon([box(0, 0, 1, 1), box(2, 0, 3, 1)]))
+    pieces = split_into_polygons(MultiPolygon([box(0, 0, 1, 1), box(2, 0, 3, 1)]))
     assert [len(piece) for piece in pieces] == [4, 4]
 
 
 def test_footprint_is_a_turned_rectangle() -> None:
-    turned = footprint(1.0, 2.0, np.pi / 2, 4.0, 2.0)
+    turned = make_footprint(1.0, 2.0, np.pi / 2, 4.0, 2.0)
     assert turned.bounds == pytest.approx((0.0, 0.0, 2.0, 4.0))

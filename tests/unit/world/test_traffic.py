@@ -9,9 +9,9 @@ from shapely.geometry import Polygon
 
 from flcav.config import InputError
 from flcav.geometry import wrap_angle
-from flcav.seeds import child_seed
-from flcav.world.map.census import mean_actors
-from flcav.world.map.surfaces import footprint
+from flcav.seeds import derive_seed
+from flcav.world.map.census import measure_traffic_density
+from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import KERB_M, TOWNS, Town, load_town
 from flcav.world.shapes import SHAPES
 from flcav.world.trace import CATEGORIES, Trace
@@ -88,7 +88,7 @@ def test_pedestrians_walk_as_fast_as_people_do_and_as_recorded(run: tuple[Town, 
 
 def test_a_pedestrian_who_changes_the_crossing_walks_there() -> None:
     """Seed 5 of `grid`: ped6 waits at one end of a corner and then takes the crossing at the other, 13 m away."""
-    trace = simulate(load_town("grid"), seed=child_seed(5, "traffic", 0), cavs=5, times_s=np.array([59.5, 60.0, 60.5]))
+    trace = simulate(load_town("grid"), seed=derive_seed(5, "traffic", 0), cavs=5, times_s=np.array([59.5, 60.0, 60.5]))
     ped6 = trace.actor.tolist().index("ped6")
     distance = np.linalg.norm(np.diff(trace.position[:, ped6], axis=0), axis=1)
     assert 0.2 < distance.max() < 0.5 * HURRY_MPS
@@ -201,7 +201,10 @@ def test_pole_8_of_grid_is_the_densest() -> None:
     for seed in range(3):
         trace = simulate(town, seed=seed, cavs=4, times_s=60.0 + 5.0 * np.arange(20))
         for range_m in (30.0, 40.0, 50.0):
-            assert town.poles.id[np.argmax(mean_actors(town.poles.position, trace, range_m))] == 8, (seed, range_m)
+            assert town.poles.id[np.argmax(measure_traffic_density(town.poles.position, trace, range_m))] == 8, (
+                seed,
+                range_m,
+            )
 
 
 def test_density_counts_who_is_within_range() -> None:
@@ -213,8 +216,8 @@ def test_density_counts_who_is_within_range() -> None:
             for actor in np.flatnonzero(trace.present[instant]):
                 centre = trace.position[instant, actor] + [0, 0, trace.size[actor, 2] / 2]
                 expected[pole] += np.sqrt(((centre - mount) ** 2).sum()) <= 35.0
-    np.testing.assert_array_equal(mean_actors(town.poles.position, trace, 35.0), expected / 2)
-    np.testing.assert_array_equal(mean_actors(town.poles.position, [trace, trace], 35.0), expected / 2)
+    np.testing.assert_array_equal(measure_traffic_density(town.poles.position, trace, 35.0), expected / 2)
+    np.testing.assert_array_equal(measure_traffic_density(town.poles.position, [trace, trace], 35.0), expected / 2)
 
 
 def test_towns_differ_in_who_drives() -> None:
@@ -245,4 +248,4 @@ def test_bad_requests_are_named(times_s: list[float], cavs: int, message: str) -
 
 def boxes(trace: Trace, instant: int) -> np.ndarray:
     rows = zip(trace.position[instant], trace.yaw[instant], trace.size)
-    return np.array([footprint(x, y, yaw, length, width) for (x, y, _), yaw, (length, width, _) in rows])
+    return np.array([make_footprint(x, y, yaw, length, width) for (x, y, _), yaw, (length, width, _) in rows])

@@ -16,10 +16,10 @@ from flcav.world.weather import (
     WEATHERS,
     Weather,
     WeatherSchedule,
+    classify_weather,
     draw_weather,
+    find_nearest_class,
     interpolate,
-    nearest_class,
-    weather_class,
 )
 
 CLASSES = ["clear", "cloudy", "overcast", "light_rain", "heavy_rain", "fog", "sunset", "night"]
@@ -36,8 +36,8 @@ def schedule(value: Any) -> WeatherSchedule:
 def test_eight_classes_with_a_preset_each():
     assert list(WEATHER_CLASSES) == CLASSES
     for name in CLASSES:
-        assert weather_class(WEATHERS[name]) == name
-    assert weather_class(WEATHERS["rainy_night"]) is None
+        assert classify_weather(WEATHERS[name]) == name
+    assert classify_weather(WEATHERS["rainy_night"]) is None
 
 
 @given(pair=st.sampled_from(list(combinations(CLASSES, 2))), seed=st.integers(0, 2**32))
@@ -45,7 +45,7 @@ def test_eight_classes_with_a_preset_each():
 def test_weathers_of_two_classes_are_a_margin_apart(pair: tuple[str, str], seed: int):
     rng = np.random.default_rng(seed)
     one, other = (draw_weather(name, rng) for name in pair)
-    assert (weather_class(one), weather_class(other)) == pair
+    assert (classify_weather(one), classify_weather(other)) == pair
     gaps = {name: abs(getattr(one, name) - getattr(other, name)) / margin for name, margin in MARGINS.items()}
     assert max(gaps.values()) >= 1 - 1e-9, gaps
 
@@ -68,14 +68,14 @@ def test_the_whole_space_holds_what_occurs(seed: int):
 
 def test_the_whole_space_reaches_every_class_and_beyond():
     rng = np.random.default_rng(0)
-    found = {weather_class(draw_weather(ANY, rng)) for _ in range(4000)}
+    found = {classify_weather(draw_weather(ANY, rng)) for _ in range(4000)}
     assert found == {*CLASSES, None}
 
 
 @given(name=st.sampled_from(CLASSES), seed=st.integers(0, 2**32))
 @settings(max_examples=100, deadline=None)
 def test_within_a_region_the_nearest_class_is_its_own(name: str, seed: int):
-    assert nearest_class(draw_weather(name, np.random.default_rng(seed))) == name
+    assert find_nearest_class(draw_weather(name, np.random.default_rng(seed))) == name
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_within_a_region_the_nearest_class_is_its_own(name: str, seed: int):
     ],
 )
 def test_between_the_regions_the_nearest_class_is_that_of_the_smaller_gap(weather: Weather, name: str):
-    assert weather_class(weather) is None
-    assert nearest_class(weather) == name
+    assert classify_weather(weather) is None
+    assert find_nearest_class(weather) == name
 
 
 def test_regions_are_a_unit_of_the_distance_apart():
@@ -147,7 +147,7 @@ def test_a_schedule_in_its_forms():
     changing = schedule(frames)
     assert [changing.at(t).rain_mm_h for t in (0.0, 2.0, 2.5, 3.0, 4.0, 99.0)] == pytest.approx([0, 0, 2, 4, 8, 8])
     drawn = schedule({"classes": ["sunset", "night"]})
-    seen = {weather_class(drawn.draw(np.random.default_rng(seed)).at(1.0)) for seed in range(20)}
+    seen = {classify_weather(drawn.draw(np.random.default_rng(seed)).at(1.0)) for seed in range(20)}
     assert seen == {"sunset", "night"}
     assert schedule({"classes": ["any"]}).draw(np.random.default_rng(1)).at(0.0) != Weather()
     with pytest.raises(ValueError, match="no weather was drawn"):
@@ -157,7 +157,7 @@ def test_a_schedule_in_its_forms():
 def test_classes_take_turns_in_an_order_of_the_scene():
     turns = schedule({"classes": [*CLASSES, "any"], "turn_s": 4.0})
     scenes = [turns.draw(np.random.default_rng(seed)) for seed in range(3)]
-    orders = [[weather_class(scene.at(4.0 * i)) for i in range(9)] for scene in scenes]
+    orders = [[classify_weather(scene.at(4.0 * i)) for i in range(9)] for scene in scenes]
     assert all({*CLASSES} <= {*order} for order in orders)
     assert orders[0] != orders[1]
     assert scenes[0].at(2.0) == interpolate(scenes[0].at(0.0), scenes[0].at(4.0), 0.5)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.options import finite
+from flcav.cli.options import check_finite
 
 
 def register(app: typer.Typer) -> None:
@@ -19,7 +19,7 @@ def birdseye(
         None, "--frame", help="Key of the frame, as the point clouds are named; else the first."
     ),
     range_m: float = typer.Option(
-        50.0, "--range", min=5.0, max=500.0, callback=finite, help="How far from the agent to show [m]."
+        50.0, "--range", min=5.0, max=500.0, callback=check_finite, help="How far from the agent to show [m]."
     ),
 ) -> None:
     """Draw a frame of a dataset from above: its points by height, its boxes, its agent."""
@@ -40,7 +40,7 @@ def birdseye(
     ground_m = -seen.world_from_agent[2, 3]
     view = View(
         points=np.concatenate(points) - (0.0, 0.0, ground_m),
-        truth=seen.annotations.boxes.transformed(agent_from_world),
+        truth=seen.annotations.boxes.transform(agent_from_world),
         returns=seen.annotations.returns,
         title=f"{seen.key} · {seen.time_s:.1f} s",
         range_m=range_m,

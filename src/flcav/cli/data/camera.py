@@ -24,7 +24,7 @@ def camera(
     from flcav.dataset.store import Dataset
     from flcav.files import write_bytes
     from flcav.report import style
-    from flcav.report.pictures.camera import camera_sheet, in_rows, shot
+    from flcav.report.pictures.camera import arrange_cameras, camera_sheet, make_shot
 
     dataset = Dataset.open(folder)
     names = [[*dataset.cameras(i), *dataset.infrareds(i)] for i in range(len(dataset))]
@@ -35,7 +35,7 @@ def camera(
     seen = dataset.frame(number)
     if name is not None and name not in names[number]:
         raise InputError(f"{folder}: no camera '{name}' in {seen.key}; it has {', '.join(names[number])}")
-    rows = in_rows(seen, names[number] if name is None else [name])
-    shots = [[shot(seen, each) for each in row] for row in rows]
+    rows = arrange_cameras(seen, names[number] if name is None else [name])
+    shots = [[make_shot(seen, each) for each in row] for row in rows]
     write_bytes(out, style.png(camera_sheet(f"{seen.key} · {seen.time_s:.1f} s", shots, boxes=boxes)))
     typer.echo(f"{out}: {seen.key}, {', '.join(each for row in rows for each in row)}")

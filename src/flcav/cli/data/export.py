@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.options import Format, listed
+from flcav.cli.options import Format, join_choices
 
 
 def register(app: typer.Typer) -> None:
@@ -14,7 +14,7 @@ def register(app: typer.Typer) -> None:
 
 
 def export(
-    format: Format = typer.Argument(metavar="FORMAT", help=f"What to write: {listed(Format)}."),
+    format: Format = typer.Argument(metavar="FORMAT", help=f"What to write: {join_choices(Format)}."),
     folder: Path = typer.Argument(metavar="DIR", help="A dataset."),
     out: Path = typer.Option(..., "--out", help="New or empty folder."),
     labels: str | None = typer.Option(
@@ -50,7 +50,7 @@ def export(
     asked = {name: value for name, value in every.items() if value is not None}
     options = parse_config(ExportOptions, asked, "export")
     dataset = Dataset.open(folder)
-    with progress.live(f"export {out}") as report:
+    with progress.show_progress(f"export {out}") as report:
         exported = write(dataset, format, out, options, progress=report)
     size_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
     written = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in exported.counts.items())

@@ -37,7 +37,7 @@ def record(
     changes = {name: value for name, value in (("frames", frames), ("seed", seed)) if value is not None}
     asked = load_recipe(recipe)
     source = EmbeddedSource(parse_config(Recipe, asked.model_dump() | changes, str(recipe)), recipe.parent)
-    with progress.live(f"record {out}") as report:
+    with progress.show_progress(f"record {out}") as report:
         written = write(source, out, jobs=jobs, engine=engine, progress=report)
     manifest = read_manifest(out)
     counts = manifest.counts

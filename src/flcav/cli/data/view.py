@@ -22,12 +22,12 @@ def view(
     from flcav import progress
     from flcav.config import InputError
     from flcav.dataset.store import Dataset
-    from flcav.extras import installation
+    from flcav.extras import format_install_command
     from flcav.files import atomic_path
     from flcav.world.map.lanes import map_layers
 
     if find_spec("rerun") is None:
-        raise InputError(f"flcav view needs Rerun, which is not installed: {installation('view')}")
+        raise InputError(f"flcav view needs Rerun, which is not installed: {format_install_command('view')}")
     if save is not None and save.suffix != ".rrd":
         raise InputError(f"--save {save}: must be the name of an .rrd file")
     if save is None and sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
@@ -49,7 +49,7 @@ def view(
     recording = rerun.RecordingStream("flcav", recording_id=shown)
 
     def log() -> None:
-        with progress.live(f"view {shown}") as report:
+        with progress.show_progress(f"view {shown}") as report:
             log_scene(recording, dataset, selected, layers, report)
         recording.flush()
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device, finite, refuse_unused
+from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device, check_finite, refuse_unused
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def errors(
         "--threshold",
         min=0.0,
         max=1.0,
-        callback=finite,
+        callback=check_finite,
         help="objects, signs: lowest score of a detection; 0.3 if not given.",
     ),
     map_: Path | None = typer.Option(None, "--map", help="PNG file: the errors in the dataset's town."),
@@ -70,7 +70,7 @@ def errors(
     town = dataset.town()
     if map_ is not None and town is None:
         raise InputError(f"{data}: its town is not known, so that there is no map of it")
-    with progress.live(f"errors of {learned.name}") as report:
+    with progress.show_progress(f"errors of {learned.name}") as report:
         found = networks.register_errors(
             learned, dataset, weights, threshold=threshold, agents=agents, device=device, progress=report
         )

@@ -43,7 +43,7 @@ def evaluate(
     from flcav.perception.tasks import task_named
 
     learned = task_named(task)
-    with progress.live(f"evaluate {learned.name}") as report:
+    with progress.show_progress(f"evaluate {learned.name}") as report:
         found = networks.evaluate(
             learned, data, weights, agents=agents, within=within, tracks=tracks, device=device, progress=report
         )

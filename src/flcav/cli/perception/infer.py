@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device, finite, refuse_unused
+from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device, check_finite, refuse_unused
 from flcav.cli.terminal import print_json
 from flcav.threads import use_threads
 
@@ -31,7 +31,7 @@ def infer(
         "--threshold",
         min=0.0,
         max=1.0,
-        callback=finite,
+        callback=check_finite,
         help="signs, objects: lowest score shown; 0.3 if not given.",
     ),
     device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),

@@ -45,13 +45,13 @@ def train(
     from flcav import progress
     from flcav.cli.options import refuse_unused
     from flcav.dataset.store import Dataset
-    from flcav.perception.device import device_named
+    from flcav.perception.device import select_device
     from flcav.perception.tasks import task_named
     from flcav.perception.training.run import CHECKPOINT, WEIGHTS, Request, prepare, train_prepared
 
     if validation is None:
         refuse_unused("a training without --validation", "patience")
-    learner, place = task_named(task), device_named(device)
+    learner, place = task_named(task), select_device(device)
     held = Dataset.open(validation) if validation else None
     request = Request([Dataset.open(folder) for folder in data], held, network, epochs, patience, seed, place, agents)
 
@@ -65,7 +65,7 @@ def train(
             typer.echo(f"{out / WEIGHTS}: trained with these settings before, nothing to do")
             return
         typer.echo("\n".join(prepared.lines()))
-        with progress.live(f"train {task}") as report:
+        with progress.show_progress(f"train {task}") as report:
             trained = train_prepared(prepared, report)
     card = trained.card
     told = f"{out / WEIGHTS}: trained on {card.samples} samples, {card.learning.steps} steps"

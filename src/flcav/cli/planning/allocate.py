@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from flcav.cli.options import listed
+from flcav.cli.options import join_choices
 from flcav.cli.terminal import print_json
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def allocate(
     ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
     baseline: Compared | None = typer.Option(
-        None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {listed(Compared)}."
+        None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {join_choices(Compared)}."
     ),
     progress: Path | None = typer.Option(
         None, "--progress", help="YAML: what is spent and observed so far; the plan goes on from there."
@@ -52,8 +52,8 @@ def allocate(
     from flcav.config import read_config
     from flcav.optimization.allocation.allocate import Infeasible
     from flcav.optimization.allocation.baselines import baseline as compared
-    from flcav.optimization.allocation.budget_sweep import savings
-    from flcav.optimization.allocation.replanning import Progress, going_on
+    from flcav.optimization.allocation.budget_sweep import compute_savings
+    from flcav.optimization.allocation.replanning import PlanState, condition_problem
     from flcav.optimization.fleet import allocate_fleet
     from flcav.optimization.graph import load_problem, read_graph
     from flcav.sources.recipe import find_recipe
@@ -61,14 +61,14 @@ def allocate(
     problem = find_recipe(problem)
     asked = load_problem(problem)
     if progress is not None:
-        asked = going_on(asked, read_config(Progress, progress))
+        asked = condition_problem(asked, read_config(PlanState, progress))
     try:
         plan, shares = allocate_fleet(asked)
     except Infeasible as error:
         if as_json:
             print_json({"status": "infeasible", "message": str(error)})
         raise
-    more = savings(asked, plan)
+    more = compute_savings(asked, plan)
     if out is not None:
         from flcav.files import write_bytes
         from flcav.report.pages.plan_page import plan_page
@@ -109,12 +109,12 @@ def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
 
 def _show(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> None:
     from flcav.cli.terminal import plain_console
-    from flcav.optimization.allocation.problem_file import MEASURES, meaning
+    from flcav.optimization.allocation.problem_file import MEASURES, explain_objective
 
     console, measure = plain_console(), MEASURES[problem.objective]
     console.print(_table(plan))
     console.print(f"{measure} {plan.objective:.6g}, {plan.status} ({_proven(plan.gap)})")
-    console.print(f"{measure.capitalize()}: {meaning(problem, plan.objective)}")
+    console.print(f"{measure.capitalize()}: {explain_objective(problem, plan.objective)}")
     verb = "adds" if problem.objective == "area" else "saves"
     for link in ("wireless", "wireline"):
         used, budget = getattr(plan.used_mb, f"{link}_mb"), getattr(problem.budgets_mb, link)

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from flcav.cli.options import finite, refuse_unused
+from flcav.cli.options import check_finite, refuse_unused
 from flcav.cli.terminal import print_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from flcav.optimization.allocation.problem_file import Learned
+    from flcav.optimization.allocation.problem_file import FittedFields
     from flcav.optimization.curves.fitting import Fit
 
 
@@ -44,19 +44,19 @@ def fit(
         "several times."
     ),
     group_samples: float = typer.Option(
-        0.0, "--group-samples", min=0, max=1e9, callback=finite, help="effective: samples that vehicles hold."
+        0.0, "--group-samples", min=0, max=1e9, callback=check_finite, help="effective: samples that vehicles hold."
     ),
     alpha: float = typer.Option(
-        0.1, "--alpha", min=1e-9, max=1e9, callback=finite, help="effective: worth of a pretraining sample."
+        0.1, "--alpha", min=1e-9, max=1e9, callback=check_finite, help="effective: worth of a pretraining sample."
     ),
     beta: float | None = typer.Option(
-        None, "--beta", min=0, max=1e9, callback=finite, help="effective: worth of a held sample; else fitted."
+        None, "--beta", min=0, max=1e9, callback=check_finite, help="effective: worth of a held sample; else fitted."
     ),
     k: int = typer.Option(
         1, "--edge-rounds-per-cloud-round", "-k", min=0, max=10**9, help="effective: edge rounds in a cloud round."
     ),
     level: float = typer.Option(
-        0.9, "--level", min=0.01, max=0.999, callback=finite, help="Share of repeats between the bands."
+        0.9, "--level", min=0.01, max=0.999, callback=check_finite, help="Share of repeats between the bands."
     ),
     repeats: int = typer.Option(200, "--repeats", min=20, max=10**5, help="Bootstrap repeats of the bands."),
     seed: int = typer.Option(0, "--seed", min=0, help="Seed of the bootstrap."),
@@ -64,10 +64,10 @@ def fit(
     """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
     from flcav.cli.tables import read_table
     from flcav.config import InputError
-    from flcav.optimization.allocation.problem_file import learned
+    from flcav.optimization.allocation.problem_file import collect_fitted_fields
     from flcav.optimization.curves import fitting as learning_curve
-    from flcav.optimization.curves.bands import bands, upper_curve
-    from flcav.optimization.curves.history import histories
+    from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
+    from flcav.optimization.curves.history import parse_histories
 
     if model is Model.additive:
         refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
@@ -75,18 +75,18 @@ def fit(
     asked = [_counts(text) for text in at]
     held, unnamed = _held(problem, history.stem)
     answers, shown, found_of = [], [], {}
-    for task, points in histories(read_table(history, ()).to_pydict(), str(history), unnamed).items():
+    for task, points in parse_histories(read_table(history, ()).to_pydict(), str(history), unnamed).items():
         try:
             found = learning_curve.fit(
                 points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta
             )
         except InputError as error:
             raise InputError(f"{history}: task {task!r}: {error}") from None
-        band = bands(found, level=level, repeats=repeats, seed=seed, k=k)
-        upper = None if band is None else upper_curve(found, band)
+        band = bootstrap_bands(found, level=level, repeats=repeats, seed=seed, k=k)
+        upper = None if band is None else fit_upper_curve(found, band)
         answers.append(_answer(task, found, band, upper, points.resources, asked, k))
         shown.append(found)
-        found_of[task] = learned(found, points.resources, upper)
+        found_of[task] = collect_fitted_fields(found, points.resources, upper)
     if problem is not None:
         _write(problem, held, found_of, k, history.name)
     if as_json:
@@ -103,7 +103,7 @@ def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
     That is the only task of the problem, or the name `stem` of the history's file.
     """
     from flcav.config import InputError, read_yaml
-    from flcav.optimization.allocation.problem_file import task_names
+    from flcav.optimization.allocation.problem_file import read_task_names
 
     if problem is None or not problem.exists():
         return None, stem
@@ -111,15 +111,15 @@ def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
         raise InputError(f"{problem}: --problem writes YAML")
     read_yaml(problem)  # raises for a file that is no YAML
     text = problem.read_bytes().decode("utf-8")
-    names = task_names(text, str(problem))
+    names = read_task_names(text, str(problem))
     return text, names[0] if len(names) == 1 else stem
 
 
-def _write(problem: Path, held: str | None, found: "Mapping[str, Learned]", k: int, history: str) -> None:
+def _write(problem: Path, held: str | None, found: "Mapping[str, FittedFields]", k: int, history: str) -> None:
     from flcav.files import write_bytes
-    from flcav.optimization.allocation.problem_file import new_problem, with_curves
+    from flcav.optimization.allocation.problem_file import format_problem, insert_curves
 
-    text = new_problem(found, k, history) if held is None else with_curves(held, found, k, str(problem))
+    text = format_problem(found, k, history) if held is None else insert_curves(held, found, k, str(problem))
     write_bytes(problem, text.encode())
 
 
@@ -153,16 +153,16 @@ def _answer(
 ) -> dict[str, Any]:  # fmt: skip
     import numpy as np
 
-    from flcav.optimization.curves.bands import METHOD, pointwise
+    from flcav.optimization.curves.bands import METHOD, tabulate_bands
 
     band = None
     if found is not None:
         band = {
             **{"method": METHOD, "level": found.level, "repeats": len(found.curves), "seed": found.seed},
-            "at": pointwise(fit, found, np.unique(measured, axis=0), k),
+            "at": tabulate_bands(fit, found, np.unique(measured, axis=0), k),
         }
-    predicted = pointwise(fit, found, np.array(asked).reshape(-1, 3), k)
-    extrapolated = [fit.beyond(*counts) for counts in asked]
+    predicted = tabulate_bands(fit, found, np.array(asked).reshape(-1, 3), k)
+    extrapolated = [fit.explain_extrapolation(*counts) for counts in asked]
     return {
         "task": task,
         **fit.curve.model_dump(),

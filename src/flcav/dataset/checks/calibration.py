@@ -24,7 +24,7 @@ def check_calibrations(calibrations: Mapping[str, Calibrations], recipe: Mapping
     for agent, (true, assumed) in calibrations.items():
         for which, calibration in (("true", true), ("assumed", assumed)):
             yield from check_calibration(f"the {which} calibration of {agent}", calibration)
-        yield from check_belief(agent, true, assumed, error)
+        yield from check_assumed(agent, true, assumed, error)
 
 
 def check_calibration(name: str, calibration: Calibration) -> Iterator[str]:
@@ -47,7 +47,7 @@ def check_calibration(name: str, calibration: Calibration) -> Iterator[str]:
             yield f"{name}: the trigger time of '{sensor}' is not finite"
 
 
-def check_belief(agent: str, true: Calibration, assumed: Calibration, error: CalibrationError) -> Iterator[str]:
+def check_assumed(agent: str, true: Calibration, assumed: Calibration, error: CalibrationError) -> Iterator[str]:
     """Check that the assumed calibration of `agent` differs from the true one by at most SIGMAS standard deviations.
 
     `error` gives the standard deviations.

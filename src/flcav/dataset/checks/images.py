@@ -6,10 +6,10 @@ import numpy as np
 
 from flcav.config import parse_config
 from flcav.geometry import Boxes, points_in_boxes, transform_points
-from flcav.sensors.camera.lens import Lens, directions
+from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.frame import Array, CameraImage, Frame, SignViews, Views
 from flcav.sensors.labels.signs import STATES
-from flcav.sensors.labels.views import actor_regions
+from flcav.sensors.labels.views import find_actor_regions
 
 MARGIN_M = 0.3  # distance by which a pixel may lie outside its actor's 3D box: wing mirrors, turning since the spin
 MARGIN_PX = 3.0  # distance by which a pixel may lie outside its actor's amodal box
@@ -68,7 +68,7 @@ def _fit(image: CameraImage) -> bool:
 def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[str]:
     """Check that the pixel counts and visible boxes of actors agree with the instance image."""
     truth, views = frame.annotations, frame.annotations.views[name]
-    found = actor_regions(image.instance.astype(np.int32), max(len(truth), int(image.instance.max(initial=0))))
+    found = find_actor_regions(image.instance.astype(np.int32), max(len(truth), int(image.instance.max(initial=0))))
     for i in np.flatnonzero(views.pixels != found.pixels[: len(truth)]):
         yield f"{frame.key}: '{name}' shows {found.pixels[i]} pixels of '{truth.track[i]}', not {views.pixels[i]}"
     same = np.isclose(views.visible_box, found.box[: len(truth)], equal_nan=True).all(axis=1)
@@ -82,7 +82,7 @@ def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) ->
     """Check that each actor's pixels, back-projected by their depth, lie in its 3D box, and in its amodal box."""
     truth, views = frame.annotations, frame.annotations.views[name]
     boxes = _boxes_then(frame, frame.calibration.offset_ms.get(name, 0.0) / 1e3)
-    rays = directions(lens).astype(np.float64).reshape(*image.instance.shape, 3)
+    rays = compute_pixel_rays(lens).astype(np.float64).reshape(*image.instance.shape, 3)
     for i in np.flatnonzero(views.pixels >= JUDGED):
         v, u = np.nonzero(image.instance == i + 1)
         if len(v) < JUDGED:

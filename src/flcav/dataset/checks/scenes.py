@@ -14,7 +14,7 @@ LONGEST_STEP_S = 1.0  # longer steps are skipped: the velocities at both ends do
 DRIFT_M, DRIFT_MPS = 0.3, 2.5  # tolerance of a position predicted from velocities: constant, and per second
 
 
-class Sight:
+class BlockedViews:
     """Detector of blocked LiDARs: counts the points close to each LiDAR over all frames of a dataset."""
 
     def __init__(self) -> None:

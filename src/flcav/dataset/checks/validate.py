@@ -13,17 +13,17 @@ from flcav.config import InputError
 from flcav.dataset.checks.calibration import check_calibrations
 from flcav.dataset.checks.frames import check_measurements, check_points, check_sweeps, check_traffic, check_values
 from flcav.dataset.checks.images import check_images
-from flcav.dataset.checks.scenes import Sight, check_motion
+from flcav.dataset.checks.scenes import BlockedViews, check_motion
 from flcav.dataset.layout import FILES, MANIFEST, FrameKey, Manifest, read_manifest, table_path, trace_path
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import read_table
 from flcav.files import sha256
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
 
-def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
+def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[str]:
     """Return the problems of the dataset in the folder `path`, one sentence each; empty for a valid dataset.
 
     Raises `InputError` where `path` holds no finished dataset.
@@ -47,7 +47,7 @@ def validate(path: Path | str, *, progress: Report = silent) -> list[str]:
     problems += check_calibrations(dataset.calibrations, manifest.recipe)
 
     traces: dict[str, Trace | None] = {}
-    sight = Sight()
+    sight = BlockedViews()
     for i, key in enumerate(dataset.keys):
         if key.scene not in traces:
             trace = _trace(dataset, key.scene, damaged)
@@ -134,7 +134,7 @@ def _trace(dataset: Dataset, scene: str, damaged: Collection[str]) -> Trace | No
     return None if trace_path(scene) in damaged else dataset.trace(scene)
 
 
-def leaks(manifests: Mapping[str, Manifest]) -> list[str]:
+def find_leaks(manifests: Mapping[str, Manifest]) -> list[str]:
     """Return a sentence for each pair of datasets of different splits that share traffic; `manifests` is by name.
 
     Frames of one scene show the same cars at the same places, so a scene belongs in one split. So does a traffic seed

@@ -13,9 +13,9 @@ import numpy as np
 from faster_coco_eval.core import mask as coco_mask
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks, split_scenes
+from flcav.dataset.formats.exporter import Exported, ExportOptions, missing_data_error, split_scenes
 from flcav.dataset.payloads import encode_png
-from flcav.dataset.rectangles import CLASSES, rectangles
+from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
 from flcav.sensors.frame import Frame
@@ -43,7 +43,7 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
                     table["annotations"].append({"id": counts[labels], "image_id": image["id"], **annotation})
         progress(i + 1, len(dataset), "")
     if not counts["images"]:
-        raise lacks(dataset, "COCO", "camera images")
+        raise missing_data_error(dataset, "COCO", "camera images")
     for (labels, split), table in tables.items():
         path = out / "annotations" / f"{labels}_{split}.json"
         path.parent.mkdir(exist_ok=True)
@@ -51,7 +51,7 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     return Exported(counts)
 
 
-def run_lengths(mask: NDArray[np.bool_]) -> dict[str, Any]:
+def encode_run_lengths(mask: NDArray[np.bool_]) -> dict[str, Any]:
     """Return COCO's compressed run-length encoding of an (H, W) mask: {"size": [H, W], "counts": text}."""
     encoded = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
     return {"size": list(mask.shape), "counts": encoded["counts"].decode("ascii")}
@@ -78,7 +78,7 @@ def _image(frame: Frame, camera: str, file_name: str, number: int) -> dict[str, 
 
 
 def _annotations(frame: Frame, camera: str, labels: str, min_pixels: int) -> list[dict[str, Any]]:
-    found = rectangles(frame, camera, labels, min_pixels)
+    found = select_rectangles(frame, camera, labels, min_pixels)
     instance = frame.images[camera].instance
     out = []
     for label, box, pixels, row in zip(found.label, found.box, found.pixels, found.row):
@@ -90,7 +90,7 @@ def _annotations(frame: Frame, camera: str, labels: str, min_pixels: int) -> lis
             "iscrowd": 0,
         }
         if labels == "actors":
-            about["segmentation"] = run_lengths(instance == row + 1)
+            about["segmentation"] = encode_run_lengths(instance == row + 1)
             about["track"] = str(frame.annotations.track[row])
             about["occlusion"] = float(frame.annotations.views[camera].occlusion[row])
         else:

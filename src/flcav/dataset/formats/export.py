@@ -15,7 +15,7 @@ from flcav.dataset.formats.nuscenes import export_nuscenes
 from flcav.dataset.formats.opv2v import export_opv2v
 from flcav.dataset.formats.yolo import export_yolo
 from flcav.dataset.store import Dataset
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ DEFAULTS = ExportOptions()
 
 
 def export(
-    dataset: Dataset, name: str, out: Path, options: ExportOptions = DEFAULTS, *, progress: Report = silent
+    dataset: Dataset, name: str, out: Path, options: ExportOptions = DEFAULTS, *, progress: Report = ignore_progress
 ) -> Exported:
     """Write `dataset` in the format `name`, one of FORMATS, to the new or empty folder `out`; return counts.
 

@@ -46,7 +46,7 @@ def read_frame(dataset: Dataset, i: int, options: ExportOptions) -> Frame:
     return frame if options.calibration == "true" else replace(frame, calibration=frame.assumed)
 
 
-def points_in_each_box(frame: Frame, sensor: str, points: NDArray[np.floating]) -> NDArray[np.int64]:
+def count_points_in_boxes(frame: Frame, sensor: str, points: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return (M,) numbers of the (N, >= 3) `points` [m] of a LiDAR or radar that lie in the box of each annotation.
 
     Readers of an export count in this way. `annotations.points` differ: they count points on the actor itself, which
@@ -56,7 +56,7 @@ def points_in_each_box(frame: Frame, sensor: str, points: NDArray[np.floating]) 
     return points_in_boxes(world, frame.annotations.boxes).sum(axis=1)
 
 
-def lacks(dataset: Dataset, name: str, needed: str, who: str = "the dataset") -> InputError:
+def missing_data_error(dataset: Dataset, name: str, needed: str, who: str = "the dataset") -> InputError:
     """Return the error for a dataset, or an agent (`who`), without what the format `name` needs."""
     return InputError(f"{dataset.folder}: cannot be exported to {name}, which needs {needed}; {who} has none")
 
@@ -93,7 +93,7 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
     return {scene: "val" if i >= first else "train" for i, scene in enumerate(scenes)}
 
 
-def split_validated(dataset: Dataset, options: ExportOptions, name: str) -> Mapping[str, str]:
+def split_with_validation(dataset: Dataset, options: ExportOptions, name: str) -> Mapping[str, str]:
     """Return `split_scenes` for a format `name` whose readers need a validation split to train.
 
     Raises `InputError` where all scenes are in the training split, unless `options` ask for no validation scenes.

@@ -30,14 +30,14 @@ def is_level(agent_from_camera: NDArray[np.float64]) -> bool:
     return bool(-agent_from_camera[2, 1] >= np.cos(LEVEL_RAD))
 
 
-def front_camera(agent_from_camera: Mapping[str, NDArray[np.float64]]) -> str | None:
+def find_front_camera(agent_from_camera: Mapping[str, NDArray[np.float64]]) -> str | None:
     """Return the name of the level camera with the least yaw, None if none is within AHEAD_RAD."""
     turned = {name: abs(optical_yaw(mount)) for name, mount in agent_from_camera.items() if is_level(mount)}
     name = min(turned, key=turned.__getitem__, default=None)
     return name if name is not None and turned[name] <= AHEAD_RAD else None
 
 
-def channels(yaw: Mapping[str, float], named: Mapping[str, float]) -> dict[str, str]:
+def assign_channels(yaw: Mapping[str, float], named: Mapping[str, float]) -> dict[str, str]:
     """Return sensor -> channel, the assignment with the least sum of angles between them.
 
     `yaw` are the directions [rad] of the sensors, `named` those of the channels. Sensors in excess of the channels are

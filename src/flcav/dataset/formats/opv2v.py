@@ -16,12 +16,12 @@ from flcav.dataset.formats.exporter import (
     Exported,
     ExportOptions,
     check_rectified,
-    lacks,
-    points_in_each_box,
+    count_points_in_boxes,
+    missing_data_error,
     read_frame,
-    split_validated,
+    split_with_validation,
 )
-from flcav.dataset.formats.mounts import agent_velocities, channels, optical_yaw
+from flcav.dataset.formats.mounts import agent_velocities, assign_channels, optical_yaw
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
@@ -50,7 +50,7 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
 
     Spins that not every agent of a scene has are left out.
     """
-    split_of = split_validated(dataset, options, "OPV2V")
+    split_of = split_with_validation(dataset, options, "OPV2V")
     exported = Exported(Counter(scenarios=0, frames=0, objects=0))
     counts, done = exported.counts, 0
     for split in ("train", "val") if "train" in split_of.values() else ():
@@ -69,7 +69,7 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
                 continue
             frame = read_frame(dataset, i, options)
             if not frame.lidar:
-                raise lacks(dataset, "OPV2V", "a LiDAR on every agent", frame.agent)
+                raise missing_data_error(dataset, "OPV2V", "a LiDAR on every agent", frame.agent)
             for track in frame.annotations.track.tolist():
                 numbers.setdefault(track, FIRST_TRACK + len(numbers))
             speed = float(np.linalg.norm(speeds[frame.agent, frame.index]))
@@ -92,7 +92,7 @@ def _shared_spins(dataset: Dataset, scene: str) -> set[int]:
         spins[dataset.keys[i].agent].add(dataset.keys[i].index)
     shared = set.intersection(*spins.values())
     if not shared:
-        raise lacks(dataset, "OPV2V", "spins that every agent of a scene has", scene)
+        raise missing_data_error(dataset, "OPV2V", "spins that every agent of a scene has", scene)
     return shared
 
 
@@ -122,10 +122,10 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, dict[str, Any]]
     lidar, points = next(iter(frame.lidar.items()))
     folder.mkdir(parents=True, exist_ok=True)
     time = f"{frame.index:06d}"
-    (folder / f"{time}.pcd").write_bytes(pcd(points))
+    (folder / f"{time}.pcd").write_bytes(encode_pcd(points))
     world_from_lidar = frame.world_from_sensor(lidar)
     mounts = frame.calibration.agent_from_sensor
-    cameras = channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
+    cameras = assign_channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
     about: dict[str, Any] = {}
     for name, camera in sorted(cameras.items(), key=lambda pair: pair[1]):
         check_rectified(frame, name, "OPV2V")
@@ -151,7 +151,7 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, dict[str, Any]]
 def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[int, dict[str, Any]]:
     """Return number -> OPV2V's box of each vehicle with at least `min_points` points of the first LiDAR in its box."""
     truth, boxes = frame.annotations, frame.annotations.boxes
-    enough = points_in_each_box(frame, *next(iter(frame.lidar.items()))) >= min_points
+    enough = count_points_in_boxes(frame, *next(iter(frame.lidar.items()))) >= min_points
     vehicles = {}
     for i in np.flatnonzero(np.isin(boxes.label, VEHICLES) & enough):
         tall = boxes.size[i, 2]
@@ -166,7 +166,7 @@ def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[in
     return vehicles
 
 
-def pcd(points: NDArray[np.float32]) -> bytes:
+def encode_pcd(points: NDArray[np.float32]) -> bytes:
     """Return a binary PCD v0.7 file of (N, 4) x, y, z [m], intensity [0, 1], with y mirrored.
 
     The intensity is the red channel of the colour, as in OPV2V.

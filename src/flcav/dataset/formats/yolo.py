@@ -9,30 +9,30 @@ from pathlib import Path
 
 import yaml
 
-from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks, split_validated
+from flcav.dataset.formats.exporter import Exported, ExportOptions, missing_data_error, split_with_validation
 from flcav.dataset.payloads import encode_png
-from flcav.dataset.rectangles import CLASSES, Rectangles, rectangles
+from flcav.dataset.rectangles import CLASSES, Rectangles, select_rectangles
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
 
 
 def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
     """Write every image of `dataset` with its signs and lights, or its actors: see `Exporter`."""
-    split_of = split_validated(dataset, options, "YOLO")
+    split_of = split_with_validation(dataset, options, "YOLO")
     counts: Counter[str] = Counter(images=0, objects=0)
     for i, key in enumerate(dataset.keys):
         frame = dataset.frame(i)
         split = split_of[key.scene]
         for camera, picture in frame.images.items():
-            found = rectangles(frame, camera, options.labels, options.min_pixels)
+            found = select_rectangles(frame, camera, options.labels, options.min_pixels)
             height, width = picture.rgb.shape[:2]
             name = f"{frame.key}_{camera}"
             _write(out / "images" / split / f"{name}.png", encode_png(picture.rgb))
-            _write(out / "labels" / split / f"{name}.txt", label_text(found, width, height).encode())
+            _write(out / "labels" / split / f"{name}.txt", format_label_file(found, width, height).encode())
             counts.update(images=1, objects=len(found))
         progress(i + 1, len(dataset), "")
     if not counts["images"]:
-        raise lacks(dataset, "YOLO", "camera images")
+        raise missing_data_error(dataset, "YOLO", "camera images")
     folders = {split: f"images/{split}" for split in ("train", "val", *split_of.values())}
     for folder in folders.values():  # Ultralytics requires the first two, even for a test
         (out / folder).mkdir(exist_ok=True)
@@ -41,7 +41,7 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     return Exported(counts)
 
 
-def label_text(found: Rectangles, width: int, height: int) -> str:
+def format_label_file(found: Rectangles, width: int, height: int) -> str:
     """Return the text of the label file of an image of `width` x `height` pixels."""
     left, top, right, bottom = (found.box / (width, height, width, height)).T
     rows = zip(found.label, (left + right) / 2, (top + bottom) / 2, right - left, bottom - top)

@@ -16,12 +16,12 @@ from typing import NamedTuple, Protocol
 
 import pyarrow as pa
 
-from flcav.dataset.calibration import to_json
+from flcav.dataset.calibration import encode_calibration
 from flcav.dataset.layout import CALIBRATION, FILES, TRACES, table_path
-from flcav.dataset.payloads import payloads
-from flcav.dataset.rows import rows_of, table_of
+from flcav.dataset.payloads import encode_payloads
+from flcav.dataset.rows import build_table, encode_frame
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
-from flcav.files import fill, write_bytes
+from flcav.files import write_bytes, write_in_pieces
 from flcav.sensors.frame import Frame
 from flcav.sources.source import Replayable, Source
 from flcav.world.trace import Trace
@@ -51,17 +51,17 @@ class Part(NamedTuple):
         return work / self.scene / f"{self.number:05d}"
 
 
-Task = Traffic | Part
+Job = Traffic | Part
 
 
-def parts(source: Source, scene: str) -> list[Part]:
+def split_scene(source: Source, scene: str) -> list[Part]:
     """Return the parts of a scene: of PART_FRAMES each for a `Replayable` source, else one of all frames."""
     count = source.frame_count(scene)
     step = PART_FRAMES if isinstance(source, Replayable) else max(count, 1)
     return [Part(scene, number, min(step, count - first), first) for number, first in enumerate(range(0, count, step))]
 
 
-def perform(source: Source, task: Task, work: Path, wrote_frame: Callable[[], None]) -> None:
+def perform(source: Source, task: Job, work: Path, wrote_frame: Callable[[], None]) -> None:
     """Perform the job `task` below the folder `work`, replacing leftovers of an earlier attempt.
 
     Calls `wrote_frame` after each frame. Raises ValueError where the source violates its protocol: it has no traffic to
@@ -99,19 +99,19 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
         if frame.key in written:
             raise ValueError(f"{frame.key}: the source yields this frame twice")
         written.add(frame.key)
-        for payload in payloads(frame):
+        for payload in encode_payloads(frame):
             path = part / PAYLOADS / payload.path
             path.parent.mkdir(parents=True, exist_ok=True)
-            fill(path, payload.data)
+            write_in_pieces(path, payload.data)
             files.append((payload.path, len(payload.data), hashlib.sha256(payload.data).hexdigest()))
-        for name, rows in rows_of(frame).items():
+        for name, rows in encode_frame(frame).items():
             tables[name].append(rows)
-        calibration = to_json(frame)
+        calibration = encode_calibration(frame)
         if calibrations.setdefault(frame.agent, calibration) != calibration:
             raise ValueError(f"{frame.key}: the sensors of {frame.agent} moved on their mounts within a dataset")
         wrote_frame()
     for name, rows in tables.items():
-        write_table(table_of(name, rows), part / table_path(name))
+        write_table(build_table(name, rows), part / table_path(name))
     listing = pa.table(dict(zip(FILES_SCHEMA.names, zip(*files) if files else ([], [], []))), schema=FILES_SCHEMA)
     write_table(listing, part / table_path(FILES))
     write_bytes(part / CALIBRATION, json.dumps(calibrations).encode())
@@ -131,11 +131,11 @@ class Engine(Protocol):
 
     slots: int
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: Job) -> None:
         """Enqueue a job."""
         ...
 
-    def wait(self) -> Iterable[Task]:
+    def wait(self) -> Iterable[Job]:
         """Block until a submitted job is done; return those done since the last call, at least one.
 
         Raises the exception of a failed job, and OSError where a worker was killed.
@@ -143,25 +143,25 @@ class Engine(Protocol):
         ...
 
 
-def pending(source: Source, scene: str, work: Path) -> list[Part]:
+def find_pending(source: Source, scene: str, work: Path) -> list[Part]:
     """Return the parts of a scene that are not completed yet."""
-    return [part for part in parts(source, scene) if not part.folder(work).is_dir()]
+    return [part for part in split_scene(source, scene) if not part.folder(work).is_dir()]
 
 
 def record_scenes(source: Source, engine: Engine, work: Path) -> None:
     """Perform all remaining jobs of all scenes on `engine`, the traffic of a scene before its parts."""
-    scenes = deque(scene for scene in source.scenes() if pending(source, scene, work))
-    ready: deque[Task] = deque()
+    scenes = deque(scene for scene in source.scenes() if find_pending(source, scene, work))
+    ready: deque[Job] = deque()
     busy = 0
     while scenes or ready or busy:
         while (scenes or ready) and busy < engine.slots + AHEAD:
             if not ready:
                 scene = scenes.popleft()
                 known = not isinstance(source, Replayable) or (work / scene / TRAFFIC).is_file()
-                ready.extend(pending(source, scene, work) if known else [Traffic(scene)])
+                ready.extend(find_pending(source, scene, work) if known else [Traffic(scene)])
             engine.submit(ready.popleft())
             busy += 1
         for task in engine.wait():
             busy -= 1
             if isinstance(task, Traffic):
-                ready.extend(pending(source, task.scene, work))
+                ready.extend(find_pending(source, task.scene, work))

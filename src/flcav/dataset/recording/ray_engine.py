@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError
-from flcav.dataset.recording.jobs import Engine, Part, Task, perform
-from flcav.extras import installation
+from flcav.dataset.recording.jobs import Engine, Job, Part, perform
+from flcav.extras import format_install_command
 from flcav.sources.source import Source
 from flcav.threads import VARIABLES
 
@@ -22,7 +22,7 @@ STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and p
 
 
 @contextlib.contextmanager
-def ray_cluster(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
+def start_ray_engine(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
     """Yield an engine of `jobs` Ray actors that perform jobs of `source` below the folder `work`.
 
     It calls `wrote` with the number of frames written so far, as parts are completed. Raises `InputError` where Ray is
@@ -31,7 +31,7 @@ def ray_cluster(source: Source, work: Path, jobs: int, wrote: Callable[[int], No
     with ray_session(jobs) as ray:
         shared = ray.put(source)
         actors = [ray.remote(num_cpus=1)(_Worker).remote(shared, work.absolute()) for _ in range(jobs)]
-        yield _Actors(actors, wrote)
+        yield _RayEngine(actors, wrote)
 
 
 @contextlib.contextmanager
@@ -45,7 +45,7 @@ def ray_session(jobs: int) -> Iterator[Any]:
     try:
         import ray  # pyright: ignore[reportMissingImports]: an extra
     except ImportError:
-        raise InputError(f"--engine ray needs Ray, which is not installed: {installation('ray')}") from None
+        raise InputError(f"--engine ray needs Ray, which is not installed: {format_install_command('ray')}") from None
     variables: dict[str, str] = dict.fromkeys(VARIABLES, "1")
     local: dict[str, Any] = {}
     if "RAY_ADDRESS" not in os.environ:
@@ -69,7 +69,7 @@ class _Worker:
     def __init__(self, source: Source, work: Path) -> None:
         self._source, self._work = source, work
 
-    def perform(self, task: Task) -> None:
+    def perform(self, task: Job) -> None:
         if not self._work.is_dir():
             raise OSError(
                 f"{self._work}: not seen from {os.uname().nodename}; record into storage that all nodes share"
@@ -77,21 +77,21 @@ class _Worker:
         perform(self._source, task, self._work, lambda: None)
 
 
-class _Actors:
+class _RayEngine:
     """An engine that hands each queued job to an idle Ray actor."""
 
     def __init__(self, actors: list[Any], wrote: Callable[[int], None]) -> None:
         self.slots = len(actors)
         self._idle, self._wrote = actors, wrote
-        self._waiting: list[Task] = []
-        self._busy: dict[Any, tuple[Any, Task]] = {}  # reference -> actor, task
+        self._waiting: list[Job] = []
+        self._busy: dict[Any, tuple[Any, Job]] = {}  # reference -> actor, task
         self._count = 0
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: Job) -> None:
         self._waiting.append(task)
         self._hand_out()
 
-    def wait(self) -> list[Task]:
+    def wait(self) -> list[Job]:
         import ray  # pyright: ignore[reportMissingImports]: an extra
         from ray.exceptions import RayActorError, RayTaskError  # pyright: ignore[reportMissingImports]
 

@@ -28,17 +28,17 @@ from flcav.dataset.layout import (
     town_path,
     trace_path,
 )
-from flcav.dataset.recording.jobs import PAYLOADS, TRAFFIC, parts, pending, record_scenes
-from flcav.dataset.recording.ray_engine import ray_cluster
-from flcav.dataset.recording.workers import processes
+from flcav.dataset.recording.jobs import PAYLOADS, TRAFFIC, find_pending, record_scenes, split_scene
+from flcav.dataset.recording.ray_engine import start_ray_engine
+from flcav.dataset.recording.workers import start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, join_tables, write_table
 from flcav.files import sha256, write_bytes, write_json
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.sources.source import Located, Source
+from flcav.sources.source import Source, TownSource
 
-ENGINES = {"processes": processes, "ray": ray_cluster}
+ENGINES = {"processes": start_processes, "ray": start_ray_engine}
 HEADER = "recipe.json"
 JOINED = "joined"  # folder below `.recording` of the concatenated tables and the calibration
 
@@ -49,7 +49,7 @@ def record(
     *,
     jobs: int = 1,
     engine: str = "processes",
-    progress: Report = silent,
+    progress: Report = ignore_progress,
 ) -> bool:
     """Record a source, or the built-in simulator with a recipe, into the folder `out`.
 
@@ -85,7 +85,7 @@ def record(
 def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report) -> None:
     """Record all remaining parts below `.recording`."""
     total = sum(source.frame_count(scene) for scene in source.scenes())
-    missing = sum(part.frames for scene in source.scenes() for part in pending(source, scene, work))
+    missing = sum(part.frames for scene in source.scenes() for part in find_pending(source, scene, work))
     start = time.perf_counter()
 
     def wrote(count: int) -> None:
@@ -133,7 +133,7 @@ def _assemble(source: Source, out: Path, header: dict[str, Any]) -> None:
     work, scenes = out / WORK, list(source.scenes())
     joined = work / JOINED
     joined.mkdir(exist_ok=True)
-    folders = [part.folder(work) for scene in scenes for part in parts(source, scene)]
+    folders = [part.folder(work) for scene in scenes for part in split_scene(source, scene)]
     listings = [work / table_path(FILES)] if _write_town(source, work, out) else []
     listings += [listing for scene in scenes if (listing := _move_traffic(work / scene, scene, out))]
     for folder in folders:
@@ -172,7 +172,7 @@ def _assemble(source: Source, out: Path, header: dict[str, Any]) -> None:
 
 def _write_town(source: Source, work: Path, out: Path) -> bool:
     """Write the source's town files and their listing; return whether there are any."""
-    files = source.town_files() if isinstance(source, Located) else {}
+    files = source.town_files() if isinstance(source, TownSource) else {}
     if not files:
         return False
     folder = town_path(str(source.describe()["town"]))

@@ -12,7 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
-from flcav.dataset.recording.jobs import Engine, Task, perform
+from flcav.dataset.recording.jobs import Engine, Job, perform
 from flcav.sources.source import Source
 from flcav.threads import VARIABLES
 
@@ -22,14 +22,14 @@ _job: Any = None  # in a worker process: source, folder, and the shared counter 
 
 
 @contextlib.contextmanager
-def processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
+def start_processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
     """Yield an engine of `jobs` processes that perform jobs of `source` below the folder `work`.
 
     It calls `wrote` with the number of frames written so far. A single one is this process; more are child
     processes, which end with this one, even if it is killed.
     """
     if jobs == 1:
-        yield _Here(source, work, wrote)
+        yield _InProcessEngine(source, work, wrote)
         return
     context = multiprocessing.get_context("spawn")
     written = context.Value("q", 0)
@@ -38,23 +38,23 @@ def processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None
         ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(source, work, written)) as pool,
         _children_end_on_error(),
     ):
-        yield _Pool(jobs, pool, lambda: wrote(written.value))
+        yield _PoolEngine(jobs, pool, lambda: wrote(written.value))
 
 
-class _Here:
+class _InProcessEngine:
     """An engine that performs jobs in sequence in this process."""
 
     slots = 1
 
     def __init__(self, source: Source, work: Path, wrote: Callable[[int], None]) -> None:
         self._source, self._work, self._wrote = source, work, wrote
-        self._tasks: deque[Task] = deque()
+        self._tasks: deque[Job] = deque()
         self._count = 0
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: Job) -> None:
         self._tasks.append(task)
 
-    def wait(self) -> list[Task]:
+    def wait(self) -> list[Job]:
         task = self._tasks.popleft()
         perform(self._source, task, self._work, self._count_frame)
         return [task]
@@ -64,17 +64,17 @@ class _Here:
         self._wrote(self._count)
 
 
-class _Pool:
+class _PoolEngine:
     """An engine on a process pool."""
 
     def __init__(self, slots: int, pool: ProcessPoolExecutor, report: Callable[[], None]) -> None:
         self.slots, self._pool, self._report = slots, pool, report
-        self._tasks: dict[Future[None], Task] = {}
+        self._tasks: dict[Future[None], Job] = {}
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: Job) -> None:
         self._tasks[self._pool.submit(_perform, task)] = task
 
-    def wait(self) -> list[Task]:
+    def wait(self) -> list[Job]:
         done: set[Future[None]] = set()
         while not done:
             done, _ = wait(self._tasks, timeout=POLL_S, return_when=FIRST_COMPLETED)
@@ -94,10 +94,10 @@ def _raise_failure(future: Future[None]) -> None:
 def _begin(source: Source, work: Path, written: Any) -> None:
     global _job
     _job = source, work, written
-    end_with_parent()
+    exit_with_parent()
 
 
-def end_with_parent() -> None:
+def exit_with_parent() -> None:
     """Make this worker process ignore Ctrl-C, which the parent handles, and exit when the parent has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_after_parent, daemon=True).start()
@@ -110,7 +110,7 @@ def _exit_after_parent() -> None:
         os._exit(1)
 
 
-def _perform(task: Task) -> None:
+def _perform(task: Job) -> None:
     source, work, written = _job
 
     def count_frame() -> None:

@@ -12,7 +12,7 @@ from typing import Annotated
 from flcav.config import read_config
 from flcav.files import Json
 from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
-from flcav.pipeline.findings import in_words
+from flcav.pipeline.findings import name_stage
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Pole, Run
@@ -165,7 +165,7 @@ def one_seed(run: Run) -> ArmsSeed:
     closed = {
         arm: run.gap_closed[name]
         for arm, stage in ARMS["grid"].items()
-        if (name := f"grid, {TASK}: {in_words(*stage)}") in run.gap_closed
+        if (name := f"grid, {TASK}: {name_stage(*stage)}") in run.gap_closed
     }
     curve = tuple(vars(block) for block in pretrained.blocks)
     return ArmsSeed(

@@ -3,7 +3,7 @@
 from collections import Counter
 
 from flcav.experiments.arms.run import ARMS, ArmsResult
-from flcav.markdown import table
+from flcav.markdown import format_table
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, verdict
 
 
@@ -22,11 +22,11 @@ def _town(results: ArmsResult, town: str) -> str:
     summary = results.summary
     closed = summary.gap_closed if town == "grid" else {}
     rows = [
-        [arm, summary.ap50[town][arm].told(), summary.ap70[town][arm].told()]
-        + ([closed[arm].told() if arm in closed else ""] if closed else [])
+        [arm, summary.ap50[town][arm].describe(), summary.ap70[town][arm].describe()]
+        + ([closed[arm].describe() if arm in closed else ""] if closed else [])
         for arm in ARMS[town]
     ]
-    return table((f"arm on `{town}`", "AP50", "AP70", *(["gap closed"] if closed else [])), rows)
+    return format_table((f"arm on `{town}`", "AP50", "AP70", *(["gap closed"] if closed else [])), rows)
 
 
 def _differences(results: ArmsResult) -> str:
@@ -35,13 +35,13 @@ def _differences(results: ArmsResult) -> str:
         own = [seed.differences[name] for seed in results.seeds]
         times = Counter(verdict(each.low, each.high) for each in own)
         counted = " / ".join(str(times[each]) for each in (HELD, UNDECIDED, NOT_HELD))
-        rows.append([name, mean.told(sign=True), counted])
+        rows.append([name, mean.describe(sign=True), counted])
     header = (
         "difference in AP50",
         "mean over seeds",
         "seeds whose own 95 % scene interval is above 0 / contains 0 / below 0",
     )
-    return table(header, rows)
+    return format_table(header, rows)
 
 
 def _seeds(results: ArmsResult) -> str:
@@ -68,4 +68,4 @@ def _seeds(results: ArmsResult) -> str:
         "wireless used",
         "wireline used",
     )
-    return table(header, rows)
+    return format_table(header, rows)

@@ -53,7 +53,7 @@ def task_columns(columns: Sequence[Column]) -> Figure:
     panels = figure.subplots(len(ROWS), len(columns), squeeze=False)
     for number, column in enumerate(columns):
         for row, axes in zip(ROWS, panels[:, number], strict=True):
-            style.bare(axes)
+            style.hide_axes(axes)
             column.draws[row](axes)
             axes.set_box_aspect(ASPECT)
             axes.set_xlabel(column.captions[row], color=style.MUTED, fontsize=style.SMALL)

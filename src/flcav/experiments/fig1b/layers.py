@@ -48,7 +48,7 @@ LAYERS: dict[str, Callable[[Any], Named]] = {
 
 
 @contextlib.contextmanager
-def watched(layers: Named) -> Iterator[dict[str, Layer]]:
+def capture_outputs(layers: Named) -> Iterator[dict[str, Layer]]:
     """Yield a dictionary of each layer's last output, by name, for the first sample of its batch."""
     seen: dict[str, Layer] = {}
 
@@ -67,7 +67,7 @@ def watched(layers: Named) -> Iterator[dict[str, Layer]]:
 
 
 @contextlib.contextmanager
-def given_to(layer: nn.Module) -> Iterator[list[Any]]:
+def capture_inputs(layer: nn.Module) -> Iterator[list[Any]]:
     """Yield a list of the positional arguments that `layer` was last called with."""
     seen: list[Any] = []
     hook = layer.register_forward_pre_hook(lambda module, given: seen.__setitem__(slice(None), given))

@@ -20,10 +20,10 @@ from flcav.dataset.payloads import POINTS
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.fig1b import columns as page
-from flcav.experiments.fig1b.layers import LAYERS, given_to, watched
+from flcav.experiments.fig1b.layers import LAYERS, capture_inputs, capture_outputs
 from flcav.geometry import inverse, transform_points
 from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
-from flcav.perception.networks import network_of
+from flcav.perception.networks import resolve_network
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.config import STRIDES
 from flcav.perception.signs.task import SIGNS
@@ -31,9 +31,9 @@ from flcav.perception.task import Finding, Task
 from flcav.perception.tasks import task_named
 from flcav.perception.trajectory.rasters import LAYERS as RASTER_LAYERS
 from flcav.perception.trajectory.task import TRAJECTORY
-from flcav.perception.weather.samples import small
+from flcav.perception.weather.samples import reduce_picture
 from flcav.perception.weather.task import WEATHER
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 from flcav.report import style
 from flcav.report.pictures.clouds import draw_boxes, draw_points
 from flcav.report.pictures.inference import boxes_in_picture
@@ -74,15 +74,15 @@ RASTER_COLOURS = {
 }
 
 
-def fig1b(out: Path, progress: Report = silent) -> bytes:
+def fig1b(out: Path, progress: Report = ignore_progress) -> bytes:
     """Record the scene into `out`, run the package's networks on it, and return the figure as a PNG.
 
     Raises `InputError` where one of the tasks has no weights in the package.
     """
-    networks = {name: network_of(task_named(name), None) for name in LAYERS}
+    networks = {name: resolve_network(task_named(name), None) for name in LAYERS}
     record(EmbeddedSource(parse_config(Recipe, dict(RECIPE), "fig1b")), out / "data", progress=progress)
     data = Dataset.open(out / "data")
-    number = most_to_see(data)
+    number = choose_frame(data)
     columns = [
         _weather(networks["weather"], data.plane_path(number, WIDE, "rgb")),
         _signs(networks["signs"], data.plane_path(number, NARROW, "rgb")),
@@ -92,7 +92,7 @@ def fig1b(out: Path, progress: Report = silent) -> bytes:
     return style.png(page.task_columns(columns), dpi=130)
 
 
-def most_to_see(data: Dataset) -> int:
+def choose_frame(data: Dataset) -> int:
     """Return the number of the frame with the most legible signs and near objects ahead, of the spin `PRESENT`."""
 
     def worth(number: int) -> float:
@@ -107,13 +107,13 @@ def most_to_see(data: Dataset) -> int:
 
 
 def _weather(network: Any, picture: Path) -> page.Column:
-    finding, layers = _looked(WEATHER, network, picture)
+    finding, layers = _run_network(WEATHER, network, picture)
     (bars,) = (mark for mark in finding.marks if isinstance(mark, Bars))
     return page.Column(
         "Weather",
         {
             "sensor": partial(page.show_picture, picture=finding.seen),
-            "processing": partial(page.show_picture, picture=small(finding.seen), smooth=False),
+            "processing": partial(page.show_picture, picture=reduce_picture(finding.seen), smooth=False),
             "network": partial(page.show_layers, layers=layers),
             "output": partial(page.show_probabilities, probabilities=bars.share),
         },
@@ -127,7 +127,7 @@ def _weather(network: Any, picture: Path) -> page.Column:
 
 
 def _signs(network: Any, picture: Path) -> page.Column:
-    finding, layers = _looked(SIGNS, network, picture)
+    finding, layers = _run_network(SIGNS, network, picture)
     (boxes,) = (mark for mark in finding.marks if isinstance(mark, PictureBoxes))
 
     def output(axes: Axes) -> None:
@@ -153,7 +153,7 @@ def _signs(network: Any, picture: Path) -> page.Column:
 
 
 def _objects(network: Any, points: Path) -> page.Column:
-    finding, layers = _looked(OBJECTS, network, points)
+    finding, layers = _run_network(OBJECTS, network, points)
     cloud, range_m, ground_m = finding.seen, network.config.range_m, network.config.ground_z_m
     (boxes,) = (mark.boxes for mark in finding.marks if isinstance(mark, CloudBoxes))
 
@@ -181,7 +181,7 @@ def _objects(network: Any, points: Path) -> page.Column:
 
 def _trajectory(network: Any, data: Dataset, number: int) -> page.Column:
     """Return the column of the trajectory task: the raster of one road user, and the predicted paths of all."""
-    with watched(LAYERS["trajectory"](network)) as seen, given_to(network.view) as given:
+    with capture_outputs(LAYERS["trajectory"](network)) as seen, capture_inputs(network.view) as given:
         finding = next(islice(TRAJECTORY.infer(network, data.folder), number, None))
     raster = given[0].raster[0].cpu().numpy()
     (paths,) = (mark for mark in finding.marks if isinstance(mark, Paths))
@@ -212,7 +212,7 @@ def _trajectory(network: Any, data: Dataset, number: int) -> page.Column:
     )
 
 
-def _looked(task: Task, network: Any, path: Path) -> tuple[Finding, list[page.Layer]]:
-    with watched(LAYERS[task.name](network)) as seen:
+def _run_network(task: Task, network: Any, path: Path) -> tuple[Finding, list[page.Layer]]:
+    with capture_outputs(LAYERS[task.name](network)) as seen:
         finding = next(task.infer(network, path, SCORE))
     return finding, list(seen.values())

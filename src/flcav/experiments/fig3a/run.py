@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import parse_config
-from flcav.optimization.curves.bands import Bands, bands
+from flcav.optimization.curves.bands import Bands, bootstrap_bands
 from flcav.optimization.curves.curves import Additive
 from flcav.optimization.curves.fitting import Fit, fit_additive
 from flcav.optimization.curves.history import History, article_histories
-from flcav.optimization.graph import Layers, build
-from flcav.pipeline.planning import history_of
+from flcav.optimization.graph import Layers, build_graph
+from flcav.pipeline.planning import load_history
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style
@@ -100,7 +100,7 @@ def _article_curve(points: History, printed: tuple[float, float]) -> ArticleCurv
     decay = fit.curve.pretrain
     grid = np.geomspace(samples.min(), samples.max(), 60)
     where = np.column_stack((grid, np.zeros_like(grid), np.zeros_like(grid)))
-    accuracy, low, high = _line(fit, bands(fit, level=LEVEL), where)
+    accuracy, low, high = _line(fit, bootstrap_bands(fit, level=LEVEL), where)
     return ArticleCurve(
         points=tuple(zip(samples.tolist(), points.accuracy.tolist(), strict=True)),
         fitted=fit.curve,
@@ -123,11 +123,11 @@ def _line(fit: Fit[Additive], found: Bands | None, where: Array) -> tuple[tuple[
 
 def _own_curves() -> OwnCurves:
     """Return a line for each number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
-    history = history_of("objects")
+    history = load_history("objects")
     samples, edge_rounds, cloud_rounds = history.resources.T
     fit = fit_additive(samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
     points = np.column_stack((history.resources, history.accuracy)).tolist()
-    found = bands(fit, level=LEVEL)
+    found = bootstrap_bands(fit, level=LEVEL)
     route = [(e, 0) for e in range(int(edge_rounds.max()) + 1)]
     route += [(int(edge_rounds.max()), c) for c in range(1, int(cloud_rounds.max()) + 1)]
     place = {each: number for number, each in enumerate(route)}
@@ -178,7 +178,7 @@ def article_graph() -> nx.Graph:
         "modalities": {"camera": {"sample_mb": 0.7}, "lidar": {"sample_mb": 1.6}},
         "vehicles": {name: {"edge": edge, "holds": {"camera": {}, "lidar": {}}} for name, edge in vehicles.items()},
     }
-    return build(parse_config(Layers, values, "the article's graph"))
+    return build_graph(parse_config(Layers, values, "the article's graph"))
 
 
 def _effective(a: float, b: float, group_samples: int) -> dict[str, str | float]:

@@ -1,12 +1,12 @@
 """Markdown tables of Fig. 3a."""
 
 from flcav.experiments.fig3a.run import Fig3a
-from flcav.markdown import bullets, table
+from flcav.markdown import format_bullets, format_table
 
 
 def tables(results: Fig3a) -> dict[str, str]:
     """Return Markdown by name: findings, article, own."""
-    return {"findings": bullets(results.findings), "article": _article(results), "own": _own(results)}
+    return {"findings": format_bullets(results.findings), "article": _article(results), "own": _own(results)}
 
 
 def _article(results: Fig3a) -> str:
@@ -16,7 +16,7 @@ def _article(results: Fig3a) -> str:
         constants = ((decay.a, printed.a, off.a), (decay.b, printed.b, off.b))
         cells = [f"{fitted:.4g} ({wanted:g}, {by:+.1%})" for fitted, wanted, by in constants]
         rows.append([task, len(each.points), *cells, f"{each.rmse:.3f}"])
-    return table(("task", "points", "a (printed, off)", "b (printed, off)", "rmse of accuracy"), rows)
+    return format_table(("task", "points", "a (printed, off)", "b (printed, off)", "rmse of accuracy"), rows)
 
 
 def _own(results: Fig3a) -> str:
@@ -28,4 +28,4 @@ def _own(results: Fig3a) -> str:
     ]
     edge, cloud = own.route[-1]
     header = ("samples", "points", "AP50 pretrained (95 % band)", f"after {edge} edge and {cloud} cloud rounds")
-    return table(header, rows)
+    return format_table(header, rows)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from flcav.experiments.fig6a.results import EQUAL, JOINT, TOWN, AllocationResult, AllocationSeed, PlanFinding
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, signed, verdict, verdict_words
+from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, explain_verdict, signed, verdict
 
 STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"}
 COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
@@ -19,7 +19,7 @@ def _better(results: AllocationResult) -> PlanFinding:
     realised = results.summary.realised[TOWN]
     difference, how = _difference(results)
     decided = verdict(difference.low, difference.high)
-    words = verdict_words(decided, len(results.seeds))
+    words = explain_verdict(decided, len(results.seeds))
     sentence = (
         f"On {TOWN}, AP50 after the last stage was {realised[EQUAL]['cloud'].mean:.3f} with equal stages and "
         f"{realised[JOINT]['cloud'].mean:.3f} with the joint plan: {signed(difference.mean)}, 95 % interval "

@@ -25,7 +25,7 @@ from flcav.experiments.fig6a.results import (
     Reached,
 )
 from flcav.intervals import Estimate, mean_over_seeds
-from flcav.pipeline.planning import history_of
+from flcav.pipeline.planning import load_history
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Run
@@ -106,7 +106,7 @@ def _difference(estimate: Estimate | None) -> Estimate:
 
 def _history_ranges() -> dict[str, tuple[float, float]]:
     """Return the least and most of each count in the history that both plans are predicted from."""
-    columns = history_of(TASK).resources.T
+    columns = load_history(TASK).resources.T
     return {name: (float(column.min()), float(column.max())) for name, column in zip(COUNTS, columns, strict=True)}
 
 

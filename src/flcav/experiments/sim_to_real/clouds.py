@@ -23,7 +23,7 @@ NO_INTENSITY = 0.005  # below this a return counts as without intensity
 Labelled = tuple[NDArray[np.float32], Boxes]  # points (N, 4) and cars of a frame, LiDAR frame
 
 
-def describe(frames: Iterable[Labelled]) -> CloudNumbers:
+def summarise_clouds(frames: Iterable[Labelled]) -> CloudNumbers:
     """Return the statistics of the clouds of several frames."""
     frames = [(points[in_view(points)], cars) for points, cars in frames]
     points = np.concatenate([points for points, _ in frames])

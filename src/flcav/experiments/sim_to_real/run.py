@@ -13,15 +13,15 @@ import numpy as np
 
 from flcav.dataset.formats.kitti.read import KittiFolder, KittiFrame
 from flcav.dataset.store import Dataset
-from flcav.experiments.sim_to_real.clouds import Labelled, describe
+from flcav.experiments.sim_to_real.clouds import Labelled, summarise_clouds
 from flcav.experiments.studies.run import DATA, record_split
 from flcav.geometry import Boxes, inverse
 from flcav.perception.images import kitti_view
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.detect import detect
-from flcav.perception.objects.evaluate import LOWEST_SCORE, OVERLAPS, number_or_none, of_class
-from flcav.perception.objects.infer import ObjectFound, box_rows, boxes_of_rows
+from flcav.perception.objects.evaluate import LOWEST_SCORE, OVERLAPS, round_or_none, select_class
+from flcav.perception.objects.infer import ObjectFound, boxes_to_rows, rows_to_boxes
 from flcav.perception.objects.model import Second
 from flcav.perception.ops.rotated import Kind
 from flcav.pipeline.provenance import Provenance, provenance
@@ -71,7 +71,7 @@ class LabelledCar:
 
 
 @dataclass(frozen=True)
-class Story:
+class FrameResult:
     """Detections and misses in a real frame; KITTI's labels themselves are not copied."""
 
     frame: str
@@ -85,7 +85,7 @@ class SimToReal(Record):
 
     clouds: Mapping[str, CloudNumbers]  # by origin: `REAL`, or a name in `RIGS`
     scores: tuple[RealScore, ...]
-    frames: tuple[Story, ...]
+    frames: tuple[FrameResult, ...]
     provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
 
 
@@ -110,21 +110,21 @@ def run_sim_to_real(
         for name, rig in RIGS.items()
     ]
     run_steps(steps, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    clouds = {REAL: describe((frame.points, of_class(frame.objects.boxes, "Car")) for frame in real)}
+    clouds = {REAL: summarise_clouds((frame.points, select_class(frame.objects.boxes, "Car")) for frame in real)}
     for name, step in zip(RIGS, steps, strict=True):
         data = Dataset.open(out / step.name / DATA)
-        clouds[name] = describe(labelled(data, number) for number in range(len(data)))
+        clouds[name] = summarise_clouds(labelled(data, number) for number in range(len(data)))
     return SimToReal(clouds, *detections(network, real), provenance(RECIPE["seed"]))
 
 
 def labelled(data: Dataset, number: int) -> Labelled:
     """Return the cloud (N, 4) of a recorded frame and the boxes of its cars and vans, LiDAR frame."""
     frame = data.frame(number)
-    boxes = frame.annotations.boxes.transformed(inverse(frame.world_from_sensor(LIDAR)))
+    boxes = frame.annotations.boxes.transform(inverse(frame.world_from_sensor(LIDAR)))
     return frame.lidar[LIDAR], boxes[np.isin(boxes.label, ("car", "van"))]
 
 
-def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[RealScore, ...], tuple[Story, ...]]:
+def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[RealScore, ...], tuple[FrameResult, ...]]:
     """Return AP by class, kind and limit of IoU over real frames, and the detections and misses of each frame.
 
     As in KITTI's evaluation, similar classes (`NEUTRAL`) are neutral. Detections outside the image are left out.
@@ -132,14 +132,14 @@ def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[Rea
     found = [shown(detect(network, frame.points, score_threshold=LOWEST_SCORE), frame) for frame in frames]
     scores = []
     for name in network.config.classes:
-        own = [of_class(boxes, name) for boxes in found]
-        targets = [of_class(frame.objects.boxes, name) for frame in frames]
+        own = [select_class(boxes, name) for boxes in found]
+        targets = [select_class(frame.objects.boxes, name) for frame in frames]
         neutral = [_neutral(frame, name) for frame in frames]
         for kind, overlap in OVERLAPS:
             matches = match(own, targets, neutral, overlap, kind)
             hits = int(matches.hit[matches.score >= SHOWN].sum())
             wrong = int((~matches.hit[matches.score >= SHOWN]).sum())
-            ap = number_or_none(average_precision(matches))
+            ap = round_or_none(average_precision(matches))
             scores.append(RealScore(name, kind, overlap, int(matches.targets.sum()), hits, wrong, ap))
     return tuple(scores), tuple(map(_story, frames, found))
 
@@ -149,13 +149,16 @@ def shown(boxes: Boxes, frame: KittiFrame) -> Boxes:
     return boxes[kitti_view(frame.image, frame.calibration).shows(boxes.center)]
 
 
-def draw_frame(kitti: Path, story: Story) -> bytes:
+def draw_frame(kitti: Path, story: FrameResult) -> bytes:
     """Return a PNG of one frame of the results: cloud from above and image, with labelled cars and detections."""
     folder = KittiFolder.open(kitti)
     frame = folder.frame(folder.names.index(story.frame))
     view = kitti_view(frame.image, frame.calibration)
-    cars, hit = of_class(frame.objects.boxes, "Car"), np.array([0.5 in car.found_at for car in story.cars], dtype=bool)
-    return style.png(real_frame(story.frame, frame.points, view, cars, hit, boxes_of_rows(story.boxes)))
+    cars, hit = (
+        select_class(frame.objects.boxes, "Car"),
+        np.array([0.5 in car.found_at for car in story.cars], dtype=bool),
+    )
+    return style.png(real_frame(story.frame, frame.points, view, cars, hit, rows_to_boxes(story.boxes)))
 
 
 def _neutral(frame: KittiFrame, name: str) -> Boxes:
@@ -163,16 +166,16 @@ def _neutral(frame: KittiFrame, name: str) -> Boxes:
     return boxes[np.array([NEUTRAL.get(str(label)) == name for label in boxes.label], dtype=bool)]
 
 
-def _story(frame: KittiFrame, found: Boxes) -> Story:
+def _story(frame: KittiFrame, found: Boxes) -> FrameResult:
     """Return the frame's detections, and each labelled car's distance and the limits of IoU it was found at."""
     boxes = frame.objects.boxes
-    cars = of_class(boxes, "Car")
+    cars = select_class(boxes, "Car")
     score = found.score if found.score is not None else np.ones(len(found))
     found = found[score >= SHOWN]
     distances = np.hypot(cars.center[:, 0], cars.center[:, 1]).round(1).tolist()
-    hit = {overlap: assign_targets(of_class(found, "Car"), cars, overlap).tolist() for overlap in (0.5, 0.7)}
+    hit = {overlap: assign_targets(select_class(found, "Car"), cars, overlap).tolist() for overlap in (0.5, 0.7)}
     labelled = tuple(
         LabelledCar(distance, tuple(overlap for overlap, targets in hit.items() if number in targets))
         for number, distance in enumerate(distances)
     )
-    return Story(frame.name, box_rows(found), labelled)
+    return FrameResult(frame.name, boxes_to_rows(found), labelled)

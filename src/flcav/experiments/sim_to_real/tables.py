@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flcav.experiments.sim_to_real.run import LabelledCar, RealScore, SimToReal
-from flcav.markdown import table
+from flcav.markdown import format_table
 from flcav.report.pictures.clouds import CloudNumbers, SeenCar
 
 
@@ -13,7 +13,7 @@ def tables(results: SimToReal) -> dict[str, str]:
     """Return Markdown by name: detections, cars, clouds."""
     clouds = results.clouds
     return {
-        "detections": table(
+        "detections": format_table(
             ("class", "overlap", "labelled", "found", "false", "AP R40"),
             [
                 (row.label, f"{row.kind} at {row.iou}", row.targets, *_found(row))
@@ -21,11 +21,11 @@ def tables(results: SimToReal) -> dict[str, str]:
                 if row.targets
             ],
         ),
-        "cars": table(
+        "cars": format_table(
             ("frame", "car at [m]", "found at IoU"),
             [(story.frame, *_car(car)) for story in results.frames for car in story.cars],
         ),
-        "clouds": table(("", *clouds), _clouds(clouds)),
+        "clouds": format_table(("", *clouds), _clouds(clouds)),
     }
 
 

@@ -7,16 +7,16 @@ import numpy as np
 
 from flcav.dataset.store import Dataset
 from flcav.experiments.studies.run import Study, StudyResult, training_rows
-from flcav.markdown import bullets, table
+from flcav.markdown import format_bullets, format_table
 from flcav.perception.objects.evaluate import Score
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.results import ObjectsEvaluation, SlicePrecision
+from flcav.perception.objects.results import BreakdownRow, ObjectsEvaluation
 from flcav.perception.objects.study import TRACKS
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.tracking import evaluate_tracks
 from flcav.report import style
 from flcav.report.charts.studies import Bar, precisions
-from flcav.verdicts import aim_sentence
+from flcav.verdicts import describe_aim
 
 WANTED = {  # aims, for cars on other scenes of the training towns: least value, claim
     "Car AP 3d at 0.5": (0.85, "Car AP3D@0.5 of 0.85"),
@@ -30,14 +30,16 @@ def tables(results: StudyResult[ObjectsEvaluation]) -> dict[str, str]:
     """Return Markdown by name: findings (a list), classes, slices, training, tracks."""
     heads = [f"{kind} at {overlap}" for kind, overlap in MEASURES]
     return {
-        "findings": bullets(_findings(results)),
-        "classes": table(("test", "class", "to find", *heads, *HEADINGS, "calibration error"), _classes(results)),
-        "slices": table(("test", "cars", "to find", *heads), _slices(results)),
-        "training": table(
+        "findings": format_bullets(_findings(results)),
+        "classes": format_table(
+            ("test", "class", "to find", *heads, *HEADINGS, "calibration error"), _classes(results)
+        ),
+        "slices": format_table(("test", "cars", "to find", *heads), _slices(results)),
+        "training": format_table(
             ("seed", "sweeps", "steps", "validation, mean AP3D@0.5 of the classes, after each epoch; the best is kept"),
             training_rows(results),
         ),
-        "tracks": table(("class", "MOTA", "AMOTA", "id switches", "velocity off by [m/s]"), _tracks(results)),
+        "tracks": format_table(("class", "MOTA", "AMOTA", "id switches", "velocity off by [m/s]"), _tracks(results)),
     }
 
 
@@ -45,7 +47,7 @@ def _findings(results: StudyResult[ObjectsEvaluation]) -> list[str]:
     seeds, said = len(results.seeds), []
     for test in dict.fromkeys(str(recipe["town"]) for recipe in results.recipes.train):
         for name, (wanted, claim) in WANTED.items():
-            said.append(aim_sentence(f"{claim} on {test}", wanted, results.summary[test][name], seeds) + ".")
+            said.append(describe_aim(f"{claim} on {test}", wanted, results.summary[test][name], seeds) + ".")
     return said
 
 
@@ -80,7 +82,7 @@ def _tracks(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
     return rows
 
 
-def _measures(seeds: Sequence[Sequence[Score | SlicePrecision]]) -> list[str]:
+def _measures(seeds: Sequence[Sequence[Score | BreakdownRow]]) -> list[str]:
     """Return the mean AP over seeds of each of `MEASURES`; `seeds`: rows of each seed."""
     return [_mean(row.ap for rows in seeds for row in rows if (row.kind, row.iou) == measure) for measure in MEASURES]
 
@@ -90,7 +92,7 @@ def _mean(values: Iterable[float | None]) -> str:
     return f"{np.mean(known):.3f}" if known else ""
 
 
-def followed(found: ObjectsEvaluation, network: Second, data: Dataset) -> ObjectsEvaluation:
+def add_tracks(found: ObjectsEvaluation, network: Second, data: Dataset) -> ObjectsEvaluation:
     """Return the evaluation completed by that of the network's tracks (MOTA, AMOTA)."""
     return replace(found, tracks=evaluate_tracks(network, data))
 
@@ -110,4 +112,4 @@ def _draw(results: StudyResult[ObjectsEvaluation]) -> bytes:
     return style.png(precisions(panels))
 
 
-STUDY = Study(OBJECTS, OBJECTS.study(), draw=_draw, extra={TRACKS: followed})
+STUDY = Study(OBJECTS, OBJECTS.study(), draw=_draw, extra={TRACKS: add_tracks})

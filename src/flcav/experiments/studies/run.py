@@ -21,7 +21,7 @@ from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps import Notify, Step, Work, run_steps
-from flcav.records import LEFT_OUT, of_json, to_json
+from flcav.records import LEFT_OUT, from_json, to_json
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
@@ -89,14 +89,16 @@ class Study(Generic[EvaluationT]):
 
     def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> Json:
         """Train the network of one seed, resuming an interrupted training; return its card as JSON."""
-        data = [opened(work, step) for step in _training_steps(self)]
-        request = Request(data, opened(work, VALIDATION), network, epochs, patience, seed)
+        data = [open_split(work, step) for step in _training_steps(self)]
+        request = Request(data, open_split(work, VALIDATION), network, epochs, patience, seed)
         return train_network(self.task, request, work.folder, work.report).model_dump(mode="json")
 
     def test(self, work: Work, *, seed: int) -> Json:
         """Return the evaluation of one seed's network on each test, as JSON by test."""
         network = load_network(self.task, work.inputs[_seed_step(seed)] / WEIGHTS)
-        return {name: self._tested(name, network, opened(work, _test_step(name)), work) for name in self.recipe.tests}
+        return {
+            name: self._tested(name, network, open_split(work, _test_step(name)), work) for name in self.recipe.tests
+        }
 
     def _tested(self, name: str, network: Any, data: Dataset, work: Work) -> Mapping[str, Json]:
         result = self.task.evaluate(network, data, progress=work.report)
@@ -146,7 +148,7 @@ def results_as_json(study: Study[EvaluationT], results: StudyResult[EvaluationT]
 
 def results_of_json(study: Study[EvaluationT], values: Json, origin: str) -> StudyResult[EvaluationT]:
     """Return the results that `results_as_json` wrote; raises `InputError`, naming `origin`, for other values."""
-    return of_json(_kind(study), values, origin)
+    return from_json(_kind(study), values, origin)
 
 
 def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int, str]]:
@@ -189,7 +191,7 @@ def _tested_step(seed: int) -> str:
 
 def _seed_result(study: Study[EvaluationT], seed: int, values: Mapping[str, Any]) -> SeedResult[EvaluationT]:
     tests = values[_tested_step(seed)]
-    evaluations = {name: study.evaluation.of_json(tests[name], f"test on {name}") for name in study.recipe.tests}
+    evaluations = {name: study.evaluation.from_json(tests[name], f"test on {name}") for name in study.recipe.tests}
     return SeedResult(seed, Card.model_validate(values[_seed_step(seed)]), evaluations)
 
 
@@ -212,6 +214,6 @@ def record_split(work: Work, recipe: dict[str, Any]) -> dict[str, int]:
     return {"frames": len(Dataset.open(work.folder / DATA))}
 
 
-def opened(work: Work, step: str) -> Dataset:
+def open_split(work: Work, step: str) -> Dataset:
     """Open the dataset that `record_split` recorded in the step `step`."""
     return Dataset.open(work.inputs[step] / DATA)

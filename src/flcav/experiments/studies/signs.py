@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 from flcav.experiments.studies.run import Study, StudyResult, training_rows
-from flcav.markdown import bullets, table
+from flcav.markdown import format_bullets, format_table
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
 from flcav.perception.signs.task import SIGNS
 from flcav.report import style
 from flcav.report.charts.studies import Bar, precisions
-from flcav.verdicts import aim_sentence
+from flcav.verdicts import describe_aim
 
 WANTED = 0.75  # aim: least mAP50 on other scenes
 
@@ -17,16 +17,16 @@ def tables(results: StudyResult[SignsEvaluation]) -> dict[str, str]:
     """Return Markdown by name: findings (a list), classes, sizes, training."""
     tested = [results.tested(test) for test in results.summary]
     return {
-        "findings": bullets(_findings(results)),
-        "classes": table(
+        "findings": format_bullets(_findings(results)),
+        "classes": format_table(
             ("class", *_heads(results)),
             _rows([[found.classes for found in seeds] for seeds in tested]),
         ),
-        "sizes": table(
+        "sizes": format_table(
             ("root of the box's area", *_heads(results)),
             _rows([[found.sizes for found in seeds] for seeds in tested]),
         ),
-        "training": table(
+        "training": format_table(
             ("seed", "pictures", "steps", "validation mAP50 after each epoch; the network of the best is kept"),
             training_rows(results),
         ),
@@ -37,7 +37,7 @@ def _findings(results: StudyResult[SignsEvaluation]) -> list[str]:
     seeds = len(results.seeds)
     said = []
     for test, means in results.summary.items():
-        aim = aim_sentence(f"mAP50 of {WANTED} on {test}", WANTED, means["mAP50"], seeds)
+        aim = describe_aim(f"mAP50 of {WANTED} on {test}", WANTED, means["mAP50"], seeds)
         said.append(f"{aim}; mAP50-95 {means['mAP50-95'].mean:.3f}.")
     return said
 

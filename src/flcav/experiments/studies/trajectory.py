@@ -6,13 +6,13 @@ import numpy as np
 
 from flcav.experiments.studies.run import SeedResult, Study, StudyResult
 from flcav.intervals import MeanOverSeeds
-from flcav.markdown import bullets, table
+from flcav.markdown import format_bullets, format_table
 from flcav.perception.trajectory import study
 from flcav.perception.trajectory.evaluate import ALL, PathErrors, TrajectoryEvaluation
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.report import style
 from flcav.report.charts.studies import ErrorBar, path_errors
-from flcav.verdicts import aim_sentence
+from flcav.verdicts import describe_aim
 
 WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # aims: largest ratio to constant velocity's final error
 SLICE = "at junctions"
@@ -27,12 +27,12 @@ PREDICTORS = {
 def tables(results: StudyResult[TrajectoryEvaluation]) -> dict[str, str]:
     """Return Markdown by name: findings (a list), errors, training."""
     return {
-        "findings": bullets(
+        "findings": format_bullets(
             _finding(wanted, test, means, len(results.seeds))
             for test, means in results.summary.items()
             for wanted in WANTED[results.network]
         ),
-        "errors": table(
+        "errors": format_table(
             (
                 "test",
                 "slice",
@@ -44,7 +44,7 @@ def tables(results: StudyResult[TrajectoryEvaluation]) -> dict[str, str]:
             ),
             [row for test, means in results.summary.items() for row in _errors(test, means)],
         ),
-        "training": table(
+        "training": format_table(
             (
                 "seed",
                 "samples",
@@ -60,7 +60,7 @@ def tables(results: StudyResult[TrajectoryEvaluation]) -> dict[str, str]:
 def _finding(wanted: float, test: str, means: Mapping[str, MeanOverSeeds], seeds: int) -> str:
     ratio = means[f"{SLICE}, ratio_single"]
     aim = f"A final error of {wanted} times constant velocity's at junctions, {test}"
-    said = aim_sentence(aim, wanted, ratio, seeds, at_most=True)
+    said = describe_aim(aim, wanted, ratio, seeds, at_most=True)
     best, plain = (means[f"{SLICE}, {key}"].mean for key in ("minFDE_K", "constant_velocity_FDE"))
     return f"{said}. Of six modes the best ends {best:.2f} m off, constant velocity {plain:.2f} m."
 
@@ -72,14 +72,14 @@ def _errors(test: str, means: Mapping[str, MeanOverSeeds]) -> list[list[str]]:
         for who, (ade, fde, missed) in PREDICTORS.items():
             average, final, misses = (means[f"{name}, {key}"] for key in (ade, fde, missed))
             share = final.mean / means[f"{name}, constant_velocity_FDE"].mean
-            shown = final.told() if final.high > final.low else f"{final.mean:.3f}"
+            shown = final.describe() if final.high > final.low else f"{final.mean:.3f}"
             numbers = [f"{average.mean:.2f}", shown, f"{misses.mean:.1%}", f"{share:.2f}"]
             rows.append([test, f"{name} ({count})", who, *numbers])
     return rows
 
 
 def _trained(seed: SeedResult[TrajectoryEvaluation]) -> list[str]:
-    every = TrajectoryEvaluation.of_json(seed.card.metrics, "card").slices[ALL]
+    every = TrajectoryEvaluation.from_json(seed.card.metrics, "card").slices[ALL]
     known = "" if every is None else f"{every.minFDE_1:.2f}, {every.minFDE_K:.2f}"
     learning = seed.card.learning
     return [str(seed.seed), str(seed.card.samples), str(learning.steps), f"{learning.loss:.2f}", known]

@@ -7,14 +7,14 @@ import numpy as np
 from flcav.dataset.store import Dataset
 from flcav.experiments.studies.run import Study, StudyResult
 from flcav.intervals import Estimate
-from flcav.markdown import bullets, table
+from flcav.markdown import format_bullets, format_table
 from flcav.perception.weather.evaluate import Classification
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.study import WHOLE_SPACE
-from flcav.perception.weather.task import WEATHER, over_the_whole_space
+from flcav.perception.weather.task import WEATHER, evaluate_whole_space
 from flcav.report import style
 from flcav.report.charts.studies import confusions
-from flcav.verdicts import aim_sentence
+from flcav.verdicts import describe_aim
 
 WANTED = 0.95  # aim: least accuracy
 
@@ -22,7 +22,7 @@ WANTED = 0.95  # aim: least accuracy
 def tables(results: StudyResult[Classification]) -> dict[str, str]:
     """Return Markdown by name: findings (a list), accuracy, recall, seeds."""
     return {
-        "findings": bullets(_findings(results)),
+        "findings": format_bullets(_findings(results)),
         "accuracy": _accuracy(results),
         "recall": _recall(results),
         "seeds": _seeds(results),
@@ -35,7 +35,7 @@ def _findings(results: StudyResult[Classification]) -> list[str]:
         for name, mean in numbers.items():
             where = "within the classes' regions" if name == "accuracy" else "by the nearest class, everywhere"
             aim = f"Accuracy of {WANTED} on {test}, {where}"
-            said.append(aim_sentence(aim, WANTED, mean, len(results.seeds)) + ".")
+            said.append(describe_aim(aim, WANTED, mean, len(results.seeds)) + ".")
     return said
 
 
@@ -45,11 +45,11 @@ def _accuracy(results: StudyResult[Classification]) -> str:
         tested = results.tested(test)
         for name, mean in numbers.items():
             each = [found if name == "accuracy" else found.nearest or found for found in tested]
-            over_scenes = ", ".join(Estimate(one.accuracy, one.low, one.high).told() for one in each)
+            over_scenes = ", ".join(Estimate(one.accuracy, one.low, one.high).describe() for one in each)
             what = "within the regions" if name == "accuracy" else "everywhere, nearest class"
-            rows.append([test, what, each[0].pictures, each[0].scenes, mean.told(), over_scenes])
+            rows.append([test, what, each[0].pictures, each[0].scenes, mean.describe(), over_scenes])
     header = ("test", "pictures", "number", "scenes", "accuracy, over seeds", "each seed, over its scenes")
-    return table(header, rows)
+    return format_table(header, rows)
 
 
 def _recall(results: StudyResult[Classification]) -> str:
@@ -64,20 +64,20 @@ def _recall(results: StudyResult[Classification]) -> str:
             taken = ", ".join(f"{other} {count}" for other, count in others.items() if count)
             cells.append(f"{matrix[number] / matrix.sum():.3f}" + (f" ({taken})" if taken else ""))
         rows.append([name, *cells])
-    return table(("class", *(f"recall, {test} (taken for)" for test in tests)), rows)
+    return format_table(("class", *(f"recall, {test} (taken for)" for test in tests)), rows)
 
 
 def _seeds(results: StudyResult[Classification]) -> str:
     rows = []
     for seed in results.seeds:
-        validated = Classification.of_json(seed.card.metrics, "card")
+        validated = Classification.from_json(seed.card.metrics, "card")
         rows.append([seed.seed, seed.card.samples, seed.card.learning.steps, f"{validated.accuracy:.3f}"])
-    return table(("seed", "training pictures", "steps", "accuracy on validation"), rows)
+    return format_table(("seed", "training pictures", "steps", "accuracy on validation"), rows)
 
 
-def with_nearest(found: Classification, network: Classifier, data: Dataset) -> Classification:
+def add_nearest(found: Classification, network: Classifier, data: Dataset) -> Classification:
     """Return the evaluation completed by that of all pictures, each labelled with the nearest class."""
-    return replace(found, nearest=over_the_whole_space(network, data))
+    return replace(found, nearest=evaluate_whole_space(network, data))
 
 
 def _draw(results: StudyResult[Classification]) -> bytes:
@@ -87,4 +87,4 @@ def _draw(results: StudyResult[Classification]) -> bytes:
     return style.png(confusions(counts, next(iter(shown.values()))[0].classes))
 
 
-STUDY = Study(WEATHER, WEATHER.study(), draw=_draw, extra={WHOLE_SPACE: with_nearest})
+STUDY = Study(WEATHER, WEATHER.study(), draw=_draw, extra={WHOLE_SPACE: add_nearest})

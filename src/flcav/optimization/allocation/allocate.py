@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.network.plan import Price
-from flcav.optimization.allocation.area import area, largest_area
-from flcav.optimization.allocation.problem import Problem, Task
+from flcav.optimization.allocation.area import area, maximise_area
+from flcav.optimization.allocation.problem import AllocationTask, Problem
 from flcav.optimization.curves.curves import Curve, Shared
-from flcav.optimization.solvers.fairness import least_largest
+from flcav.optimization.solvers.fairness import minimise_largest_error
 from flcav.optimization.solvers.instance import Infeasible as Infeasible
-from flcav.optimization.solvers.instance import Instance, cost_of, instance
+from flcav.optimization.solvers.instance import Instance, build_instance, price_counts
 from flcav.optimization.solvers.instance import stage_plan as stage_plan
-from flcav.optimization.solvers.weighted import least_weighted
+from flcav.optimization.solvers.weighted import minimise_weighted_error
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
     It is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS` tasks. Robust plans minimise the upper
     bands of the learning curves. `marginal_error_per_gb` is the derivative of the continuous optimum by each budget,
     times 1000 MB: a shadow price at these budgets, not a forecast of what 1000 MB more bring, for which see
-    `budget_sweep.savings`. Raises `Infeasible`, naming the budget, the cost of the least plan within the limits and the
+    `budget_sweep.compute_savings`. Raises `Infeasible`, naming the budget, the cost of the least plan within the limits and the
     excess, and `InputError` where the solver cannot handle the problem's numbers.
 
     >>> from flcav import allocate, load_problem
@@ -92,10 +92,10 @@ def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
     >>> plan.status, plan.tasks[0].name, plan.used_mb.wireless_mb <= 4000
     ('optimal', 'objects', True)
     """
-    asked = resolved(problem)
+    asked = resolve_problem(problem)
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
-    best = _METHODS[problem.objective](asked, instance(asked), sought)
-    plans = described(problem, best.x)
+    best = _METHODS[problem.objective](asked, build_instance(asked), sought)
+    plans = build_task_plans(problem, best.x)
     lower = None if best.lower is None else min(best.lower, best.objective)
     achieved = None if lower is None else relative_gap(best.objective, lower)
     return Allocation(
@@ -104,7 +104,7 @@ def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
         lower_bound=lower,
         gap=achieved,
         tasks=plans,
-        used_mb=used(plans),
+        used_mb=sum_prices(plans),
         marginal_error_per_gb=Price(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates)),
         note=NO_CERTIFICATE if lower is None else None,
         warnings=_beyond(problem, plans),
@@ -116,7 +116,7 @@ def relative_gap(objective: float, lower: float) -> float:
     return (objective - lower) / lower if lower > 0 else float(objective > 0)
 
 
-def resolved(problem: Problem) -> Problem:
+def resolve_problem(problem: Problem) -> Problem:
     """Return the problem that is solved: with upper bands as curves if robust, importances as weights if given.
 
     The importance of a task is the performance lost when it is left out, `performance` - `performance_without`, at
@@ -132,14 +132,14 @@ def resolved(problem: Problem) -> Problem:
     return problem.model_copy(update={"tasks": tasks})
 
 
-def described(problem: Problem, x: Array) -> tuple[TaskPlan, ...]:
+def build_task_plans(problem: Problem, x: Array) -> tuple[TaskPlan, ...]:
     """Return the tasks' plans for x (3N,): samples, edge rounds and cloud rounds of each task in order."""
     return tuple(_task_plan(problem, task, row) for task, row in zip(problem.tasks, x.reshape(-1, 3)))
 
 
-def _task_plan(problem: Problem, task: Task, row: Array) -> TaskPlan:
+def _task_plan(problem: Problem, task: AllocationTask, row: Array) -> TaskPlan:
     samples, edge_rounds, cloud_rounds = (int(count) for count in row)
-    cost = cost_of(problem, task, (samples, edge_rounds, cloud_rounds))
+    cost = price_counts(problem, task, (samples, edge_rounds, cloud_rounds))
 
     def error(curve: Curve) -> float:
         return float(curve.error(samples, edge_rounds, cloud_rounds, problem.edge_rounds_per_cloud_round))
@@ -152,7 +152,7 @@ def _task_plan(problem: Problem, task: Task, row: Array) -> TaskPlan:
     )
 
 
-def used(plans: tuple[TaskPlan, ...]) -> Price:
+def sum_prices(plans: tuple[TaskPlan, ...]) -> Price:
     """Return the total cost of the plans."""
     return Price(sum(plan.wireless_mb for plan in plans), sum(plan.wireline_mb for plan in plans))
 
@@ -163,7 +163,7 @@ def weighted_error(problem: Problem, plans: Sequence[TaskPlan]) -> float:
     return sum(task.weight * error for task, error in zip(problem.tasks, errors, strict=True))
 
 
-def score(problem: Problem, plans: Sequence[TaskPlan]) -> float:
+def evaluate_objective(problem: Problem, plans: Sequence[TaskPlan]) -> float:
     """Return the value of the problem's objective at the plans: weighted error, largest error or area."""
     if problem.objective == "weighted":
         return weighted_error(problem, plans)
@@ -187,17 +187,19 @@ def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:
 
 
 def _weighted(problem: Problem, made: Instance, gap: float) -> _Best:
-    found = least_weighted(made, gap)
-    return _Best(found.x, weighted_error(problem, described(problem, found.x)), found.bound + made.floor, found.rates)
+    found = minimise_weighted_error(made, gap)
+    return _Best(
+        found.x, weighted_error(problem, build_task_plans(problem, found.x)), found.bound + made.floor, found.rates
+    )
 
 
 def _fair(problem: Problem, made: Instance, gap: float) -> _Best:
-    found = least_largest(problem, made, gap)
+    found = minimise_largest_error(problem, made, gap)
     return _Best(found.x, found.level, found.bound, found.rates)
 
 
 def _area(problem: Problem, made: Instance, gap: float) -> _Best:
-    found = largest_area(problem, max(gap, AREA_GAP))
+    found = maximise_area(problem, max(gap, AREA_GAP))
     return _Best(found.x, found.area, None, found.rates)
 
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.curves import Shared
-from flcav.optimization.solvers.instance import instance
-from flcav.optimization.solvers.weighted import least_weighted
+from flcav.optimization.solvers.instance import build_instance
+from flcav.optimization.solvers.weighted import minimise_weighted_error
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ def area(accuracy: Array) -> float:
     return 0.5 * float(np.sin(2 * np.pi / len(corners)) * (corners @ np.roll(corners, -1)))
 
 
-def largest_area(problem: Problem, gap: float) -> Polygon:
+def maximise_area(problem: Problem, gap: float) -> Polygon:
     """Return the plan of largest area among the local optima from several starts; there is no certificate.
 
     `gap` is the relative gap of each weighted problem, and the least relative gain of a step. Raises `Infeasible` where
@@ -56,7 +56,7 @@ def _climb(problem: Problem, weights: Array, gap: float) -> Polygon:
     best = Polygon(np.zeros(0), -np.inf, np.zeros(2))
     for _ in range(STEPS):
         weighed = _weighed(problem, np.maximum(weights, LEAST_WEIGHT))
-        found = least_weighted(instance(weighed), gap)
+        found = minimise_weighted_error(build_instance(weighed), gap)
         accuracy = _accuracy(problem, found.x)
         reached = Polygon(found.x, area(accuracy), found.rates)
         if reached.area <= best.area * (1 + gap):

@@ -11,14 +11,21 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 from flcav.network.plan import Price
-from flcav.optimization.allocation.allocate import Infeasible, TaskPlan, described, resolved, score, used
+from flcav.optimization.allocation.allocate import (
+    Infeasible,
+    TaskPlan,
+    build_task_plans,
+    evaluate_objective,
+    resolve_problem,
+    sum_prices,
+)
 from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
-from flcav.optimization.solvers.instance import Instance, instance
+from flcav.optimization.solvers.instance import Instance, build_instance
 from flcav.optimization.solvers.rounding import trim
 from flcav.optimization.solvers.separable import relax
-from flcav.optimization.solvers.weighted import least_weighted, terms_of
-from flcav.optimization.vehicles import vehicle_shares
+from flcav.optimization.solvers.weighted import list_terms, minimise_weighted_error
+from flcav.optimization.vehicles import split_plan
 
 Array = NDArray[np.float64]
 
@@ -44,13 +51,13 @@ def baseline(problem: Problem, name: str) -> Baseline:
     Baselines respect the fleet's budgets alone: `note` says where the vehicles' samples or links do not suffice. Raises
     `Infeasible` as `allocate` does, KeyError for an unknown name.
     """
-    asked = resolved(problem)
-    plans = described(problem, BASELINES[name](asked, instance(asked)))
+    asked = resolve_problem(problem)
+    plans = build_task_plans(problem, BASELINES[name](asked, build_instance(asked)))
     try:
-        vehicle_shares(problem, plans)
+        split_plan(problem, plans)
     except Infeasible:
-        return Baseline(name, score(asked, plans), plans, used(plans), NOT_CARRIED)
-    return Baseline(name, score(asked, plans), plans, used(plans))
+        return Baseline(name, evaluate_objective(asked, plans), plans, sum_prices(plans), NOT_CARRIED)
+    return Baseline(name, evaluate_objective(asked, plans), plans, sum_prices(plans))
 
 
 def equal_stages(problem: Problem, made: Instance) -> Array:
@@ -67,7 +74,7 @@ def equal_stages(problem: Problem, made: Instance) -> Array:
         most = np.where(np.arange(3) == stage, high, x)
         budget = x.ravel() @ made.cost + np.where(uses[stage, :], share, 0.0)
         limited = _limited(problem, x, most, budget)
-        x = least_weighted(instance(limited), GAP).x.reshape(-1, 3)
+        x = minimise_weighted_error(build_instance(limited), GAP).x.reshape(-1, 3)
     return x.ravel()
 
 
@@ -84,7 +91,7 @@ def equal_tasks(problem: Problem, made: Instance) -> Array:
         alone = problem.model_copy(update={"tasks": (task,)})
         own = slice(number, number + 1)
         limited = _limited(alone, low[own], high[own], low[number] @ cost[number] + share)
-        x[number] = least_weighted(instance(limited), GAP).x
+        x[number] = minimise_weighted_error(build_instance(limited), GAP).x
     return x.ravel()
 
 
@@ -104,12 +111,12 @@ def max_throughput(problem: Problem, made: Instance) -> Array:
     return trim(made, x, messages)
 
 
-def article(problem: Problem, made: Instance) -> Array:
+def round_down_optimum(problem: Problem, made: Instance) -> Array:
     """Return the continuous optimum rounded down (3N,), the last step of the article's allocator."""
     if made.effective is None:
         x = relax(made.separable).x
     else:
-        program = Program(terms_of(made), made.low, made.high, made.cost, made.budget)
+        program = Program(list_terms(made), made.low, made.high, made.cost, made.budget)
         starts = [made.low + (made.high - made.low) * share for share in np.linspace(0, 1, 6) ** 3]
         x, _, _ = continuous_optimum(program, starts, GAP)
     return trim(made, np.clip(np.floor(x + 1e-9), made.low, made.high), np.ones(len(x)))
@@ -132,5 +139,5 @@ BASELINES: dict[str, Callable[[Problem, Instance], Array]] = {
     "equal-stages": equal_stages,
     "equal-tasks": equal_tasks,
     "max-throughput": max_throughput,
-    "article": article,
+    "article": round_down_optimum,
 }

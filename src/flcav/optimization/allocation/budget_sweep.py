@@ -42,7 +42,7 @@ class Saving:
     saved: float  # by how much the objective is less than this plan's; of an area: by how much it is more
 
 
-def budget_sweep(
+def sweep_budgets(
     problem: Problem, plan: Allocation, scaled: Sequence[str] = LINKS, factors: Sequence[float] = FACTORS
 ) -> tuple[BudgetPoint, ...]:
     """Return the optimal objective at each of `factors`, ascending, times the budgets of the `scaled` links.
@@ -69,11 +69,11 @@ def budget_sweep(
     return tuple(points)
 
 
-def savings(problem: Problem, plan: Allocation) -> tuple[Saving, ...]:
+def compute_savings(problem: Problem, plan: Allocation) -> tuple[Saving, ...]:
     """Return the gains over `plan` of 10 % and of 50 % more budget on each link alone, each solved anew."""
     found = []
     for link in LINKS:
-        points = budget_sweep(problem, plan, (link,), (1.0, *(1 + added for added in ADDED)))
+        points = sweep_budgets(problem, plan, (link,), (1.0, *(1 + added for added in ADDED)))
         for added, point in zip(ADDED, points[1:], strict=True):
             more_mb = added * getattr(problem.budgets_mb, link)
             saved = abs(plan.objective - point.objective)

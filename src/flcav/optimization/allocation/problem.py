@@ -15,7 +15,7 @@ WORST = 1e6  # largest error that a curve may predict within the limits; that of
 Count = Annotated[int, Field(ge=0, le=MOST)]
 Vehicles = Annotated[int, Field(ge=1, le=MOST)]
 Range = tuple[Count, Count]  # least and most, both allowed
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(min_length=1)]
 Objective = Literal["weighted", "max-min", "area"]
 
@@ -65,7 +65,7 @@ class Measured(Config):
     cloud_rounds: NonNegative | None = None
 
 
-class Task(Quantities):
+class AllocationTask(Quantities):
     """A unit of allocation: one perception task or a cluster, with its message sizes, vehicles and learning curve.
 
     Tasks that share a network and its data are a cluster, with a `shared` curve: their weighted mean error.
@@ -84,7 +84,7 @@ class Task(Quantities):
     curve: Curve
     upper: Curve | None = None  # the upper band of `curve`, for robust plans
     measured: Measured = Measured()
-    performance_without: Share | None = None  # of the whole system when this task is left out
+    performance_without: Fraction | None = None  # of the whole system when this task is left out
 
     @property
     def learners(self) -> tuple[Learner, ...]:
@@ -173,8 +173,10 @@ class Problem(Quantities):
     horizon_s: Positive | None = None  # longest time that each vehicle's own link may be busy with the plan
     objective: Objective = "weighted"
     robust: bool = False  # whether to plan for the upper bands of the curves
-    performance: Share | None = None  # of the whole system with all tasks; then weights are what each task adds to it
-    tasks: Annotated[tuple[Task, ...], Field(min_length=1)]
+    performance: Fraction | None = (
+        None  # of the whole system with all tasks; then weights are what each task adds to it
+    )
+    tasks: Annotated[tuple[AllocationTask, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
     def _one_link_per_vehicle(self) -> Self:

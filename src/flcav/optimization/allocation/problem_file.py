@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.optimization.allocation.allocate import resolved
+from flcav.optimization.allocation.allocate import resolve_problem
 from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.curves import Additive, Effective
 from flcav.optimization.curves.fitting import QUANTITIES, CurveFit
@@ -45,13 +45,13 @@ TERMS = {
 }
 
 
-def meaning(problem: Problem, objective: float) -> str:
+def explain_objective(problem: Problem, objective: float) -> str:
     """Return the definition of the problem's objective, in a sentence.
 
     For weights that do not sum to 1, a second sentence gives the mean error of a plan whose objective is `objective`.
     """
     sentence = TERMS[MEASURES[problem.objective]]
-    weights = sum(task.weight for task in resolved(problem).tasks)
+    weights = sum(task.weight for task in resolve_problem(problem).tasks)
     if problem.objective != "weighted" or abs(weights - 1) < 1e-9:
         return sentence
     return f"{sentence} Here they sum to {weights:.3g}, and the mean is {objective / weights:.4g}."
@@ -64,7 +64,7 @@ ENDLESS = 10**9  # width of a line that is never wrapped
 
 
 @dataclass(frozen=True)
-class Learned:
+class FittedFields:
     """The fields of a task in an allocation problem that a history determines."""
 
     curve: Additive | Effective
@@ -73,15 +73,15 @@ class Learned:
     measured: Mapping[str, float]  # most of each quantity that varies in the history
 
 
-def learned(fit: CurveFit, resources: Array, upper: Additive | Effective | None) -> Learned:
+def collect_fitted_fields(fit: CurveFit, resources: Array, upper: Additive | Effective | None) -> FittedFields:
     """Return the fields of a task from its `fit`, its `upper` band and the `resources` (n, 3) of its history."""
     least = np.ceil(resources.min(axis=0)).astype(int).tolist()
     most = np.floor(resources.max(axis=0)).astype(int).tolist()
     limits = {name: [low, max(low, high)] for name, low, high in zip(QUANTITIES, least, most, strict=True)}
-    return Learned(fit.curve, upper, limits, fit.measured)
+    return FittedFields(fit.curve, upper, limits, fit.measured)
 
 
-def new_problem(tasks: Mapping[str, Learned], k: int, history: str) -> str:
+def format_problem(tasks: Mapping[str, FittedFields], k: int, history: str) -> str:
     """Return the YAML text of a new problem of `tasks`, by name; fields that no history determines are left empty.
 
     `k` are the edge rounds per cloud round, `history` names the source of the curves in a comment.
@@ -106,12 +106,12 @@ def new_problem(tasks: Mapping[str, Learned], k: int, history: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def task_names(text: str, origin: str) -> list[str]:
+def read_task_names(text: str, origin: str) -> list[str]:
     """Return the names of the tasks in the `text` of a problem; raises `InputError` where it is no problem."""
     return list(_tasks(text, origin)[1])
 
 
-def with_curves(text: str, tasks: Mapping[str, Learned], k: int, origin: str) -> str:
+def insert_curves(text: str, tasks: Mapping[str, FittedFields], k: int, origin: str) -> str:
     """Return the `text` of a problem (a list of tasks or a graph) with the fitted fields of `tasks` put in, by name.
 
     Existing limits are kept. `k` are the edge rounds per cloud round of fits over effective samples. Raises
@@ -137,7 +137,7 @@ def with_curves(text: str, tasks: Mapping[str, Learned], k: int, origin: str) ->
     return text
 
 
-def _fields(own: Learned) -> dict[str, Any]:
+def _fields(own: FittedFields) -> dict[str, Any]:
     """Return the fields of a task, as in a problem file."""
     return {
         "limits": dict(own.limits),

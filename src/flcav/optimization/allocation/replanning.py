@@ -10,20 +10,20 @@ from pydantic import Field
 
 from flcav.config import Config, InputError
 from flcav.optimization.allocation.allocate import Allocation, allocate
-from flcav.optimization.allocation.problem import Budgets, Count, Problem, Share, Task
+from flcav.optimization.allocation.problem import AllocationTask, Budgets, Count, Fraction, Problem
 from flcav.optimization.curves.curves import Additive, Curve, Decay, Effective, NonNegative
-from flcav.optimization.solvers.instance import cost_of
+from flcav.optimization.solvers.instance import price_counts
 
 LEAST_ERROR = 1e-6  # error assumed for an accuracy of 1: test sets are finite
 
 
-class Spent(Config):
+class TaskState(Config):
     """The resources that one task has spent so far, and the accuracy of its network now."""
 
     samples: Count
     edge_rounds: Count = 0
     cloud_rounds: Count = 0
-    accuracy: Share | None = None  # None: not measured; of a cluster: the weighted mean of its members'
+    accuracy: Fraction | None = None  # None: not measured; of a cluster: the weighted mean of its members'
 
     @property
     def counts(self) -> tuple[int, int, int]:
@@ -38,22 +38,22 @@ class Sent(Config):
     wireline: NonNegative
 
 
-class Progress(Config):
+class PlanState(Config):
     """The state of a plan's execution: resources spent by task, and megabytes sent."""
 
-    tasks: Annotated[Mapping[str, Spent], Field(min_length=1)]  # by name
+    tasks: Annotated[Mapping[str, TaskState], Field(min_length=1)]  # by name
     used_mb: Sent | None = None  # None: the cost of the counts by the problem's sizes
 
 
-def replan(problem: Problem, progress: Progress, *, gap: float = 1e-4) -> Allocation:
+def replan(problem: Problem, progress: PlanState, *, gap: float = 1e-4) -> Allocation:
     """Return the best plan that continues from `progress`; its counts are totals, including what is spent.
 
-    Raises `InputError` as `going_on` does, and `Infeasible` where the rest of the budgets allows no plan.
+    Raises `InputError` as `condition_problem` does, and `Infeasible` where the rest of the budgets allows no plan.
     """
-    return allocate(going_on(problem, progress), gap=gap)
+    return allocate(condition_problem(problem, progress), gap=gap)
 
 
-def going_on(problem: Problem, progress: Progress) -> Problem:
+def condition_problem(problem: Problem, progress: PlanState) -> Problem:
     """Return the problem given `progress`: resources spent are lower limits, curves pass through observed accuracies.
 
     A task's curve and upper band, floors included, are scaled by the ratio of observed to predicted error. Budgets are
@@ -71,7 +71,7 @@ def going_on(problem: Problem, progress: Progress) -> Problem:
     return problem.model_copy(update={"tasks": tasks, "budgets_mb": _left(problem, progress)})
 
 
-def _continued(problem: Problem, task: Task, spent: Spent) -> Task:
+def _continued(problem: Problem, task: AllocationTask, spent: TaskState) -> AllocationTask:
     fields = ("samples", "edge_rounds", "cloud_rounds")
     limits = {}
     for stage, (name, done) in enumerate(zip(fields, spent.counts)):
@@ -106,13 +106,13 @@ def _smaller(decay: Decay, factor: float) -> Decay:
     return decay.model_copy(update={"a": decay.a * factor})
 
 
-def _left(problem: Problem, progress: Progress) -> Budgets:
+def _left(problem: Problem, progress: PlanState) -> Budgets:
     """Return the budgets less the difference of the megabytes sent and the cost of the counts."""
     budgets = problem.budgets_mb
     if progress.used_mb is None:
         return budgets
     done = [
-        cost_of(problem, task, progress.tasks[task.name].counts)
+        price_counts(problem, task, progress.tasks[task.name].counts)
         for task in problem.tasks
         if task.name in progress.tasks
     ]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.optimization.curves.curves import Additive, Effective
-from flcav.optimization.curves.fitting import CurveFit, refitted
+from flcav.optimization.curves.fitting import CurveFit, refit
 from flcav.seeds import stream
 
 Array = NDArray[np.float64]
@@ -38,7 +38,9 @@ class Bands:
         return np.where(np.isnan(low), np.inf, low), np.where(np.isnan(high), np.inf, high)
 
 
-def bands(fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 0, k: int = 1) -> Bands | None:
+def bootstrap_bands(
+    fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 0, k: int = 1
+) -> Bands | None:
     """Return the confidence band of `fit`; None where there are no more points than parameters, so no residuals."""
     fitted = fit.fitted
     if fitted is None or fit.points <= len(fitted.parameters):
@@ -51,11 +53,11 @@ def bands(fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 
     curves = []
     for _ in range(repeats):
         drawn = rng.choice(residual, len(predicted)) / np.where(known, root, 1.0)
-        curves.append(fitted.form.curve(refitted(fitted, np.maximum(predicted + drawn, 0.0))))
+        curves.append(fitted.form.curve(refit(fitted, np.maximum(predicted + drawn, 0.0))))
     return Bands(level, seed, tuple(curves), k)
 
 
-def upper_curve(fit: CurveFit, found: Bands) -> Additive | Effective:
+def fit_upper_curve(fit: CurveFit, found: Bands) -> Additive | Effective:
     """Return a curve of the fit's form that is not below the upper band: the worst case of a robust plan.
 
     It is fitted to the band, then its floor is raised until it is not below the band at the measured resources and at
@@ -67,13 +69,13 @@ def upper_curve(fit: CurveFit, found: Bands) -> Additive | Effective:
     most = spent.max(axis=0)
     checked = np.unique(np.concatenate((spent, *(np.maximum(spent, factor * most) for factor in BEYOND))), axis=0)
     _, high = found.between(spent)
-    curve = fitted.form.curve(refitted(fitted, high))
+    curve = fitted.form.curve(refit(fitted, high))
     _, band = found.between(checked)
     lift = float(np.max(np.maximum(band - curve.error(*checked.T, k=found.k), 0.0)))
     return curve.model_copy(update={"floor": curve.floor + lift})
 
 
-def pointwise(fit: CurveFit, found: Bands | None, resources: Array, k: int) -> list[dict[str, float | None]]:
+def tabulate_bands(fit: CurveFit, found: Bands | None, resources: Array, k: int) -> list[dict[str, float | None]]:
     """Return the curve with its bands at every row of `resources` (n, 3), a dictionary per row.
 
     Keys: samples, edge_rounds, cloud_rounds, error, low and high; without bands, low and high are None.

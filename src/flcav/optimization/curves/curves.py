@@ -37,13 +37,13 @@ def effective_samples(
     return alpha * samples + group * (1 - 1 / (t + 1))
 
 
-class Fitted(Config):
+class CurveConfig(Config):
     """Base of learning curves: parameters come from fits, and those of steep curves may be very large or small."""
 
     magnitudes: ClassVar[tuple[float, float]] = (1e-100, 1e100)
 
 
-class Decay(Fitted):
+class Decay(CurveConfig):
     """Inverse power law a * (x + x0)^(-b): a stage's error after x samples or rounds. By default it is 0."""
 
     a: NonNegative = 0.0
@@ -66,7 +66,7 @@ class Decay(Fitted):
             return self.a * shifted**-self.b if self.a > 0 else np.zeros_like(shifted)
 
 
-class Additive(Fitted):
+class Additive(CurveConfig):
     """Additive learning curve: error = floor + the sum of an inverse power law per stage."""
 
     model: Literal["additive"] = "additive"
@@ -89,7 +89,7 @@ class Additive(Fitted):
         return self.floor + self.pretrain.at(samples) + self.edge.at(edge_rounds) + self.cloud.at(cloud_rounds)
 
 
-class Effective(Fitted):
+class Effective(CurveConfig):
     """Learning curve over effective samples: error = floor + a * n^(-b).
 
     n is `effective_samples` with group = beta * group_samples and t = edge_rounds + k * cloud_rounds.

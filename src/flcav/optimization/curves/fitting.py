@@ -33,7 +33,7 @@ class Fit(Generic[CurveT]):
     rmse: float  # of the accuracy
     points: int
     aicc: float  # corrected Akaike information criterion
-    fitted: "Fitted[CurveT] | None" = None  # data and parameters of the fit; None: not known
+    fitted: "FitState[CurveT] | None" = None  # data and parameters of the fit; None: not known
 
     @property
     def r_squared(self) -> float | None:
@@ -73,7 +73,7 @@ class Fit(Generic[CurveT]):
             said.append(f"the curve explains {max(self.r_squared, 0):.0%} of the variance of the accuracy")
         return tuple(said)
 
-    def beyond(self, samples: float, edge_rounds: float, cloud_rounds: float) -> str | None:
+    def explain_extrapolation(self, samples: float, edge_rounds: float, cloud_rounds: float) -> str | None:
         """Return a sentence that names the quantities above the largest in the history; None where there are none."""
         if self.fitted is None:
             return None
@@ -91,7 +91,7 @@ CurveFit = Fit[Additive] | Fit[Effective]
 
 
 @dataclass(frozen=True)
-class Fitted(Generic[CurveT]):
+class FitState(Generic[CurveT]):
     """The parameters, data and loss of a fit: all that is needed to repeat it."""
 
     form: Form[CurveT]
@@ -184,7 +184,7 @@ def fit_effective(
     return _chosen(effective_forms(spent, alpha, beta, group_samples, k), spent, accuracy, weight)
 
 
-def refitted(fitted: Fitted[Any], error: Array) -> Array:
+def refit(fitted: FitState[Any], error: Array) -> Array:
     """Return the parameters (P,) of the same form fitted to other errors (n,) at the same resources.
 
     The search starts from the parameters of `fitted`.
@@ -210,7 +210,7 @@ def _chosen(forms: Sequence[Form[CurveT]], spent: Array, accuracy: ArrayLike, we
 
 def _solved(
     form: Form[CurveT], spent: Array, error: Array, weight: Array, robust: bool, tolerance: float = EXACT
-) -> Fitted[CurveT]:
+) -> FitState[CurveT]:
     """Return the least-squares fit from several starts; if `robust`, refined under the soft L1 loss."""
     starts = form.starts(max(float(np.median(error)), 1e-3))
     _, p = _least(form, spent, error, weight, starts, None, tolerance)
@@ -219,7 +219,7 @@ def _solved(
         residuals = (form.predict(p, spent) - error) * np.sqrt(weight)
         scale = max(3 * 1.4826 * float(np.median(np.abs(residuals))), 1e-6)
         _, p = _least(form, spent, error, weight, [p], scale, tolerance)
-    return Fitted(form, p, spent, error, weight, scale)
+    return FitState(form, p, spent, error, weight, scale)
 
 
 def _least(
@@ -250,7 +250,7 @@ def _least(
     return float(best.cost), best.x
 
 
-def _measured(fitted: Fitted[CurveT]) -> Fit[CurveT]:
+def _measured(fitted: FitState[CurveT]) -> Fit[CurveT]:
     form, weight = fitted.form, fitted.weight
     residual = form.predict(fitted.parameters, fitted.resources) - fitted.error
     mean_square = float((weight * residual**2).sum() / weight.sum())

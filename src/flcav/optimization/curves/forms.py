@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, parse_config
-from flcav.optimization.curves.curves import STAGES, Additive, Effective, Fitted, effective_samples
+from flcav.optimization.curves.curves import STAGES, Additive, CurveConfig, Effective, effective_samples
 
 Array = NDArray[np.float64]
 CurveT = TypeVar("CurveT", Additive, Effective, covariant=True)
@@ -181,7 +181,7 @@ class EffectiveForm:
 
 def _share(fitted: float) -> float:
     """Return a fitted floor or beta; 0 for one below the smallest number that a curve may hold."""
-    return float(fitted) if fitted >= Fitted.magnitudes[0] else 0.0
+    return float(fitted) if fitted >= CurveConfig.magnitudes[0] else 0.0
 
 
 def effective_forms(

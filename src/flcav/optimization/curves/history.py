@@ -43,10 +43,10 @@ class History:
 def article_histories() -> dict[str, History]:
     """Return the histories of Wang et al., IEEE Network 37(3), 2023, Fig. 3a, by task."""
     with ARTICLE.open("rb") as file:
-        return histories(pyarrow.csv.read_csv(file).to_pydict(), str(ARTICLE), "")
+        return parse_histories(pyarrow.csv.read_csv(file).to_pydict(), str(ARTICLE), "")
 
 
-def histories(columns: Table, origin: str, unnamed: str) -> dict[str, History]:
+def parse_histories(columns: Table, origin: str, unnamed: str) -> dict[str, History]:
     """Return the history of each task, by name, from a table in either form.
 
     `unnamed` is the task's name in a table without a column `task`. Raises `InputError` naming `origin`, the row (from
@@ -72,7 +72,7 @@ def histories(columns: Table, origin: str, unnamed: str) -> dict[str, History]:
         rows = [row for row, name in enumerate(names) if name == task]
         own = amounts[rows]
         if not joint:
-            own = resources_in_order([str(columns["stage"][row]) for row in rows], own[:, 0])
+            own = accumulate_resources([str(columns["stage"][row]) for row in rows], own[:, 0])
         found[task] = History(own, accuracy[rows], weight[rows])
     return found
 
@@ -95,7 +95,7 @@ def _with_accuracy(columns: Table, origin: str) -> Table:
     return columns
 
 
-def resources_in_order(stage: Sequence[str], resource: ArrayLike) -> Array:
+def accumulate_resources(stage: Sequence[str], resource: ArrayLike) -> Array:
     """Return samples, edge rounds and cloud rounds (n, 3) of a long table's rows.
 
     Each row has its own stage's `resource` (n,), the largest of each earlier stage, and 0 of each later one.

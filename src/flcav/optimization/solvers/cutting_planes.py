@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from scipy.sparse import coo_array, csr_array
 
-from flcav.optimization.solvers.instance import variables
+from flcav.optimization.solvers.instance import require_optimum
 
 Array = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class Cuts:
         matrix, limit = self._rows()
         bounds = np.stack((self._low(), self._high()), axis=1)
         result = linprog(self._objective(), A_ub=matrix, b_ub=limit, bounds=bounds, method="highs")
-        return variables(result)[: len(self.program.low)], float(result.fun) / self._scale
+        return require_optimum(result)[: len(self.program.low)], float(result.fun) / self._scale
 
     def solve(self, gap: float) -> tuple[Array, float]:
         """Return the optimum whole x (n,) to a relative `gap`, and the proven lower bound.
@@ -92,7 +92,7 @@ class Cuts:
             constraints=LinearConstraint(matrix, ub=limit),  # pyright: ignore[reportArgumentType]
             options={"mip_rel_gap": gap},
         )
-        return np.round(variables(result)[: len(self.program.low)]), float(result.mip_dual_bound) / self._scale
+        return np.round(require_optimum(result)[: len(self.program.low)]), float(result.mip_dual_bound) / self._scale
 
     def _objective(self) -> Array:
         return np.r_[np.zeros(len(self.program.low)), np.ones(len(self.program.terms))]

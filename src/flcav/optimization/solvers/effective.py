@@ -44,7 +44,7 @@ class EffectiveTasks:
         effective = effective_samples(own[:, 0], t, self.alpha[:, 0], self.group[:, 0])
         return self.gain[:, 0] * effective ** -self.b[:, 0]
 
-    def cheapest(self, multipliers: Array) -> tuple[Array, Array]:
+    def minimise_lagrangian(self, multipliers: Array) -> tuple[Array, Array]:
         """Return the whole quantities (E, 3) of least error plus price at `multipliers` (2,), and the minima (E,)."""
         samples, value = self._best_samples(multipliers)
         best = np.argmin(value, axis=1)
@@ -52,7 +52,7 @@ class EffectiveTasks:
         chosen = np.concatenate((samples[task, best][:, None], self.rounds[task, best]), axis=1)
         return chosen, value[task, best]
 
-    def within(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
+    def tighten_bounds(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
         """Return least and most quantities, (E, 3) each, of the choices within `slack` of a task's least Lagrangian.
 
         The Lagrangian is error plus price at `multipliers` (2,).
@@ -94,7 +94,7 @@ class EffectiveTasks:
         return effective_samples(samples, self.rounds[:, :, 0] + self.k * self.rounds[:, :, 1], self.alpha, self.group)
 
 
-def effective_tasks(
+def build_effective_tasks(
     numbers: Sequence[int], weights: Sequence[float], curves: Sequence[Effective], k: int, low: Array, high: Array,
     cost: Array,
 ) -> EffectiveTasks:  # fmt: skip

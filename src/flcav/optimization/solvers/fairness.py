@@ -59,11 +59,11 @@ class Choices:
         kept = needed <= self.most
         counts = np.column_stack((needed[kept], self.rounds[kept]))
         cost = counts @ self.cost
-        first = undominated(cost)
+        first = find_undominated(cost)
         return counts[first], cost[first]
 
 
-def least_largest(problem: Problem, made: Instance, gap: float) -> Fair:
+def minimise_largest_error(problem: Problem, made: Instance, gap: float) -> Fair:
     """Return a plan whose largest error is within a relative `gap` of the least possible, where one is found.
 
     `made` is `problem` in arrays. The bound is proven in any case. Raises `InputError` where the limits of a task leave
@@ -74,20 +74,20 @@ def least_largest(problem: Problem, made: Instance, gap: float) -> Fair:
     best, unreached = made.low, level
     while unreached - bound > 0.1 * gap * bound:
         middle = 0.5 * (unreached + bound)
-        if hold(tasks, middle, made.budget).out_of_reach:
+        if choose_at_level(tasks, middle, made.budget).out_of_reach:
             bound = middle
         else:
             unreached = middle
     tried, stride = bound, 0.1 * gap * bound
     while level - tried > 0.1 * gap * tried:
         trial = min(0.5 * (level + tried), tried + stride)
-        plan, excluded = together(hold(tasks, trial, made.budget))
+        plan, excluded = combine_choices(choose_at_level(tasks, trial, made.budget))
         if plan is not None:
             best, level = plan.ravel(), max(map(_largest, tasks, plan))
             continue
         bound = trial if excluded and bound == tried else bound
         tried, stride = trial, 2 * stride
-    held, below = (hold(tasks, level * share, made.budget) for share in (1, 1 - SMALL))
+    held, below = (choose_at_level(tasks, level * share, made.budget) for share in (1, 1 - SMALL))
     dearer = below.total(held.prices) - held.total(held.prices)
     rates = SMALL * level / dearer * held.prices if 0 < dearer < np.inf else np.zeros(2)
     best = fill(made, best, made.cost @ held.prices + 1e-300)
@@ -96,7 +96,7 @@ def least_largest(problem: Problem, made: Instance, gap: float) -> Fair:
 
 
 @dataclass(frozen=True)
-class Held:
+class LevelChoices:
     """The Pareto-optimal choices of all tasks at one error level, and the link prices of the best lower bound."""
 
     counts: tuple[Array, ...]  # per task (P, 3)
@@ -110,14 +110,14 @@ class Held:
         return sum(float((cost @ prices).min()) if len(cost) else np.inf for cost in self.costs)
 
 
-def hold(tasks: Sequence[Choices], level: float, budget: Array) -> Held:
+def choose_at_level(tasks: Sequence[Choices], level: float, budget: Array) -> LevelChoices:
     """Return the tasks' choices at an error `level`, with the link prices that maximise the least total cost.
 
     The total cost is concave in the wireless link's share of the price; bisection on its supergradient maximises it.
     """
     counts, costs = zip(*(task.frontier(level) for task in tasks))
     if not all(map(len, counts)):
-        return Held(counts, costs, budget, 0.5 / budget, out_of_reach=True)
+        return LevelChoices(counts, costs, budget, 0.5 / budget, out_of_reach=True)
     joined = np.concatenate(costs) / budget
     starts = np.cumsum([0, *map(len, costs[:-1])])
     task = np.repeat(np.arange(len(costs)), list(map(len, costs)))
@@ -131,10 +131,10 @@ def hold(tasks: Sequence[Choices], level: float, budget: Array) -> Held:
         chosen = np.flatnonzero(priced <= least[task])
         wireless, wireline = joined[chosen[np.searchsorted(task[chosen], np.arange(len(starts)))]].sum(axis=0)
         low, high = (max(low, share), high) if wireless > wireline else (low, min(high, share))
-    return Held(counts, costs, budget, np.array((best, 1 - best)) / budget, out_of_reach=most > 1 + PROVEN)
+    return LevelChoices(counts, costs, budget, np.array((best, 1 - best)) / budget, out_of_reach=most > 1 + PROVEN)
 
 
-def together(held: Held) -> tuple[NDArray[np.float64] | None, bool]:
+def combine_choices(held: LevelChoices) -> tuple[NDArray[np.float64] | None, bool]:
     """Return a plan of whole counts (N, 3) within the budgets, or None; and whether it is proven that there is none.
 
     Dynamic programming over the tasks: of the partial plans only those on the Pareto front of both links' costs are
@@ -153,7 +153,7 @@ def together(held: Held) -> tuple[NDArray[np.float64] | None, bool]:
         total = (sums[:, None] + cost[usable]).reshape(-1, 2)
         more = (extra[:, None] + above[usable]).ravel()
         kept = np.flatnonzero((more <= spare) & np.all(total + least[number + 1 :].sum(axis=0) <= allowed, axis=1))
-        kept = kept[undominated(total[kept])]
+        kept = kept[find_undominated(total[kept])]
         if not len(kept):
             return None, exact
         if len(kept) > MOST_MERGED:
@@ -168,7 +168,7 @@ def together(held: Held) -> tuple[NDArray[np.float64] | None, bool]:
     return np.array(plan[::-1]), False
 
 
-def undominated(cost: Array) -> NDArray[np.intp]:
+def find_undominated(cost: Array) -> NDArray[np.intp]:
     """Return the indices of the Pareto-optimal rows of `cost` (n, 2), sorted by the first column; one of equals."""
     order = np.lexsort((cost[:, 1], cost[:, 0]))
     second = cost[order, 1]

@@ -9,16 +9,16 @@ from scipy.optimize import OptimizeResult
 
 from flcav.config import InputError, shorten
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
-from flcav.optimization.allocation.problem import Problem, Task
+from flcav.optimization.allocation.problem import AllocationTask, Problem
 from flcav.optimization.curves.curves import Additive, Effective
-from flcav.optimization.solvers.effective import EffectiveTasks, effective_tasks
+from flcav.optimization.solvers.effective import EffectiveTasks, build_effective_tasks
 from flcav.optimization.solvers.rounding import outermost
 from flcav.optimization.solvers.separable import BUDGET_SLACK, Separable, room
 
 Array = NDArray[np.float64]
 
 
-def variables(result: OptimizeResult) -> Array:
+def require_optimum(result: OptimizeResult) -> Array:
     """Return the optimal variables in the result of SciPy's solver; raises `InputError` where it found none."""
     if result.x is None:
         raise InputError(f"the solver fails on numbers of such different sizes: {shorten(result.message)}")
@@ -77,29 +77,29 @@ class Instance:
                     change[column] += self.effective.error(moved) - before
         return change
 
-    def cheapest(self, multipliers: Array) -> tuple[Array, float]:
+    def minimise_lagrangian(self, multipliers: Array) -> tuple[Array, float]:
         """Return the whole x (n,) of least Lagrangian at `multipliers` (2,), and the lower bound that it proves."""
         problem, prices = self.separable, self.separable.prices(multipliers)
-        below = np.floor(problem.cheapest(multipliers))
+        below = np.floor(problem.minimise_lagrangian(multipliers))
         above = np.minimum(below + 1, problem.high)
         values = [problem.error(x) + prices * x for x in (below, above)]
         x, value = np.where(values[0] <= values[1], below, above), np.minimum(*values)
         total = float(value.sum())
         if self.effective is not None:
-            own, least = self.effective.cheapest(multipliers)
+            own, least = self.effective.minimise_lagrangian(multipliers)
             quantity = self.effective.quantity
             total += float(least.sum() - value[quantity].sum())
             x[quantity] = own
         return x, total - float(multipliers @ problem.budget)
 
-    def narrowed(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
+    def tighten_bounds(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
         """Return least and most of each quantity, (n,) each, whose error plus price is within `slack` of its minimum.
 
         Prices are those at `multipliers` (2,). If `slack` is the distance from the dual bound to a known plan's error,
         no better plan has a quantity outside these bounds.
         """
         problem, prices = self.separable, self.separable.prices(multipliers)
-        best, _ = self.cheapest(multipliers)
+        best, _ = self.minimise_lagrangian(multipliers)
         limit = problem.error(best) + prices * best + slack
 
         def good(x: Array) -> NDArray[np.bool_]:
@@ -108,11 +108,11 @@ class Instance:
         low, high = (outermost(good, best, edge) for edge in (problem.low, problem.high))
         if self.effective is not None:
             quantity = self.effective.quantity
-            low[quantity], high[quantity] = self.effective.within(multipliers, slack)
+            low[quantity], high[quantity] = self.effective.tighten_bounds(multipliers, slack)
         return low, high
 
 
-def instance(problem: Problem) -> Instance:
+def build_instance(problem: Problem) -> Instance:
     """Return `problem` in arrays, its upper bounds lowered to what the budgets have room for.
 
     Raises `Infeasible`, naming the budget, the cost of the least plan and the excess, where that exceeds a budget.
@@ -138,29 +138,29 @@ def instance(problem: Problem) -> Instance:
     powers = replace(powers, high=np.minimum(high, low + room(powers)))
     numbers, weights, curves = zip(*alone) if alone else ((), (), ())
     k = problem.edge_rounds_per_cloud_round
-    effective = effective_tasks(numbers, weights, curves, k, low, powers.high, powers.cost) if alone else None
+    effective = build_effective_tasks(numbers, weights, curves, k, low, powers.high, powers.cost) if alone else None
     floor = sum(learner.weight * learner.curve.floor for task in problem.tasks for learner in task.learners)
     return Instance(powers, effective, floor)
 
 
-def stage_plan(problem: Problem, task: Task, counts: Sequence[int]) -> StagePlan:
+def stage_plan(problem: Problem, task: AllocationTask, counts: Sequence[int]) -> StagePlan:
     """Return the plan of `task` with `counts` = samples, edge rounds, cloud rounds."""
     samples, edge_rounds, cloud_rounds = counts
     return StagePlan(samples, edge_rounds, cloud_rounds, task.edge_groups, problem.edge_rounds_per_cloud_round)
 
 
-def cost_of(problem: Problem, task: Task, counts: Sequence[int]) -> Price:
+def price_counts(problem: Problem, task: AllocationTask, counts: Sequence[int]) -> Price:
     """Return the cost on each uplink [MB] of `counts` = samples, edge rounds, cloud rounds of `task`."""
     return price(stage_plan(problem, task, counts), MessageSizes(task.sample_mb, task.model_mb))
 
 
 def unit_costs(problem: Problem) -> Array:
     """Return the cost (3N, 2) [MB] of one sample, edge round and cloud round of each task: `price` is linear."""
-    prices = [cost_of(problem, task, unit) for task in problem.tasks for unit in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    prices = [price_counts(problem, task, unit) for task in problem.tasks for unit in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
     return np.array([(each.wireless_mb, each.wireline_mb) for each in prices])
 
 
-def _range(problem: Problem, task: Task) -> tuple[Array, Array]:
+def _range(problem: Problem, task: AllocationTask) -> tuple[Array, Array]:
     """Return least and most of a task's quantities, (3,) each, without those at which the error is infinite."""
     limits = task.limits
     ranges = np.array((limits.samples, limits.edge_rounds, limits.cloud_rounds), dtype=np.float64)

@@ -61,7 +61,7 @@ class Separable:
         """Return the price (n,) of one unit of each quantity at `multipliers` (2,)."""
         return multipliers[0] * self._columns[0] + multipliers[1] * self._columns[1]
 
-    def cheapest(self, multipliers: Array) -> Array:
+    def minimise_lagrangian(self, multipliers: Array) -> Array:
         """Return the continuous x (n,) that minimises the Lagrangian, error plus price, at `multipliers` (2,)."""
         return self._level(self.prices(multipliers))
 
@@ -114,7 +114,7 @@ class Separable:
 
 
 @dataclass(frozen=True)
-class Relaxed:
+class ContinuousOptimum:
     """The continuous optimum, with its multipliers and dual bound."""
 
     x: Array  # (n,)
@@ -122,7 +122,7 @@ class Relaxed:
     bound: float  # the dual value: no plan within the budgets has less error
 
 
-def separable(
+def check_separable(
     a: ArrayLike, b: ArrayLike, x0: ArrayLike, low: ArrayLike, high: ArrayLike, cost: ArrayLike, budget: ArrayLike
 ) -> Separable:
     """Return a checked separable program of n quantities with one inverse power each.
@@ -162,7 +162,7 @@ def room(problem: Separable) -> Array:
         return np.floor(np.min(np.where(problem.cost > 0, left / problem.cost, np.inf), axis=1))
 
 
-def relax(problem: Separable) -> Relaxed:
+def relax(problem: Separable) -> ContinuousOptimum:
     """Return the continuous optimum, by an active-set search over the budgets that bind.
 
     The sets are tried in this order: none, the scarcer budget, both, the other one.
@@ -183,10 +183,10 @@ def relax(problem: Separable) -> Relaxed:
     return _ascend(problem, [other], _start(problem, [other]))
 
 
-def _value(problem: Separable, multipliers: Array) -> Relaxed:
-    x = problem.cheapest(multipliers)
+def _value(problem: Separable, multipliers: Array) -> ContinuousOptimum:
+    x = problem.minimise_lagrangian(multipliers)
     overspend = problem.spent(x) - problem.budget
-    return Relaxed(x, multipliers, float(problem.error(x).sum() + multipliers @ overspend))
+    return ContinuousOptimum(x, multipliers, float(problem.error(x).sum() + multipliers @ overspend))
 
 
 def _start(problem: Separable, binding: list[int]) -> Array:
@@ -198,7 +198,7 @@ def _start(problem: Separable, binding: list[int]) -> Array:
     return multipliers
 
 
-def _ascend(problem: Separable, binding: list[int], start: Array) -> Relaxed:
+def _ascend(problem: Separable, binding: list[int], start: Array) -> ContinuousOptimum:
     """Return the maximum of the dual over the multipliers of the `binding` budgets, by Newton in their logarithms."""
     now = _value(problem, start)
     overspend = (problem.spent(now.x) - problem.budget)[binding]

@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 
 from flcav.optimization.curves.curves import effective_samples
 from flcav.optimization.solvers.cutting_planes import Line, Program, Term, outer_approximation
-from flcav.optimization.solvers.instance import Instance, variables
+from flcav.optimization.solvers.instance import Instance, require_optimum
 from flcav.optimization.solvers.rounding import fill, trim
 from flcav.optimization.solvers.separable import Separable, newton_step, relax
 
@@ -84,7 +84,7 @@ class EffectiveTerm:
         return float(effective_samples(samples, t, self.alpha, self.group))
 
 
-def terms_of(instance: Instance) -> list[Term]:
+def list_terms(instance: Instance) -> list[Term]:
     """Return the convex terms whose sum is the weighted error above the floors."""
     powers, effective = instance.separable, instance.effective
     of = np.arange(len(powers.a)) if powers.of is None else powers.of
@@ -118,12 +118,12 @@ class Solution:
         return float(self.error > self.bound)
 
 
-def whole_plan(problem: Separable, gap: float = 1e-4) -> Solution:
+def solve_separable(problem: Separable, gap: float = 1e-4) -> Solution:
     """Return whole quantities of a separable program within a relative `gap` of the least error."""
-    return least_weighted(Instance(problem, None, 0.0), gap)
+    return minimise_weighted_error(Instance(problem, None, 0.0), gap)
 
 
-def least_weighted(instance: Instance, gap: float) -> Solution:
+def minimise_weighted_error(instance: Instance, gap: float) -> Solution:
     """Return a whole plan whose weighted error is within a relative `gap` of the least, or the best found.
 
     Raises `InputError` where HiGHS fails.
@@ -131,7 +131,7 @@ def least_weighted(instance: Instance, gap: float) -> Solution:
     best = Solution(instance.low, instance.error(instance.low), -np.inf, np.zeros(2), np.zeros(2))
     bound_at = best.multipliers
     for number, (multipliers, bound) in enumerate(_multipliers(instance, gap)):
-        x, proven = instance.cheapest(multipliers)
+        x, proven = instance.minimise_lagrangian(multipliers)
         if max(proven, bound) > best.bound:
             bound_at = multipliers
         prices = instance.separable.prices(multipliers + 1e-9 * multipliers.sum() + 1e-300)
@@ -162,9 +162,9 @@ def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]
     yield multipliers, relaxed.bound
     binding = [int(link) for link in np.flatnonzero(multipliers > 0)]
     for _ in range(CORRECTIONS if binding else 0):
-        x, _ = instance.cheapest(multipliers)
+        x, _ = instance.minimise_lagrangian(multipliers)
         overspend = (problem.spent(x) - problem.budget)[binding]
-        step = newton_step(problem, problem.cheapest(multipliers), multipliers, binding, overspend)
+        step = newton_step(problem, problem.minimise_lagrangian(multipliers), multipliers, binding, overspend)
         multipliers = multipliers.copy()
         multipliers[binding] *= np.exp(np.clip(step, -0.1, 0.1))
         yield multipliers, -np.inf
@@ -177,12 +177,12 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
     rows, values, proven = [], [], []
     multipliers = [0.01 * largest]
     for _ in range(PLANES):
-        x, bound = instance.cheapest(multipliers[-1])
+        x, bound = instance.minimise_lagrangian(multipliers[-1])
         proven.append(bound)
         rows.append(np.r_[1.0, (instance.budget - x @ instance.cost) * largest])
         values.append(instance.error(x))
         model = linprog([-1.0, 0, 0], A_ub=np.array(rows), b_ub=values, bounds=[(None, None), (0, 1), (0, 1)])
-        weights = variables(model)[1:]
+        weights = require_optimum(model)[1:]
         if -model.fun - max(proven) <= 0.02 * gap * (max(proven) + instance.floor):
             break
         multipliers.append(weights * largest)
@@ -192,9 +192,9 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
 
 def _closed(instance: Instance, best: Solution, gap: float) -> Solution:
     """Return `best` or a better plan, with its bound, by outer approximation within the tightened bounds."""
-    _, bound = instance.cheapest(best.multipliers)
-    low, high = instance.narrowed(best.multipliers, (best.error - bound) * (1 + 1e-9) + 1e-15)
-    program = Program(terms_of(instance), low, high, instance.cost, instance.budget)
+    _, bound = instance.minimise_lagrangian(best.multipliers)
+    low, high = instance.tighten_bounds(best.multipliers, (best.error - bound) * (1 + 1e-9) + 1e-15)
+    program = Program(list_terms(instance), low, high, instance.cost, instance.budget)
     starts = [np.minimum(low + step, high) for step in range(int(min((high - low).max(), 40)) + 1)]
     starts += [np.floor(low + (high - low) * share) for share in np.linspace(0, 1, 9)]
     visited, proven = outer_approximation(program, [*starts, np.clip(best.x, low, high)], gap, instance.floor)

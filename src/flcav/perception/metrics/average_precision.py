@@ -10,7 +10,7 @@ sec. 2.5, eqs. 1-2). Intervals: see `flcav.intervals`.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flcav.intervals import REDRAWS, over_scenes
+from flcav.intervals import REDRAWS, bootstrap_over_scenes
 from flcav.perception.metrics.matching import Matches
 
 RECALLS = np.arange(1, 41) / 40
@@ -48,7 +48,7 @@ def bootstrap_interval(
     """
     if len(np.unique(np.asarray(scene_of_frame)[matches.targets > 0])) < 2:
         return float("nan"), float("nan")
-    return over_scenes(lambda times: weighted_precision(matches, times), scene_of_frame, n, rng=rng)
+    return bootstrap_over_scenes(lambda times: weighted_precision(matches, times), scene_of_frame, n, rng=rng)
 
 
 def bootstrap_difference(
@@ -58,7 +58,7 @@ def bootstrap_difference(
 
     Both are evaluated on the same `n` resamples of the scenes; scene_of_frame (F,): scene of each frame.
     """
-    return over_scenes(
+    return bootstrap_over_scenes(
         lambda times: weighted_precision(after, times) - weighted_precision(before, times), scene_of_frame, n, rng=rng
     )
 

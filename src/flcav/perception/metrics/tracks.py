@@ -20,7 +20,7 @@ APART_M = 2.0  # largest distance in the plane between the centres of an object 
 
 
 @dataclass(frozen=True)
-class Moment:
+class TrackingFrame:
     """Ground truth and tracks of one class in one frame of a sequence; positions in one coordinate frame [m]."""
 
     objects: NDArray[np.str_]  # (M,) identity of each object to be tracked
@@ -32,7 +32,7 @@ class Moment:
 
 
 @dataclass(frozen=True)
-class Clear:
+class ClearMot:
     """CLEAR MOT counts, summed over all frames."""
 
     objects: int  # to be tracked
@@ -58,7 +58,9 @@ class Clear:
         return self.distance_m / self.hits if self.hits else float("nan")
 
 
-def clear(sequences: Sequence[Sequence[Moment]], threshold: float = -np.inf, apart_m: float = APART_M) -> Clear:
+def count_clear_mot(
+    sequences: Sequence[Sequence[TrackingFrame]], threshold: float = -np.inf, apart_m: float = APART_M
+) -> ClearMot:
     """Return the CLEAR MOT counts of the tracks that score at least `threshold`.
 
     sequences: the frames of each, in time order. A pair of the frame before is kept while it is within `apart_m`; other
@@ -82,20 +84,20 @@ def clear(sequences: Sequence[Sequence[Moment]], threshold: float = -np.inf, apa
             idle = np.delete(moment.neutral[kept], taken)
             counts += (len(moment.objects), len(moment.objects) - len(pairs), int((~idle).sum()), switched)
     objects, misses, wrong, switches = counts.tolist()
-    return Clear(objects, misses, wrong, switches, distance)
+    return ClearMot(objects, misses, wrong, switches, distance)
 
 
-def amota(sequences: Sequence[Sequence[Moment]], apart_m: float = APART_M) -> float:
+def amota(sequences: Sequence[Sequence[TrackingFrame]], apart_m: float = APART_M) -> float:
     """Return AMOTA in [0, 1], the mean of scaled MOTA over 40 recalls; NaN without objects.
 
     A recall that is not reached counts 0. Thresholds are the scores of the tracks, at most 200 quantiles of them.
     """
-    everything = clear(sequences, apart_m=apart_m)
+    everything = count_clear_mot(sequences, apart_m=apart_m)
     if not everything.objects:
         return float("nan")
     scores = sorted({float(s) for moments in sequences for moment in moments for s in moment.score}, reverse=True)
     scores = scores if len(scores) <= 200 else list(np.quantile(scores, np.linspace(1, 0, 200)))
-    reached = [clear(sequences, score, apart_m) for score in scores]
+    reached = [count_clear_mot(sequences, score, apart_m) for score in scores]
     values = []
     for recall in RECALLS:
         enough = [counts for counts in reached if counts.hits >= recall * counts.objects - 1e-9]
@@ -103,14 +105,14 @@ def amota(sequences: Sequence[Sequence[Moment]], apart_m: float = APART_M) -> fl
     return float(np.mean(values))
 
 
-def _scaled_mota(counts: Clear, recall: float) -> float:
+def _scaled_mota(counts: ClearMot, recall: float) -> float:
     wanted = recall * counts.objects
     wrong = counts.switches + counts.false_positives + counts.misses - (1 - recall) * counts.objects
     return float(np.clip(1 - wrong / wanted, 0, 1))
 
 
 def _pairs(
-    moment: Moment, kept: NDArray[np.int64], apart: Array, last: dict[str, int], apart_m: float
+    moment: TrackingFrame, kept: NDArray[np.int64], apart: Array, last: dict[str, int], apart_m: float
 ) -> list[tuple[int, int]]:
     """Return the pairs (index of an object, index into `kept`) of one frame; apart (M, K): their distances [m]."""
     place = {int(track): t for t, track in enumerate(moment.tracks[kept])}

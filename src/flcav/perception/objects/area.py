@@ -9,7 +9,7 @@ from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.truth import MIN_RETURNS
 
 
-def narrowed(config: SecondConfig, text: str) -> SecondConfig:
+def narrow_range(config: SecondConfig, text: str) -> SecondConfig:
     """Return `config` with the smaller range `text`: metres ahead, a comma, metres to either side, as in "48,24".
 
     Networks of different ranges are thus evaluated on the same objects. Raises `InputError` for any other text, and
@@ -28,7 +28,7 @@ def narrowed(config: SecondConfig, text: str) -> SecondConfig:
 
 
 @dataclass(frozen=True)
-class Rules:
+class TargetCriteria:
     """Criteria that make an object a target, and the confidence level of intervals."""
 
     range_m: tuple[float, ...]  # of its centre, LiDAR frame: minima x, y, z, then maxima [m]
@@ -44,9 +44,9 @@ class Rules:
         ]
 
 
-def rules(config: SecondConfig) -> Rules:
+def target_criteria(config: SecondConfig) -> TargetCriteria:
     """Return the target criteria of an evaluation of a network of `config`."""
-    return Rules(tuple(config.range_m), MIN_RETURNS, CONFIDENCE)
+    return TargetCriteria(tuple(config.range_m), MIN_RETURNS, CONFIDENCE)
 
 
 def _extent(range_m: tuple[float, ...]) -> str:

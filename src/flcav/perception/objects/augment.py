@@ -38,22 +38,22 @@ def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Samp
     if (low != 1).any() or (high != 1).any():
         factor = rng.uniform(low, high, size=(len(sample.boxes), 3))
         changed = (sample.boxes.label == "Car") & (rng.random(len(factor)) < how.resized)
-        sample = resized(sample, np.where(changed[:, None], factor, 1.0))
-    sample = transformed(sample, mirror, turn, scale)
+        sample = resize_objects(sample, np.where(changed[:, None], factor, 1.0))
+    sample = transform_sample(sample, mirror, turn, scale)
     if how.shift_m:
-        sample = shifted(sample, rng.uniform(-how.shift_m, how.shift_m, size=2))
+        sample = shift_sample(sample, rng.uniform(-how.shift_m, how.shift_m, size=2))
     if how.tilt_rad or how.lift_m:
         slope = np.tan(rng.uniform(0, how.tilt_rad)) * _unit(rng.uniform(0, 2 * np.pi))
-        sample = sheared(sample, slope, rng.uniform(-how.lift_m, how.lift_m))
+        sample = tilt_sample(sample, slope, rng.uniform(-how.lift_m, how.lift_m))
     kept = np.ones(len(sample.points), dtype=bool)
     if how.drop:
         kept &= rng.random(len(kept)) >= rng.uniform(0, how.drop)
     if how.view and rng.random() < how.view:
         kept &= in_view(sample.points)
-    return sample if kept.all() else thinned(sample, kept)
+    return sample if kept.all() else keep_returns(sample, kept)
 
 
-def transformed(sample: Sample, mirror: float, turn_rad: float, scale: float) -> Sample:
+def transform_sample(sample: Sample, mirror: float, turn_rad: float, scale: float) -> Sample:
     """Return the sample with y times `mirror` (1 or -1), then turned counter-clockwise by `turn_rad`, then scaled."""
     cos, sin = np.cos(turn_rad) * scale, np.sin(turn_rad) * scale
     plane = np.array([[cos, sin], [-mirror * sin, mirror * cos]])  # right factor of rows (x, y)
@@ -69,7 +69,7 @@ def transformed(sample: Sample, mirror: float, turn_rad: float, scale: float) ->
     return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact)
 
 
-def resized(sample: Sample, factor: NDArray[np.float64]) -> Sample:
+def resize_objects(sample: Sample, factor: NDArray[np.float64]) -> Sample:
     """Return the sample with length, width and height of box n and the returns inside it scaled by factor[n] (N, 3).
 
     The centre of an object's bottom face stays in place.
@@ -86,7 +86,7 @@ def resized(sample: Sample, factor: NDArray[np.float64]) -> Sample:
     return replace(sample, points=points, boxes=replace(boxes, center=foot + size * (0, 0, 0.5), size=size))
 
 
-def shifted(sample: Sample, by_m: NDArray[np.float64]) -> Sample:
+def shift_sample(sample: Sample, by_m: NDArray[np.float64]) -> Sample:
     """Return the sample shifted in x, y by `by_m` (2,) [m]: the distance of parked cars from the lane varies."""
     points = sample.points.copy()
     points[:, :2] += by_m.astype(np.float32)
@@ -99,7 +99,7 @@ def shifted(sample: Sample, by_m: NDArray[np.float64]) -> Sample:
     return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact)
 
 
-def sheared(sample: Sample, slope: NDArray[np.float64], lift_m: float) -> Sample:
+def tilt_sample(sample: Sample, slope: NDArray[np.float64], lift_m: float) -> Sample:
     """Return the sample with z raised by lift_m + slope . (x, y), slope (2,): a small tilt, with boxes kept upright."""
     points = sample.points.copy()
     points[:, 2] += (points[:, :2] @ slope + lift_m).astype(np.float32)
@@ -118,20 +118,22 @@ def in_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:
     return (x > 0) & (np.abs(y) < side * x) & (z > -down * x) & (z < up * x)
 
 
-def thinned(sample: Sample, kept: NDArray[np.bool_]) -> Sample:
+def keep_returns(sample: Sample, kept: NDArray[np.bool_]) -> Sample:
     """Return the sample with the returns of the mask `kept` (N,) alone.
 
     Objects left with fewer than `MIN_RETURNS` returns are ignored; those left with none are removed.
     """
     points = sample.points[kept]
-    returns = _counted(points, sample.boxes)
+    returns = _count_returns(points, sample.boxes)
     enough = returns >= MIN_RETURNS
     exact = None if sample.exact is None else sample.exact[enough]
-    ignore = concatenate([sample.boxes[(returns > 0) & ~enough], sample.ignore[_counted(points, sample.ignore) > 0]])
+    ignore = concatenate(
+        [sample.boxes[(returns > 0) & ~enough], sample.ignore[_count_returns(points, sample.ignore) > 0]]
+    )
     return replace(sample, points=points, boxes=sample.boxes[enough], ignore=ignore, exact=exact)
 
 
-def _counted(points: NDArray[np.float32], boxes: Boxes) -> NDArray[np.int64]:
+def _count_returns(points: NDArray[np.float32], boxes: Boxes) -> NDArray[np.int64]:
     return points_in_boxes(points, boxes).sum(1)
 
 
@@ -147,7 +149,7 @@ class Cutouts:
     points: tuple[NDArray[np.float32], ...]  # of each box (N, 4) x, y, z [m], intensity [0, 1]
 
 
-def cut(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
+def cut_out_objects(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
     """Return the ground-truth database of samples: objects in range, of known pose, with enough returns."""
     boxes, points = [Boxes.empty()], []
     for sample in samples:
@@ -160,7 +162,7 @@ def cut(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
     return Cutouts(concatenate(boxes), tuple(points))
 
 
-def pasted(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator) -> Sample:
+def paste_objects(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator) -> Sample:
     """Return the sample with objects of the ground-truth database pasted in, up to `most` of each class in all.
 
     Candidates are drawn by `rng` without replacement; those whose footprints overlap another object's are left out.
@@ -171,7 +173,7 @@ def pasted(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator
         missing = max(most - np.count_nonzero(sample.boxes.label == label), 0)
         drawn.append(rng.permutation(known)[:missing])
     numbers = np.concatenate([np.zeros(0, dtype=np.int64), *drawn])
-    taken = numbers[free(cutouts.boxes[numbers], concatenate([sample.boxes, sample.ignore]))]
+    taken = numbers[select_free(cutouts.boxes[numbers], concatenate([sample.boxes, sample.ignore]))]
     added = cutouts.boxes[taken]
     kept = sample.points[~points_in_boxes(sample.points, added).any(0)]
     exact = None if sample.exact is None else np.append(sample.exact, np.ones(len(added), dtype=bool))
@@ -179,7 +181,7 @@ def pasted(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator
     return replace(sample, points=cloud, boxes=concatenate([sample.boxes, added]), exact=exact)
 
 
-def free(candidates: Boxes, there: Boxes) -> NDArray[np.int64]:
+def select_free(candidates: Boxes, there: Boxes) -> NDArray[np.int64]:
     """Return the indices of candidates, chosen greedily in order, that overlap no other box in bird's-eye view.
 
     Neither those `there` nor one another.

@@ -8,7 +8,7 @@ import numpy as np
 from flcav.geometry import Boxes
 from flcav.perception.metrics import calibration_error, fit_logistic, match
 from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.evaluate import Asked, detections_and_truths, number_or_none, of_class
+from flcav.perception.objects.evaluate import FrameTruth, detect_frames, round_or_none, select_class
 from flcav.perception.objects.model import Second
 from flcav.records import Class
 from flcav.sensors.frame import Frame
@@ -22,7 +22,7 @@ def calibrate(network: Second, frames: Iterable[Frame]) -> None:
     See `flcav.perception.metrics.calibration.fit_logistic`.
     """
     network.config = replace(network.config, calibration=None)
-    detections, truths = detections_and_truths(network, frames)
+    detections, truths = detect_frames(network, frames)
     fitted = []
     for name in network.config.classes:
         matches = _matches(detections, truths, name)
@@ -31,7 +31,7 @@ def calibrate(network: Second, frames: Iterable[Frame]) -> None:
 
 
 @dataclass(frozen=True)
-class Trust:
+class Reliability:
     """Reliability of one class's scores and predicted variances; None without detections or variances."""
 
     label: Class
@@ -40,7 +40,9 @@ class Trust:
     variance_ratio: float | None  # mean squared error of x and y of true positives / mean predicted variance
 
 
-def trust(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> tuple[Trust, ...]:
+def measure_reliability(
+    detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: Sequence[str]
+) -> tuple[Reliability, ...]:
     """Return calibration error and variance ratio per class; detections and truths run over the same frames.
 
     A variance ratio of 1 is calibrated, above 1 overconfident, below 1 underconfident.
@@ -49,20 +51,20 @@ def trust(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequenc
     for name in classes:
         matches = _matches(detections, truths, name)
         ece, ratio = calibration_error(matches.score, matches.hit), _variance_ratio(detections, truths, name)
-        rows.append(Trust(name, len(matches.score), number_or_none(ece), number_or_none(ratio)))
+        rows.append(Reliability(name, len(matches.score), round_or_none(ece), round_or_none(ratio)))
     return tuple(rows)
 
 
-def _matches(detections: Sequence[Boxes], truths: Sequence[Asked], name: str):
-    found = [of_class(boxes, name) for boxes in detections]
-    targets = [of_class(truth.targets, name) for truth in truths]
-    return match(found, targets, [of_class(truth.neutral, name) for truth in truths], OVERLAP)
+def _matches(detections: Sequence[Boxes], truths: Sequence[FrameTruth], name: str):
+    found = [select_class(boxes, name) for boxes in detections]
+    targets = [select_class(truth.targets, name) for truth in truths]
+    return match(found, targets, [select_class(truth.neutral, name) for truth in truths], OVERLAP)
 
 
-def _variance_ratio(detections: Sequence[Boxes], truths: Sequence[Asked], name: str) -> float:
+def _variance_ratio(detections: Sequence[Boxes], truths: Sequence[FrameTruth], name: str) -> float:
     error, variance = [0.0], [0.0]
     for boxes, truth in zip(detections, truths, strict=True):
-        found, targets = of_class(boxes, name), of_class(truth.targets, name)
+        found, targets = select_class(boxes, name), select_class(truth.targets, name)
         if found.variance is None or not len(found):
             continue
         target = assign_targets(found, targets, OVERLAP)

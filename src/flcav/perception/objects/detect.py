@@ -12,7 +12,7 @@ from flcav.geometry import Boxes, concatenate
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.loss import LOG_VARIANCES, predict
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.targets import anchor_boxes, anchor_classes, decode, decoded_variance
+from flcav.perception.objects.targets import anchor_boxes, anchor_classes, decode, decode_variance
 from flcav.perception.ops.rotated import nms
 
 CANDIDATES = 256  # anchors of highest score per class that enter non-maximum suppression
@@ -40,19 +40,19 @@ def detect_all(
     with torch.inference_mode():
         for first in range(0, len(clouds), batch):
             output = predict(network, clouds[first : first + batch])
-            score = calibrated(output.score, network.config).sigmoid().cpu().numpy()
+            score = calibrate_logits(output.score, network.config).sigmoid().cpu().numpy()
             box = output.box.double().cpu().numpy()
             direction = output.direction.argmax(2).cpu().numpy()
             spread = [None] * len(score)
             if output.log_variance is not None:
                 spread = output.log_variance.double().clamp(*LOG_VARIANCES).exp().cpu().numpy()
             parts = zip(score, box, direction, spread, strict=True)
-            found += [_boxes(network, *one, score_threshold) for one in parts]
+            found += [_decode_boxes(network, *one, score_threshold) for one in parts]
     network.train(training)
     return found
 
 
-def calibrated(logits: Tensor, config: SecondConfig) -> Tensor:
+def calibrate_logits(logits: Tensor, config: SecondConfig) -> Tensor:
     """Return the calibrated logits (..., classes), whose sigmoid is the score; unchanged without a calibration."""
     if config.calibration is None:
         return logits
@@ -60,7 +60,7 @@ def calibrated(logits: Tensor, config: SecondConfig) -> Tensor:
     return logits * factor + summand
 
 
-def _boxes(
+def _decode_boxes(
     network: Second, score: NDArray, box: NDArray, direction: NDArray, spread: NDArray | None, threshold: float
 ) -> Boxes:
     config = network.config
@@ -76,6 +76,6 @@ def _boxes(
         kept = nms(torch.from_numpy(rows), torch.from_numpy(scores)).numpy()
         found = Boxes.from_array(rows[kept], name, scores[kept])
         if spread is not None:
-            found = replace(found, variance=decoded_variance(spread[own][kept], rows[kept], anchors[kept]))
+            found = replace(found, variance=decode_variance(spread[own][kept], rows[kept], anchors[kept]))
         parts.append(found)
     return concatenate(parts)

@@ -12,7 +12,7 @@ from flcav.geometry import Boxes, points_in_boxes, transform_points
 from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError, keep_first
 from flcav.perception.metrics.matching import assign_targets, on_neutral
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
+from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
 from flcav.sensors.frame import Frame
 
 OVERLAP = 0.5  # 3D IoU from which an object is detected
@@ -67,7 +67,7 @@ def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfi
 
 
 def _false_positives(frame: Frame, found: Boxes, config: SecondConfig) -> list[PerceptionError]:
-    name = only_lidar(frame)
+    name = choose_lidar(frame)
     found = found[in_range(found, config)]
     returns = points_in_boxes(frame.lidar[name], found).sum(1)
     world = transform_points(frame.world_from_sensor(name), found.center)

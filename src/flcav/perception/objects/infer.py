@@ -15,8 +15,8 @@ from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
 from flcav.perception.images import CameraView, recorded_view, view_beside
-from flcav.perception.objects.samples import checked_points
-from flcav.perception.objects.truth import only_lidar
+from flcav.perception.objects.samples import validate_points
+from flcav.perception.objects.truth import choose_lidar
 from flcav.perception.task import Result
 from flcav.records import Class
 
@@ -29,7 +29,7 @@ class Cloud(NamedTuple):
     view: Callable[[], CameraView | None]  # reads the view of a camera with the same direction, None without one
 
 
-def point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterator[Cloud]:
+def read_point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterator[Cloud]:
     """Yield the point clouds of a KITTI .bin file, of a folder of them, or of `frames` (None: all) of a dataset folder.
 
     Raises `InputError` where `path` is none of these, a frame has no LiDAR, or a cloud is empty, truncated or not of
@@ -46,7 +46,7 @@ def point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterator[Cl
         clouds = map(_of_file, [path])
     else:
         raise InputError(f"{path}: no such file or folder")
-    return (cloud._replace(points=checked_points(cloud.points, cloud.path)) for cloud in clouds)
+    return (cloud._replace(points=validate_points(cloud.points, cloud.path)) for cloud in clouds)
 
 
 @dataclass(frozen=True)
@@ -80,15 +80,15 @@ class ObjectsFound(Result):
         return lines
 
 
-def box_rows(boxes: Boxes) -> tuple[ObjectFound, ...]:
+def boxes_to_rows(boxes: Boxes) -> tuple[ObjectFound, ...]:
     """Return the boxes as records, one per box; a score that is not known is 1."""
     scores = boxes.score if boxes.score is not None else np.ones(len(boxes))
     rows = zip(boxes.label.tolist(), scores.tolist(), boxes.array().tolist(), strict=True)
     return tuple(ObjectFound(label, score, *row) for label, score, row in rows)
 
 
-def boxes_of_rows(rows: Sequence[ObjectFound]) -> Boxes:
-    """Return the records as boxes: the inverse of `box_rows`."""
+def rows_to_boxes(rows: Sequence[ObjectFound]) -> Boxes:
+    """Return the records as boxes: the inverse of `boxes_to_rows`."""
     array = np.array([(b.x, b.y, b.z, b.length, b.width, b.height, b.yaw) for b in rows]).reshape(-1, 7)
     return Boxes.from_array(array, [row.label for row in rows], [row.score for row in rows])
 
@@ -101,5 +101,5 @@ def _recorded(folder: Path, frames: Sequence[int] | None) -> Iterator[Cloud]:
     dataset = Dataset.open(folder)
     for i in dataset.numbers(frames):
         frame = dataset.frame(i)
-        lidar = only_lidar(frame)
+        lidar = choose_lidar(frame)
         yield Cloud(folder / frame.key, frame.lidar[lidar], partial(recorded_view, dataset, i, lidar))

@@ -20,7 +20,7 @@ from torch import Tensor
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import HeadOutput, Second
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.targets import Targets, anchor_classes, assign
+from flcav.perception.objects.targets import Targets, anchor_classes, assign_anchors
 
 ALPHA, GAMMA = 0.25, 2.0  # of the focal loss
 BOX_WEIGHT, DIRECTION_WEIGHT, VARIANCE_WEIGHT = 2.0, 1.0, 0.2
@@ -45,7 +45,7 @@ def second_loss(output: HeadOutput, targets: Sequence[Targets], config: SecondCo
     logits = output.score.flatten()
     wanted = torch.zeros_like(logits)
     wanted[positive * classes + kind] = 1
-    scores = focal(logits, wanted).view(samples, anchors, classes).sum(2)
+    scores = focal_loss(logits, wanted).view(samples, anchors, classes).sum(2)
     classification = (scores * weight).sum()
 
     residual = torch.cat([target.residual for target in targets]).to(device)
@@ -67,7 +67,7 @@ def gaussian_nll(error: Tensor, log_variance: Tensor) -> Tensor:
     return (error.square() * torch.exp(-log_variance) + log_variance) / 2
 
 
-def focal(logits: Tensor, wanted: Tensor) -> Tensor:
+def focal_loss(logits: Tensor, wanted: Tensor) -> Tensor:
     """Return the focal loss of each logit (Lin et al., "Focal Loss for Dense Object Detection", eq. 5).
 
     wanted, in the shape of logits: 1 for positives, 0 for negatives.
@@ -79,7 +79,7 @@ def focal(logits: Tensor, wanted: Tensor) -> Tensor:
 
 def batch_loss(network: Second, samples: Sequence[Sample]) -> Tensor:
     """Return the scalar loss of `network` on a batch of samples, differentiable in the network's parameters."""
-    targets = [assign(sample, network.config) for sample in samples]
+    targets = [assign_anchors(sample, network.config) for sample in samples]
     return second_loss(predict(network, [sample.points for sample in samples]), targets, network.config)
 
 

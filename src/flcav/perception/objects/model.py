@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from flcav.config import InputError
-from flcav.perception.device import bfloat16
+from flcav.perception.device import autocast_bfloat16
 from flcav.perception.objects.config import ANCHORS, KITTI_CAR, Anchor, Augmentation, SecondConfig
 from flcav.perception.ops.norm import NormReLU
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d
@@ -139,7 +139,7 @@ class Second(nn.Module):
     def forward(self, voxels: SparseTensor) -> HeadOutput:
         """Return the raw predictions for every anchor of each sample."""
         features = voxels.features
-        with bfloat16(features.device, self.training and self.config.bfloat16):
+        with autocast_bfloat16(features.device, self.training and self.config.bfloat16):
             maps = self.head(self.birds_eye(self.backbone(voxels).birds_eye()))
         cells = maps.to(features.dtype).permute(0, 2, 3, 1).flatten(1, 2)  # (B, H W, channels)
         parts = cells.split([self.anchors_per_cell * width for width in self.per_anchor], 2)

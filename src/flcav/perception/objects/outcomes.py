@@ -10,11 +10,11 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.intervals import REDRAWS
 from flcav.perception.metrics import Matches, match, orientation_similarity, right_headings, weighted_precision
-from flcav.perception.objects.evaluate import detections_and_truths, of_class
+from flcav.perception.objects.evaluate import detect_frames, select_class
 from flcav.perception.objects.model import Second
 from flcav.perception.ops.rotated import Kind
 from flcav.perception.outcomes import Outcomes, Times, Values
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 
 CLASSES, HIDDEN = "classes", "hidden"
 MEASURED = "3d50"
@@ -27,21 +27,23 @@ class ObjectsOutcomes:
     measure_name = "AP50"
     redraws = REDRAWS
 
-    def outcomes(self, network: Second, data: Dataset, frames: Sequence[int], progress: Report = silent) -> Outcomes:
+    def outcomes(
+        self, network: Second, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
+    ) -> Outcomes:
         """Return the matches of each class and kind of overlap (`KEPT`), by frame, and the number of hidden objects.
 
         Raises `InputError` where there are no frames, or one has no LiDAR.
         """
-        found, truths = detections_and_truths(network, map(data.frame, frames), total=len(frames), progress=progress)
+        found, truths = detect_frames(network, map(data.frame, frames), total=len(frames), progress=progress)
         classes = network.config.classes
         if not truths:
             raise InputError("evaluation on 0 frames: at least one is wanted")
         hidden = [sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes]
         arrays: dict[str, Any] = {CLASSES: np.array(classes), HIDDEN: np.array(hidden)}
         for name in classes:
-            own = [of_class(boxes, name) for boxes in found]
-            targets = [of_class(truth.targets, name) for truth in truths]
-            neutral = [of_class(truth.neutral, name) for truth in truths]
+            own = [select_class(boxes, name) for boxes in found]
+            targets = [select_class(truth.targets, name) for truth in truths]
+            neutral = [select_class(truth.neutral, name) for truth in truths]
             for key, (kind, overlap) in KEPT.items():
                 matches = match(own, targets, neutral, overlap, kind)
                 arrays |= {f"{name}/{key}/{field}": value for field, value in vars(matches).items()}
@@ -61,7 +63,7 @@ class ObjectsOutcomes:
         and hidden objects.
         """
         once = np.ones((1, len(outcomes.scene)), dtype=np.int64)
-        each = [matches_of(outcomes, name) for name in outcomes.arrays[CLASSES]]
+        each = [read_matches(outcomes, name) for name in outcomes.arrays[CLASSES]]
         known = [matches for matches in each if matches.targets.any()]
         right = [share for matches in known if not np.isnan(share := right_headings(matches))]
         return {
@@ -74,13 +76,13 @@ class ObjectsOutcomes:
         }
 
     def _mean_precision(self, outcomes: Outcomes, key: str, times: Times) -> Values:
-        each = [weighted_precision(matches_of(outcomes, name, key), times) for name in outcomes.arrays[CLASSES]]
+        each = [weighted_precision(read_matches(outcomes, name, key), times) for name in outcomes.arrays[CLASSES]]
         known = ~np.isnan(each)
         with np.errstate(invalid="ignore"):
             return np.where(known, each, 0.0).sum(axis=0) / known.sum(axis=0)
 
 
-def matches_of(outcomes: Outcomes, name: str, key: str = MEASURED) -> Matches:
+def read_matches(outcomes: Outcomes, name: str, key: str = MEASURED) -> Matches:
     """Return the matches of class `name` for the kind of overlap and IoU `key`, one of `KEPT`."""
     return Matches(**{field.name: outcomes.arrays[f"{name}/{key}/{field.name}"] for field in fields(Matches)})
 

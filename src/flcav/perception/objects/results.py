@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, concatenate
 from flcav.perception.metrics import average_precision, interval_words, match
-from flcav.perception.objects.area import Rules
-from flcav.perception.objects.calibrate import OVERLAP, Trust
-from flcav.perception.objects.evaluate import OVERLAPS, Asked, Score, number_or_none, of_class
+from flcav.perception.objects.area import TargetCriteria
+from flcav.perception.objects.calibrate import OVERLAP, Reliability
+from flcav.perception.objects.evaluate import OVERLAPS, FrameTruth, Score, round_or_none, select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.perception.task import Evaluated
 from flcav.perception.tracking.evaluate import TracksEvaluation
@@ -23,7 +23,7 @@ OCCLUSIONS = ((0.0, 0.2), (0.2, 0.6), (0.6, 1.01))  # from, to: occluded share
 BORDER_M = 2.0  # detections up to this far outside a range of distances are kept: they may be of objects in it
 
 
-class Slice(NamedTuple):
+class BreakdownPart(NamedTuple):
     """One part of a breakdown: the objects of a range of distance or occlusion, or the frames of a weather."""
 
     by: str  # distance | occlusion | weather
@@ -34,7 +34,7 @@ class Slice(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SlicePrecision:
+class BreakdownRow:
     """Average precision of one class in one part of a breakdown, for one kind of overlap and IoU threshold."""
 
     by: str  # distance | occlusion | weather
@@ -46,29 +46,31 @@ class SlicePrecision:
     targets: int  # in the part
 
 
-def sliced(detections: Sequence[Boxes], truths: Sequence[Asked], classes: Sequence[str]) -> tuple[SlicePrecision, ...]:
+def break_down(
+    detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: Sequence[str]
+) -> tuple[BreakdownRow, ...]:
     """Return the breakdown of AP: a row for each part, class with targets in it, kind of overlap and IoU threshold.
 
     detections (LiDAR frame) and truths run over the same frames.
     """
     rows = []
-    for part in slices(detections, truths):
+    for part in split_parts(detections, truths):
         for label in classes:
-            found = [of_class(boxes, label) for boxes in part.detections]
+            found = [select_class(boxes, label) for boxes in part.detections]
             own = [truth.targets.label == label for truth in truths]
             targets = [t.targets[o & w] for t, o, w in zip(truths, own, part.wanted, strict=True)]
             count = sum(len(targets[frame]) for frame in part.frames)
             if not count:
                 continue
             others = [t.targets[o & ~w] for t, o, w in zip(truths, own, part.wanted, strict=True)]
-            neutral = [concatenate([of_class(t.neutral, label), o]) for t, o in zip(truths, others, strict=True)]
+            neutral = [concatenate([select_class(t.neutral, label), o]) for t, o in zip(truths, others, strict=True)]
             for kind, overlap in OVERLAPS:
                 ap = average_precision(match(found, targets, neutral, overlap, kind), part.frames)
-                rows.append(SlicePrecision(part.by, part.name, label, kind, overlap, number_or_none(ap), count))
+                rows.append(BreakdownRow(part.by, part.name, label, kind, overlap, round_or_none(ap), count))
     return tuple(rows)
 
 
-def slice_lines(rows: Sequence[SlicePrecision], overlap: float) -> list[str]:
+def format_breakdown(rows: Sequence[BreakdownRow], overlap: float) -> list[str]:
     """Return a breakdown at IoU `overlap` in words: a line per class and part, class by class."""
     own = [row for row in rows if row.iou == overlap]
     ap = {(row.label, row.by, row.slice, row.kind): row.ap for row in own}
@@ -81,7 +83,7 @@ def slice_lines(rows: Sequence[SlicePrecision], overlap: float) -> list[str]:
     ]
 
 
-def slices(detections: Sequence[Boxes], truths: Sequence[Asked]) -> Iterator[Slice]:
+def split_parts(detections: Sequence[Boxes], truths: Sequence[FrameTruth]) -> Iterator[BreakdownPart]:
     """Yield the parts of the breakdown, by distance, occlusion and weather.
 
     Occlusion is left out unless every frame has it, weather unless the frames have several.
@@ -91,18 +93,18 @@ def slices(detections: Sequence[Boxes], truths: Sequence[Asked]) -> Iterator[Sli
         near = [_between(_distance(boxes), low - BORDER_M, high + BORDER_M) for boxes in detections]
         found = [boxes[kept] for boxes, kept in zip(detections, near, strict=True)]
         wanted = [_between(_distance(truth.targets), low, high) for truth in truths]
-        yield Slice("distance", f"{low}-{high} m", found, wanted, everything)
+        yield BreakdownPart("distance", f"{low}-{high} m", found, wanted, everything)
     hidden = [truth.occlusion for truth in truths if truth.occlusion is not None]
     if len(hidden) == len(truths):
         for low, high in OCCLUSIONS:
             wanted = [_between(share, low, high) for share in hidden]
-            yield Slice("occlusion", f"{low:.0%}-{min(high, 1):.0%}", list(detections), wanted, everything)
+            yield BreakdownPart("occlusion", f"{low:.0%}-{min(high, 1):.0%}", list(detections), wanted, everything)
     seen = {truth.weather for truth in truths}
     weathers = [name for name in WEATHER_CLASSES if name in seen]
     for name in weathers if len(weathers) > 1 else ():
         wanted = [np.ones(len(truth.targets), dtype=bool) for truth in truths]
         frames = np.flatnonzero([truth.weather == name for truth in truths])
-        yield Slice("weather", name, list(detections), wanted, frames)
+        yield BreakdownPart("weather", name, list(detections), wanted, frames)
 
 
 def _distance(boxes: Boxes) -> NDArray[np.float64]:
@@ -120,9 +122,9 @@ class ObjectsEvaluation(Evaluated):
     frames: int
     scenes: int
     scores: tuple[Score, ...]  # class by class
-    rules: Annotated[Rules | None, LEFT_OUT] = None  # target criteria; None in results of earlier versions
-    slices: tuple[SlicePrecision, ...]  # breakdown of AP
-    trust: tuple[Trust, ...]  # calibration of scores and variances, one per class
+    rules: Annotated[TargetCriteria | None, LEFT_OUT] = None  # target criteria; None in results of earlier versions
+    slices: tuple[BreakdownRow, ...]  # breakdown of AP
+    trust: tuple[Reliability, ...]  # calibration of scores and variances, one per class
     tracks: Annotated[TracksEvaluation | None, LEFT_OUT] = None  # None unless asked for
 
     @property
@@ -167,7 +169,7 @@ class ObjectsEvaluation(Evaluated):
                 found += f", {row.right_headings:.0%} of those found head the right way"
             counts = f"objects: {row.targets}, and {row.hidden} without a return"
             lines.append(f"{row.label:<12}{row.kind:>4} IoU {row.iou:.1f}  {found}  ({counts})")
-        lines += [f"at IoU {OVERLAP:g} by distance, occlusion and weather:", *slice_lines(self.slices, OVERLAP)]
+        lines += [f"at IoU {OVERLAP:g} by distance, occlusion and weather:", *format_breakdown(self.slices, OVERLAP)]
         for row in self.trust:
             if row.ece is not None:
                 lines.append(f"{row.label:<12}expected calibration error {row.ece:.3f}")

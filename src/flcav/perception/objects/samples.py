@@ -13,7 +13,7 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.truth import ground_truth, only_lidar
+from flcav.perception.objects.truth import choose_lidar, ground_truth
 from flcav.sensors.frame import Frame
 
 HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one that a network expects
@@ -41,7 +41,7 @@ def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = No
     """
     truth = ground_truth(frame, config, lidar)
     ignored = (truth.returns > 0) & ((truth.known & ~truth.enough) | truth.lookalike)
-    points = near_range(frame.lidar[only_lidar(frame, lidar)], config)
+    points = crop_to_range(frame.lidar[choose_lidar(frame, lidar)], config)
     return Sample(points, truth.boxes[truth.enough], truth.boxes[ignored])
 
 
@@ -63,7 +63,7 @@ class RecordedSweeps(Sequence[Sample]):
         return sample_from_frame(self._data.frame(self._frames[index]), self._config)
 
 
-def fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
+def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
     """Return the numbers of the frames whose first LiDAR is mounted within `HEIGHT_SLACK_M` of the height expected.
 
     The height is that of the calibration above the agent's origin, the expected one is -config.ground_z_m. A vehicle's
@@ -89,7 +89,7 @@ def fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
     return fitting or range(len(data))
 
 
-def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:
+def crop_to_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:
     """Return the points (N', 4) of a sweep (N, 4) that global augmentation may move into the range of `config`.
 
     Global augmentation is mirroring, turning, scaling, shifting, tilting and lifting; the bounds are approximate.
@@ -108,7 +108,7 @@ def near_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.
     return points[kept]
 
 
-def checked_points(points: NDArray[np.float32], origin: str | Path) -> NDArray[np.float32]:
+def validate_points(points: NDArray[np.float32], origin: str | Path) -> NDArray[np.float32]:
     """Return the points unchanged; raises `InputError` unless they are (N, 4), N >= 1, of finite numbers.
 
     origin: their file or frame, named in the message.

@@ -101,7 +101,7 @@ def decode(residual: Array, direction: NDArray[np.int64], anchors: Array) -> Arr
     return np.concatenate((plane, height[:, None], size, yaw[:, None]), 1)
 
 
-def decoded_variance(variance: Array, boxes: Array, anchors: Array) -> Array:
+def decode_variance(variance: Array, boxes: Array, anchors: Array) -> Array:
     """Return the variances (P, 7) of decoded boxes [m^2, rad^2] from the variances (P, 7) of their residuals.
 
     First-order error propagation: a size is the exponential of its residual, the others are linear in theirs.
@@ -116,7 +116,7 @@ def direction_of(yaw: Array) -> NDArray[np.int64]:
     return (np.mod(yaw - np.pi / 4, 2 * np.pi) >= np.pi).astype(np.int64)
 
 
-def free_cells(free: NDArray[np.float32], config: SecondConfig) -> NDArray[np.bool_]:
+def mark_free_cells(free: NDArray[np.float32], config: SecondConfig) -> NDArray[np.bool_]:
     """Return a mask (rows, columns) of the head's grid, True for cells with one of the free positions (K, 2) x, y [m].
 
     Positions should be at most half a cell apart in a free area; otherwise cells of a turned sample are missed.
@@ -131,7 +131,7 @@ def free_cells(free: NDArray[np.float32], config: SecondConfig) -> NDArray[np.bo
     return mask
 
 
-def assign(sample: Sample, config: SecondConfig) -> Targets:
+def assign_anchors(sample: Sample, config: SecondConfig) -> Targets:
     """Return the training targets of a sample: positive, negative and ignored anchors, residuals, directions.
 
     An anchor is positive for the object of its class with the highest IoU, if that is at least the class's
@@ -145,9 +145,9 @@ def assign(sample: Sample, config: SecondConfig) -> Targets:
     exact = np.ones(len(boxes), dtype=bool) if sample.exact is None else sample.exact[inside]
     counts = np.ones(len(anchors), dtype=bool)
     if sample.free is not None:
-        counts &= np.repeat(free_cells(sample.free, config).ravel(), HEADINGS * len(config.classes))
+        counts &= np.repeat(mark_free_cells(sample.free, config).ravel(), HEADINGS * len(config.classes))
     ignored = np.concatenate((sample.ignore.array(), sample.boxes.array()[~inside]))
-    counts[_touched(ignored, config)] = False
+    counts[_find_ignored(ignored, config)] = False
     owner = np.full(len(anchors), -1)
     for index, anchor in enumerate(config.anchors):
         rows = np.flatnonzero(labels == anchor.name)
@@ -189,7 +189,7 @@ def _near(boxes: Array, config: SecondConfig) -> NDArray[np.int64]:
     return (np.flatnonzero(close)[:, None] * per_cell + np.arange(per_cell)).ravel()
 
 
-def _touched(boxes: Array, config: SecondConfig) -> NDArray[np.int64]:
+def _find_ignored(boxes: Array, config: SecondConfig) -> NDArray[np.int64]:
     near = _near(boxes, config)
     if not len(near):
         return near

@@ -11,23 +11,23 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.marks import CloudBoxes
-from flcav.perception.objects.area import rules
-from flcav.perception.objects.augment import Cutouts, augment, cut, pasted
-from flcav.perception.objects.calibrate import calibrate, trust
+from flcav.perception.objects.area import target_criteria
+from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
+from flcav.perception.objects.calibrate import calibrate, measure_reliability
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
 from flcav.perception.objects.errors import register_errors
-from flcav.perception.objects.evaluate import detections_and_truths, score_detections
-from flcav.perception.objects.infer import ObjectsFound, box_rows, point_clouds
+from flcav.perception.objects.evaluate import detect_frames, score_detections
+from flcav.perception.objects.infer import ObjectsFound, boxes_to_rows, read_point_clouds
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.outcomes import ObjectsOutcomes
-from flcav.perception.objects.results import ObjectsEvaluation, sliced
-from flcav.perception.objects.samples import RecordedSweeps, Sample, fitting_frames
-from flcav.perception.objects.truth import only_lidar
+from flcav.perception.objects.results import ObjectsEvaluation, break_down
+from flcav.perception.objects.samples import RecordedSweeps, Sample, select_fitting_frames
+from flcav.perception.objects.truth import choose_lidar
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 
 
 class ObjectsTask(ObjectsOutcomes):
@@ -66,7 +66,7 @@ class ObjectsTask(ObjectsOutcomes):
 
         See `flcav.perception.objects.samples`. Raises `InputError` where there are LiDARs but none fits.
         """
-        return fitting_frames(data, config)
+        return select_fitting_frames(data, config)
 
     def draw(self, samples: Sequence[Sample], index: int, config: SecondConfig, rng: np.random.Generator) -> Sample:
         """Return sample `index` augmented as `config.augmentation` says, ground-truth sampling first.
@@ -76,12 +76,12 @@ class ObjectsTask(ObjectsOutcomes):
         how = config.augmentation
         sample = samples[index]
         if how.paste:
-            sample = pasted(sample, self._cutouts(samples, config), how.paste, rng)
+            sample = paste_objects(sample, self._cutouts(samples, config), how.paste, rng)
         return augment(sample, how, rng)
 
     def _cutouts(self, samples: Sequence[Sample], config: SecondConfig) -> Cutouts:
         if self._cut is None or self._cut[0] is not samples:
-            self._cut = samples, cut((samples[number] for number in range(len(samples))), config)
+            self._cut = samples, cut_out_objects((samples[number] for number in range(len(samples))), config)
         return self._cut[1]
 
     def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
@@ -95,7 +95,7 @@ class ObjectsTask(ObjectsOutcomes):
         frames: Sequence[int] | None = None,
         *,
         asked: SecondConfig | None = None,
-        progress: Report = silent,
+        progress: Report = ignore_progress,
     ) -> ObjectsEvaluation:
         """Return AP and AOS per class, kind of overlap and IoU, with intervals over scenes; breakdown; calibration.
 
@@ -103,16 +103,14 @@ class ObjectsTask(ObjectsOutcomes):
         `flcav.perception.objects.area`. Raises `InputError` where there are no frames, or one has no LiDAR.
         """
         numbers, classes = data.numbers(frames), network.config.classes
-        found, truths = detections_and_truths(
-            network, map(data.frame, numbers), asked, total=len(numbers), progress=progress
-        )
+        found, truths = detect_frames(network, map(data.frame, numbers), asked, total=len(numbers), progress=progress)
         return ObjectsEvaluation(
             frames=len(truths),
             scenes=len({truth.scene for truth in truths}),
             scores=score_detections(found, truths, classes),
-            rules=rules(asked or network.config),
-            slices=sliced(found, truths, classes),
-            trust=trust(found, truths, classes),
+            rules=target_criteria(asked or network.config),
+            slices=break_down(found, truths, classes),
+            trust=measure_reliability(found, truths, classes),
         )
 
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
@@ -131,9 +129,11 @@ class ObjectsTask(ObjectsOutcomes):
         path: a KITTI .bin file, a folder of them, or a dataset folder, of which `frames` (None: all). Raises
         `InputError` for anything else, see `flcav.perception.objects.infer`.
         """
-        for cloud in point_clouds(path, frames):
+        for cloud in read_point_clouds(path, frames):
             found = detect(network, cloud.points, score_threshold=threshold)
-            yield Finding(cloud.path, cloud.points, ObjectsFound(box_rows(found)), (CloudBoxes(found),), cloud.view)
+            yield Finding(
+                cloud.path, cloud.points, ObjectsFound(boxes_to_rows(found)), (CloudBoxes(found),), cloud.view
+            )
 
     def register_errors(
         self,
@@ -141,7 +141,7 @@ class ObjectsTask(ObjectsOutcomes):
         data: Dataset,
         frames: Sequence[int] | None = None,
         threshold: float = THRESHOLD,
-        progress: Report = silent,
+        progress: Report = ignore_progress,
     ) -> Registry:
         """Return the registry of the network's misses and false positives on frames (None: all).
 
@@ -152,7 +152,7 @@ class ObjectsTask(ObjectsOutcomes):
         def found() -> Iterator[Boxes]:
             for done, number in enumerate(numbers, start=1):
                 frame = data.frame(number)
-                yield detect(network, frame.lidar[only_lidar(frame)], score_threshold=threshold)
+                yield detect(network, frame.lidar[choose_lidar(frame)], score_threshold=threshold)
                 progress(done, len(numbers), "")
 
         return Registry(register_errors(map(data.frame, numbers), found(), network.config, threshold))

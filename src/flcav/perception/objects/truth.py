@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """Ground truth of one frame: its M annotated actors, for a network of some classes and range.
 
     Rows are those of the frame's annotations. Besides targets, faint and hidden objects there are objects out of range,
@@ -68,17 +68,17 @@ class Truth:
         return self.known & self.inside & (self.returns == 0)
 
 
-def ground_truth(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Truth:
+def ground_truth(frame: Frame, config: SecondConfig, lidar: str | None = None) -> GroundTruth:
     """Return the ground truth of `frame` for a network of `config`, in the frame of the LiDAR.
 
     lidar: its name; None: the frame's first. Raises `InputError` where the frame has none of that name.
     """
     annotations = frame.annotations
-    boxes = annotations.boxes.transformed(inverse(frame.world_from_sensor(only_lidar(frame, lidar))))
+    boxes = annotations.boxes.transform(inverse(frame.world_from_sensor(choose_lidar(frame, lidar))))
     lookalike = is_lookalike(annotations.boxes.label, config.classes)
     label = np.where(lookalike, "Car", detection_labels(annotations.boxes.label, config.classes))
     named = Boxes(boxes.center, boxes.size, boxes.yaw, label)
-    return Truth(named, annotations.returns, in_range(boxes, config), lookalike)
+    return GroundTruth(named, annotations.returns, in_range(boxes, config), lookalike)
 
 
 def in_range(boxes: Boxes, config: SecondConfig) -> Mask:
@@ -102,7 +102,7 @@ def is_lookalike(category: NDArray[np.str_], classes: tuple[str, ...]) -> Mask:
     return np.array([LOOKALIKE.get(str(name)) in classes for name in category], dtype=bool)
 
 
-def only_lidar(frame: Frame, name: str | None = None) -> str:
+def choose_lidar(frame: Frame, name: str | None = None) -> str:
     """Return the LiDAR `name` of the frame, None: its first; raises `InputError` where it has no such LiDAR."""
     if name is None and frame.lidar:
         return next(iter(frame.lidar))

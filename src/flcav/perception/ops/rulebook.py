@@ -25,7 +25,7 @@ Int64s = NDArray[np.int64]
 
 
 @compiled
-def submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int64s]:
+def find_submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int64s]:
     """Return the pairs of a 3x3x3 submanifold convolution: source (P,), target (P,), number of pairs per offset (27,).
 
     keys (N,) ascending; steps (13,) key differences of the offsets after the centre, z-major. Pairs are grouped by
@@ -67,7 +67,7 @@ def submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int6
 
 
 @compiled
-def strided_pairs(
+def find_strided_pairs(
     keys: Int64s, samples: int, shape: Int64s, kernel: Int64s, stride: Int64s, padding: Int64s, out_shape: Int64s
 ) -> tuple[Int32s, Int32s, Int64s, Int64s]:
     """Return the pairs of a strided convolution: source (P,), target (P,), number per offset (K,), output keys (M,).
@@ -133,7 +133,7 @@ class Groups:
 
 
 @dataclass(frozen=True)
-class Rules:
+class Rulebook:
     """Rulebook of a sparse convolution: P pairs (input voxel, output voxel), grouped by kernel offset.
 
     Within an offset, targets ascend.
@@ -151,7 +151,7 @@ def _compiled(keys: Tensor) -> bool:
     return keys.device.type == "cpu"
 
 
-def _grouped(row: Tensor, offset: Tensor, offsets: int, rows: int) -> Groups:
+def _group_pairs(row: Tensor, offset: Tensor, offsets: int, rows: int) -> Groups:
     # row (P,): of each pair, in [0, rows); offset (P,): its kernel offset, in [0, offsets)
     number = torch.arange(len(row), device=row.device, dtype=torch.int32)
     table = torch.full((rows * offsets,), -1, device=row.device, dtype=torch.int32)
@@ -167,15 +167,15 @@ def _places(mask: Tensor, count: int) -> Tensor:
     return torch.searchsorted(rank, torch.arange(1, count + 1, device=mask.device, dtype=torch.int32))
 
 
-def keys_of(cells: Tensor, shape: Triple) -> Tensor:
+def encode_cells(cells: Tensor, shape: Triple) -> Tensor:
     """Return the (N,) integer keys of cells (N, 4), rows sample, z, y, x, of a grid of extents `shape` (z, y, x)."""
     depth, height, width = (extent + 2 for extent in shape)
     sample, z, y, x = cells.unbind(1)
     return ((sample * depth + z + 1) * height + y + 1) * width + x + 1
 
 
-def cells_of(keys: Tensor, shape: Triple) -> Tensor:
-    """Return the cells (N, 4), rows sample, z, y, x, of keys (N,): the inverse of `keys_of`."""
+def decode_keys(keys: Tensor, shape: Triple) -> Tensor:
+    """Return the cells (N, 4), rows sample, z, y, x, of keys (N,): the inverse of `encode_cells`."""
     depth, height, width = (extent + 2 for extent in shape)
     row = keys.div(width, rounding_mode="floor")
     layer = row.div(height, rounding_mode="floor")
@@ -183,7 +183,7 @@ def cells_of(keys: Tensor, shape: Triple) -> Tensor:
     return torch.stack((sample, layer - sample * depth - 1, row - layer * height - 1, keys - row * width - 1), 1)
 
 
-def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
+def build_submanifold_rulebook(keys: Tensor, shape: Triple) -> Rulebook:
     """Return the rulebook of a 3x3x3 submanifold convolution, whose output voxels are its input voxels.
 
     keys (N,): ascending; shape: extents z, y, x of the grid. Only the 13 offsets after the centre are searched: the
@@ -193,12 +193,12 @@ def submanifold_rules(keys: Tensor, shape: Triple) -> Rules:
     _, height, width = (extent + 2 for extent in shape)
     if _compiled(keys):
         steps = [(z * height + y) * width + x for z, y, x in product((-1, 0, 1), repeat=3)]
-        source, target, counts = submanifold_pairs(keys.numpy(), np.array(steps[14:]))
-        return Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(keys))
-    return _submanifold_rules(keys, height, width)
+        source, target, counts = find_submanifold_pairs(keys.numpy(), np.array(steps[14:]))
+        return Rulebook(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(keys))
+    return _build_submanifold_rulebook(keys, height, width)
 
 
-def _submanifold_rules(keys: Tensor, height: int, width: int) -> Rules:
+def _build_submanifold_rulebook(keys: Tensor, height: int, width: int) -> Rulebook:
     count = len(keys)
     later = torch.cat((keys, keys.new_full((3,), -1)))  # padded: a look-up of up to 3 rows past the end finds no key
     lines = (width, (height - 1) * width, height * width, (height + 1) * width)
@@ -224,12 +224,12 @@ def _submanifold_rules(keys: Tensor, height: int, width: int) -> Rules:
     per_offset = torch.cat((per_offset.flip(0), per_offset.new_full((1,), count), per_offset))
     offset = torch.repeat_interleave(per_offset, output_size=len(source))
     counts = (*counts[::-1], count, *counts)
-    return Rules(source, target, counts, count, _grouped(target, offset, len(counts), count))
+    return Rulebook(source, target, counts, count, _group_pairs(target, offset, len(counts), count))
 
 
-def strided_rules(
+def build_strided_rulebook(
     keys: Tensor, shape: Triple, kernel: Triple, stride: Triple, padding: Triple, samples: int
-) -> tuple[Rules, Tensor, Triple]:
+) -> tuple[Rulebook, Tensor, Triple]:
     """Return the rulebook of a strided sparse convolution, its output keys (M,), sorted, and its output grid (z, y, x).
 
     keys (N,) of `samples` grids of extents `shape`; shape, kernel, stride, padding: z, y, x. Output voxels are the
@@ -240,18 +240,18 @@ def strided_rules(
     out_shape = (depth, height, width)
     if _compiled(keys):
         triples = (np.array(triple) for triple in (shape, kernel, stride, padding, out_shape))
-        source, target, counts, out_keys = strided_pairs(keys.numpy(), samples, *triples)
-        rules = Rules(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(out_keys))
+        source, target, counts, out_keys = find_strided_pairs(keys.numpy(), samples, *triples)
+        rules = Rulebook(torch.from_numpy(source), torch.from_numpy(target), tuple(counts.tolist()), len(out_keys))
         return rules, torch.from_numpy(out_keys), out_shape
-    rules, out_keys = _strided_rules(keys, shape, kernel, stride, padding, out_shape, samples)
+    rules, out_keys = _build_strided_rulebook(keys, shape, kernel, stride, padding, out_shape, samples)
     return rules, out_keys, out_shape
 
 
-def _strided_rules(
+def _build_strided_rulebook(
     keys: Tensor, shape: Triple, kernel: Triple, stride: Triple, padding: Triple, out_shape: Triple, samples: int
-) -> tuple[Rules, Tensor]:
+) -> tuple[Rulebook, Tensor]:
     depth, height, width = (extent + 2 for extent in out_shape)
-    cells = cells_of(keys, shape)
+    cells = decode_keys(keys, shape)
     reached = cells[:, 0] * (depth * height * width)  # becomes (kz, ky, kx, N): key of the output voxel
     valid = torch.ones_like(reached, dtype=torch.bool)  # whether there is such a voxel
     for axis, key_step in zip((2, 1, 0), (1, width, height * width), strict=True):
@@ -275,6 +275,6 @@ def _strided_rules(
     target = number[reached[flat]] - 1
     offset = torch.repeat_interleave(per_offset, output_size=len(source))
     by_target, by_source = (
-        _grouped(row, offset, offsets, rows) for row, rows in ((target, targets), (source, len(keys)))
+        _group_pairs(row, offset, offsets, rows) for row, rows in ((target, targets), (source, len(keys)))
     )
-    return Rules(source, target, tuple(counts), targets, by_target, by_source), _places(occupied, targets)
+    return Rulebook(source, target, tuple(counts), targets, by_target, by_source), _places(occupied, targets)

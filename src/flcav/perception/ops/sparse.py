@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from flcav.perception.ops import blocks
-from flcav.perception.ops.rulebook import Groups, Rules, Triple, cells_of, strided_rules, submanifold_rules
+from flcav.perception.ops.rulebook import (
+    Groups,
+    Triple,
+    build_strided_rulebook,
+    build_submanifold_rulebook,
+    decode_keys,
+)
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,7 @@ class SparseTensor:
     keys: Tensor  # (N,) int64 keys of the cells, ascending; see `flcav.perception.ops.rulebook`
     shape: Triple  # grid extents z, y, x
     samples: int  # grids in the batch, B
-    rules: dict[str, Rules] = field(default_factory=dict)  # cache of the submanifold rulebook of these voxels
+    rulebooks: dict[str, Rulebook] = field(default_factory=dict)  # cache of the submanifold rulebook of these voxels
 
     def with_features(self, features: Tensor) -> "SparseTensor":
         """Return the same voxels with other features (N, C')."""
@@ -37,7 +43,7 @@ class SparseTensor:
     def dense(self) -> Tensor:
         """Return the dense tensor (B, C, D, H, W), zero where no voxel is occupied."""
         depth, height, width = self.shape
-        sample, z, y, x = cells_of(self.keys, self.shape).unbind(1)
+        sample, z, y, x = decode_keys(self.keys, self.shape).unbind(1)
         flat = ((sample * depth + z) * height + y) * width + x
         rows = self.features.new_zeros(self.samples * depth * height * width, self.features.shape[1])
         rows = rows.index_copy(0, flat, self.features)
@@ -46,14 +52,14 @@ class SparseTensor:
     def birds_eye(self) -> Tensor:
         """Return the bird's-eye-view map (B, D*C, H, W), height layers stacked as channels, in channels-last memory."""
         depth, height, width = self.shape
-        sample, z, y, x = cells_of(self.keys, self.shape).unbind(1)
+        sample, z, y, x = decode_keys(self.keys, self.shape).unbind(1)
         flat = ((sample * height + y) * width + x) * depth + z
         rows = self.features.new_zeros(self.samples * height * width * depth, self.features.shape[1])
         rows = rows.index_copy(0, flat, self.features)
         return rows.view(self.samples, height, width, -1).permute(0, 3, 1, 2)
 
 
-def sparse_convolution(features: Tensor, weight: Tensor, rules: Rules) -> Tensor:
+def sparse_convolution(features: Tensor, weight: Tensor, rules: Rulebook) -> Tensor:
     """Return the sparse convolution (M, C'): row t is the sum of features[s] @ weight[k] over the pairs (s, t, k).
 
     features (N, C), weight (K, C, C'); differentiable in both. Computed in the precision of the features; elsewhere
@@ -68,7 +74,7 @@ def sparse_convolution(features: Tensor, weight: Tensor, rules: Rules) -> Tensor
 
 class _SparseConvolution(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, features: Tensor, weight: Tensor, rules: Rules) -> Tensor:
+    def forward(ctx: Any, features: Tensor, weight: Tensor, rules: Rulebook) -> Tensor:
         ctx.save_for_backward(features, weight)
         ctx.rules, ctx.sources = rules, len(features)
         if rules.by_target is not None:
@@ -96,12 +102,12 @@ class _SparseConvolution(torch.autograd.Function):
         return grad_features, grad_weight, None
 
 
-def _pairs(rules: Rules) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+def _pairs(rules: Rulebook) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
     """Return source (P,), target (P,), and (K + 1,) where the pairs of each offset begin and the last ones end."""
     return rules.source.numpy(), rules.target.numpy(), np.cumsum((0, *rules.counts), dtype=np.int64)
 
 
-def _grouped(features: Tensor, weight: Tensor, rules: Rules, by_target: Groups) -> Tensor:
+def _grouped(features: Tensor, weight: Tensor, rules: Rulebook, by_target: Groups) -> Tensor:
     products = [
         features[source] @ kernel for source, kernel in zip(rules.source.split(rules.counts), weight, strict=True)
     ]
@@ -109,7 +115,7 @@ def _grouped(features: Tensor, weight: Tensor, rules: Rules, by_target: Groups) 
 
 
 def _grouped_gradients(
-    features: Tensor, weight: Tensor, gradient: Tensor, rules: Rules, wants_features: bool
+    features: Tensor, weight: Tensor, gradient: Tensor, rules: Rulebook, wants_features: bool
 ) -> tuple[Tensor | None, Tensor]:
     grad_weight = torch.empty_like(weight)
     products = []
@@ -141,9 +147,9 @@ class SubmanifoldConv3d(nn.Module):
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Return the convolution on the same voxels; their rulebook is built once and cached."""
-        if "submanifold" not in x.rules:
-            x.rules["submanifold"] = submanifold_rules(x.keys, x.shape)
-        return x.with_features(sparse_convolution(x.features, self.weight, x.rules["submanifold"]))
+        if "submanifold" not in x.rulebooks:
+            x.rulebooks["submanifold"] = build_submanifold_rulebook(x.keys, x.shape)
+        return x.with_features(sparse_convolution(x.features, self.weight, x.rulebooks["submanifold"]))
 
 
 class StridedConv3d(nn.Module):
@@ -159,7 +165,7 @@ class StridedConv3d(nn.Module):
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Return the convolution as a sparse tensor of the coarser grid."""
-        rules, keys, shape = strided_rules(x.keys, x.shape, self.kernel, self.stride, self.padding, x.samples)
+        rules, keys, shape = build_strided_rulebook(x.keys, x.shape, self.kernel, self.stride, self.padding, x.samples)
         return SparseTensor(sparse_convolution(x.features, self.weight, rules), keys, shape, x.samples)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from flcav.perception.ops.rulebook import Triple, keys_of
+from flcav.perception.ops.rulebook import Triple, encode_cells
 
 
 def grid_shape(range_m: Sequence[float], voxel_m: Sequence[float]) -> Triple:
@@ -31,7 +31,7 @@ def voxelize(
     inside = ((cell >= 0) & (cell < points.new_tensor((shape[2], shape[1], shape[0] - 1)))).all(1)
     kept = inside.nonzero()[:, 0]
     x, y, z = cell[kept].long().unbind(1)
-    keys, order = keys_of(torch.stack((sample[kept], z, y, x), 1), shape).sort(stable=True)
+    keys, order = encode_cells(torch.stack((sample[kept], z, y, x), 1), shape).sort(stable=True)
     keys, count = torch.unique_consecutive(keys, return_counts=True)
     means = torch.segment_reduce(
         points[kept[order]], "mean", lengths=count, axis=0, unsafe=True

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.perception.images import recoloured, resized
+from flcav.perception.images import recoloured, resize_picture
 from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.samples import Sample, size_px
 
@@ -39,8 +39,8 @@ def draw(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.ran
         size = (columns[column + 1] - x, rows[row + 1] - y)
         wanted = int(rng.integers(len(config.classes))) if number else None
         sample = samples[index] if wanted is None else _one_with(wanted, samples, rng)
-        parts.append((window(sample, *size, config, rng, wanted), x, y))
-    return _in_other_colours(joined(parts, width, height), rng)
+        parts.append((draw_window(sample, *size, config, rng, wanted), x, y))
+    return _in_other_colours(join_mosaic(parts, width, height), rng)
 
 
 def _borders(length: int, parts: int, rng: np.random.Generator) -> list[int]:
@@ -58,7 +58,7 @@ def _one_with(label: int, samples: Sequence[Sample], rng: np.random.Generator) -
     return sample
 
 
-def joined(parts: Sequence[tuple[Sample, int, int]], width: int, height: int) -> Sample:
+def join_mosaic(parts: Sequence[tuple[Sample, int, int]], width: int, height: int) -> Sample:
     """Return the mosaic of parts at (x, y) [px] of their upper left corners; the rest is grey."""
     picture = np.full((height, width, 3), GREY, np.uint8)
     for part, x, y in parts:
@@ -69,7 +69,7 @@ def joined(parts: Sequence[tuple[Sample, int, int]], width: int, height: int) ->
     return Sample(picture, boxes, np.concatenate([part.label for part, *_ in parts]), ignore)
 
 
-def window(
+def draw_window(
     sample: Sample,
     width: int,
     height: int,
@@ -93,10 +93,10 @@ def window(
     corner = np.where(size < full, np.clip(corner, 0, full - size), (full - size) / 2)
     x, y = np.round(corner).astype(int)
     across, down = np.maximum(np.round(size).astype(int), 1)
-    return cut(sample, (int(x), int(y), int(across), int(down)), (width, height), config)
+    return crop_sample(sample, (int(x), int(y), int(across), int(down)), (width, height), config)
 
 
-def cut(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], config: SignsConfig) -> Sample:
+def crop_sample(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], config: SignsConfig) -> Sample:
     """Return the crop `part` (x, y, width, height) [px] of a sample, resized to `size` (width, height) [px].
 
     Padding outside the image is grey. Boxes of which less than the share `WHOLE` remains, or that become smaller than
@@ -118,7 +118,7 @@ def cut(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], 
     left = size_px(boxes) ** 2
     found = (left >= WHOLE * before) & (size_px(boxes) >= config.smallest_px)
     ignore = np.concatenate((ignore[size_px(ignore) > 0], boxes[~found & (left > 0)]))
-    return Sample(resized(canvas, *size), boxes[found], sample.label[found], ignore)
+    return Sample(resize_picture(canvas, *size), boxes[found], sample.label[found], ignore)
 
 
 def _in_other_colours(sample: Sample, rng: np.random.Generator) -> Sample:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from flcav.perception.device import bfloat16
+from flcav.perception.device import autocast_bfloat16
 from flcav.perception.images import Picture
 from flcav.perception.ops.rectangles import nms
 from flcav.perception.signs.augment import GREY
@@ -74,7 +74,7 @@ def detect(network: SignDetector, picture: Picture, *, threshold: float) -> Dete
     training = network.training
     network.eval()
     with torch.inference_mode():
-        raw = predict(network, [padded(picture)])
+        raw = predict(network, [pad_to_stride(picture)])
         cells = [
             torch.cat((decode(maps, level, network.config), maps[..., 4:].sigmoid()), -1)[0].flatten(0, 2)
             for level, maps in enumerate(raw)
@@ -84,7 +84,7 @@ def detect(network: SignDetector, picture: Picture, *, threshold: float) -> Dete
     return found
 
 
-def padded(picture: Picture) -> Picture:
+def pad_to_stride(picture: Picture) -> Picture:
     """Return the image padded with grey on the right and below, to sides that are multiples of the largest stride."""
     down, across = (-side % STRIDES[-1] for side in picture.shape[:2])
     return np.pad(picture, ((0, down), (0, across), (0, 0)), constant_values=GREY)
@@ -98,7 +98,7 @@ def predict(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Te
     """
     device = next(network.parameters()).device
     stacked = torch.from_numpy(np.stack(pictures)).to(device)
-    with bfloat16(device, wanted=True):
+    with autocast_bfloat16(device, wanted=True):
         raw = network(stacked.permute(0, 3, 1, 2).float() / 255)
     return [maps.float() for maps in raw]
 

@@ -7,20 +7,20 @@ import torch
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.rectangles import CLASSES, HALF_PX, rectangles
+from flcav.dataset.rectangles import CLASSES, HALF_PX, select_rectangles
 from flcav.dataset.store import Dataset
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry, keep_first
-from flcav.perception.images import checked_picture
+from flcav.perception.images import check_picture
 from flcav.perception.ops.rectangles import iou
 from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.detect import Detections, detect
 from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.samples import size_px, wanted_boxes
-from flcav.progress import Report, silent
-from flcav.sensors.camera.lens import unprojected
+from flcav.perception.signs.samples import find_targets, size_px
+from flcav.progress import Report, ignore_progress
+from flcav.sensors.camera.lens import unproject_pixels
 from flcav.sensors.frame import Frame
 from flcav.world.rays.embree import Embree, Solid
-from flcav.world.static import Things, static_world, town_things
+from flcav.world.static import SignsAndSignals, build_static_world, list_signs_and_signals
 
 OVERLAP = 0.5  # least IoU of a true positive
 WITHIN = 0.5  # least share of a detection on a neutral (too small or cut off) box for it to be no mistake
@@ -31,7 +31,7 @@ def register_errors(
     data: Dataset,
     frames: Sequence[int],
     threshold: float,
-    progress: Report = silent,
+    progress: Report = ignore_progress,
 ) -> Registry:
     """Return the missed signs and lights of the town, each once, and the false positives of each scene.
 
@@ -42,7 +42,7 @@ def register_errors(
     town = data.town()
     if town is None:
         raise InputError(f"{data.folder}: its town is not known, so that signs have no place in it")
-    things, mesh = town_things(town), static_world(town).mesh
+    things, mesh = list_signs_and_signals(town), build_static_world(town).mesh
     solid = Embree().solid(mesh.vertices, mesh.faces)
     pairs = [(number, camera) for number in frames for camera in data.cameras(number)]
     if not pairs:
@@ -52,7 +52,7 @@ def register_errors(
     dropped = 0
     for done, (number, camera) in enumerate(pairs, start=1):
         frame = data.frame(number)
-        picture = checked_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}")
+        picture = check_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}")
         found = detect(network, picture, threshold=threshold)
         height, width = picture.shape[:2]
         misses, false = _mistakes(frame, camera, found, (width, height), network.config)
@@ -69,9 +69,9 @@ def _mistakes(
     frame: Frame, camera: str, found: Detections, size: tuple[int, int], config: SignsConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the annotation rows of the missed signs of an image, and the indices of the false positives."""
-    shown = rectangles(frame, camera, "signs", min_pixels=1)
+    shown = select_rectangles(frame, camera, "signs", min_pixels=1)
     names = [CLASSES["signs"][number] for number in shown.label]
-    wanted = wanted_boxes(shown.box, size, config) & np.array([name in config.classes for name in names], dtype=bool)
+    wanted = find_targets(shown.box, size, config) & np.array([name in config.classes for name in names], dtype=bool)
     overlap = iou(torch.from_numpy(found.box), torch.from_numpy(shown.box)).numpy()
     same = np.array([[config.classes[label] == name for name in names] for label in found.label], dtype=bool)
     overlap = np.where(same.reshape(overlap.shape), overlap, 0.0)
@@ -92,8 +92,8 @@ def _on(box: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
     return bool(((high - low).clip(min=0).prod(1) >= WITHIN * (box[2:] - box[:2]).prod()).any())
 
 
-def _misses(frame: Frame, camera: str, rows: NDArray[np.int64], things: Things) -> Iterator[PerceptionError]:
-    signs, shown = frame.annotations.signs[camera], rectangles(frame, camera, "signs", min_pixels=1)
+def _misses(frame: Frame, camera: str, rows: NDArray[np.int64], things: SignsAndSignals) -> Iterator[PerceptionError]:
+    signs, shown = frame.annotations.signs[camera], select_rectangles(frame, camera, "signs", min_pixels=1)
     for row in rows.tolist():
         thing = int(signs.thing[row])
         label = CLASSES["signs"][shown.label[int(np.flatnonzero(shown.row == row)[0])]]
@@ -110,7 +110,7 @@ def _meets(
         return
     calibration = frame.calibration
     middle = (found.box[numbers, :2] + found.box[numbers, 2:]) / 2 - HALF_PX
-    plane = unprojected(calibration.intrinsics[camera], calibration.distortion.get(camera, np.zeros(5)), middle)
+    plane = unproject_pixels(calibration.intrinsics[camera], calibration.distortion.get(camera, np.zeros(5)), middle)
     rays = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     world_from_camera = frame.world_from_sensor(camera)

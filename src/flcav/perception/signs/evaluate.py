@@ -21,7 +21,7 @@ ALL, FIFTY = 0, 0  # index of the area range of all sizes; index of the IoU thre
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """Ground truth of one image."""
 
     box: NDArray[np.float64]  # (N, 4) x1 y1 x2 y2 [px] of the targets
@@ -96,7 +96,7 @@ class SignsEvaluation(Evaluated):
 
 
 def mean_average_precision(
-    found: Sequence[Detections], truths: Sequence[Truth], classes: Sequence[str], smallest_px: float
+    found: Sequence[Detections], truths: Sequence[GroundTruth], classes: Sequence[str], smallest_px: float
 ) -> SignsEvaluation:
     """Return mAP at IoU 0.5 and averaged over IoU 0.5 to 0.95, by class and by size of the true box.
 
@@ -136,7 +136,10 @@ def mean_average_precision(
 
 
 def _evaluated(
-    found: Sequence[Detections], truths: Sequence[Truth], classes: Sequence[str], ranges: Sequence[tuple[float, float]]
+    found: Sequence[Detections],
+    truths: Sequence[GroundTruth],
+    classes: Sequence[str],
+    ranges: Sequence[tuple[float, float]],
 ) -> COCOeval_faster:
     annotations = [
         {"image_id": image, "category_id": number, "bbox": _corner_and_size(box), "iscrowd": int(crowd)}

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from flcav.perception.ops.rectangles import complete_iou
 from flcav.perception.signs.config import STRIDES, SignsConfig
-from flcav.perception.signs.model import boxes_of
+from flcav.perception.signs.model import decode_boxes
 from flcav.perception.signs.samples import Sample
 
 MOST_TIMES = 4.0  # largest ratio of a box's width or height to its anchor's, either way; `decode` reaches no more
@@ -32,7 +32,7 @@ class Targets:
     counted: Tensor  # (B, rows, columns) whether a cell enters the objectness loss
 
 
-def assign(samples: Sequence[Sample], config: SignsConfig) -> list[Targets]:
+def assign_anchors(samples: Sequence[Sample], config: SignsConfig) -> list[Targets]:
     """Return the training targets at each of `STRIDES` for images of one size.
 
     A box is assigned to every anchor whose width and height are within a factor of four of its own, in the cell of its
@@ -88,7 +88,7 @@ def detection_loss(raw: Sequence[Tensor], targets: Sequence[Targets], config: Si
     """
     total = raw[0].new_zeros(())
     for level, (cells, asked) in enumerate(zip(raw, targets, strict=True)):
-        asked = _on(asked, cells.device)
+        asked = _to_device(asked, cells.device)
         wanted = torch.zeros_like(cells[..., 4])
         counted = asked.counted[:, None].expand_as(wanted).clone()
         if len(asked.image):
@@ -96,7 +96,7 @@ def detection_loss(raw: Sequence[Tensor], targets: Sequence[Targets], config: Si
             found = cells[place]
             anchor = cells.new_tensor(config.anchors_px[level])[asked.anchor]
             cell = torch.stack((asked.column, asked.row), 1)
-            overlap = complete_iou(boxes_of(found[:, :4], cell, anchor, STRIDES[level]), asked.box)
+            overlap = complete_iou(decode_boxes(found[:, :4], cell, anchor, STRIDES[level]), asked.box)
             label = functional.one_hot(asked.label, len(config.classes)).to(found)
             total = total + BOX * (1 - overlap).mean()
             total = total + CLASS * functional.binary_cross_entropy_with_logits(found[:, 5:], label)
@@ -115,5 +115,5 @@ def _largest_at(maps: Tensor, place: tuple[Tensor, ...], values: Tensor) -> Tens
     return maps.flatten().scatter_reduce(0, flat, values, "amax").view_as(maps)
 
 
-def _on(targets: Targets, device: torch.device) -> Targets:
+def _to_device(targets: Targets, device: torch.device) -> Targets:
     return Targets(**{name: tensor.to(device) for name, tensor in vars(targets).items()})

@@ -40,7 +40,7 @@ class Bottleneck(nn.Module):
         return maps + self.layers(maps) if self.shortcut else self.layers(maps)
 
 
-class Partial(nn.Module):
+class CrossStagePartial(nn.Module):
     """A cross-stage partial (CSP) stage: one half of the channels passes the bottlenecks, the other half skips them."""
 
     def __init__(self, into: int, out: int, depth: int, shortcut: bool = True) -> None:
@@ -55,7 +55,7 @@ class Partial(nn.Module):
         return self.merge(torch.cat((self.through(maps), self.past(maps)), 1))
 
 
-class Pyramid(nn.Module):
+class SpatialPyramidPooling(nn.Module):
     """Spatial pyramid pooling: the input with its maxima over 5, 9 and 13 pixels, by repeated max pooling over 5."""
 
     def __init__(self, channels: int) -> None:
@@ -81,15 +81,22 @@ class SignDetector(nn.Module):
         c1, c2, c3, c4, c5 = (_multiple_of_8(channels * config.width) for channels in CHANNELS)
         d2, d3, d4, d5, neck = (max(1, round(depth * config.depth)) for depth in (*DEPTHS, NECK_DEPTH))
         self.to_8 = nn.Sequential(
-            unit(3, c1, 6, 2, 2), unit(c1, c2, 3, 2), Partial(c2, c2, d2), unit(c2, c3, 3, 2), Partial(c3, c3, d3)
+            unit(3, c1, 6, 2, 2),
+            unit(c1, c2, 3, 2),
+            CrossStagePartial(c2, c2, d2),
+            unit(c2, c3, 3, 2),
+            CrossStagePartial(c3, c3, d3),
         )
-        self.to_16 = nn.Sequential(unit(c3, c4, 3, 2), Partial(c4, c4, d4))
-        self.to_32 = nn.Sequential(unit(c4, c5, 3, 2), Partial(c5, c5, d5), Pyramid(c5))
+        self.to_16 = nn.Sequential(unit(c3, c4, 3, 2), CrossStagePartial(c4, c4, d4))
+        self.to_32 = nn.Sequential(unit(c4, c5, 3, 2), CrossStagePartial(c5, c5, d5), SpatialPyramidPooling(c5))
         self.up = nn.Upsample(scale_factor=2, mode="nearest")
         self.narrow_32, self.narrow_16 = unit(c5, c4), unit(c4, c3)
-        self.down_16, self.down_8 = Partial(2 * c4, c4, neck, False), Partial(2 * c3, c3, neck, False)
+        self.down_16, self.down_8 = (
+            CrossStagePartial(2 * c4, c4, neck, False),
+            CrossStagePartial(2 * c3, c3, neck, False),
+        )
         self.stride_8, self.stride_16 = unit(c3, c3, 3, 2), unit(c4, c4, 3, 2)
-        self.up_16, self.up_32 = Partial(2 * c3, c4, neck, False), Partial(2 * c4, c5, neck, False)
+        self.up_16, self.up_32 = CrossStagePartial(2 * c3, c4, neck, False), CrossStagePartial(2 * c4, c5, neck, False)
         self.fields = 5 + len(config.classes)  # x, y, width, height, objectness, classes
         per_cell = len(config.anchors_px[0]) * self.fields
         self.heads = nn.ModuleList(nn.Conv2d(channels, per_cell, 1) for channels in (c3, c4, c5))
@@ -128,10 +135,10 @@ def decode(raw: Tensor, level: int, config: SignsConfig) -> Tensor:
     across = torch.arange(columns, device=raw.device)
     down = torch.arange(rows, device=raw.device)
     cell = torch.stack((across.expand(rows, -1), down[:, None].expand(-1, columns)), -1)  # (rows, columns, 2)
-    return boxes_of(raw[..., :4], cell, raw.new_tensor(config.anchors_px[level])[:, None, None], stride)
+    return decode_boxes(raw[..., :4], cell, raw.new_tensor(config.anchors_px[level])[:, None, None], stride)
 
 
-def boxes_of(raw: Tensor, cell: Tensor, anchor: Tensor, stride: int) -> Tensor:
+def decode_boxes(raw: Tensor, cell: Tensor, anchor: Tensor, stride: int) -> Tensor:
     """Return boxes (..., 4) x1 y1 x2 y2 [px] of raw predictions t (..., 4), cells (..., 2) and anchors (..., 2) [px].
 
     With s = sigmoid(t) and the cell's column and row c: centre = (2 s_xy - 0.5 + c) stride, size = (2 s_wh)^2 anchor.

@@ -9,10 +9,10 @@ from flcav.dataset.store import Dataset
 from flcav.perception.outcomes import Outcomes, Times, Values
 from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.detect import Detections, detect
-from flcav.perception.signs.evaluate import Truth, mean_average_precision
+from flcav.perception.signs.evaluate import GroundTruth, mean_average_precision
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.samples import RecordedPictures
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 
 LOWEST_SCORE = 0.01  # score threshold; detections below it hardly change the average precision
 FOUND, WANTED, NEUTRAL = "found", "wanted", "neutral"
@@ -26,13 +26,13 @@ class SignsOutcomes:
     redraws = 200  # few, since each bootstrap sample matches all images anew
 
     def outcomes(
-        self, network: SignDetector, data: Dataset, frames: Sequence[int], progress: Report = silent
+        self, network: SignDetector, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
     ) -> Outcomes:
         """Return detections and ground truth of each image, flattened, with the counts per image."""
         recorded = _last_asked_for(data, network.config, tuple(frames))
         found, truths = [], []
         for done, sample in enumerate(recorded, start=1):
-            truths.append(Truth(sample.boxes, sample.label, sample.ignore))
+            truths.append(GroundTruth(sample.boxes, sample.label, sample.ignore))
             found.append(detect(network, sample.picture, threshold=LOWEST_SCORE))
             progress(done, len(recorded), "")
         arrays = {
@@ -69,7 +69,7 @@ class SignsOutcomes:
         return {"mAP50-95": result.map50_95, "targets": float(len(outcomes.arrays[f"{WANTED}/label"]))}
 
 
-def by_picture(outcomes: Outcomes) -> tuple[list[Detections], list[Truth]]:
+def by_picture(outcomes: Outcomes) -> tuple[list[Detections], list[GroundTruth]]:
     """Return the detections and the ground truth of each image."""
 
     def parts(name: str, field: str) -> list[np.ndarray]:
@@ -77,7 +77,7 @@ def by_picture(outcomes: Outcomes) -> tuple[list[Detections], list[Truth]]:
         return np.split(outcomes.arrays[f"{name}/{field}"], ends)
 
     found = [Detections(*one) for one in zip(*(parts(FOUND, field) for field in ("box", "label", "score")))]
-    truths = [Truth(*one) for one in zip(parts(WANTED, "box"), parts(WANTED, "label"), parts(NEUTRAL, "box"))]
+    truths = [GroundTruth(*one) for one in zip(parts(WANTED, "box"), parts(WANTED, "label"), parts(NEUTRAL, "box"))]
     return found, truths
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.rectangles import CLASSES, rectangles
+from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
-from flcav.perception.images import Picture, checked_picture
+from flcav.perception.images import Picture, check_picture
 from flcav.perception.signs.config import SignsConfig
 from flcav.sensors.frame import Frame
 
@@ -50,7 +50,9 @@ class RecordedPictures(Sequence[Sample]):
         number, camera = self._of[index]
         picture = self._data.plane(number, camera, "rgb")
         frame = self._data.frame(number)
-        sample = sample_of(frame, camera, checked_picture(picture, f"{self._data.folder} {frame.key}"), self._config)
+        sample = sample_from_frame(
+            frame, camera, check_picture(picture, f"{self._data.folder} {frame.key}"), self._config
+        )
         if self._kept_bytes + picture.nbytes <= KEPT_BYTES:
             self._kept[index] = sample
             self._kept_bytes += picture.nbytes
@@ -61,22 +63,22 @@ class RecordedPictures(Sequence[Sample]):
         return self._data.keys[self._of[index][0]].scene
 
 
-def sample_of(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
+def sample_from_frame(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
     """Return a camera's image with the boxes of its signs and lights.
 
     Boxes smaller than `config.smallest_px`, and boxes cut off by the image's edge, are ignored: a lamp may lie outside.
     """
-    shown = rectangles(frame, camera, "signs", min_pixels=1)
+    shown = select_rectangles(frame, camera, "signs", min_pixels=1)
     names = [CLASSES["signs"][number] for number in shown.label]
     known = np.array([name in config.classes for name in names], dtype=bool)
     label = np.array([config.classes.index(name) for name, ok in zip(names, known) if ok], dtype=np.int64)
     box = shown.box[known]
     height, width = picture.shape[:2]
-    wanted = wanted_boxes(box, (width, height), config)
+    wanted = find_targets(box, (width, height), config)
     return Sample(picture, box[wanted], label[wanted], box[~wanted])
 
 
-def wanted_boxes(box: NDArray[np.float64], size: tuple[int, int], config: SignsConfig) -> NDArray[np.bool_]:
+def find_targets(box: NDArray[np.float64], size: tuple[int, int], config: SignsConfig) -> NDArray[np.bool_]:
     """Return (N,) which boxes (N, 4) are targets in an image of `size` (width, height) [px]: whole and large enough."""
     whole = (box[:, :2] > 0).all(1) & (box[:, 2:] < size).all(1)
     return whole & (size_px(box) >= config.smallest_px)

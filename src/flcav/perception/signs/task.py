@@ -11,20 +11,20 @@ from torch import Tensor
 from flcav.dataset.store import Dataset
 from flcav.perception.client import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.errors import THRESHOLD, Registry
-from flcav.perception.images import pictures
+from flcav.perception.images import read_pictures
 from flcav.perception.marks import PictureBoxes
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
 from flcav.perception.signs.detect import boxes_found, detect, predict
 from flcav.perception.signs.errors import register_errors
 from flcav.perception.signs.evaluate import SignsEvaluation, mean_average_precision
-from flcav.perception.signs.loss import assign, detection_loss
+from flcav.perception.signs.loss import assign_anchors, detection_loss
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.outcomes import SignsOutcomes, by_picture
 from flcav.perception.signs.samples import RecordedPictures, Sample
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 
 BOX_BYTES = 4 * 4 + 1  # [B] of a label: a box in float32, and its class
 
@@ -64,10 +64,15 @@ class SignsTask(SignsOutcomes):
     def loss(self, network: SignDetector, samples: Sequence[Sample]) -> Tensor:
         """Return the loss of a batch of images of one size, whose sides are multiples of 32; see `detection_loss`."""
         raw = predict(network, [sample.picture for sample in samples])
-        return detection_loss(raw, assign(samples, network.config), network.config)
+        return detection_loss(raw, assign_anchors(samples, network.config), network.config)
 
     def evaluate(
-        self, network: SignDetector, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
+        self,
+        network: SignDetector,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        *,
+        progress: Report = ignore_progress,
     ) -> SignsEvaluation:
         """Return COCO's mAP, as a whole, by class and by size; see `mean_average_precision`."""
         kept = self.outcomes(network, data, data.numbers(frames), progress)
@@ -85,7 +90,7 @@ class SignsTask(SignsOutcomes):
         self, network: SignDetector, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
         """Yield the detections of each image at `path`, by falling score."""
-        for origin, rgb in pictures(path, frames):
+        for origin, rgb in read_pictures(path, frames):
             found = detect(network, rgb, threshold=threshold)
             names = np.array(network.config.classes)[found.label]
             marks = (PictureBoxes(found.box, names, found.score),)
@@ -97,7 +102,7 @@ class SignsTask(SignsOutcomes):
         data: Dataset,
         frames: Sequence[int] | None = None,
         threshold: float = THRESHOLD,
-        progress: Report = silent,
+        progress: Report = ignore_progress,
     ) -> Registry:
         """Return the missed signs and the false positives, see `flcav.perception.signs.errors.register_errors`."""
         return register_errors(network, data, data.numbers(frames), threshold, progress)

@@ -10,15 +10,15 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse
 from flcav.perception.metrics.matching import on_neutral
-from flcav.perception.metrics.tracks import Moment, amota, clear
+from flcav.perception.metrics.tracks import TrackingFrame, amota, count_clear_mot
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.detect import detect
-from flcav.perception.objects.evaluate import number_or_none
+from flcav.perception.objects.evaluate import round_or_none
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.truth import ground_truth, in_range, only_lidar
+from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
 from flcav.perception.task import Result
 from flcav.perception.tracking.tracker import Tracked, Tracker
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 from flcav.records import Class
 from flcav.sensors.frame import Frame
 
@@ -68,7 +68,7 @@ def evaluate_tracks(
     frames: Sequence[int] | None = None,
     *,
     asked: SecondConfig | None = None,
-    progress: Report = silent,
+    progress: Report = ignore_progress,
 ) -> TracksEvaluation:
     """Return MOTA, AMOTA, identity switches and velocity error per class.
 
@@ -77,9 +77,9 @@ def evaluate_tracks(
 
     Raises `InputError` where consecutive frames of a sequence are more than `LONGEST_GAP_S` apart.
     """
-    numbers, config = sequences(data, frames), asked or network.config
+    numbers, config = group_sequences(data, frames), asked or network.config
     total = sum(map(len, numbers.values()))
-    per_class: dict[str, list[list[Moment]]] = {name: [] for name in network.config.classes}
+    per_class: dict[str, list[list[TrackingFrame]]] = {name: [] for name in network.config.classes}
     speed_errors: dict[str, list[float]] = {name: [] for name in network.config.classes}
     done = 0
     for sequence in numbers.values():
@@ -87,9 +87,9 @@ def evaluate_tracks(
         story: list[tuple[Frame, Tracked]] = []
         for number in sequence:
             frame = data.frame(number)
-            lidar = only_lidar(frame)
+            lidar = choose_lidar(frame)
             found = detect(network, frame.lidar[lidar], score_threshold=SCORE)
-            story.append((frame, tracker.step(found.transformed(frame.world_from_sensor(lidar)), frame.time_s)))
+            story.append((frame, tracker.step(found.transform(frame.world_from_sensor(lidar)), frame.time_s)))
             done += 1
             progress(done, total, "")
         final = _final_scores([tracked for _, tracked in story])
@@ -99,24 +99,24 @@ def evaluate_tracks(
             speed_errors[name] += [error for _, errors in moments for error in errors]
     rows = []
     for name, moments in per_class.items():
-        counts = clear(moments)
+        counts = count_clear_mot(moments)
         rows.append(
             TrackScore(
                 name,
                 objects=counts.objects,
-                mota=number_or_none(counts.mota),
-                amota=number_or_none(amota(moments)),
-                motp_m=number_or_none(counts.motp_m),
+                mota=round_or_none(counts.mota),
+                amota=round_or_none(amota(moments)),
+                motp_m=round_or_none(counts.motp_m),
                 misses=counts.misses,
                 false_positives=counts.false_positives,
                 id_switches=counts.switches,
-                velocity_error_mps=number_or_none(float(np.mean(speed_errors[name] or [np.nan]))),
+                velocity_error_mps=round_or_none(float(np.mean(speed_errors[name] or [np.nan]))),
             )
         )
     return TracksEvaluation(len(numbers), total, tuple(rows))
 
 
-def sequences(data: Dataset, frames: Sequence[int] | None = None) -> dict[tuple[str, str], list[int]]:
+def group_sequences(data: Dataset, frames: Sequence[int] | None = None) -> dict[tuple[str, str], list[int]]:
     """Return the numbers of the frames (None: all) by (scene, agent), in time order.
 
     Raises `InputError` where consecutive frames of a sequence are more than `LONGEST_GAP_S` apart.
@@ -143,7 +143,7 @@ def _final_scores(story: Sequence[Tracked]) -> dict[int, float]:
 
 def _moment(
     frame: Frame, tracked: Tracked, final: Mapping[int, float], config: SecondConfig, name: str
-) -> tuple[Moment, list[float]]:
+) -> tuple[TrackingFrame, list[float]]:
     """Return ground truth and tracks of class `name` in a frame, and velocity errors [m/s].
 
     There is one error for each track within 1 m of an object: that of the velocity in the plane, against the nearest
@@ -152,13 +152,13 @@ def _moment(
     truth, annotations = ground_truth(frame, config), frame.annotations
     of_class = truth.boxes.label == name
     wanted = of_class & truth.target
-    sensor_from_world = inverse(frame.world_from_sensor(only_lidar(frame)))
+    sensor_from_world = inverse(frame.world_from_sensor(choose_lidar(frame)))
     own = np.flatnonzero(tracked.boxes.label == name)
-    own = own[in_range(tracked.boxes[own].transformed(sensor_from_world), config)]
+    own = own[in_range(tracked.boxes[own].transform(sensor_from_world), config)]
     boxes: Boxes = tracked.boxes[own]
     objects = np.flatnonzero(wanted)
     places, found = annotations.boxes.center[objects, :2], boxes.center[:, :2]
-    moment = Moment(
+    moment = TrackingFrame(
         objects=annotations.track[objects],
         places=places,
         tracks=tracked.track[own],

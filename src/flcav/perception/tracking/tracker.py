@@ -37,13 +37,13 @@ class State(NamedTuple):
     covariance: Array  # (9, 9)
 
 
-def first_state(box: Array, variance: Array) -> State:
+def start_state(box: Array, variance: Array) -> State:
     """Return the state of a new track from its first detection: box (7,) with `variance` (7,), mean velocity zero."""
     spread = np.concatenate((np.maximum(variance, LEAST_VARIANCE), np.full(2, FIRST_SPEED**2)))
     return State(np.concatenate((box, np.zeros(2))), np.diag(spread))
 
 
-def predicted(state: State, after_s: float) -> State:
+def predict_state(state: State, after_s: float) -> State:
     """Return the Kalman prediction of the state `after_s` [s] later, at constant velocity."""
     step = np.eye(STATES)
     step[0, 7] = step[1, 8] = after_s
@@ -70,7 +70,7 @@ def innovation(state: State, box: Array, variance: Array) -> tuple[Array, Array]
     return off, state.covariance[:MEASURED, :MEASURED] + np.diag(np.maximum(variance, LEAST_VARIANCE))
 
 
-def updated(state: State, box: Array, variance: Array) -> State:
+def update_state(state: State, box: Array, variance: Array) -> State:
     """Return the Kalman update of the state by the detection box (7,) with `variance` (7,)."""
     off, spread = innovation(state, box, variance)
     gain = np.linalg.solve(spread, state.covariance[:MEASURED]).T
@@ -134,27 +134,27 @@ class Tracker:
             variance = np.tile(UNKNOWN_VARIANCE, (len(detections), 1))
         scores = np.ones(len(detections)) if detections.score is None else detections.score
         for track in self._tracks:
-            track.state = predicted(track.state, after_s)
+            track.state = predict_state(track.state, after_s)
             track.missed += 1
         rows = detections.array()
         free = np.ones(len(rows), dtype=bool)
         for label in sorted({track.label for track in self._tracks}):
             tracks = [track for track in self._tracks if track.label == label]
             own = np.flatnonzero(detections.label == label)
-            for t, d in assigned([track.state for track in tracks], rows[own], variance[own], after_s):
+            for t, d in assign_detections([track.state for track in tracks], rows[own], variance[own], after_s):
                 track, number = tracks[t], own[d]
-                track.state = updated(track.state, rows[number], variance[number])
+                track.state = update_state(track.state, rows[number], variance[number])
                 track.scores.append(float(scores[number]))
                 track.missed = 0
                 free[number] = False
         for number in np.flatnonzero(free):
-            state = first_state(rows[number], variance[number])
+            state = start_state(rows[number], variance[number])
             self._tracks.append(_Track(self._next, str(detections.label[number]), state, [float(scores[number])]))
             self._next += 1
         self._tracks = [track for track in self._tracks if track.missed <= self.patience]
-        return self._told(first)
+        return self._report(first)
 
-    def _told(self, first: bool) -> Tracked:
+    def _report(self, first: bool) -> Tracked:
         told = [track for track in self._tracks if (len(track.scores) >= self.confirm or first) and track.missed == 0]
         mean = np.array([track.state.mean for track in told]).reshape(-1, 9)
         boxes = Boxes(
@@ -168,7 +168,7 @@ class Tracker:
         return Tracked(boxes, np.array([track.number for track in told], dtype=np.int64), mean[:, 7:])
 
 
-def assigned(states: list[State], boxes: Array, variance: Array, after_s: float) -> list[tuple[int, int]]:
+def assign_detections(states: list[State], boxes: Array, variance: Array, after_s: float) -> list[tuple[int, int]]:
     """Return the pairs (index of a state, index of a box) of least total cost: the Hungarian method within the gate.
 
     The cost is twice the negative log-likelihood of the detection's x, y under the prediction, up to a constant.

@@ -3,7 +3,7 @@
 from flcav.perception.training.loop import (
     SCHEDULES,
     Checkpointing,
-    History,
+    TrainingHistory,
     Validation,
     adamw,
     batches,
@@ -15,7 +15,7 @@ from flcav.perception.training.loop import (
 __all__ = [
     "SCHEDULES",
     "Checkpointing",
-    "History",
+    "TrainingHistory",
     "Validation",
     "adamw",
     "batches",

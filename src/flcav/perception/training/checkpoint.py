@@ -17,7 +17,9 @@ from flcav.perception.card import Card, DataEntry
 from flcav.perception.weights import read_card
 
 TRAINED = ("device", "epochs", "patience", "batch", "learning_rate", "schedule")  # settings in `Card.training`
-Part = tuple[str, tuple[str, ...] | None]  # a dataset: SHA-256 of its manifest, agents used (None in older cards)
+DataIdentity = tuple[
+    str, tuple[str, ...] | None
+]  # a dataset: SHA-256 of its manifest, agents used (None in older cards)
 NAMED = {"data": "other data or agents", "validation": "other validation data or agents"}
 
 
@@ -29,8 +31,8 @@ class Settings(Config):
     seed: int
     threads: int | None  # CPU threads
     device: str | None  # cpu | cuda
-    data: tuple[Part, ...]
-    validation: Part | None
+    data: tuple[DataIdentity, ...]
+    validation: DataIdentity | None
     epochs: int
     patience: int | None  # None without validation data
     batch: int
@@ -60,12 +62,12 @@ def settings_of(card: Card) -> Settings:
     )
 
 
-def part_of(entry: DataEntry) -> Part:
+def part_of(entry: DataEntry) -> DataIdentity:
     """Return the identity of a dataset in a card: its manifest's SHA-256 and the agents used."""
     return entry.manifest, entry.agents
 
 
-def finished_card(path: Path, asked: Settings) -> Card | None:
+def find_finished_card(path: Path, asked: Settings) -> Card | None:
     """Return the card of the weights at `path`; None if there is no such file.
 
     Raises `InputError` if they were trained with other settings than `asked`, so that they are not overwritten.
@@ -79,7 +81,7 @@ def finished_card(path: Path, asked: Settings) -> Card | None:
 
 
 @dataclass
-class Progress:
+class RunState:
     """State of a training run: losses, validation scores and best weights so far."""
 
     losses: list[float] = field(default_factory=list)  # of each step
@@ -88,7 +90,7 @@ class Progress:
 
 
 def save_checkpoint(
-    path: Path, identity: str, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer
+    path: Path, identity: str, progress: RunState, network: nn.Module, optimizer: torch.optim.Optimizer
 ) -> None:
     """Write a checkpoint of the run `identity`, atomically: progress, network and optimiser."""
     state = {
@@ -104,17 +106,17 @@ def save_checkpoint(
     write_bytes(path, data.getvalue())
 
 
-def load_checkpoint(path: Path, identity: str, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
+def load_checkpoint(path: Path, identity: str, network: nn.Module, optimizer: torch.optim.Optimizer) -> RunState:
     """Restore network and optimiser in place and return the progress; without a file, an empty progress.
 
     Raises `InputError` if the file is not a checkpoint, or one of another run. No code in the file is executed.
     """
     if not path.exists():
-        return Progress()
+        return RunState()
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         found = str(state["identity"])
-        progress = Progress(state["losses"].tolist(), state["scores"].tolist(), state["best"])
+        progress = RunState(state["losses"].tolist(), state["scores"].tolist(), state["best"])
     except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError, AttributeError):
         raise InputError(f"{path}: not a checkpoint; remove it to start afresh") from None
     if found != identity:

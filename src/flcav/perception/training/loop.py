@@ -17,8 +17,8 @@ from torch import nn
 
 from flcav.config import InputError
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
-from flcav.perception.training.checkpoint import Progress, load_checkpoint, save_checkpoint
-from flcav.progress import Report, silent
+from flcav.perception.training.checkpoint import RunState, load_checkpoint, save_checkpoint
+from flcav.progress import Report, ignore_progress
 from flcav.seeds import stream
 
 
@@ -68,13 +68,13 @@ class Validation:
     every: int  # steps between validations
     patience: int  # validations without a new best after which training stops
 
-    def over(self, scores: Sequence[float]) -> bool:
+    def is_over(self, scores: Sequence[float]) -> bool:
         """Return whether training stops: none of the last `patience` of `scores` is above all scores before them."""
         return len(scores) > self.patience and max(scores[-self.patience :]) <= max(scores[: -self.patience])
 
 
 @dataclass(frozen=True)
-class History:
+class TrainingHistory:
     """Losses and validation scores of a training."""
 
     losses: NDArray[np.float64]  # (steps,) loss of each batch; fewer steps than asked for after early stopping
@@ -94,8 +94,8 @@ def train(
     checkpointing: Checkpointing | None = None,
     validation: Validation | None = None,
     watch: Watch = _unwatched,
-    progress: Report = silent,
-) -> History:
+    progress: Report = ignore_progress,
+) -> TrainingHistory:
     """Train `network` in place for `steps` optimiser steps; hyperparameters default to `task.practice`.
 
     Each epoch goes through the samples in a new random order. With `validation`, training may stop early, and the
@@ -115,11 +115,11 @@ def train(
     waits = None if validation is None else (validation.every, validation.patience)
     settings = [task.name, repr(network.config), steps, batch, learning_rate, schedule, seed, waits]
     identity = f"{json.dumps(settings)} on {len(samples)} samples {checkpointing.of if checkpointing else ''}"
-    done = load_checkpoint(checkpointing.path, identity, network, optimizer) if checkpointing else Progress()
+    done = load_checkpoint(checkpointing.path, identity, network, optimizer) if checkpointing else RunState()
     order = batches(len(samples), batch, steps, seed)
     config: Any = network.config  # an attribute of every network of a task
     for number in range(len(done.losses), steps):
-        if validation and validation.over(done.scores):
+        if validation and validation.is_over(done.scores):
             break
         rate = learning_rate * SCHEDULES[schedule](number / steps)
         for group in optimizer.param_groups:
@@ -138,7 +138,7 @@ def train(
             save_checkpoint(checkpointing.path, identity, done, network, optimizer)
     if done.best is not None:
         network.load_state_dict(done.best)
-    return History(np.array(done.losses), np.array(done.scores))
+    return TrainingHistory(np.array(done.losses), np.array(done.scores))
 
 
 def train_steps(
@@ -199,13 +199,13 @@ def batches(samples: int, batch: int, steps: int, seed: int) -> NDArray[np.int64
     return order[: steps * batch].reshape(steps, batch)
 
 
-def _validate(validation: Validation, network: nn.Module, done: Progress) -> None:
+def _validate(validation: Validation, network: nn.Module, done: RunState) -> None:
     score = validation.score(network)
     if score > max(done.scores, default=-np.inf):
         done.best = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     done.scores.append(score)
 
 
-def _note(done: Progress) -> str:
+def _note(done: RunState) -> str:
     loss = f"loss {np.mean(done.losses[-20:]):.3f}"
     return f"{loss}, score {done.scores[-1]:.3f} (best {max(done.scores):.3f})" if done.scores else loss

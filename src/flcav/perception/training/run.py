@@ -14,14 +14,14 @@ from torch.utils.data import ConcatDataset
 
 from flcav.dataset.store import Dataset
 from flcav.files import check_writable
-from flcav.perception.agents import Chosen, choose_frames
+from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, DataEntry, data_entry, write_card
 from flcav.perception.device import CPU, processor_of
-from flcav.perception.task import Calibrates, Evaluated, Task, configuration, fresh
-from flcav.perception.training.checkpoint import Settings, finished_card, part_of
+from flcav.perception.task import Calibrates, Evaluated, Task, find_configuration, fresh
+from flcav.perception.training.checkpoint import Settings, find_finished_card, part_of
 from flcav.perception.training.loop import Checkpointing, Validation, Watch, train
 from flcav.perception.weights import save_network
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 
 
 @contextlib.contextmanager
@@ -70,7 +70,7 @@ class Part:
     """A dataset with the frames selected from it."""
 
     data: Dataset
-    chosen: Chosen
+    chosen: FrameSelection
     entry: DataEntry  # its entry in the card
 
 
@@ -95,14 +95,14 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainingResult:
     """Result of a training: model card and evaluation."""
 
     card: Card  # of the weights
     evaluation: Evaluated | None = None  # on the validation data; None without, or if finished before
 
 
-def train_network(task: Task, request: Request, out: Path, progress: Report = silent) -> Card:
+def train_network(task: Task, request: Request, out: Path, progress: Report = ignore_progress) -> Card:
     """Train a network and write weights, card and curves to `out`; resume an interrupted run there. Return the card.
 
     The learning rate follows one schedule over all epochs. With validation data, the network of the best epoch is kept,
@@ -119,7 +119,7 @@ def prepare(task: Task, request: Request, out: Path) -> Prepared:
     of other settings; `OSError`, before any data are read, if `out` cannot be written.
     """
     check_writable(out)
-    config = configuration(task, request.network)
+    config = find_configuration(task, request.network)
     parts = tuple(_part(task, config, data, request.agents) for data in request.data)
     held = None if request.validation is None else _part(task, config, request.validation, request.agents)
     settings = Settings(
@@ -134,7 +134,7 @@ def prepare(task: Task, request: Request, out: Path) -> Prepared:
         patience=request.patience if held else None,
         **vars(task.practice),
     )
-    finished = finished_card(out / WEIGHTS, settings)
+    finished = find_finished_card(out / WEIGHTS, settings)
     samples: Any = ()
     if finished is None:
         found = [task.samples(part.data, config, part.chosen.frames) for part in parts]
@@ -144,10 +144,10 @@ def prepare(task: Task, request: Request, out: Path) -> Prepared:
     return Prepared(task, request, out, config, settings, parts, held, finished, samples)
 
 
-def train_prepared(prepared: Prepared, progress: Report = silent) -> Trained:
+def train_prepared(prepared: Prepared, progress: Report = ignore_progress) -> TrainingResult:
     """Perform the training that `prepare` returned, see `train_network`; return its card and evaluation."""
     if prepared.finished is not None:
-        return Trained(prepared.finished)
+        return TrainingResult(prepared.finished)
     task, request, out, held = prepared.task, prepared.request, prepared.out, prepared.held
     settings, samples = prepared.settings, prepared.samples
     network = fresh(task, prepared.config, request.seed).to(request.device)
@@ -185,7 +185,7 @@ def train_prepared(prepared: Prepared, progress: Report = silent) -> Trained:
     )
     save_network(task, network, out / WEIGHTS, card)
     write_card(card, out / CARD)
-    return Trained(card, evaluation)
+    return TrainingResult(card, evaluation)
 
 
 def _part(task: Task, config: Any, data: Dataset, agents: str | None) -> Part:

@@ -32,7 +32,7 @@ class Inputs(NamedTuple):
     camera_from_frame: Tensor | None = None  # (B, n, 4, 4) from the road user's frame to the optical one
 
 
-class Seen(NamedTuple):
+class GroundFeatures(NamedTuple):
     """Bird's-eye features of the surroundings."""
 
     summary: Tensor  # (B, summary) of the whole patch
@@ -64,11 +64,11 @@ class RasterEncoder(nn.Module):
         self.layers = nn.Sequential(conv(len(LAYERS), fine, 2), conv(fine, ground, 2))
         self.sum_up = Summary(ground, coarse, self.summary)
 
-    def forward(self, inputs: Inputs) -> Seen:
+    def forward(self, inputs: Inputs) -> GroundFeatures:
         """Return the features of rasters (B, LAYERS, cells, cells); a place of `ground` is 4 x 4 cells."""
         assert inputs.raster is not None
         ground = self.layers(inputs.raster)
-        return Seen(self.sum_up(ground), ground)
+        return GroundFeatures(self.sum_up(ground), ground)
 
 
 def conv(maps: int, out: int, stride: int | tuple[int, int] = 1) -> nn.Sequential:
@@ -110,23 +110,23 @@ class CrossViewEncoder(nn.Module):
     pixels: Tensor  # (P, 3) homogeneous coordinates of the image features
     places: Tensor  # (Q, 2) x, y of the queries [SCALE_M]
 
-    def forward(self, inputs: Inputs) -> Seen:
+    def forward(self, inputs: Inputs) -> GroundFeatures:
         """Return the features of images (B, n, 3, height, width); `ground` has twice the resolution of the queries."""
         assert inputs.pictures is not None
         assert inputs.intrinsics is not None
         assert inputs.camera_from_frame is not None
         batch, cameras = inputs.pictures.shape[:2]
         features = self.pictures(inputs.pictures.flatten(0, 1)).flatten(2).transpose(1, 2)
-        looks, stands = rays(inputs.intrinsics, inputs.camera_from_frame, self.pixels)
+        looks, stands = cast_rays(inputs.intrinsics, inputs.camera_from_frame, self.pixels)
         position = functional.normalize(self.direction(looks) - self.standpoint(stands)[:, :, None], dim=-1)
         seen = features.unflatten(0, (batch, cameras)) + position  # (B, n, P, width)
-        seen, met = seen.flatten(1, 2), met_ground(looks, stands).flatten(1, 2)
+        seen, met = seen.flatten(1, 2), intersect_ground(looks, stands).flatten(1, 2)
         ground = (self.ground + self.place(self.places)).expand(batch, -1, -1)
         for attend in self.rounds:
             ground = attend(ground, self.places, seen, met)
         side = round(len(self.places) ** 0.5)
         maps = self.refine(ground.transpose(1, 2).unflatten(2, (side, side)))
-        return Seen(self.sum_up(maps), maps, self.map(maps))
+        return GroundFeatures(self.sum_up(maps), maps, self.map(maps))
 
 
 class CrossAttention(nn.Module):
@@ -167,7 +167,7 @@ class CrossAttention(nn.Module):
         return tokens.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
 
-def rays(intrinsics: Tensor, camera_from_frame: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def cast_rays(intrinsics: Tensor, camera_from_frame: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """Return unit directions (B, n, P, 3) of the rays through homogeneous `pixels` (P, 3), and their origins (B, n, 3).
 
     Both are in the frame of the road user; the origins, the cameras' positions, are in units of SCALE_M. `intrinsics`
@@ -180,10 +180,10 @@ def rays(intrinsics: Tensor, camera_from_frame: Tensor, pixels: Tensor) -> tuple
     return looks, stands / SCALE_M
 
 
-def met_ground(looks: Tensor, stands: Tensor) -> Tensor:
+def intersect_ground(looks: Tensor, stands: Tensor) -> Tensor:
     """Return the intersections (B, n, P, 2) x, y of the rays with the ground z = 0 [SCALE_M], at most `FAR_M` away.
 
-    `looks` and `stands` are the directions and origins of `rays`.
+    `looks` and `stands` are the directions and origins of `cast_rays`.
     """
     level = torch.linalg.vector_norm(looks[..., :2], dim=-1, keepdim=True).clamp(min=1e-6)
     fall = (-looks[..., 2:] / level).clamp(min=1e-6)

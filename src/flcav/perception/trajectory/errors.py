@@ -8,20 +8,22 @@ from flcav.dataset.store import Dataset
 from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry, keep_first
 from flcav.perception.trajectory.evaluate import MISS_M
 from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.predict import predict, single
+from flcav.perception.trajectory.predict import find_medoid, predict
 from flcav.perception.trajectory.samples import Samples
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 from flcav.world.trace import Trace
 
 
-def register_errors(network: TrajectoryNetwork, data: Dataset, samples: Samples, progress: Report = silent) -> Registry:
+def register_errors(
+    network: TrajectoryNetwork, data: Dataset, samples: Samples, progress: Report = ignore_progress
+) -> Registry:
     """Return the first miss of each road user and scene: a single path with a final error above `MISS_M`.
 
     Its position is that of the road user at the present, on the ground (z = 0).
     """
     columns: dict[str, Any] = samples.columns
     paths, probabilities = predict(network, samples, progress)
-    said = paths[np.arange(len(paths)), single(paths, probabilities), -1]
+    said = paths[np.arange(len(paths)), find_medoid(paths, probabilities), -1]
     wrong = np.linalg.norm(said - columns["future"][:, -1], axis=1) > MISS_M
     traces: dict[str, Trace | None] = {scene: data.trace(scene) for scene in np.unique(columns["scene"]).tolist()}
     errors = []

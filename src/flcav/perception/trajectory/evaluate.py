@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.perception.task import Evaluated
-from flcav.perception.trajectory.predict import single
+from flcav.perception.trajectory.predict import find_medoid
 from flcav.perception.trajectory.tracks import constant_velocity
 from flcav.records import LEFT_OUT
 
@@ -98,7 +98,7 @@ class TrajectoryEvaluation(Evaluated):
         return lines
 
 
-def metrics(paths: Array, probabilities: Array, columns: Mapping[str, NDArray[Any]]) -> TrajectoryEvaluation:
+def evaluate_paths(paths: Array, probabilities: Array, columns: Mapping[str, NDArray[Any]]) -> TrajectoryEvaluation:
     """Return the displacement errors of all samples, of those at junctions, and of those turning at junctions.
 
     `paths` (N, K, FUTURE, 2) [m] and `probabilities` (N, K) are the forecasts of N samples, `columns` the arrays of
@@ -109,9 +109,9 @@ def metrics(paths: Array, probabilities: Array, columns: Mapping[str, NDArray[An
     slices = {
         ALL: np.ones(len(future), np.bool_),
         "at junctions": at_junction,
-        "turning at junctions": at_junction & turning(future),
+        "turning at junctions": at_junction & is_turning(future),
     }
-    errors = errors_of(paths, probabilities, future, constant_velocity(past))
+    errors = compute_errors(paths, probabilities, future, constant_velocity(past))
     return TrajectoryEvaluation(
         modes=paths.shape[1],
         miss_m=MISS_M,
@@ -120,7 +120,7 @@ def metrics(paths: Array, probabilities: Array, columns: Mapping[str, NDArray[An
     )
 
 
-def turning(future: Array) -> NDArray[np.bool_]:
+def is_turning(future: Array) -> NDArray[np.bool_]:
     """Return (N,) whether a future (N, FUTURE, 2) [m] turns.
 
     It turns if the displacement in its last second is above 1 m and more than 20 degrees off the x axis.
@@ -129,14 +129,14 @@ def turning(future: Array) -> NDArray[np.bool_]:
     return (np.abs(np.arctan2(last[:, 1], last[:, 0])) > TURN) & (np.linalg.norm(last, axis=1) > 1.0)
 
 
-def errors_of(paths: Array, probabilities: Array, future: Array, baseline: Array) -> dict[str, Array]:
+def compute_errors(paths: Array, probabilities: Array, future: Array, baseline: Array) -> dict[str, Array]:
     """Return ADE and FDE (N,) [m] of each sample by name: of likeliest mode, best mode, single path, and baseline.
 
     `paths` are (N, K, FUTURE, 2), `probabilities` (N, K), `future` and `baseline` (N, FUTURE, 2), in one frame.
     """
     off = np.linalg.norm(paths - future[:, None], axis=3)  # (N, K, FUTURE)
     everyone = np.arange(len(off))
-    likeliest, only = off[everyone, probabilities.argmax(axis=1)], off[everyone, single(paths, probabilities)]
+    likeliest, only = off[everyone, probabilities.argmax(axis=1)], off[everyone, find_medoid(paths, probabilities)]
     plain = np.linalg.norm(baseline - future, axis=2)
     return {
         "minADE_1": likeliest.mean(axis=1),

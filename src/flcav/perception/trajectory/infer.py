@@ -14,10 +14,10 @@ from flcav.perception.marks import Light, Mode, Paths, RoadUser
 from flcav.perception.task import Finding, Result
 from flcav.perception.trajectory.config import FUTURE, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.predict import predict, single
+from flcav.perception.trajectory.predict import find_medoid, predict
 from flcav.perception.trajectory.rasters import OPEN
-from flcav.perception.trajectory.roads import STATIC_ROWS, RoadMap, roads_of
-from flcav.perception.trajectory.samples import Samples, present_at, seen_from, traffic
+from flcav.perception.trajectory.roads import STATIC_ROWS, RoadMap, load_roads
+from flcav.perception.trajectory.samples import Samples, extract_columns, find_near, load_traffic
 from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame
 from flcav.records import Class
 from flcav.world.map.lanes import rasterise
@@ -32,7 +32,7 @@ TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())  # of the path poi
 
 
 @dataclass(frozen=True)
-class Place:
+class Pose2D:
     """A 2D pose in the world."""
 
     x: float  # world [m]
@@ -70,7 +70,7 @@ class Forecasts(Result):
     """The forecasts of a frame."""
 
     time_s: tuple[float, ...]  # times of the points of every path, after the present
-    observer: Place
+    observer: Pose2D
     lights: tuple[Light, ...]
     agents: tuple[Forecast, ...]
 
@@ -84,7 +84,7 @@ class Forecasts(Result):
         return lines or ["nobody to predict"]
 
 
-def findings(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | None = None) -> Iterator[Finding]:
+def forecast_frames(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | None = None) -> Iterator[Finding]:
     """Yield the forecasts of `frames` of the dataset `path` (None: all).
 
     `Finding.seen` is the map around the observer, (len(STATIC), H, W), row 0 farthest ahead and column 0 farthest left.
@@ -97,18 +97,18 @@ def findings(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | Non
     for number in data.numbers(frames):
         key = data.keys[number]
         if key.scene not in traces:
-            traces = {key.scene: traffic(data, key.scene)}
+            traces = {key.scene: load_traffic(data, key.scene)}
         trace = traces[key.scene]
         world_from_agent = data.frame(number).world_from_agent
         observer = np.array([*world_from_agent[:2, 3], yaw_of(world_from_agent)])
         found = _predicted(network, data, number, trace, observer)
-        yield Finding(path / data.name(number), map_around(roads_of(data), observer), forecasts(found), (found,))
+        yield Finding(path / data.name(number), map_around(load_roads(data), observer), forecasts(found), (found,))
 
 
 def forecasts(paths: Paths) -> Forecasts:
     """Return the JSON record of the forecasts of a frame."""
     x, y, yaw = paths.observer
-    return Forecasts(paths.times_s, Place(x, y, yaw), paths.lights, tuple(map(_forecast, paths.users)))
+    return Forecasts(paths.times_s, Pose2D(x, y, yaw), paths.lights, tuple(map(_forecast, paths.users)))
 
 
 def _forecast(user: RoadUser) -> Forecast:
@@ -141,17 +141,17 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
     key, config = data.keys[number], network.config
     instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
     if config.cameras:
-        wanted = seen_from(trace, key)
+        wanted = find_near(trace, key)
     else:
         apart = into_frame(trace.position[None, instant, :, :2], observer[None])[0]
         wanted = (np.abs(apart) <= AROUND_M).all(axis=1)
-    columns = present_at(trace, key.time_s, roads_of(data), config.patch, wanted, complete=False)
+    columns = extract_columns(trace, key.time_s, load_roads(data), config.patch, wanted, complete=False)
     count = len(columns["past"])
     columns |= {"scene": np.full(count, key.scene), "frame": np.full(count, number)}
     users: list[RoadUser] = []
     if count:
         paths, probabilities = predict(network, Samples(data, columns, config.cameras))
-        first = single(paths, probabilities)
+        first = find_medoid(paths, probabilities)
         present, plain = columns["pose"], constant_velocity(columns["past"])
         for i, actor in enumerate(columns["actor"]):
             modes = [Mode(float(share), _in_world(way, present[i])) for share, way in zip(probabilities[i], paths[i])]
@@ -170,7 +170,7 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
                 )
             )
     x, y, yaw = observer.tolist()
-    return Paths((x, y, yaw), AROUND_M, TIMES_S, tuple(users), _lights(trace, instant, roads_of(data)))
+    return Paths((x, y, yaw), AROUND_M, TIMES_S, tuple(users), _lights(trace, instant, load_roads(data)))
 
 
 def _lights(trace: Trace, instant: int, roads: RoadMap) -> tuple[Light, ...]:

@@ -5,14 +5,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from flcav.perception.trajectory.cross_view import LEARNED
-from flcav.perception.trajectory.model import Forecast
+from flcav.perception.trajectory.model import ForecastTensors
 from flcav.perception.trajectory.rasters import LAYERS
 
 SHARED = 0.05  # share of the regression over all modes, against unused modes: Rupprecht et al., ICCV 2017, eq. 5
 MODE_WEIGHT = 1.0  # weight of the mode classification
 
 
-def forecast_loss(forecast: Forecast, future: Tensor) -> Tensor:
+def forecast_loss(forecast: ForecastTensors, future: Tensor) -> Tensor:
     """Return the winner-takes-all regression and the mode classification against `future` (B, FUTURE, 2) [m].
 
     The winner is the mode with the smallest average displacement error. Regression is Huber's loss with threshold 1 m,

@@ -12,13 +12,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from flcav.perception.trajectory.config import FUTURE, STEP_S, TrajectoryConfig
-from flcav.perception.trajectory.cross_view import CrossViewEncoder, Inputs, RasterEncoder, Seen
+from flcav.perception.trajectory.cross_view import CrossViewEncoder, GroundFeatures, Inputs, RasterEncoder
 
 SCALE_M = 10.0  # unit of positions and speeds inside the network
 TRACK = 6  # number of features of a point of the past
 
 
-class Forecast(NamedTuple):
+class ForecastTensors(NamedTuple):
     """Output tensors of the network: K modes per sample."""
 
     paths: Tensor  # (B, K, FUTURE, 2) x, y [m] in the frame of the present
@@ -43,15 +43,15 @@ class TrajectoryNetwork(nn.Module):
         nn.init.normal_(self.change.weight, std=0.01)
         nn.init.zeros_(self.change.bias)
 
-    def forward(self, inputs: Inputs) -> Forecast:
+    def forward(self, inputs: Inputs) -> ForecastTensors:
         """Return the forecast of a batch."""
         seen = self.view(inputs)
         _, (encoded, _) = self.track(_features(inputs.past))
         context = self.context(torch.cat((encoded[-1], seen.summary), dim=1))
         paths = self._decoded(context, inputs.past[:, -1, 3] * STEP_S, seen)
-        return Forecast(paths, self.likely(context), seen.map_logits)
+        return ForecastTensors(paths, self.likely(context), seen.map_logits)
 
-    def _decoded(self, context: Tensor, step_m: Tensor, seen: Seen) -> Tensor:
+    def _decoded(self, context: Tensor, step_m: Tensor, seen: GroundFeatures) -> Tensor:
         batch, modes, hidden = len(context), self.config.modes, self.config.hidden
         state = torch.tanh(self.begin(context)).reshape(batch * modes, hidden)
         cell = torch.zeros_like(state)

@@ -7,12 +7,12 @@ import numpy as np
 from flcav.dataset.store import Dataset
 from flcav.intervals import REDRAWS
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
-from flcav.perception.trajectory.evaluate import MISS_M, errors_of
+from flcav.perception.trajectory.evaluate import MISS_M, compute_errors
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.samples import samples_of
 from flcav.perception.trajectory.tracks import constant_velocity
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 
 NUMBERS = {
     "single path FDE m": "single_FDE",
@@ -28,14 +28,14 @@ class TrajectoryOutcomes:
     redraws = REDRAWS
 
     def outcomes(
-        self, network: TrajectoryNetwork, data: Dataset, frames: Sequence[int], progress: Report = silent
+        self, network: TrajectoryNetwork, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
     ) -> Outcomes:
-        """Return the displacement errors of each sample [m], see `errors_of`."""
+        """Return the displacement errors of each sample [m], see `compute_errors`."""
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
         columns = samples.columns
         future, past = columns["future"].astype(np.float64), columns["past"]
-        errors = errors_of(paths, probabilities, future, constant_velocity(past))
+        errors = compute_errors(paths, probabilities, future, constant_velocity(past))
         return Outcomes(np.asarray(columns["scene"], dtype=np.str_), dict(errors))
 
     def measure(self, outcomes: Outcomes, times: Times) -> Values:

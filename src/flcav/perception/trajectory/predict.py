@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from flcav.perception.trajectory.cross_view import Inputs
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.samples import Sample
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 
 
 def inputs_of(samples: Sequence[Sample], network: nn.Module) -> Inputs:
@@ -49,7 +49,9 @@ Array = NDArray[np.float64]
 RASTERS, VIEWS = 256, 16  # batch sizes of inference with rasters and with cameras
 
 
-def predict(network: TrajectoryNetwork, samples: Sequence[Sample], progress: Report = silent) -> tuple[Array, Array]:
+def predict(
+    network: TrajectoryNetwork, samples: Sequence[Sample], progress: Report = ignore_progress
+) -> tuple[Array, Array]:
     """Return the forecasts of N samples: paths (N, K, FUTURE, 2) [m] in the samples' frames and probabilities (N, K).
 
     The network's training mode is left as it was.
@@ -69,7 +71,7 @@ def predict(network: TrajectoryNetwork, samples: Sequence[Sample], progress: Rep
     return np.concatenate(paths), np.concatenate(probabilities)
 
 
-def single(paths: Array, probabilities: Array) -> NDArray[np.int64]:
+def find_medoid(paths: Array, probabilities: Array) -> NDArray[np.int64]:
     """Return the index (N,) of the mode that is given as the single path: the medoid of the forecast.
 
     The medoid is the mode with the least expected average distance to the other modes under the predicted

@@ -28,7 +28,7 @@ _LONG, _WIDE = np.meshgrid(np.linspace(-0.5, 0.5, 17), np.linspace(-0.5, 0.5, 5)
 BODY = np.stack((_LONG, _WIDE), axis=-1).reshape(-1, 2)  # points inside a box, as shares of its length and width
 
 
-def rasters(
+def draw_rasters(
     trace: Trace, tracks: Tracks, lit: NDArray[np.str_], predicted: NDArray[np.int64], roads: RoadMap, patch: Patch
 ) -> NDArray[np.bool_]:
     """Return the rasters (N, len(LAYERS), cells, cells) around the actors `predicted` (N,), as indices into `trace`.
@@ -37,7 +37,7 @@ def rasters(
     farthest ahead and column 0 farthest left, as in `flcav.world.map.lanes`.
     """
     frame = np.concatenate((tracks.position[PAST, predicted], tracks.yaw[PAST, predicted, None]), axis=1)
-    sheets = Sheets(frame, patch)
+    sheets = RasterCanvas(frame, patch)
     if len(predicted):
         _mark_map(sheets, roads)
         _mark_lights(sheets, roads, trace, lit)
@@ -49,7 +49,7 @@ def rasters(
     return sheets.cells.reshape(len(predicted), len(LAYERS), patch.cells, patch.cells)
 
 
-class Sheets:
+class RasterCanvas:
     """The rasters of N road users while they are drawn; `cells` (N, len(LAYERS), cells * cells) is changed in place."""
 
     def __init__(self, frame: Array, patch: Patch) -> None:
@@ -64,7 +64,7 @@ class Sheets:
         self.cells[sheet[inside], LAYERS.index(layer), at[inside]] = True
 
 
-def _mark_map(sheets: Sheets, roads: RoadMap) -> None:
+def _mark_map(sheets: RasterCanvas, roads: RoadMap) -> None:
     frame = sheets.frame
     grid = np.broadcast_to(centres(sheets.patch), (len(frame), sheets.patch.cells**2, 2))
     sheets.cells[:, : len(STATIC)] = roads.static(out_of_frame(grid, frame)).transpose(0, 2, 1)
@@ -74,7 +74,7 @@ def _mark_map(sheets: Sheets, roads: RoadMap) -> None:
             sheets.mark("way", np.array([row]), np.concatenate([roads.reach[lane] for lane in lanes])[None])
 
 
-def _mark_lights(sheets: Sheets, roads: RoadMap, trace: Trace, lit: NDArray[np.str_]) -> None:
+def _mark_lights(sheets: RasterCanvas, roads: RoadMap, trace: Trace, lit: NDArray[np.str_]) -> None:
     everyone = np.arange(len(sheets.frame))
     for layer, wanted in (("green", True), ("red", False)):
         bars = _bars(roads, trace.light, lit, wanted)
@@ -82,7 +82,7 @@ def _mark_lights(sheets: Sheets, roads: RoadMap, trace: Trace, lit: NDArray[np.s
 
 
 def _mark_others(
-    sheets: Sheets,
+    sheets: RasterCanvas,
     layer: str,
     trace: Trace,
     tracks: Tracks,

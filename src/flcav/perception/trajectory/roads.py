@@ -72,7 +72,7 @@ class RoadMap:
 
 
 @lru_cache(maxsize=8)
-def roads_of(data: Dataset) -> RoadMap:
+def load_roads(data: Dataset) -> RoadMap:
     """Return the map of a dataset's town, cached; raises `InputError` if the town is unknown."""
     town = data.town()
     if town is None:

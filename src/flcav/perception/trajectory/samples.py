@@ -17,10 +17,10 @@ from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, pose
 from flcav.perception.agents import POLE, kind_of
-from flcav.perception.images import Picture, checked_picture, resized
+from flcav.perception.images import Picture, check_picture, resize_picture
 from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.rasters import rasters
-from flcav.perception.trajectory.roads import BEFORE_M, RoadMap, roads_of
+from flcav.perception.trajectory.rasters import draw_rasters
+from flcav.perception.trajectory.roads import BEFORE_M, RoadMap, load_roads
 from flcav.perception.trajectory.tracks import check_instants, into_frame, tracks_around
 from flcav.world.trace import Trace
 
@@ -61,8 +61,8 @@ def _read(settings: CrossView, data: Dataset, number: int) -> Pictured:
     frame = data.frame(number)
     pictures, intrinsics, views = [], [], []
     for camera in data.cameras(number):
-        rgb = checked_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}/{camera}")
-        pictures.append(resized(rgb, settings.width_px, settings.height_px))
+        rgb = check_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}/{camera}")
+        pictures.append(resize_picture(rgb, settings.width_px, settings.height_px))
         intrinsics.append(rescaled(frame.assumed.intrinsics[camera], rgb, settings))
         views.append(inverse(frame.assumed_world_from_sensor(camera)))
     return np.stack(pictures), np.stack(intrinsics), np.stack(views)
@@ -151,23 +151,23 @@ def _parts(
     for number in frames:
         key = data.keys[number]
         if key.scene not in traces:
-            traces = {key.scene: traffic(data, key.scene)}
+            traces = {key.scene: load_traffic(data, key.scene)}
         trace = traces[key.scene]
         if cameras:
             if not data.cameras(number):
                 raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
-            wanted = seen_from(trace, key)
+            wanted = find_near(trace, key)
         elif (key.scene, key.index) in seen:
             continue
         else:
             wanted = np.ones(len(trace.actor), np.bool_)
         seen.add((key.scene, key.index))
-        rows = present_at(trace, key.time_s, roads_of(data), patch, wanted)
+        rows = extract_columns(trace, key.time_s, load_roads(data), patch, wanted)
         count = len(rows["past"])
         yield rows | {"scene": np.full(count, key.scene), "frame": np.full(count, number)}
 
 
-def watching_frames(data: Dataset, cameras: bool) -> Sequence[int]:
+def select_fitting_frames(data: Dataset, cameras: bool) -> Sequence[int]:
     """Return the numbers of the frames that can have samples: all; with `cameras` those of vehicles, if any.
 
     With cameras only road users around an observing vehicle are predicted, none around a pole.
@@ -176,7 +176,7 @@ def watching_frames(data: Dataset, cameras: bool) -> Sequence[int]:
     return driving if cameras and driving else range(len(data))
 
 
-def traffic(data: Dataset, scene: str) -> Trace:
+def load_traffic(data: Dataset, scene: str) -> Trace:
     """Return the traffic of a scene; raises `InputError` if it was not recorded, or at too coarse instants."""
     trace = data.trace(scene)
     if trace is None:
@@ -185,7 +185,7 @@ def traffic(data: Dataset, scene: str) -> Trace:
     return trace
 
 
-def seen_from(trace: Trace, key: FrameKey) -> NDArray[np.bool_]:
+def find_near(trace: Trace, key: FrameKey) -> NDArray[np.bool_]:
     """Return (A,) which actors are within `SEEN_M` of the observing vehicle, itself included; none for a pole."""
     instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
     own = trace.actor == key.agent
@@ -195,7 +195,7 @@ def seen_from(trace: Trace, key: FrameKey) -> NDArray[np.bool_]:
     return np.linalg.norm(apart, axis=1) <= SEEN_M  # False for absent actors
 
 
-def present_at(
+def extract_columns(
     trace: Trace, time_s: float, roads: RoadMap, patch: Patch, wanted: NDArray[np.bool_], complete: bool = True
 ) -> dict[str, NDArray]:
     """Return the columns of `Sample` except scene and frame, of the `wanted` (A,) vehicles on the road at `time_s`.
@@ -214,7 +214,7 @@ def present_at(
     speed = tracks.speed[: PAST + 1, actor].T
     past = np.concatenate((path[:, : PAST + 1], turn[..., None], speed[..., None]), axis=2)
     lit = trace.light_state[max(0, int(np.searchsorted(trace.time_s, time_s + 1e-6, side="right")) - 1)]
-    seen = rasters(trace, tracks, lit, actor, roads, patch)
+    seen = draw_rasters(trace, tracks, lit, actor, roads, patch)
     _, to_junction_m = roads.lanes_at(pose[:, :2], pose[:, 2])
     return {
         "past": past.astype(np.float32),

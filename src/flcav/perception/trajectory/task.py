@@ -15,14 +15,14 @@ from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.perception.trajectory.config import CONFIGURATIONS, TrajectoryConfig
 from flcav.perception.trajectory.errors import register_errors
-from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, metrics
-from flcav.perception.trajectory.infer import findings
+from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
+from flcav.perception.trajectory.infer import forecast_frames
 from flcav.perception.trajectory.loss import forecast_loss, map_loss
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.outcomes import TrajectoryOutcomes
 from flcav.perception.trajectory.predict import futures_of, inputs_of, predict, rasters_of
-from flcav.perception.trajectory.samples import Sample, samples_of, watching_frames
-from flcav.progress import Report, silent
+from flcav.perception.trajectory.samples import Sample, samples_of, select_fitting_frames
+from flcav.progress import Report, ignore_progress
 
 Array = NDArray[np.float64]
 
@@ -55,8 +55,8 @@ class TrajectoryTask(TrajectoryOutcomes):
         return samples_of(data, config, frames)
 
     def fitting(self, data: Dataset, config: TrajectoryConfig) -> Sequence[int]:
-        """Return the numbers of the frames that can have samples, see `watching_frames`."""
-        return watching_frames(data, config.cameras is not None)
+        """Return the numbers of the frames that can have samples, see `select_fitting_frames`."""
+        return select_fitting_frames(data, config.cameras is not None)
 
     def draw(self, samples: Sequence[Sample], index: int, config: TrajectoryConfig, rng: np.random.Generator) -> Sample:
         """Return the sample without augmentation: its frame already removes rotation and translation."""
@@ -78,12 +78,12 @@ class TrajectoryTask(TrajectoryOutcomes):
         data: Dataset,
         frames: Sequence[int] | None = None,
         *,
-        progress: Report = silent,
+        progress: Report = ignore_progress,
     ) -> TrajectoryEvaluation:
         """Return displacement errors of single path, K modes and constant velocity by slice, see `metrics`."""
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
-        return metrics(paths, probabilities, samples.columns)
+        return evaluate_paths(paths, probabilities, samples.columns)
 
     def sample_bytes(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> list[int]:
         """Return the size [B] of each frame's samples: past and future in float32; the map is not sent.
@@ -100,7 +100,7 @@ class TrajectoryTask(TrajectoryOutcomes):
         self, network: TrajectoryNetwork, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
         """Yield the forecasts of each frame of a dataset, see `findings`; all modes, whatever the threshold."""
-        yield from findings(network, path, frames)
+        yield from forecast_frames(network, path, frames)
 
     def register_errors(
         self,
@@ -108,7 +108,7 @@ class TrajectoryTask(TrajectoryOutcomes):
         data: Dataset,
         frames: Sequence[int] | None = None,
         threshold: float = 0.0,
-        progress: Report = silent,
+        progress: Report = ignore_progress,
     ) -> Registry:
         """Return the misses, see `flcav.perception.trajectory.errors.register_errors`; `threshold` has no effect."""
         return register_errors(network, data, samples_of(data, network.config, frames), progress)

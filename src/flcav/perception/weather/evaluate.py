@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.intervals import CONFIDENCE, over_scenes
+from flcav.intervals import CONFIDENCE, bootstrap_over_scenes
 from flcav.perception.metrics import interval_words
 from flcav.perception.task import Evaluated
 from flcav.records import LEFT_OUT
@@ -27,7 +27,7 @@ class Classification(Evaluated):
     confusion: tuple[tuple[int, ...], ...]  # numbers of images: rows are the true class, columns the predicted one
     pictures: int  # number of images
     scenes: int  # number of scenes
-    nearest: Annotated["Classification | None", LEFT_OUT] = None  # on all images, see `over_the_whole_space`
+    nearest: Annotated["Classification | None", LEFT_OUT] = None  # on all images, see `evaluate_whole_space`
 
     @property
     def score(self) -> float:
@@ -54,7 +54,7 @@ class Classification(Evaluated):
         return lines
 
 
-def classification(
+def evaluate_classes(
     truth: NDArray[np.int64], found: NDArray[np.int64], scenes: Sequence[str], classes: Sequence[str], seed: int = 0
 ) -> Classification:
     """Return accuracy with its 95 % bootstrap interval over scenes, recall per class, and the confusion matrix.
@@ -83,4 +83,4 @@ def classification(
 def _interval(right: NDArray[np.bool_], scenes: Sequence[str], seed: int) -> tuple[float, float] | tuple[None, None]:
     if len(set(scenes)) < 2:
         return None, None
-    return over_scenes(lambda times: times @ right / times.sum(axis=1), scenes, rng=stream(seed, "bootstrap"))
+    return bootstrap_over_scenes(lambda times: times @ right / times.sum(axis=1), scenes, rng=stream(seed, "bootstrap"))

@@ -8,9 +8,9 @@ from flcav.dataset.store import Dataset
 from flcav.intervals import REDRAWS
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
 from flcav.perception.weather.model import Classifier
-from flcav.perception.weather.predict import probabilities
-from flcav.perception.weather.samples import labelled
-from flcav.progress import Report, silent
+from flcav.perception.weather.predict import predict_probabilities
+from flcav.perception.weather.samples import label_pictures
+from flcav.progress import Report, ignore_progress
 
 
 class WeatherOutcomes:
@@ -20,11 +20,11 @@ class WeatherOutcomes:
     redraws = REDRAWS
 
     def outcomes(
-        self, network: Classifier, data: Dataset, frames: Sequence[int], progress: Report = silent
+        self, network: Classifier, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
     ) -> Outcomes:
         """Return the true class ("truth") and the predicted class ("named") of each image, as indices."""
-        samples = labelled(data, network.config.classes, frames)
-        named = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
+        samples = label_pictures(data, network.config.classes, frames)
+        named = predict_probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
         truth = np.array([sample.label for sample in samples])
         return Outcomes(np.array([sample.scene for sample in samples]), {"truth": truth, "named": named})
 

@@ -8,13 +8,15 @@ from torch import Tensor
 
 from flcav.perception.images import Picture
 from flcav.perception.weather.model import Classifier
-from flcav.perception.weather.samples import batched
-from flcav.progress import Report, silent
+from flcav.perception.weather.samples import stack_pictures
+from flcav.progress import Report, ignore_progress
 
 BATCH = 256  # images of a batch of inference
 
 
-def probabilities(network: Classifier, small_pictures: Sequence[Picture], progress: Report = silent) -> np.ndarray:
+def predict_probabilities(
+    network: Classifier, small_pictures: Sequence[Picture], progress: Report = ignore_progress
+) -> np.ndarray:
     """Return the class probabilities (N, classes) of images of 32 x 32 pixels.
 
     The network's training mode is left as it was.
@@ -33,4 +35,4 @@ def probabilities(network: Classifier, small_pictures: Sequence[Picture], progre
 
 def tensor_of(network: Classifier, small_pictures: list[Picture]) -> Tensor:
     """Return images as the network's input tensor (N, 3, 32, 32) in [-1, 1], on its device."""
-    return torch.from_numpy(batched(small_pictures)).to(next(network.parameters()).device)
+    return torch.from_numpy(stack_pictures(small_pictures)).to(next(network.parameters()).device)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.perception.images import Picture, recorded, resized
+from flcav.perception.images import Picture, read_recorded, resize_picture
 from flcav.perception.weather.model import SIDE
-from flcav.world.weather import Weather, weather_class
+from flcav.world.weather import Weather, classify_weather
 
 SHIFT_PX = 3  # largest shift of augmentation
 GAIN, GAMMA, SATURATION = 0.05, 0.2, 0.25  # largest absolute logarithms of augmentation's random factors
@@ -26,12 +26,12 @@ class Sample:
     scene: str = ""  # name of its scene
 
 
-def labelled(
+def label_pictures(
     data: Dataset,
     classes: Sequence[str],
     frames: Sequence[int] | None = None,
     *,
-    named: Callable[[Weather], str | None] = weather_class,
+    named: Callable[[Weather], str | None] = classify_weather,
 ) -> list[Sample]:
     """Return the images of all cameras in frames of a dataset (None: all), reduced to 32 x 32 pixels, with their class.
 
@@ -52,12 +52,12 @@ def labelled(
 
 @lru_cache(maxsize=4)  # since a validation reads the same images after every epoch
 def _reduced(data: Dataset, frames: tuple[int, ...] | None) -> list[tuple[Picture, Weather | None, str]]:
-    return [(small(rgb), frame.weather, frame.scene) for frame, _, rgb in recorded(data, frames)]
+    return [(reduce_picture(rgb), frame.weather, frame.scene) for frame, _, rgb in read_recorded(data, frames)]
 
 
-def small(picture: Picture) -> Picture:
+def reduce_picture(picture: Picture) -> Picture:
     """Return the whole image resized to 32 x 32 pixels, whatever its aspect ratio."""
-    return resized(picture, SIDE, SIDE)
+    return resize_picture(picture, SIDE, SIDE)
 
 
 def augment(sample: Sample, rng: np.random.Generator) -> Sample:
@@ -75,6 +75,6 @@ def augment(sample: Sample, rng: np.random.Generator) -> Sample:
     return Sample(shown.astype(np.uint8), sample.label, sample.scene)
 
 
-def batched(pictures: list[Picture]) -> NDArray[np.float32]:
+def stack_pictures(pictures: list[Picture]) -> NDArray[np.float32]:
     """Return images (32, 32, 3) uint8 as one array (B, 3, 32, 32) in [-1, 1]."""
     return np.stack(pictures).transpose(0, 3, 1, 2).astype(np.float32) / 127.5 - 1

@@ -12,19 +12,19 @@ from torch.nn import functional
 
 from flcav.dataset.store import Dataset
 from flcav.perception.client import ANNOTATED, camera_ahead, picture_bytes
-from flcav.perception.images import pictures
+from flcav.perception.images import read_pictures
 from flcav.perception.marks import Bars
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice, Result
 from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
-from flcav.perception.weather.evaluate import Classification, classification
+from flcav.perception.weather.evaluate import Classification, evaluate_classes
 from flcav.perception.weather.model import Classifier, LeNet
 from flcav.perception.weather.outcomes import WeatherOutcomes
-from flcav.perception.weather.predict import probabilities, tensor_of
-from flcav.perception.weather.samples import Sample, augment, labelled, small
-from flcav.progress import Report, silent
+from flcav.perception.weather.predict import predict_probabilities, tensor_of
+from flcav.perception.weather.samples import Sample, augment, label_pictures, reduce_picture
+from flcav.progress import Report, ignore_progress
 from flcav.records import Class
-from flcav.world.weather import WEATHER_CLASSES, nearest_class
+from flcav.world.weather import WEATHER_CLASSES, find_nearest_class
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class WeatherTask(WeatherOutcomes):
 
     def samples(self, data: Dataset, config: LeNetConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
         """Return the images whose weather is in the region of one of the classes, see `labelled`."""
-        return labelled(data, config.classes, frames)
+        return label_pictures(data, config.classes, frames)
 
     def draw(self, samples: Sequence[Sample], index: int, config: LeNetConfig, rng: np.random.Generator) -> Sample:
         """Return an augmented sample, see `flcav.perception.weather.samples.augment`."""
@@ -76,10 +76,15 @@ class WeatherTask(WeatherOutcomes):
         return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
 
     def evaluate(
-        self, network: Classifier, data: Dataset, frames: Sequence[int] | None = None, *, progress: Report = silent
+        self,
+        network: Classifier,
+        data: Dataset,
+        frames: Sequence[int] | None = None,
+        *,
+        progress: Report = ignore_progress,
     ) -> Classification:
         """Return accuracy, recall per class and the confusion matrix, see `classification`."""
-        return classified(network, self.samples(data, network.config, frames), progress)
+        return evaluate_samples(network, self.samples(data, network.config, frames), progress)
 
     def sample_bytes(self, data: Dataset, config: LeNetConfig, frames: Sequence[int]) -> list[int]:
         """Return the size [B] of each frame's images, plus one byte for the class."""
@@ -90,8 +95,8 @@ class WeatherTask(WeatherOutcomes):
     ) -> Iterator[Finding]:
         """Yield the class probabilities and the likeliest class of each image at `path`; `threshold` has no effect."""
         classes = network.config.classes
-        for origin, rgb in pictures(path, frames):
-            shares = probabilities(network, [small(rgb)])[0]
+        for origin, rgb in read_pictures(path, frames):
+            shares = predict_probabilities(network, [reduce_picture(rgb)])[0]
             rows = {name: float(share) for name, share in zip(classes, shares, strict=True)}
             yield Finding(origin, rgb, Named(classes[int(shares.argmax())], rows), (Bars(rows),))
 
@@ -99,17 +104,19 @@ class WeatherTask(WeatherOutcomes):
 WEATHER = WeatherTask()
 
 
-def classified(network: Classifier, samples: Sequence[Sample], progress: Report = silent) -> Classification:
+def evaluate_samples(
+    network: Classifier, samples: Sequence[Sample], progress: Report = ignore_progress
+) -> Classification:
     """Return the classification metrics of a network on labelled images, see `classification`."""
-    found = probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
+    found = predict_probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
     truth = np.array([sample.label for sample in samples])
-    return classification(truth, found, [sample.scene for sample in samples], network.config.classes)
+    return evaluate_classes(truth, found, [sample.scene for sample in samples], network.config.classes)
 
 
-def over_the_whole_space(network: Classifier, data: Dataset) -> Classification:
+def evaluate_whole_space(network: Classifier, data: Dataset) -> Classification:
     """Return the classification metrics on all images: weathers outside the regions get the nearest class.
 
     Raises `InputError` as `labelled` does.
     """
-    samples = labelled(data, network.config.classes, named=nearest_class)
-    return classified(network, samples)
+    samples = label_pictures(data, network.config.classes, named=find_nearest_class)
+    return evaluate_samples(network, samples)

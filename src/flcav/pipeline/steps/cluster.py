@@ -22,9 +22,9 @@ from typing import IO, Any
 
 from flcav.dataset.recording.ray_engine import ray_session
 from flcav.pipeline.provenance import provenance
-from flcav.pipeline.steps.engines import KILLED, Engine, Hands, perform
+from flcav.pipeline.steps.engines import KILLED, Engine, Workers, perform
 from flcav.pipeline.steps.source_hash import package_hash
-from flcav.pipeline.steps.step import Record, Step, aside, remove, value_of
+from flcav.pipeline.steps.step import Record, Step, read_value, remove, reserve_sibling
 from flcav.threads import use_threads
 
 PIECE_BYTES = 8_000_000
@@ -52,7 +52,7 @@ class _Cluster:
         self._actors: list[Any] = []
 
     @contextlib.contextmanager
-    def hands(self, folder: Path, jobs: int) -> Iterator[Hands]:
+    def hands(self, folder: Path, jobs: int) -> Iterator[Workers]:
         """Yield `jobs` actors; a step raises `OSError` where its actor was killed, or runs another flcav."""
         remote = self._ray.remote(num_cpus=1, max_concurrency=3)(_Worker)  # perform, hear and leave at the same time
         actors = [remote.remote() for _ in range(jobs)]
@@ -67,7 +67,7 @@ class _Cluster:
 
         with ThreadPoolExecutor(jobs) as threads:
             try:
-                yield Hands(submit, reports)
+                yield Workers(submit, reports)
             finally:
                 self._leave(actors)
 
@@ -90,7 +90,7 @@ class _Cluster:
             working = actor.perform.remote(self._ray.cloudpickle.dumps((step, record)))
             self._hear(actor, folder / step.name, lambda *told: reports.put((step.name, *told)))
             self._ray.get(working)
-            return value_of(folder / step.name)
+            return read_value(folder / step.name)
         except RayTaskError as error:
             raise error.cause from None
         except RayActorError:
@@ -221,7 +221,7 @@ def replace_folder(folder: Path, names: Collection[str] | None, archive: IO[byte
 
     It is replaced as a whole: an interruption leaves the old folder, or none.
     """
-    new = aside(folder, "new")
+    new = reserve_sibling(folder, "new")
     new.mkdir(parents=True)
     with zipfile.ZipFile(archive) as files:
         files.extractall(new)

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from flcav.dataset.recording.workers import end_with_parent
+from flcav.dataset.recording.workers import exit_with_parent
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.steps.step import Record, Step, Work, value_of, write_done, write_started
+from flcav.pipeline.steps.step import Record, Step, Work, read_value, write_done, write_started
 from flcav.progress import Report
 from flcav.threads import use_threads
 
@@ -19,7 +19,7 @@ KILLED = "a step's process was killed from outside, most often for want of memor
 
 
 @dataclass(frozen=True)
-class Hands:
+class Workers:
     """The workers for the steps of one folder."""
 
     submit: Callable[[Step, Record], Future[Any]]  # -> future value of the step
@@ -29,7 +29,7 @@ class Hands:
 class Engine(Protocol):
     """What executes steps: processes, or a cluster."""
 
-    def hands(self, folder: Path, jobs: int) -> contextlib.AbstractContextManager[Hands]:
+    def hands(self, folder: Path, jobs: int) -> contextlib.AbstractContextManager[Workers]:
         """Return a context of `jobs` workers for the steps in `folder`; leaving it by an exception stops them."""
         ...
 
@@ -42,14 +42,14 @@ class Processes:
     """Worker processes of one thread each on this machine; they end with this process, however it ends."""
 
     @contextlib.contextmanager
-    def hands(self, folder: Path, jobs: int) -> Iterator[Hands]:
+    def hands(self, folder: Path, jobs: int) -> Iterator[Workers]:
         """Yield `jobs` processes; raises `OSError` where one was killed."""
         context = multiprocessing.get_context("spawn")
         queue = context.Queue()
         made_by = replace(provenance(), threads=1)
         with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start, initargs=(queue,)) as pool:
             try:
-                yield Hands(lambda step, record: pool.submit(_perform, step, folder, record, made_by), queue)
+                yield Workers(lambda step, record: pool.submit(_perform, step, folder, record, made_by), queue)
             except BrokenProcessPool:
                 raise OSError(KILLED) from None
             except BaseException:
@@ -70,11 +70,11 @@ def perform(step: Step, folder: Path, record: Record, made_by: Provenance, repor
     report(0, 1, "")
     write_started(own, record)
     value = step.run(Work(own, {name: folder / name for name in step.needs}, report), **step.arguments)
-    write_done(own, record, value, asdict(replace(made_by, seed=seed_in(step.arguments))))
-    return value_of(own)
+    write_done(own, record, value, asdict(replace(made_by, seed=find_seed(step.arguments))))
+    return read_value(own)
 
 
-def seed_in(arguments: Mapping[str, Any]) -> int | None:
+def find_seed(arguments: Mapping[str, Any]) -> int | None:
     """Return the seed among a step's arguments or the fields of one of them, such as a recipe; None without one."""
     for values in (arguments, *arguments.values()):
         seed = values.get("seed") if isinstance(values, Mapping) else getattr(values, "seed", None)
@@ -89,7 +89,7 @@ _queue: Any = None
 def _start(queue: Any) -> None:
     global _queue
     _queue = queue
-    end_with_parent()
+    exit_with_parent()
     use_threads(1)
 
 

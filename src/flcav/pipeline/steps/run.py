@@ -20,7 +20,7 @@ from typing import Any
 from flcav.config import InputError, read_json
 from flcav.files import write_json
 from flcav.pipeline.steps.engines import Engine, Processes
-from flcav.pipeline.steps.source_hash import Sources, starts
+from flcav.pipeline.steps.source_hash import Sources, find_definitions
 from flcav.pipeline.steps.step import (
     DONE,
     DONE_BEFORE,
@@ -30,11 +30,11 @@ from flcav.pipeline.steps.step import (
     Notify,
     Record,
     Step,
-    aside,
-    held_in,
-    refusal,
+    make_stale_error,
+    read_record,
+    read_value,
     remove,
-    value_of,
+    reserve_sibling,
 )
 
 
@@ -73,9 +73,9 @@ def run_steps(
     ("redo") or kept ("keep", their records unchanged). Raises `InputError` where `folder` holds steps of other
     arguments or, where that is refused, of other code; `OSError` where a worker was killed.
     """
-    plan = _planned(steps, folder, notify, stale, Sources())
+    plan = _plan_steps(steps, folder, notify, stale, Sources())
     if plan.waiting:
-        with _opened(engine, jobs) as workers:
+        with _open_engine(engine, jobs) as workers:
             _run(plan, workers, jobs, notify)
     return plan.values
 
@@ -99,10 +99,10 @@ def run_side_by_side(
         name = folder.name if names is None else names[folder]
         return lambda step, done, total, note: notify(f"{name}/{step}", done, total, note)
 
-    plans = [_planned(steps, folder, named(folder), stale, sources) for folder, steps in runs.items()]
+    plans = [_plan_steps(steps, folder, named(folder), stale, sources) for folder, steps in runs.items()]
     waiting = [plan for plan in plans if plan.waiting]
     if waiting:
-        with _opened(engine, jobs) as workers, ThreadPoolExecutor(jobs) as threads:
+        with _open_engine(engine, jobs) as workers, ThreadPoolExecutor(jobs) as threads:
             each = max(1, jobs // len(runs))
             started = [threads.submit(_run, plan, workers, each, named(plan.folder)) for plan in waiting]
             try:
@@ -125,20 +125,20 @@ class _Plan:
     values: dict[str, Any]  # of finished steps
 
 
-def _opened(engine: str, jobs: int) -> contextlib.AbstractContextManager[Engine]:
+def _open_engine(engine: str, jobs: int) -> contextlib.AbstractContextManager[Engine]:
     """Return a context of an engine; raises `InputError` for an unknown one."""
     if engine not in ENGINES:
         raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
     return ENGINES[engine](jobs)
 
 
-def _planned(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Plan:
+def _plan_steps(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Plan:
     """Return the work that is left of `steps`, notifying of those done before; raises `InputError` as `run_steps`."""
-    records, kept = _settled(steps, folder, stale, sources)
+    records, kept = _settle_records(steps, folder, stale, sources)
     values: dict[str, Any] = {}
     for step in steps:
         if (folder / step.name / DONE).exists():
-            values[step.name] = value_of(folder / step.name)
+            values[step.name] = read_value(folder / step.name)
             notify(step.name, 1, 1, KEPT if step.name in kept else DONE_BEFORE)
     return _Plan(folder, records, [step for step in steps if step.name not in values], values)
 
@@ -170,7 +170,9 @@ def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
     return sorted(steps, key=lambda step: -len(rests[step.name]))
 
 
-def _settled(steps: Sequence[Step], folder: Path, stale: str, sources: Sources) -> tuple[dict[str, Record], set[str]]:
+def _settle_records(
+    steps: Sequence[Step], folder: Path, stale: str, sources: Sources
+) -> tuple[dict[str, Record], set[str]]:
     """Return the record by which each step is, or is to be, done, and the stale steps; "redo" removes these."""
     if stale not in STALE:
         raise InputError(f"stale '{stale}': choose one of {', '.join(STALE)}")
@@ -178,9 +180,9 @@ def _settled(steps: Sequence[Step], folder: Path, stale: str, sources: Sources) 
     outdated: dict[str, tuple[Record, Record]] = {}
     for step in steps:
         asked = step.fingerprint({name: records[name].fingerprint for name in step.needs})
-        code = sources.hashes(starts((step.run, step.arguments)))
+        code = sources.hashes(find_definitions((step.run, step.arguments)))
         record = Record.of(asked, code, [records[name] for name in step.needs])
-        held = held_in(folder / step.name)
+        held = read_record(folder / step.name)
         if held is not None and held.fingerprint != asked:
             raise InputError(f"{folder}: holds the steps of another configuration; choose another folder")
         if held is not None and held.lineage != record.lineage:
@@ -188,9 +190,9 @@ def _settled(steps: Sequence[Step], folder: Path, stale: str, sources: Sources) 
             record = held if stale == "keep" else record
         records[step.name] = record
     if outdated and stale == "refuse":
-        raise refusal(folder, outdated)
+        raise make_stale_error(folder, outdated)
     for step in steps:
-        aside(folder / step.name, "old")
+        reserve_sibling(folder / step.name, "old")
         if stale == "redo" and step.name in outdated:
             remove(folder / step.name)
     return records, set(outdated)

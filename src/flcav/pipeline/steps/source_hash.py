@@ -40,7 +40,7 @@ class Sources:
         self._hashes: dict[frozenset[Place], dict[str, str]] = {}
 
     def hashes(self, starts: Iterable[Place]) -> dict[str, str]:
-        """Return, by module, a hash of the definitions in it that are reachable from `starts`."""
+        """Return, by module, a hash of the definitions in it that are reachable from `find_definitions`."""
         key = frozenset(starts)
         if key not in self._hashes:
             self._hashes[key] = {
@@ -51,7 +51,7 @@ class Sources:
         return self._hashes[key]
 
     def _reached(self, starts: Iterable[Place]) -> dict[str, list[str]]:
-        """Return, by module, the text of the statements reachable from `starts`, in the order of the source."""
+        """Return, by module, the text of the statements reachable from `find_definitions`, in the order of the source."""
         found: dict[str, set[_Statement]] = {}
         others: dict[str, set[str]] = {}
         left, seen = list(starts), set(starts)
@@ -116,15 +116,15 @@ class Sources:
         return None if foreign or not loaded.endswith(".py") else Path(loaded)
 
 
-def starts(value: Any) -> Iterator[Place]:
+def find_definitions(value: Any) -> Iterator[Place]:
     """Yield the definitions of all functions and classes in `value`, its fields, items and bound arguments included.
 
     Fields of a dataclass with `compare=False` are left out.
     """
     if isinstance(value, MethodType):
-        yield from starts(value.__self__)
+        yield from find_definitions(value.__self__)
     elif isinstance(value, functools.partial):
-        yield from starts((value.func, value.args, value.keywords))
+        yield from find_definitions((value.func, value.args, value.keywords))
     elif isinstance(value, FunctionType | type):
         name = value.__qualname__.partition(".")[0]
         yield value.__module__, WHOLE if name == "<lambda>" else name
@@ -132,14 +132,14 @@ def starts(value: Any) -> Iterator[Place]:
         if found := NAMED.fullmatch(value):
             yield found[1], found[2]
     elif isinstance(value, Mapping):
-        yield from starts(tuple(value.values()))
+        yield from find_definitions(tuple(value.values()))
     elif isinstance(value, list | tuple | set | frozenset):
         for item in value:
-            yield from starts(item)
+            yield from find_definitions(item)
     else:
-        yield from starts(type(value))
+        yield from find_definitions(type(value))
         if is_dataclass(value):
-            yield from starts([getattr(value, each.name) for each in fields(value) if each.compare])
+            yield from find_definitions([getattr(value, each.name) for each in fields(value) if each.compare])
 
 
 def package_hash() -> str:

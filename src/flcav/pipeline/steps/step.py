@@ -30,7 +30,7 @@ class Work:
 
     def result(self, step: str) -> Any:
         """Return the value of the finished step `step`, one that this step needs."""
-        return value_of(self.inputs[step])
+        return read_value(self.inputs[step])
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def digest(value: Any, **how: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True, **how).encode()).hexdigest()[:16]
 
 
-def held_in(folder: Path) -> Record | None:
+def read_record(folder: Path) -> Record | None:
     """Read the record by which the step in `folder` was done or, if it is not, begun; None where it was neither.
 
     Without recorded code, `code` is empty and `lineage` is "". Raises `InputError` for a file that is no record.
@@ -97,7 +97,7 @@ def held_in(folder: Path) -> Record | None:
     return None
 
 
-def value_of(folder: Path) -> Any:
+def read_value(folder: Path) -> Any:
     """Read the value of the finished step in `folder`."""
     return json.loads((folder / DONE).read_text())["value"]
 
@@ -119,7 +119,7 @@ def changed_modules(held: Record, wanted: Record) -> list[str]:
     return [name for name in sorted({*held.code, *wanted.code}) if held.code.get(name) != wanted.code.get(name)]
 
 
-def refusal(folder: Path, outdated: Mapping[str, tuple[Record, Record]]) -> InputError:
+def make_stale_error(folder: Path, outdated: Mapping[str, tuple[Record, Record]]) -> InputError:
     """Return the error for a folder whose steps are of other code; `outdated`: records (held, wanted) by step."""
     modules = {name: changed_modules(*records) for name, records in outdated.items()}
     unknown = [name for name, (held, _) in outdated.items() if not held.code]
@@ -148,13 +148,13 @@ def remove(folder: Path) -> None:
     if folder.is_symlink():
         folder.unlink()
         return
-    old = aside(folder, "old")
+    old = reserve_sibling(folder, "old")
     if folder.exists():
         folder.rename(old)
     shutil.rmtree(old, ignore_errors=True)
 
 
-def aside(folder: Path, what: str) -> Path:
+def reserve_sibling(folder: Path, what: str) -> Path:
     """Return a hidden path beside a step's folder, free for use: what an interrupted run left there is removed."""
     path = folder.with_name(f".{folder.name}.{what}")
     shutil.rmtree(path, ignore_errors=True)

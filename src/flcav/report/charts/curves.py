@@ -46,7 +46,7 @@ def draw_layers(axes: Axes, graph: nx.Graph) -> None:
                 (number - 0.5) * GAP, top, f"layer {number}", ha="center", fontsize=style.SMALL, color=style.MUTED
             )
     axes.set(xlim=(-1.1, 3 * GAP + 1.1), ylim=(min(y for _, y in places.values()) - 0.6, top + 0.5))
-    style.bare(axes)
+    style.hide_axes(axes)
 
 
 def _draw_node(axes: Axes, graph: nx.Graph, node: Node, x: float, y: float) -> None:

@@ -7,11 +7,11 @@ from typing import Any
 import networkx as nx
 
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
-from flcav.optimization.allocation.allocate import Allocation, TaskPlan, resolved
+from flcav.optimization.allocation.allocate import Allocation, TaskPlan, resolve_problem
 from flcav.optimization.allocation.baselines import baseline
-from flcav.optimization.allocation.budget_sweep import FACTORS, LINKS, BudgetPoint, Saving, budget_sweep
-from flcav.optimization.allocation.problem import Problem, Task
-from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, meaning
+from flcav.optimization.allocation.budget_sweep import FACTORS, LINKS, BudgetPoint, Saving, sweep_budgets
+from flcav.optimization.allocation.problem import AllocationTask, Problem
+from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, explain_objective
 from flcav.optimization.vehicles import VehicleShare
 from flcav.report import style
 from flcav.report.charts import curves as layers_chart
@@ -56,7 +56,7 @@ def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Seque
     """
     scaled = {"both links": LINKS, "wireless alone": ("wireless",), "wireline alone": ("wireline",)}
     factors = FACTORS if plan.note is None else COARSE
-    sweep = {name: budget_sweep(problem, plan, links, factors) for name, links in scaled.items()}
+    sweep = {name: sweep_budgets(problem, plan, links, factors) for name, links in scaled.items()}
     links = {
         link: {
             "budget_mb": getattr(problem.budgets_mb, link),
@@ -68,7 +68,7 @@ def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Seque
     }
     tasks = [
         {**asdict(row), "weight": task.weight, "vehicles": sum(task.edge_groups)}
-        for task, row in zip(resolved(problem).tasks, plan.tasks, strict=True)
+        for task, row in zip(resolve_problem(problem).tasks, plan.tasks, strict=True)
     ]
     values = {
         "measure": {"name": MEASURES[problem.objective], "kind": problem.objective, **BETTER[problem.objective]},
@@ -100,7 +100,7 @@ def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Seque
 def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
     """Return the terms that the page defines, with their definitions."""
     measure, saved = MEASURES[problem.objective], "gained" if problem.objective == "area" else "saved"
-    terms = {"error": TERMS["error"], measure: meaning(problem, plan.objective), "budget": TERMS["budget"]}
+    terms = {"error": TERMS["error"], measure: explain_objective(problem, plan.objective), "budget": TERMS["budget"]}
     terms[saved] = TERMS["saved"]
     used = ["up to"] * problem.robust + ["proven"] * (plan.lower_bound is not None)
     return terms | {name: TERMS[name] for name in used}
@@ -120,7 +120,7 @@ def _parts(problem: Problem, plan: Allocation) -> list[plan_charts.Part]:
     return [{"link": link, "task": task, "stage": stage, "mb": mb} for (link, task, stage), mb in totals.items()]
 
 
-def _stage_prices(problem: Problem, task: Task, row: TaskPlan) -> dict[str, Price]:
+def _stage_prices(problem: Problem, task: AllocationTask, row: TaskPlan) -> dict[str, Price]:
     sizes, k = MessageSizes(task.sample_mb, task.model_mb), problem.edge_rounds_per_cloud_round
     none = StagePlan(0, 0, 0, task.edge_groups, k)
     return {name: price(replace(none, **{field: getattr(row, field)}), sizes) for field, name in STAGES.items()}

@@ -10,14 +10,14 @@ from flcav.dataset.store import Dataset
 from flcav.files import write_bytes
 from flcav.geometry import Boxes
 from flcav.perception.errors import PerceptionError, load_errors
-from flcav.perception.objects.truth import only_lidar
-from flcav.pipeline.arms import Names, settings_of
+from flcav.perception.objects.truth import choose_lidar
+from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.findings import WORDS
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import LOOK
-from flcav.pipeline.labels import labels_of
+from flcav.pipeline.labels import choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results import ERRORS, LinkUse, Looked, Placed, Run, Seen
+from flcav.pipeline.results import ERRORS, LinkUse, Placed, Run, SweepComparison, SweepDetections
 from flcav.pipeline.running import WORK
 from flcav.report import style
 from flcav.report.charts import figures
@@ -105,8 +105,8 @@ def _file_name(task: str) -> str:
 
 
 def _names(run: Run) -> Names:
-    labels = {task: labels_of(task, own.labels) for task, own in run.recipe.tasks.items()}
-    return Names(settings_of(run.recipe, labels))
+    labels = {task: choose_labels(task, own.labels) for task, own in run.recipe.tasks.items()}
+    return Names(resolve_settings(run.recipe, labels))
 
 
 def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
@@ -182,17 +182,17 @@ def _sent(run: Run) -> Sequence[Row]:
 
 
 def _sweep(work: Path, names: Names, run: Run) -> sweeps.Sweep:
-    looked = Looked.load(work / LOOK)
+    looked = SweepComparison.load(work / LOOK)
     region = run.recipe.with_role("federate")[0]
     data: Dataset = Frames.open(work / names.recording(region, "test", OBJECTS)).data
     frame = data.frame(looked.frame)
-    lidar = only_lidar(frame)
+    lidar = choose_lidar(frame)
     ground_m = -float(frame.world_from_sensor(lidar)[2, 3])
     before, after = _detections("pretrained", looked.before), _detections("after the last stage", looked.after)
     return sweeps.Sweep(frame.lidar[lidar], ground_m, _boxes(looked.targets), before, after)
 
 
-def _detections(title: str, seen: Seen) -> sweeps.Detections:
+def _detections(title: str, seen: SweepDetections) -> sweeps.Detections:
     return sweeps.Detections(
         title, _boxes(seen.boxes), np.array(seen.hit, dtype=bool), np.array(seen.found, dtype=bool)
     )

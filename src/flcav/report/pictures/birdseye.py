@@ -52,7 +52,7 @@ def birdseye(view: View) -> Figure:
 def draw_view(axes: Axes, view: View) -> None:
     """Draw the view into axes."""
     axes.set(xlim=(-view.range_m, view.range_m), ylim=(-view.range_m, view.range_m), aspect="equal")
-    style.bare(axes)
+    style.hide_axes(axes)
     _draw_rings(axes, view.range_m)
     _draw_points(axes, view.points)
     seen = view.returns > 0

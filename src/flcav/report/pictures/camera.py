@@ -31,7 +31,7 @@ def show_view(axes: Axes, view: CameraView) -> None:
     height, width = view.picture.shape[:2]
     axes.imshow(view.picture)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    style.bare(axes)
+    style.hide_axes(axes)
 
 
 def points_on_picture(axes: Axes, points: NDArray[np.float32], view: CameraView) -> ScalarMappable:
@@ -88,7 +88,7 @@ class Shot:
     signs: SignViews | None  # None for an infrared camera
 
 
-def shot(frame: Frame, camera: str) -> Shot:
+def make_shot(frame: Frame, camera: str) -> Shot:
     """Return the picture and the visible annotations of a frame's camera, by its true calibration.
 
     Boxes are moved from the LiDAR spin to the time of the picture. A thermal image becomes grey, warm is bright.
@@ -107,7 +107,7 @@ def shot(frame: Frame, camera: str) -> Shot:
     )
 
 
-def in_rows(frame: Frame, cameras: Sequence[str]) -> list[list[str]]:
+def arrange_cameras(frame: Frame, cameras: Sequence[str]) -> list[list[str]]:
     """Return the cameras in rows: those that look ahead from left to right, and below them those that look back.
 
     Up to `ONE_ROW` cameras are in one row.

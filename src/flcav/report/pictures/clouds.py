@@ -173,7 +173,7 @@ def real_frame(
     draw_boxes(above, cars[hit], style.GREEN, fill=0.25, width=1.0)
     draw_boxes(above, cars[~hit], style.MISSED, fill=0.35, width=1.0)
     draw_boxes(above, found, style.BLUE, width=1.4)
-    style.bare(above)
+    style.hide_axes(above)
     style.scale_bar(above, 10)
     above.set_title(f"{name}: {hit.sum()} of {len(cars)} cars found at IoU 0.5")
     show_view(ahead, view)

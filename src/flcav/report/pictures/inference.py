@@ -116,13 +116,13 @@ def _show(page: FigureBase, seen: NDArray[Any], view: CameraView | None, title: 
 def _picture(axes: Axes, picture: NDArray[np.uint8]) -> None:
     height, width = picture.shape[:2]
     axes.imshow(picture, extent=(0, width, height, 0))  # pixels by their edges
-    style.bare(axes)
+    style.hide_axes(axes)
 
 
 def _cloud_from_above(axes: Axes, points: NDArray[np.float32]) -> None:
     axes.scatter(*on_page(points[:, :2]).T, s=0.4, color=style.POINT, linewidths=0, rasterized=True)
     axes.plot(0, 0, "^", color=style.INK, markersize=6)
-    style.bare(axes)
+    style.hide_axes(axes)
 
 
 def _frame_from_above(axes: Axes, marks: Iterable[Mark]) -> None:

@@ -59,7 +59,7 @@ def draw_town(axes: Axes, town: Town) -> None:
     """Draw roads, buildings and trees of `town`, and a scale bar."""
     x_low, y_low, x_high, y_high = town.bounds
     axes.set(xlim=(x_low, x_high), ylim=(y_low, y_high), aspect="equal")
-    style.bare(axes)
+    style.hide_axes(axes)
     axes.add_collection(PolyCollection(list(town.sidewalks), facecolor=style.SIDEWALK, linewidth=0))
     axes.add_collection(PolyCollection(list(town.roads), facecolor=style.ROAD, edgecolor=style.ROAD, linewidth=0.5))
     trees = [Circle((x, y), radius) for x, y, _, radius in town.trees]

@@ -33,7 +33,7 @@ def paths_on_map(axes: Axes, layers: NDArray[np.bool_], paths: Paths) -> None:
     for user in paths.users:
         _draw_user(axes, user, observer)
     axes.plot(0, 0, "^", markersize=6, color=style.INK, markeredgecolor="white", zorder=8)
-    style.bare(axes)
+    style.hide_axes(axes)
 
 
 def _ground(layers: NDArray[np.bool_]) -> Array:

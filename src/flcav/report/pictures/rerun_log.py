@@ -20,9 +20,9 @@ from PIL import Image
 from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse
-from flcav.progress import Report, silent
+from flcav.progress import Report, ignore_progress
 from flcav.sensors.frame import Frame
-from flcav.sensors.radar.radar import echo_directions
+from flcav.sensors.radar.radar import compute_echo_directions
 from flcav.world.map.layers import MapLayers
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ def log_scene(
     dataset: Dataset,
     selected: Sequence[int],
     layers: MapLayers | None,
-    progress: Report = silent,
+    progress: Report = ignore_progress,
 ) -> None:
     """Log the frames `selected` of one scene into a `rerun.RecordingStream`; `layers` is the map of its town."""
     recording.set_log_time_enabled(False)
@@ -127,7 +127,7 @@ def _log_pose(recording: Any, path: str, parent_from_child: Array) -> None:
 
 def _log_radar(recording: Any, path: str, echoes: NDArray[np.float32]) -> None:
     colours = RADAR_COLOURS(0.5 + echoes[:, 3] / (2 * RADAR_M_S), bytes=True)
-    recording.log(path, rr.Points3D(echoes[:, :1] * echo_directions(echoes), colors=colours, radii=0.12))
+    recording.log(path, rr.Points3D(echoes[:, :1] * compute_echo_directions(echoes), colors=colours, radii=0.12))
 
 
 def _log_pinhole(recording: Any, path: str, intrinsics: Array, picture: NDArray) -> None:

@@ -13,7 +13,7 @@ from shapely.geometry import MultiPoint
 
 from flcav.report import style
 from flcav.world.map.lanes import map_layers
-from flcav.world.map.paint import painted
+from flcav.world.map.paint import outline_paint
 from flcav.world.map.town import Town
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ def draw_map(axes: Axes, town: Town) -> None:
     layers = map_layers(town)
     x_low, y_low, x_high, y_high = town.bounds
     axes.set(xlim=(x_low, x_high), ylim=(y_low, y_high), aspect="equal", facecolor=GRASS)
-    style.bare(axes)
+    style.hide_axes(axes)
 
     def fill(polygons: Iterable[Array], colour: str | list[str], edge: str = "none", width: float = 0.0) -> None:
         axes.add_collection(PolyCollection(list(polygons), facecolors=colour, edgecolors=edge, linewidths=width))
@@ -56,7 +56,7 @@ def draw_map(axes: Axes, town: Town) -> None:
     fill(town.sidewalks, PAVEMENT, PAVEMENT, 0.3)
     fill(town.roads, ROAD, ROAD, 0.3)
     axes.add_collection(LineCollection(list(town.kerbs), colors=KERB, linewidths=0.6))
-    fill((shape.outline for shape in painted(layers)), PAINTED, PAINTED, 0.15)
+    fill((shape.outline for shape in outline_paint(layers)), PAINTED, PAINTED, 0.15)
     for _, rows in town.clutter:
         fill((footprint(*row[:5]) for row in rows), CLUTTER)
     houses = [footprint(*row[:5]) for row in town.buildings]

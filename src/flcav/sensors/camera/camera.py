@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.compiled import compiled
-from flcav.sensors.camera.lens import Lens, directions
+from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.camera.tone import GRAINS, develop, grain
 from flcav.sensors.rendering.appearance import SEMANTICS
 from flcav.sensors.rendering.rain import add_drops
@@ -29,7 +29,9 @@ class Exposure(NamedTuple):
     rgb: NDArray[np.uint8]  # (H, W, 3) sRGB
     depth_m: NDArray[np.float32]  # (H, W) z in the optical frame; inf for the sky
     semantic: NDArray[np.uint8]  # (H, W) one of SEMANTICS
-    instance: NDArray[np.int32]  # (H, W) 0 none, a + 1 = the trace's actor a, -(t + 1) = thing t of `town_things`
+    instance: NDArray[
+        np.int32
+    ]  # (H, W) 0 none, a + 1 = the trace's actor a, -(t + 1) = thing t of `list_signs_and_signals`
 
 
 def photograph(
@@ -54,7 +56,7 @@ def photograph(
     shift = int(rng.integers(GRAINS))
     develop(picture.radiance, picture.exposure, grain(), shift, np.float32(camera.noise), rgb.reshape(-1, 3))
     semantic, instance = _labels(picture)
-    depth = picture.seen.distance * directions(camera)[:, 2]
+    depth = picture.seen.distance * compute_pixel_rays(camera)[:, 2]
     return Exposure(rgb, depth.reshape(shape), semantic.reshape(shape), instance.reshape(shape))
 
 

@@ -19,13 +19,13 @@ from pydantic import Field
 from scipy.ndimage import gaussian_filter
 
 from flcav.compiled import compiled
-from flcav.sensors.camera.lens import Lens, directions
-from flcav.sensors.rendering.ambient_occlusion import openness
-from flcav.sensors.rendering.appearance import Appearance, appearance_of
-from flcav.sensors.rendering.facade import wall_at
-from flcav.sensors.rendering.gbuffer import Survey, survey
-from flcav.sensors.rendering.light import light_of, soften, sunlit
-from flcav.sensors.rendering.noise import noise_at
+from flcav.sensors.camera.lens import Lens, compute_pixel_rays
+from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
+from flcav.sensors.rendering.appearance import Appearance, build_appearance
+from flcav.sensors.rendering.facade import shade_facade
+from flcav.sensors.rendering.gbuffer import GBuffer, fill_gbuffer
+from flcav.sensors.rendering.light import compute_light, compute_sun_visibility, soften
+from flcav.sensors.rendering.noise import sample_noise
 from flcav.world.materials import Material
 from flcav.world.scene import Scene
 from flcav.world.static import Part
@@ -91,7 +91,7 @@ class Infrared(Lens):
     noise_k: float = Field(default=0.06, ge=0, le=5)  # standard deviation of a pixel
 
 
-def thermal_image(
+def render_thermal(
     scene: Scene,
     world_from_camera: Array,
     infrared: Infrared,
@@ -104,12 +104,12 @@ def thermal_image(
 
     `world_from_camera` (4, 4) is the pose of the optical frame, as for `camera.photograph`.
     """
-    rays = directions(infrared)
-    appearance, light = appearance_of(scene), light_of(weather)
+    rays = compute_pixel_rays(infrared)
+    appearance, light = build_appearance(scene), compute_light(weather)
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden)
-    seen = survey(scene, appearance, world_from_camera, rays, hits)
-    lit = soften(sunlit(scene, seen, light, hidden), seen, infrared.width)
-    free = openness(scene, seen, infrared, hidden)
+    seen = fill_gbuffer(scene, appearance, world_from_camera, rays, hits)
+    lit = soften(compute_sun_visibility(scene, seen, light, hidden), seen, infrared.width)
+    free = compute_ambient_occlusion(scene, seen, infrared, hidden)
     pane, patch = _texture_of(seen, appearance, infrared)
     met = seen.row >= 0
     material = appearance.material[np.maximum(seen.row, 0)]
@@ -151,14 +151,14 @@ def _sunshine(weather: Weather) -> float:
     return float(np.clip(height * 3, 0, 1) * (1 - 0.85 * np.clip((weather.cloud_cover - 0.3) / 0.6, 0, 1)))
 
 
-def _living(seen: Survey, material: NDArray[np.uint8], air: float) -> Array:
+def _living(seen: GBuffer, material: NDArray[np.uint8], air: float) -> Array:
     """Return (N,) how much warmer than the air skin and clothes are [K]; 0 for other surfaces."""
     body = _BODY[material] + 273.15
     clothed = np.where(material == Material.SKIN, 1.0, 0.7)
     return np.where(np.isnan(body) | (seen.instance < 1), 0.0, clothed * (body - air))
 
 
-def _driving(scene: Scene, seen: Survey, material: NDArray[np.uint8], lamps_on: bool) -> Array:
+def _driving(scene: Scene, seen: GBuffer, material: NDArray[np.uint8], lamps_on: bool) -> Array:
     """Return (N,) how much warmer the parts of vehicles in traffic are than when parked [K]; 0 for other surfaces."""
     trace = scene.trace
     warm = np.zeros(len(seen))
@@ -178,7 +178,7 @@ def _driving(scene: Scene, seen: Survey, material: NDArray[np.uint8], lamps_on: 
 
 
 def _texture_of(
-    seen: Survey, appearance: Appearance, infrared: Infrared
+    seen: GBuffer, appearance: Appearance, infrared: Infrared
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return each pixel's share (N,) of window panes and its noise of temperature (N,), -0.5 to 0.5."""
     pane, patch = np.zeros(len(seen), np.float32), np.zeros(len(seen), np.float32)
@@ -194,9 +194,11 @@ def _texture(seen, appearance, pixel_angle, pane, patch):
         if row < 0 or seen.instance[ray] > 0:
             continue
         x, y, z = seen.position[ray, 0], seen.position[ray, 1], seen.position[ray, 2]
-        broad = noise_at(table, (x + z) * 0.25, (y - z) * 0.25)
+        broad = sample_noise(table, (x + z) * 0.25, (y - z) * 0.25)
         patch[ray] = (
-            np.float32(0.7) * broad + np.float32(0.3) * noise_at(table, (x + z) * 2.1, (y - z) * 2.1) - np.float32(0.5)
+            np.float32(0.7) * broad
+            + np.float32(0.3) * sample_noise(table, (x + z) * 2.1, (y - z) * 2.1)
+            - np.float32(0.5)
         )
         if appearance.material[row] == WALL and appearance.part[row] == BUILDING:
             nx, ny = seen.normal[ray, 0], seen.normal[ray, 1]
@@ -204,5 +206,5 @@ def _texture(seen, appearance, pixel_angle, pane, patch):
             across = seen.distance[ray] * pixel_angle
             slant = across / max(facing, np.float32(0.02))
             building = appearance.part_row[row]
-            found = wall_at(building, x, y, z, nx, ny, across, slant, appearance.facades, table)
+            found = shade_facade(building, x, y, z, nx, ny, across, slant, appearance.facades, table)
             pane[ray] = found[3]

@@ -61,10 +61,10 @@ class Lens(Config):
 
 def project(lens: Lens, points: ArrayLike) -> Array:
     """Return the pixels (N, 2) u, v of points (N, 3) in the optical frame; NaN for those with z <= 0."""
-    return projected(lens.intrinsics(), lens.distortion(), points)
+    return project_points(lens.intrinsics(), lens.distortion(), points)
 
 
-def projected(intrinsics: Array, distortion: Array, points: ArrayLike) -> Array:
+def project_points(intrinsics: Array, distortion: Array, points: ArrayLike) -> Array:
     """Return pixels as `project` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
     x, y, z = np.asarray(points, np.float64).reshape(-1, 3).T
     z = np.where(z > 1e-9, z, np.nan)
@@ -77,10 +77,10 @@ def unproject(lens: Lens, pixels: ArrayLike) -> Array:
 
     Newton's method; NaN where it finds no direction that the distortion maps to the pixel.
     """
-    return unprojected(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
+    return unproject_pixels(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
 
 
-def directions(lens: Lens) -> NDArray[np.float32]:
+def compute_pixel_rays(lens: Lens) -> NDArray[np.float32]:
     """Return the viewing rays of the pixels' centres: (height * width, 3) unit vectors, optical frame; read-only."""
     intrinsics, distortion = lens.intrinsics().ravel().tolist(), lens.distortion().tolist()
     return _directions(lens.width, lens.height, tuple(intrinsics), tuple(distortion))
@@ -92,14 +92,14 @@ def _directions(
 ) -> NDArray[np.float32]:
     v, u = np.mgrid[:height, :width]
     pixels = np.stack((u.ravel(), v.ravel()), axis=1).astype(np.float64)
-    plane = unprojected(np.reshape(intrinsics, (3, 3)), np.array(distortion), pixels)
+    plane = unproject_pixels(np.reshape(intrinsics, (3, 3)), np.array(distortion), pixels)
     rays = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
     rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
     rays.flags.writeable = False
     return rays
 
 
-def unprojected(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
+def unproject_pixels(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
     """Return a, b (N, 2) as `unproject` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
     fx, fy, cx, cy = _focus(intrinsics)
     wanted = (pixels - (cx, cy)) / (fx, fy)

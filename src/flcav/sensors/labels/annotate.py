@@ -10,9 +10,9 @@ from flcav.geometry import Boxes
 from flcav.sensors.camera.lens import Lens
 from flcav.sensors.frame import Annotations, Array
 from flcav.sensors.labels.signs import view_signs
-from flcav.sensors.labels.views import actor_regions, view_actors
+from flcav.sensors.labels.views import find_actor_regions, view_actors
 from flcav.sensors.lidar.lidar import Lidar
-from flcav.sensors.lidar.visibility import occluded_rays
+from flcav.sensors.lidar.visibility import count_occluded_rays
 from flcav.world.scene import Scene
 
 
@@ -53,7 +53,7 @@ def annotate(
     cameras' trigger times, and back to the spin.
     """
     trace, index = scene.trace, scene.index
-    regions = {name: actor_regions(sight.instance, len(trace.actor)) for name, sight in sights.items()}
+    regions = {name: find_actor_regions(sight.instance, len(trace.actor)) for name, sight in sights.items()}
     labelled = np.logical_or.reduce([within, *(region.pixels > 0 for region in regions.values())])
     if own is not None:
         labelled[own] = False
@@ -91,7 +91,7 @@ def _occlusion(scene: Scene, sweeps: list[Sweep], actors: NDArray[np.int64]) -> 
         visible += sweep.visible[actors]
     seen = np.flatnonzero(visible)  # the occlusion of the others is 1, whatever the number of occluded rays
     for sweep in sweeps:
-        occluded[seen] += occluded_rays(
+        occluded[seen] += count_occluded_rays(
             scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, sweep.distance, sweep.instance, actors[seen]
         )
     return 1 - visible / np.maximum(visible + occluded, 1)

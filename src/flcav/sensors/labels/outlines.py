@@ -36,7 +36,7 @@ def hull(category: str, shape: int) -> Hull:
     return Hull(vertices[found.vertices], np.unique(sides, axis=0))
 
 
-def amodal_boxes(
+def compute_amodal_boxes(
     scene: Scene, world_from_camera: Array, lens: Lens, actors: NDArray[np.int64], near_m: float = NEAR_M
 ) -> Array:
     """Return the amodal 2-D boxes (M, 4) x1 y1 x2 y2 [px] of `actors` (M,), around all that is beyond the near plane.
@@ -58,20 +58,20 @@ def amodal_boxes(
         first = np.cumsum([0, *(len(points) for points in outlines.values())])[:-1]
         lowest, highest = np.minimum.reduceat(pixels, first), np.maximum.reduceat(pixels, first)
         boxes[list(outlines)] = np.concatenate((lowest, highest), axis=1)
-    boxes[truncation(boxes, lens) == 1] = np.nan
+    boxes[compute_truncation(boxes, lens) == 1] = np.nan
     return boxes
 
 
-def clipped(boxes: Array, lens: Lens) -> Array:
+def clip_boxes(boxes: Array, lens: Lens) -> Array:
     """Return boxes (M, 4) clipped to the image; of zero area where they lie outside, NaN where they are NaN."""
     last = (lens.width - 0.5, lens.height - 0.5)
     return np.clip(boxes, -0.5, (*last, *last))
 
 
-def truncation(boxes: Array, lens: Lens) -> Array:
+def compute_truncation(boxes: Array, lens: Lens) -> Array:
     """Return (M,) the share of each box (M, 4) that lies outside the image; 1 where the box is NaN."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = _area(clipped(boxes, lens)) / _area(boxes)
+        share = _area(clip_boxes(boxes, lens)) / _area(boxes)
     return 1 - np.nan_to_num(share, nan=0.0)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.frame import Array, SignViews
-from flcav.sensors.labels.views import thing_regions
+from flcav.sensors.labels.views import find_thing_regions
 from flcav.world.scene import Scene
 
 READABLE = np.cos(np.radians(80.0))  # of the largest angle between a sign's normal and the line of sight
@@ -24,7 +24,7 @@ def view_signs(scene: Scene, world_from_camera: Array, instance: NDArray[np.int3
     at the instant of the image.
     """
     things = scene.things
-    regions = thing_regions(instance, len(things))
+    regions = find_thing_regions(instance, len(things))
     camera = world_from_camera[:3, 3]
     sight = camera - things.position
     distance = np.linalg.norm(sight, axis=1)

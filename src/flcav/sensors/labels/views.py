@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from flcav.compiled import compiled
 from flcav.geometry import inverse
-from flcav.sensors.camera.lens import Lens, directions
+from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.frame import Array, Views
-from flcav.sensors.labels.outlines import amodal_boxes, clipped, truncation
+from flcav.sensors.labels.outlines import clip_boxes, compute_amodal_boxes, compute_truncation
 from flcav.world.scene import Scene
 
 OUTER_EDGES = np.array((-0.5, -0.5, 0.5, 0.5))  # from the centres of the outermost pixels
@@ -22,12 +22,12 @@ class Regions(NamedTuple):
     box: NDArray[np.float64]  # (K, 4) x1 y1 x2 y2 [px], to the pixels' outer edges; NaN where there are none
 
 
-def actor_regions(instance: NDArray[np.int32], count: int) -> Regions:
+def find_actor_regions(instance: NDArray[np.int32], count: int) -> Regions:
     """Return the regions of actors 0 to `count` - 1, whose values in the `instance` image (H, W) are 1 to `count`."""
     return _regions(instance, count, 1)
 
 
-def thing_regions(instance: NDArray[np.int32], count: int) -> Regions:
+def find_thing_regions(instance: NDArray[np.int32], count: int) -> Regions:
     """Return the regions of things 0 to `count` - 1, whose values in the `instance` image (H, W) are -1 to -`count`."""
     return _regions(instance, count, -1)
 
@@ -71,9 +71,9 @@ def view_actors(
     `instance` (H, W) is a + 1 at the scene's actor a, `regions` are those of all the scene's actors. The scene is at
     the instant of the image. Occlusion compares an image's pixels with rays cast at the actor alone.
     """
-    box = amodal_boxes(scene, world_from_camera, lens, actors)
+    box = compute_amodal_boxes(scene, world_from_camera, lens, actors)
     occlusion = np.ones(len(actors))
-    inside = clipped(box, lens)
+    inside = clip_boxes(box, lens)
     for row in np.flatnonzero(regions.pixels[actors]):  # the occlusion of the others is 1
         actor = int(actors[row])
         sampled = _sampled(inside[row])
@@ -85,7 +85,7 @@ def view_actors(
         amodal_box=box,
         visible_box=regions.box[actors],
         pixels=regions.pixels[actors],
-        truncation=truncation(box, lens),
+        truncation=compute_truncation(box, lens),
         occlusion=occlusion,
     )
 
@@ -107,7 +107,7 @@ def _unoccluded(
 ) -> int:
     """Return the number of sampled pixels that show the actor in an empty world."""
     rows, columns = sampled
-    rays = directions(lens).reshape(lens.height, lens.width, 3)[np.ix_(rows, columns)].reshape(-1, 3)
+    rays = compute_pixel_rays(lens).reshape(lens.height, lens.width, 3)[np.ix_(rows, columns)].reshape(-1, 3)
     if not len(rays):
         return 0
     body_from_camera = inverse(scene.world_from_actor(actor)) @ world_from_camera

@@ -43,7 +43,7 @@ SPREAD_M = (10.0 * betaincinv(2.0, 20.0, (np.arange(QUANTILES) + 0.5) / QUANTILE
 
 
 @lru_cache(maxsize=64)
-def soft_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Floats, Floats]:
+def compute_fog_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Floats, Floats]:
     """Return the peak power of the fog's return before a surface and the range [m] of that peak, by range of surface.
 
     Both are (K,) float32; entry k is for a surface at k * STEP_M, the last for all ranges beyond. Power is relative to
@@ -88,7 +88,7 @@ def rain_range_noise(rain_mm_h: float) -> float:
     return 0.02 * (1 - np.exp(-rain_mm_h)) ** 2
 
 
-def drops(rain_mm_h: float, extinction_per_m: float, divergence_rad: float, least_power: float) -> Drops:
+def compute_drops(rain_mm_h: float, extinction_per_m: float, divergence_rad: float, least_power: float) -> Drops:
     """Return the distribution of the brightest drop in rain of `rain_mm_h` > 0, for powers of `least_power` and more.
 
     `extinction_per_m` is that of fog and rain; the beam is `divergence_rad` times the range wide. Source: LISA.
@@ -126,7 +126,7 @@ class Air(NamedTuple):
     drop_range_m: Floats  # (L, SHARES) quantiles of a drop's range
 
 
-def air_in(weather: Weather, divergence_rad: float, least_power: float) -> Air | None:
+def compute_air(weather: Weather, divergence_rad: float, least_power: float) -> Air | None:
     """Return the extinction, fog and rain of `weather`; None where there is neither fog nor rain.
 
     A beam is `divergence_rad` times the range wide; drops whose return is below `least_power` are left out.
@@ -135,12 +135,12 @@ def air_in(weather: Weather, divergence_rad: float, least_power: float) -> Air |
     if rain == 0 and fog == 0:
         return None
     extinction = fog + rain_extinction(rain)
-    soft = soft_returns(fog, extinction) if fog else NO_FOG
-    drop = drops(rain, extinction, divergence_rad, least_power) if rain else NO_DROPS
+    soft = compute_fog_returns(fog, extinction) if fog else NO_FOG
+    drop = compute_drops(rain, extinction, divergence_rad, least_power) if rain else NO_DROPS
     return Air(2 * extinction, rain_range_noise(rain), *soft, *drop)
 
 
-def through_air(
+def add_air_returns(
     distance: Floats, brightness: Floats, air: Air, rng: np.random.Generator
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Return the strongest return of each of N rays: distance [m], brightness, whether fog or rain sent it; each (N,).

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flcav.config import Config
-from flcav.sensors.lidar.air import air_in, through_air
+from flcav.sensors.lidar.air import add_air_returns, compute_air
 from flcav.sensors.lidar.beams import BEAMS, CarlaReturns, carla_returns
-from flcav.sensors.lidar.returns import LEVELS, QUANTILES, Echoes, brightness, cast_through_glass, detect
-from flcav.sensors.lidar.rolling import sectors, time_in_spin_s
+from flcav.sensors.lidar.returns import LEVELS, QUANTILES, Returns, cast_through_glass, compute_brightness, detect
+from flcav.sensors.lidar.rolling import step_sectors, time_in_spin_s
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import OFFSET_S, Scene
 from flcav.world.weather import Weather
@@ -84,16 +84,16 @@ class Lidar(Config):
         return self
 
 
-def ray_pattern(lidar: Lidar) -> NDArray[np.float32]:
+def build_ray_pattern(lidar: Lidar) -> NDArray[np.float32]:
     """Return the ray directions of one spin: (channels * azimuth_steps, 3) unit vectors, sensor frame; read-only.
 
     Channel after channel from the highest; within a channel, azimuth runs counter-clockwise from straight ahead.
     """
-    return _ray_pattern(lidar.channels, lidar.up_deg, lidar.down_deg, lidar.elevations_deg, lidar.azimuth_steps)
+    return _build_ray_pattern(lidar.channels, lidar.up_deg, lidar.down_deg, lidar.elevations_deg, lidar.azimuth_steps)
 
 
 @lru_cache(maxsize=16)
-def _ray_pattern(
+def _build_ray_pattern(
     channels: int, up_deg: float, down_deg: float, elevations_deg: tuple[float, ...] | None, steps: int
 ) -> NDArray[np.float32]:
     even = np.linspace(up_deg, down_deg, channels)
@@ -117,15 +117,15 @@ def cast(
     lidar: Lidar,
     passes: NDArray[np.bool_],
     hidden: int | None = None,
-) -> Echoes:
+) -> Returns:
     """Return the surface within range from which each ray of one spin returns, in a world without the actor `hidden`.
 
     `passes` (N,) marks the rays that go through glass. A rolling LiDAR rides on `hidden`; it stands still where that is
     None.
     """
-    pattern, surfaces = ray_pattern(lidar), scene.surfaces
+    pattern, surfaces = build_ray_pattern(lidar), scene.surfaces
 
-    def part(pose: NDArray[np.float64], rays: NDArray[np.int64] | slice) -> Echoes:
+    def part(pose: NDArray[np.float64], rays: NDArray[np.int64] | slice) -> Returns:
         directions = pattern[rays]
 
         def trace(rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
@@ -136,15 +136,15 @@ def cast(
     if not lidar.rolling:
         return part(world_from_sensor, slice(None))
     steps, whole = lidar.azimuth_steps, _room_for(len(pattern))
-    for columns, pose in sectors(scene, world_from_sensor, steps, 1 / lidar.rate_hz, hidden):
+    for columns, pose in step_sectors(scene, world_from_sensor, steps, 1 / lidar.rate_hz, hidden):
         rays = (np.arange(lidar.channels)[:, None] * steps + columns).ravel()
         for values, found in zip(whole, part(pose, rays)):
             values[rays] = found
     return whole
 
 
-def _room_for(rays: int) -> Echoes:
-    return Echoes(
+def _room_for(rays: int) -> Returns:
+    return Returns(
         np.empty(rays, np.float32),
         np.empty(rays, np.int32),
         np.empty(rays, np.int32),
@@ -157,7 +157,7 @@ def measure(
     scene: Scene,
     world_from_sensor: NDArray[np.float64],
     lidar: Lidar,
-    echoes: Echoes,
+    echoes: Returns,
     rng: np.random.Generator,
     weather: Weather | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -171,23 +171,23 @@ def measure(
     source = echoes.instance - 1
     if lidar.carla is not None:
         error_m = np.float32(lidar.noise_m) * QUANTILES[noise]
-        points, reported = carla_returns(lidar.carla, ray_pattern(lidar), echoes.distance, error_m, rng)
+        points, reported = carla_returns(lidar.carla, build_ray_pattern(lidar), echoes.distance, error_m, rng)
         return points, source[reported]
 
     weather = weather or CLEAR
     sensor_from_instance = (world_from_sensor[:3, :3].T @ scene.world_from_instance()).astype(np.float32)
-    bright = brightness(
-        echoes, ray_pattern(lidar), scene.surfaces, sensor_from_instance, weather.wetness, lidar.roughness_rad
+    bright = compute_brightness(
+        echoes, build_ray_pattern(lidar), scene.surfaces, sensor_from_instance, weather.wetness, lidar.roughness_rad
     )
     distance, least_power = echoes.distance, 0.9 / lidar.sensitivity_m**2
-    air = air_in(weather, lidar.divergence_rad, 0.7 * least_power)
+    air = compute_air(weather, lidar.divergence_rad, 0.7 * least_power)
     if air is not None:
-        distance, bright, aerial = through_air(distance, bright, air, rng)
+        distance, bright, aerial = add_air_returns(distance, bright, air, rng)
         source = np.where(aerial, -1, source)
     points = np.empty((rays, 4), np.float32)
     actor = np.empty(rays, np.int32)
     kept = detect(
-        ray_pattern(lidar),
+        build_ray_pattern(lidar),
         distance,
         bright,
         source,
@@ -200,11 +200,12 @@ def measure(
         points,
         actor,
     )
-    _report_intensity(points[:kept], lidar)
+    compress_intensity(points[:kept], lidar)
     return points[:kept], actor[:kept]
 
 
-def _report_intensity(points: NDArray[np.float32], lidar: Lidar) -> None:
+def compress_intensity(points: NDArray[np.float32], lidar: Lidar) -> None:
+    """Raise the intensities of `points` (N, 4) to the sensor's gamma, in place."""
     if lidar.intensity_gamma != 1:
         points[:, 3] **= np.float32(lidar.intensity_gamma)
     if lidar.intensity_floor > 0:

@@ -31,7 +31,7 @@ LEVELS = 4096
 QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of the normal distribution
 
 
-class Trace(Protocol):
+class CastRays(Protocol):
     """A ray caster over a fixed set of rays, given the indices of those to cast: see `Target.trace`."""
 
     def __call__(self, rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
@@ -39,7 +39,7 @@ class Trace(Protocol):
         ...
 
 
-class Echoes(NamedTuple):
+class Returns(NamedTuple):
     """The surface from which each of N LiDAR rays returns."""
 
     distance: NDArray[np.float32]  # (N,) [m]; inf where none
@@ -50,18 +50,18 @@ class Echoes(NamedTuple):
 
 
 def cast_through_glass(
-    trace: Trace,
+    trace: CastRays,
     passes: NDArray[np.bool_],
     first: NDArray[np.int64],
     material: NDArray[np.uint8],
-) -> Echoes:
+) -> Returns:
     """Return the surface from which each of N rays returns; rays marked in `passes` (N,) go through up to PANES panes.
 
     Face f of instance i is of `material[first[i] + f]`.
     """
     hits = trace(slice(None))
     found, through = _look_up(hits.instance, hits.face, first, material, passes, GLASS)
-    echoes = Echoes(*hits, found, np.zeros(len(passes), np.uint8))
+    echoes = Returns(*hits, found, np.zeros(len(passes), np.uint8))
     for _ in range(PANES):
         if not len(through):
             break
@@ -90,7 +90,7 @@ def _look_up(instance, face, first, material, passes, glass):
 
 
 @compiled
-def brightness(echoes, directions, surfaces, sensor_from_instance, wetness, roughness=0.0):
+def compute_brightness(echoes, directions, surfaces, sensor_from_instance, wetness, roughness=0.0):
     """Return the brightness of each ray's surface, reflectivity * cos(incidence): (N,) float32, 0 where there is none.
 
     It is 1 for a white surface at normal incidence. `directions` (N, 3) are unit rays, sensor frame;
@@ -116,11 +116,11 @@ def brightness(echoes, directions, surfaces, sensor_from_instance, wetness, roug
         )
         seen = surfaces.reflectivity[i, material]
         if wetness > 0 and material in (ROAD, SIDEWALK):
-            seen *= np.float32(1 - wetness * (1 - under_water(cosine, seen)))
+            seen *= np.float32(1 - wetness * (1 - compute_wet_brightness(cosine, seen)))
         if surfaces.retro[material]:
             seen *= np.float32(RETRO_GAIN)
         elif roughness > 0 and ROUGH[material]:
-            seen *= rough_cosine(cosine, roughness)
+            seen *= compute_oren_nayar(cosine, roughness)
         else:
             seen *= cosine
         for _ in range(panes[ray]):
@@ -130,7 +130,7 @@ def brightness(echoes, directions, surfaces, sensor_from_instance, wetness, roug
 
 
 @compiled
-def rough_cosine(cosine, roughness):
+def compute_oren_nayar(cosine, roughness):
     """Return the Oren-Nayar reflectance, seen from the light, over that of a Lambertian surface at normal incidence.
 
     `cosine` is that of the incidence, `roughness` the standard deviation of the facets' slopes [rad]. Source: Oren and
@@ -142,7 +142,7 @@ def rough_cosine(cosine, roughness):
 
 
 @compiled
-def under_water(cosine, reflectivity):
+def compute_wet_brightness(cosine, reflectivity):
     """Return the brightness of a diffuse surface under a water film, relative to dry: (1 - F)^2 / n^2 / (1 - p a).
 
     F is the film's Fresnel reflectance at the incidence of that `cosine`, n the refractive index, p the share that the
@@ -173,7 +173,7 @@ def detect(
 ):
     """Detect returns: write the first M rows of `points` (N, 4) and `actor` (N,), and return M.
 
-    A return of power P = `brightness` / `distance`^2 is detected with a probability that rises linearly from 0 at
+    A return of power P = `compute_brightness` / `distance`^2 is detected with a probability that rises linearly from 0 at
     0.7 P_min to `keep` at 1.3 P_min; `inverse_threshold` is 1 / P_min, `chance` (N,) in [0, 1) decides. `noise` (N,) is
     the quantile of a normal range error of standard deviation hypot(`noise_m`, `noise_share` * distance). A point is
     x, y, z [m] in the sensor's frame and the brightness, at most 1. `source` (N,) is the actor each return comes from.

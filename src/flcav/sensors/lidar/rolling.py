@@ -21,7 +21,7 @@ SECTORS = 36
 ROUNDING = 1e-6  # of a turn: a beam straight back belongs to the beginning of the spin, not to its end
 
 
-def sectors(
+def step_sectors(
     scene: Scene, world_from_sensor: NDArray[np.float64], steps: int, spin_s: float, carrier: int | None
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """Yield for each sector its columns (C,) of the ray pattern and the (4, 4) pose of the sensor at its time.

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.compiled import compiled
-from flcav.sensors.lidar.lidar import Lidar, ray_pattern
+from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.sensors.lidar.returns import cast_through_glass
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
@@ -15,7 +15,7 @@ from flcav.world.scene import Scene
 BOX_MARGIN_M = 0.01  # by which boxes are grown, so that no ray that grazes a mesh is missed
 
 
-def occluded_rays(
+def count_occluded_rays(
     scene: Scene,
     world_from_sensor: NDArray[np.float64],
     lidar: Lidar,
@@ -29,7 +29,7 @@ def occluded_rays(
     `distance` (N,) [m] and `instance` (N,) are where the sweep's rays ended and at what: a + 1 at actor a. `passes`
     (N,) marks the rays that go through glass.
     """
-    pattern, surfaces = ray_pattern(lidar), scene.surfaces
+    pattern, surfaces = build_ray_pattern(lidar), scene.surfaces
     body_from_sensor = _bodies_from(scene.poses()[actors], world_from_sensor)
     rays, counts = _stopped_rays(
         pattern, lidar.azimuth_steps, body_from_sensor, scene.trace.size[actors], BOX_MARGIN_M, distance
@@ -65,7 +65,7 @@ def _stopped_rays(directions, steps, body_from_sensor, size, margin, distance):
     found = np.empty(1024, np.int64)
     total = 0
     for box in range(len(size)):
-        rays = rays_into_box(directions, steps, body_from_sensor[box], size[box], margin, distance)
+        rays = find_occluded_rays(directions, steps, body_from_sensor[box], size[box], margin, distance)
         counts[box] = len(rays)
         if total + len(rays) > len(found):
             larger = np.empty(2 * (total + len(rays)), np.int64)
@@ -77,7 +77,7 @@ def _stopped_rays(directions, steps, body_from_sensor, size, margin, distance):
 
 
 @compiled
-def rays_into_box(directions, steps, body_from_sensor, size, margin, distance):
+def find_occluded_rays(directions, steps, body_from_sensor, size, margin, distance):
     """Return the indices of the rays of a spinning pattern (channels * steps, 3) that end before a box on their way.
 
     Rays end at `distance` (N,) [m]. The box of `size` (3,), grown by `margin` [m], stands on the origin of the body

@@ -25,7 +25,7 @@ from flcav.world.trace import CATEGORIES
 Array = NDArray[np.float64]
 
 
-class Echo(NamedTuple):
+class AspectRcs(NamedTuple):
     """Radar cross-section of a class of actors, by aspect."""
 
     mean_dbsm: float  # level without flashes, seen from the side
@@ -33,14 +33,14 @@ class Echo(NamedTuple):
     end_db: float  # level seen from ahead and behind, over that from the side
 
 
-ECHOES: dict[str, Echo] = {
-    "car": Echo(8.0, 9.0, -3.0),
-    "van": Echo(11.0, 10.0, -3.0),
-    "truck": Echo(16.0, 12.0, -4.0),
-    "bus": Echo(17.0, 13.0, -5.0),
-    "motorcycle": Echo(2.0, 4.0, -3.0),
-    "bicycle": Echo(-3.0, 4.0, -4.0),
-    "pedestrian": Echo(-8.0, 1.0, 1.5),
+ACTOR_RCS: dict[str, AspectRcs] = {
+    "car": AspectRcs(8.0, 9.0, -3.0),
+    "van": AspectRcs(11.0, 10.0, -3.0),
+    "truck": AspectRcs(16.0, 12.0, -4.0),
+    "bus": AspectRcs(17.0, 13.0, -5.0),
+    "motorcycle": AspectRcs(2.0, 4.0, -3.0),
+    "bicycle": AspectRcs(-3.0, 4.0, -4.0),
+    "pedestrian": AspectRcs(-8.0, 1.0, 1.5),
 }
 FLASH = 24.0  # exponent of the cosine of a flash's angle: about 27 degrees wide at half its decibels
 
@@ -62,10 +62,10 @@ GLINT = 40.0  # exponent of the cosine of incidence
 
 _TOWN = 10 ** (np.array([TOWN_DB.get(material, ELSE_DB) for material in Material]) / 10)
 _LIES = np.array([material in LYING for material in Material])
-_ACTOR = np.array([ECHOES[category] for category in CATEGORIES])
+_ACTOR = np.array([ACTOR_RCS[category] for category in CATEGORIES])
 
 
-def actor_rcs(category: NDArray[np.str_], aspect: Array) -> Array:
+def compute_actor_rcs(category: NDArray[np.str_], aspect: Array) -> Array:
     """Return (K,) mean radar cross-sections [m^2] of whole, unoccluded actors.
 
     `category` (K,) are their classes, `aspect` (K,) the direction to the radar [rad], counter-clockwise from ahead.
@@ -81,7 +81,7 @@ def silhouette(size: Array, aspect: Array) -> Array:
     return (length * np.abs(np.sin(aspect)) + width * np.abs(np.cos(aspect))) * height
 
 
-def town_rcs_per_area(material: NDArray[np.uint8], cosine: Array) -> Array:
+def compute_town_rcs(material: NDArray[np.uint8], cosine: Array) -> Array:
     """Return (K,) cross-sections per projected area of the town's surfaces, by material and `cosine` of incidence."""
     glint = 1 + (10 ** (GLINT_DB / 10) - 1) * cosine**GLINT
     return _TOWN[material] * np.where(_LIES[material], 1.0, glint)

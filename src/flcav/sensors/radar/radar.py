@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from flcav.sensors.radar.detector import (
     Array,
     Radar,
-    actor_rcs,
+    compute_actor_rcs,
+    compute_town_rcs,
     detect,
     false_alarms,
     resolve,
     silhouette,
-    town_rcs_per_area,
 )
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
@@ -24,7 +24,7 @@ RAYS_PER_CELL = 3  # along azimuth, and as many along elevation
 LIMBS_M_S = {"pedestrian": 0.5, "bicycle": 0.5}  # standard deviation of limbs' speeds (micro-Doppler)
 
 
-def radar_sweep(
+def sweep_radar(
     scene: Scene,
     world_from_radar: Array,
     velocity: Array,
@@ -40,7 +40,7 @@ def radar_sweep(
     the distance grows] and radar cross-section [dBsm]. Actors (N,) are the trace's, by the largest share of the echo;
     -1 for the town and for false alarms. `velocity` (3,) is the radar's [m/s, world frame], `hidden` the carrier.
     """
-    directions, solid_angle = rays_of(radar, rng)
+    directions, solid_angle = draw_rays(radar, rng)
     hits = scene.cast(world_from_radar, directions, far_m=radar.range_m, hidden=hidden)
     met = np.flatnonzero(hits.instance >= 0)
     hits = Hits(hits.distance[met], hits.instance[met], hits.face[met])
@@ -59,14 +59,14 @@ def radar_sweep(
     return everything[order], owner[order]
 
 
-def echo_directions(echoes: NDArray[np.float32]) -> Array:
+def compute_echo_directions(echoes: NDArray[np.float32]) -> Array:
     """Return (N, 3) unit vectors from the radar to the detections (N, 5) of a sweep, radar frame."""
     azimuth, elevation = echoes[:, 1:3].T.astype(np.float64)
     level = np.cos(elevation)
     return np.column_stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)))
 
 
-def rays_of(radar: Radar, rng: np.random.Generator) -> tuple[NDArray[np.float32], Array]:
+def draw_rays(radar: Radar, rng: np.random.Generator) -> tuple[NDArray[np.float32], Array]:
     """Return N unit rays (N, 3), one at random in each cell of a grid over the field of view, and cells' (N,) [sr]."""
     _, (left, right), (low, high), _ = radar.extent()
     _, azimuth_cell, elevation_cell, _ = radar.resolution()
@@ -91,14 +91,14 @@ def cross_sections(scene: Scene, world_from_radar: Array, ahead: Array, hits: Hi
     turn = world_from_radar[:3, :3].T @ scene.world_from_instance()
     normal = np.einsum("nij,nj->ni", turn[hits.instance], surfaces.normal[row].astype(np.float64))
     cosine = np.abs((normal * ahead).sum(axis=1))
-    per_area = town_rcs_per_area(surfaces.material[row], cosine)
+    per_area = compute_town_rcs(surfaces.material[row], cosine)
 
     moving = hits.instance > 0
     seen, which = np.unique(hits.instance[moving] - 1, return_inverse=True)
     x, y, _, yaw = scene.poses()[seen].T
     aspect = np.arctan2(world_from_radar[1, 3] - y, world_from_radar[0, 3] - x) - yaw
     category, size = scene.trace.category[seen], scene.trace.size[seen]
-    per_area[moving] = (actor_rcs(category, aspect) / silhouette(size, aspect))[which]
+    per_area[moving] = (compute_actor_rcs(category, aspect) / silhouette(size, aspect))[which]
     return per_area * solid_angle * hits.distance.astype(np.float64) ** 2
 
 

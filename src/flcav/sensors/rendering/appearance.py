@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.rendering.facade import Facades, facades_of
-from flcav.sensors.rendering.ground import Markings, markings_of
-from flcav.sensors.rendering.noise import clouds
-from flcav.sensors.rendering.signs import SIGN_KINDS, pictures
+from flcav.sensors.rendering.ground import Markings, build_markings
+from flcav.sensors.rendering.noise import make_noise
+from flcav.sensors.rendering.signs import SIGN_KINDS, draw_signs
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.layers import MapLayers
 from flcav.world.map.town import Town
@@ -28,7 +28,7 @@ from flcav.world.materials import (
 )
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
-from flcav.world.static import Part, static_world
+from flcav.world.static import Part, build_static_world
 
 # Numbers and names of CARLA's semantic tags (0.9.15)
 SEMANTICS: dict[str, int] = {
@@ -99,7 +99,7 @@ class Appearance(NamedTuple):
 _KNOWN: WeakKeyDictionary[Scene, Appearance] = WeakKeyDictionary()
 
 
-def appearance_of(scene: Scene) -> Appearance:
+def build_appearance(scene: Scene) -> Appearance:
     """Return the appearance tables of `scene`: cached, the same for all its instants."""
     if scene not in _KNOWN:
         _KNOWN[scene] = _appearance(scene)
@@ -108,7 +108,7 @@ def appearance_of(scene: Scene) -> Appearance:
 
 def _appearance(scene: Scene) -> Appearance:
     surfaces, trace, town = scene.surfaces, scene.trace, scene.town
-    world = static_world(town)
+    world = build_static_world(town)
     rows, actors = len(surfaces.material), len(world.part)
     semantic = np.zeros(rows, np.uint8)
     part, part_row, thing = np.zeros(rows, np.uint8), np.zeros(rows, np.int32), np.zeros(rows, np.int32)
@@ -145,17 +145,17 @@ def _appearance(scene: Scene) -> Appearance:
         markings=_markings(town),
         facades=facades_of(town.name, town.buildings),
         plates=Plates(
-            place.astype(np.float32), np.array([SIGN_KINDS.index(kind) for kind in signs.kind], np.uint8), pictures()
+            place.astype(np.float32), np.array([SIGN_KINDS.index(kind) for kind in signs.kind], np.uint8), draw_signs()
         ),
-        noise=clouds(),
+        noise=make_noise(),
     )
 
 
 def _markings(town: Town) -> Markings:
     """Return the road markings of a town; none where its net file does not exist."""
     if not town.net.exists():
-        return markings_of(MapLayers((), (), (), (), (), ()))
-    return markings_of(map_layers(town))
+        return build_markings(MapLayers((), (), (), (), (), ()))
+    return build_markings(map_layers(town))
 
 
 @lru_cache(maxsize=64)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from flcav.compiled import inlined
 from flcav.seeds import stream
-from flcav.sensors.rendering.noise import fade, hashed, noise_at, overlap
+from flcav.sensors.rendering.noise import fade, hash_pair, overlap, sample_noise
 from flcav.world.meshes.buildings import BAY_M, GABLED_BELOW_M, STOREY_M
 
 PLASTER, BRICK, PANEL = range(3)
@@ -60,7 +60,7 @@ def facades_of(name: str, buildings: NDArray[np.float64]) -> Facades:
 
 
 @inlined
-def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
+def shade_facade(building, x, y, z, nx, ny, across, slant, facades, table):
     """Return red, green, blue, the share of glass, and the window's number, at a point of a building's wall.
 
     x, y, z is the point, nx, ny the normal, world frame. `across` [m] is the pixel's footprint at normal incidence,
@@ -76,7 +76,7 @@ def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
         length, number = facades.size[building, 0], 0
     if v < 0:
         number += 2
-    tone = np.float32(0.90) + np.float32(0.20) * noise_at(table, u * 0.7 + building * 13.0, z * 0.5)
+    tone = np.float32(0.90) + np.float32(0.20) * sample_noise(table, u * 0.7 + building * 13.0, z * 0.5)
     tone -= np.float32(0.14) * max(np.float32(0), np.float32(1) - z)  # dirt splashed up from the ground
     style = facades.style[building]
     if style == BRICK:
@@ -89,7 +89,7 @@ def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
     else:
         fine = fade(np.float32(0.05), slant)
         if fine > 0:
-            tone += fine * np.float32(0.08) * (noise_at(table, u * 24.0, z * 24.0) - np.float32(0.5))
+            tone += fine * np.float32(0.08) * (sample_noise(table, u * 24.0, z * 24.0) - np.float32(0.5))
     wall = facades.wall
     red, green, blue = wall[building, 0] * tone, wall[building, 1] * tone, wall[building, 2] * tone
     storey = int(z // STOREY_M)
@@ -101,7 +101,7 @@ def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
     a = u + length / 2 - (bay + np.float32(0.5)) * pitch
     width, height, sill = np.float32(WINDOW_M[0]), np.float32(WINDOW_M[1]), np.float32(SILL_M)
     ground_floor = storey == 0
-    door = ground_floor and hashed(building * 4 + number, bay) < np.float32(0.3)
+    door = ground_floor and hash_pair(building * 4 + number, bay) < np.float32(0.3)
     if door:
         width, height, sill = np.float32(1.1), np.float32(2.2), np.float32(0.0)
     b = z - storey * STOREY_M - sill - height / 2
@@ -119,14 +119,14 @@ def wall_at(building, x, y, z, nx, ny, across, slant, facades, table):
     window = bay * 64 + storey * 4 + number
     light_frame = np.float32(0.60) if style != PANEL else np.float32(0.10)
     if door:
-        shade = np.float32(0.5) + hashed(building, bay)
+        shade = np.float32(0.5) + hash_pair(building, bay)
         red = red * (1 - opening) + opening * np.float32(0.14) * shade
         green = green * (1 - opening) + opening * np.float32(0.085) * shade
         blue = blue * (1 - opening) + opening * np.float32(0.06) * shade
         return red, green, blue, np.float32(0), 0
     inside = np.float32(0.022)
-    if hashed(building * 7 + 3, window) < np.float32(0.45):  # a curtain
-        inside = np.float32(0.20) if b > (hashed(building, window) - np.float32(0.6)) * height else inside
+    if hash_pair(building * 7 + 3, window) < np.float32(0.45):  # a curtain
+        inside = np.float32(0.20) if b > (hash_pair(building, window) - np.float32(0.6)) * height else inside
     red = red * (1 - opening) + trim * light_frame + glass * inside
     green = green * (1 - opening) + trim * light_frame + glass * inside
     blue = blue * (1 - opening) + trim * light_frame + glass * inside * np.float32(1.05)
@@ -146,5 +146,5 @@ def _bricks(u, z, wide, tall):
     inside = overlap(a, np.float32(0.115), max(wide, np.float32(0.003))) * overlap(
         b, np.float32(0.0325), max(tall, np.float32(0.003))
     )
-    tone = np.float32(0.86) + np.float32(0.32) * hashed(brick, course)
+    tone = np.float32(0.86) + np.float32(0.32) * hash_pair(brick, course)
     return 1 + near * (tone * inside + np.float32(1.5) * (1 - inside) - 1)

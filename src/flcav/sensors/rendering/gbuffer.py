@@ -13,7 +13,7 @@ from flcav.world.scene import Scene
 LIFT_M = 0.015  # offset along the normal of secondary rays' origins
 
 
-class Survey(NamedTuple):
+class GBuffer(NamedTuple):
     """G-buffer: the hits of N rays, world frame."""
 
     ray: NDArray[np.float32]  # (N, 3) unit direction
@@ -27,18 +27,18 @@ class Survey(NamedTuple):
         return len(self.distance)
 
 
-def survey(
+def fill_gbuffer(
     scene: Scene,
     appearance: Appearance,
     world_from_camera: NDArray[np.float64],
     directions: NDArray[np.float32],
     hits: Hits,
-) -> Survey:
+) -> GBuffer:
     """Return the G-buffer of N rays `directions` (N, 3), unit, optical frame, from their `hits`."""
     count, poses = len(directions), scene.poses()
     bodies = np.zeros((len(poses) + 1, 5), np.float32)  # by instance: x, y, z, cosine and sine of the yaw
     bodies[1:] = np.c_[poses[:, :3], np.cos(poses[:, 3]), np.sin(poses[:, 3])]
-    out = Survey(
+    out = GBuffer(
         np.empty((count, 3), np.float32),
         hits.distance,
         hits.instance,

@@ -7,7 +7,7 @@ from flcav.compiled import compiled
 from flcav.geometry import inverse, transform_points
 from flcav.sensors.camera.lens import Lens, project
 from flcav.sensors.rendering.light import DARK, Light
-from flcav.sensors.rendering.state import AMBER, GREEN, RED, State, lamp_places
+from flcav.sensors.rendering.state import AMBER, GREEN, RED, LampState, lamp_places
 from flcav.world.meshes.furniture import LENS_PITCH_M
 from flcav.world.scene import Scene
 
@@ -27,7 +27,7 @@ Glowing = tuple[NDArray[np.float64], tuple[float, float, float], float]  # place
 def add_glare(
     image: NDArray[np.float32],
     scene: Scene,
-    state: State,
+    state: LampState,
     light: Light,
     world_from_camera: NDArray[np.float64],
     lens: Lens,
@@ -47,7 +47,7 @@ def add_glare(
     inside &= (np.abs(pixels - (lens.width / 2, lens.height / 2)) < (lens.width, lens.height)).all(axis=1)
     far = np.where(inside, distance - 0.5, -1.0)
     towards = (away / distance[:, None]).astype(np.float32)
-    hides = scene.blocked(
+    hides = scene.find_occluded(
         np.tile(eye, (len(places), 1)).astype(np.float32), towards, far.astype(np.float32), hidden=hidden
     )
     kept = inside & ~hides
@@ -84,14 +84,16 @@ def add_sun_glare(
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     far = np.full(SUN_RAYS, SUN_REACH_M, np.float32)
     eyes = np.tile(eye, (SUN_RAYS, 1)).astype(np.float32)
-    free = 1 - float(scene.blocked(eyes, rays.astype(np.float32), far, hidden=hidden).mean())
+    free = 1 - float(scene.find_occluded(eyes, rays.astype(np.float32), far, hidden=hidden).mean())
     if free > 0:
         power = free * np.array(light.sun) * np.exp(-float(light.extinction) * HAZE_M)
         focal = lens.intrinsics()[0, 0]
         _veil(image, pixel, power.astype(np.float32), 1 / (SUN_SPREAD_RAD * focal), 1 / (SUN_VEIL_RAD * focal))
 
 
-def _glowing(scene: Scene, state: State, light: Light, eye: NDArray[np.float64], hidden: int | None) -> list[Glowing]:
+def _glowing(
+    scene: Scene, state: LampState, light: Light, eye: NDArray[np.float64], hidden: int | None
+) -> list[Glowing]:
     trace, out = scene.trace, []
     for actor in np.flatnonzero((state.head[1:] > 0) | (state.tail[1:] > 0)):
         if actor == hidden or not trace.present[scene.index, actor]:

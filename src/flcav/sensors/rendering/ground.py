@@ -17,9 +17,9 @@ from shapely.geometry import LineString, Polygon
 from shapely.ops import substring
 
 from flcav.compiled import inlined
-from flcav.sensors.rendering.noise import fade, hashed, noise_at, overlap
+from flcav.sensors.rendering.noise import fade, hash_pair, overlap, sample_noise
 from flcav.world.map.layers import Arrow, ArrowKind, MapLayers, Marking
-from flcav.world.map.paint import glyph, stripes
+from flcav.world.map.paint import outline_arrow, outline_stripes
 
 CELL_M = 1.0  # side of the cells of the grid
 REACH_M = 0.3  # margin around a rectangle within which cells list it
@@ -39,11 +39,11 @@ class Markings(NamedTuple):
     listed: NDArray[np.int32]  # lists of rows of `rectangle`, cell after cell
 
 
-def markings_of(layers: MapLayers) -> Markings:
+def build_markings(layers: MapLayers) -> Markings:
     """Return the lane lines, crossings and arrows of a map as rectangles."""
     pieces = [(piece, COLOURS.get(line.colour, COLOURS["white"])) for line in layers.markings for piece in _line(line)]
     white = COLOURS["white"]
-    pieces += [(_box(stripe), white) for crossing in layers.crossings for stripe in stripes(crossing)]
+    pieces += [(_box(stripe), white) for crossing in layers.crossings for stripe in outline_stripes(crossing)]
     pieces += [(strip, white) for arrow in layers.arrows for strip in _arrow(arrow)]
     rectangle = np.array([piece for piece, _ in pieces], np.float32).reshape(-1, 6)
     colour = np.array([colour for _, colour in pieces], np.float32).reshape(-1, 3)
@@ -51,7 +51,7 @@ def markings_of(layers: MapLayers) -> Markings:
 
 
 @inlined
-def paint_at(x, y, look_x, look_y, across, along, markings):
+def find_paint(x, y, look_x, look_y, across, along, markings):
     """Return the painted share of a pixel's footprint around x, y, and the row of the rectangle that covers most of it.
 
     The footprint is `along` [m] long in the horizontal unit direction look_x, look_y, and `across` [m] wide.
@@ -105,7 +105,7 @@ def _arrow(arrow: Arrow) -> Iterator[Rectangle]:
 @lru_cache(maxsize=16)
 def _strips(kind: ArrowKind) -> tuple[tuple[float, float, float, float], ...]:
     """Return an arrow at the origin that points along x, as strips: centre x, y, half length, half width [m]."""
-    shape = Polygon(glyph(Arrow(kind, 0.0, 0.0, 0.0, "")))
+    shape = Polygon(outline_arrow(Arrow(kind, 0.0, 0.0, 0.0, "")))
     low_x, low_y, high_x, high_y = shape.bounds
     out = []
     for start in np.arange(low_x, high_x, STRIP_M):
@@ -152,18 +152,18 @@ JOINT_M = 0.012  # width of the joints between slabs
 @inlined
 def asphalt(x, y, footprint, table):
     """Return the brightness of asphalt at x, y relative to its mean colour: grain, stains, repairs, sealed cracks."""
-    broad = noise_at(table, x * 0.9, y * 0.9)
-    patch = noise_at(table, x * 0.11 + 40.0, y * 0.11)
+    broad = sample_noise(table, x * 0.9, y * 0.9)
+    patch = sample_noise(table, x * 0.11 + 40.0, y * 0.11)
     tone = np.float32(0.68) + np.float32(0.30) * broad + np.float32(0.40) * patch
     middle = fade(np.float32(0.12), footprint)
     if middle > 0:
-        tone += middle * np.float32(0.30) * (noise_at(table, x * 9.0, y * 9.0) - np.float32(0.5))
-        crack = abs(noise_at(table, x * 0.55 + 90.0, y * 0.55 + 17.0) - np.float32(0.5))
+        tone += middle * np.float32(0.30) * (sample_noise(table, x * 9.0, y * 9.0) - np.float32(0.5))
+        crack = abs(sample_noise(table, x * 0.55 + 90.0, y * 0.55 + 17.0) - np.float32(0.5))
         if crack < np.float32(0.006) and patch > np.float32(0.45):
             tone -= middle * np.float32(0.35)
     fine = fade(np.float32(0.022), footprint)
     if fine > 0:
-        tone += fine * np.float32(0.55) * (noise_at(table, x * 71.0, y * 71.0) - np.float32(0.5))
+        tone += fine * np.float32(0.55) * (sample_noise(table, x * 71.0, y * 71.0) - np.float32(0.5))
     return tone
 
 
@@ -171,10 +171,10 @@ def asphalt(x, y, footprint, table):
 def paving(x, y, footprint, table):
     """Return the brightness of paving slabs at x, y relative to their mean colour."""
     i, j = int(np.floor(x / SLAB_M)), int(np.floor(y / SLAB_M))
-    tone = np.float32(0.86) + np.float32(0.24) * noise_at(table, x * 0.5, y * 0.5)
+    tone = np.float32(0.86) + np.float32(0.24) * sample_noise(table, x * 0.5, y * 0.5)
     near = fade(np.float32(0.5), footprint)
     if near > 0:
-        tone += near * np.float32(0.16) * (hashed(i, j) - np.float32(0.5))
+        tone += near * np.float32(0.16) * (hash_pair(i, j) - np.float32(0.5))
         u, v = np.float32(x - (i + 0.5) * SLAB_M), np.float32(y - (j + 0.5) * SLAB_M)
         half = np.float32(SLAB_M / 2 - JOINT_M / 2)
         width = max(footprint, np.float32(0.004))
@@ -182,19 +182,19 @@ def paving(x, y, footprint, table):
         tone *= 1 - near * np.float32(0.55) * (1 - inside)
         fine = fade(np.float32(0.03), footprint)
         if fine > 0:
-            tone += fine * np.float32(0.16) * (noise_at(table, x * 45.0, y * 45.0) - np.float32(0.5))
+            tone += fine * np.float32(0.16) * (sample_noise(table, x * 45.0, y * 45.0) - np.float32(0.5))
     return tone
 
 
 @inlined
 def grass(x, y, footprint, table):
     """Return the brightness of grass at x, y relative to its mean colour, and its dryness, 0 to 1."""
-    dry = noise_at(table, x * 0.07, y * 0.07)
-    tone = np.float32(0.55) + np.float32(0.6) * noise_at(table, x * 0.8, y * 0.8)
+    dry = sample_noise(table, x * 0.07, y * 0.07)
+    tone = np.float32(0.55) + np.float32(0.6) * sample_noise(table, x * 0.8, y * 0.8)
     near = fade(np.float32(0.10), footprint)
     if near > 0:
-        tone += near * np.float32(0.7) * (noise_at(table, x * 16.0, y * 16.0) - np.float32(0.5))
+        tone += near * np.float32(0.7) * (sample_noise(table, x * 16.0, y * 16.0) - np.float32(0.5))
     fine = fade(np.float32(0.02), footprint)
     if fine > 0:
-        tone += fine * np.float32(0.7) * (noise_at(table, x * 61.0, y * 43.0) - np.float32(0.5))
+        tone += fine * np.float32(0.7) * (sample_noise(table, x * 61.0, y * 43.0) - np.float32(0.5))
     return max(tone, np.float32(0.1)), dry

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.compiled import compiled
-from flcav.sensors.rendering.gbuffer import Survey
+from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.sensors.rendering.state import Lamps, light_up
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
@@ -71,7 +71,7 @@ class Light(NamedTuple):
     lamps: np.float32  # 0 off, 1 on
 
 
-def light_of(weather: Weather) -> Light:
+def compute_light(weather: Weather) -> Light:
     """Return the sun, sky and air of `weather`: tables by the sun's elevation, changed by clouds, fog and rain."""
     elevation, azimuth = np.radians(weather.sun_elevation_deg), np.radians(weather.sun_azimuth_deg)
     level = np.cos(elevation)
@@ -132,25 +132,27 @@ DARK = 1e-3  # irradiance of the sun below which it casts no shadow
 SAME = 0.04  # relative difference of distance up to which two pixels lie on one surface
 
 
-def lamp_light_on(scene: Scene, seen: Survey, lamps: Lamps, hidden: int | None) -> NDArray[np.float32]:
+def compute_lamplight(scene: Scene, seen: GBuffer, lamps: Lamps, hidden: int | None) -> NDArray[np.float32]:
     """Return the irradiance (N, 3) of lamps at each hit; only the strongest lamp there casts shadows."""
     light, most, towards = (np.zeros((len(seen), 3), np.float32) for _ in range(3))
     far = np.empty(len(seen), np.float32)
     light_up(seen, lamps, light, most, towards, far)
-    _add_where_free(light, most, scene.blocked(seen.position, towards, far, hidden=hidden))
+    _add_where_free(light, most, scene.find_occluded(seen.position, towards, far, hidden=hidden))
     return light
 
 
-def sunlit(scene: Scene, seen: Survey, light: Light, hidden: int | None) -> NDArray[np.float32]:
+def compute_sun_visibility(scene: Scene, seen: GBuffer, light: Light, hidden: int | None) -> NDArray[np.float32]:
     """Return for each hit (N,) 0 where it is in the sun's shadow, else 1; also 1 where it faces away from the sun."""
     far = np.empty(len(seen), np.float32)
     _facing(seen, light.to_sun, max(light.sun) > DARK, far)
     return (
-        (~scene.blocked(seen.position, np.array([light.to_sun]), far, hidden=hidden)).view(np.uint8).astype(np.float32)
+        (~scene.find_occluded(seen.position, np.array([light.to_sun]), far, hidden=hidden))
+        .view(np.uint8)
+        .astype(np.float32)
     )
 
 
-def soften(lit: NDArray[np.float32], seen: Survey, width: int) -> NDArray[np.float32]:
+def soften(lit: NDArray[np.float32], seen: GBuffer, width: int) -> NDArray[np.float32]:
     """Return `lit` (N,), an image's row after row, with soft shadow edges, as of an extended sun.
 
     A 3 x 3 binomial filter (weights 1, 2, 1 each way) over pixels of similar distance.

@@ -12,7 +12,7 @@ SIDE = 256  # cells along each side of a table, a power of two
 
 
 @lru_cache(maxsize=1)
-def clouds() -> NDArray[np.float32]:
+def make_noise() -> NDArray[np.float32]:
     """Return a table (SIDE, SIDE) of periodic fractal noise, uniformly distributed in [0, 1]: power-law spectrum."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(SIDE), np.fft.rfftfreq(SIDE), indexing="ij")) * SIDE
     amplitude = np.where(frequency > 0, np.maximum(frequency, 2.0) ** -1.7, 0.0)
@@ -23,7 +23,7 @@ def clouds() -> NDArray[np.float32]:
 
 
 @inlined
-def noise_at(table, x, y):
+def sample_noise(table, x, y):
     """Return the value of a table at x, y (in cells, periodic), by bilinear interpolation."""
     i, j = int(np.floor(x)), int(np.floor(y))
     u, v = np.float32(x - i), np.float32(y - j)
@@ -34,7 +34,7 @@ def noise_at(table, x, y):
 
 
 @inlined
-def hashed(a, b):
+def hash_pair(a, b):
     """Return a hash of the whole numbers a and b, as a number in [0, 1)."""
     word = np.uint32((a * 374761393 + b * 668265263) & 0xFFFFFFFF)
     word = np.uint32(((word ^ (word >> np.uint32(13))) * np.uint64(1274126177)) & np.uint64(0xFFFFFFFF))

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.compiled import compiled
-from flcav.sensors.rendering.noise import noise_at
+from flcav.sensors.rendering.noise import sample_noise
 from flcav.world.materials import Material
 
 ROAD = int(Material.ROAD)
@@ -58,15 +58,15 @@ def add_mirrored(radiance, seen, appearance, mirrored, wetness, extinction, widt
         if row < 0 or seen.instance[pixel] != 0 or appearance.material[row] != ROAD:
             continue
         x, y = seen.position[pixel, 0], seen.position[pixel, 1]
-        level = noise_at(appearance.noise, x * 0.45 + 11.0, y * 0.45) * np.float32(0.6)
-        level += noise_at(appearance.noise, x * 0.10, y * 0.10 + 29.0) * np.float32(0.4)
+        level = sample_noise(appearance.noise, x * 0.45 + 11.0, y * 0.45) * np.float32(0.6)
+        level += sample_noise(appearance.noise, x * 0.10, y * 0.10 + 29.0) * np.float32(0.4)
         puddle = min(max((level - np.float32(1.02) + np.float32(0.75) * wetness) * 4, np.float32(0)), np.float32(1))
         facing = -seen.ray[pixel, 2]
         grazing = 1 - facing
         share = np.float32(WATER) + (1 - np.float32(WATER)) * grazing * grazing * grazing * grazing * grazing
         share *= wetness * (np.float32(0.35) + np.float32(0.65) * puddle)
         share *= np.exp(-extinction * seen.distance[pixel])
-        ripple = (noise_at(appearance.noise, x * 5.0, y * 5.0) - np.float32(0.5)) * RIPPLE_PX
+        ripple = (sample_noise(appearance.noise, x * 5.0, y * 5.0) - np.float32(0.5)) * RIPPLE_PX
         j = min(pixel // width // 2, height // 2 - 1)
         i = min(max(int(pixel % width / 2 + ripple), 0), width // 2 - 1)
         for band in range(3):

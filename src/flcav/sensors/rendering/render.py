@@ -11,16 +11,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.sensors.camera.lens import Lens, directions
+from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.rendering import rain
 from flcav.sensors.rendering import supersampling as antialias
 from flcav.sensors.rendering import supersampling as edges
-from flcav.sensors.rendering.ambient_occlusion import openness
-from flcav.sensors.rendering.appearance import Appearance, appearance_of
-from flcav.sensors.rendering.gbuffer import Survey, survey
+from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
+from flcav.sensors.rendering.appearance import Appearance, build_appearance
+from flcav.sensors.rendering.gbuffer import GBuffer, fill_gbuffer
 from flcav.sensors.rendering.glare import add_glare, add_sun_glare
-from flcav.sensors.rendering.light import Light, lamp_light_on, light_of, soften, sunlit
-from flcav.sensors.rendering.state import Lamps, State, lamps_of, no_lamps, state_of
+from flcav.sensors.rendering.light import Light, compute_lamplight, compute_light, compute_sun_visibility, soften
+from flcav.sensors.rendering.state import Lamps, LampState, collect_lamps, compute_lamp_state, no_lamps
 from flcav.sensors.rendering.surface import shade
 from flcav.world.rays.raycaster import Hits
 from flcav.world.scene import Scene
@@ -55,7 +55,7 @@ class Picture(NamedTuple):
 
     radiance: NDArray[np.float32]  # (N, 3) of each pixel, row after row
     exposure: np.float32  # factor of the radiance before tone mapping
-    seen: Survey  # G-buffer of the primary rays
+    seen: GBuffer  # G-buffer of the primary rays
     painted: NDArray[np.bool_]  # (N,) whether a pixel shows a road marking
     appearance: Appearance
 
@@ -64,7 +64,7 @@ class _World(NamedTuple):
     scene: Scene
     appearance: Appearance
     light: Light
-    state: State
+    state: LampState
     lamps: Lamps
     pixel_angle: np.float32
     hidden: int | None
@@ -85,18 +85,18 @@ def render(
     the rain.
     """
     keep_freed_memory()
-    rays, light, appearance = directions(lens), light_of(weather), appearance_of(scene)
-    state = state_of(scene, float(light.lamps), low_sight=bool(light.extinction > LOW_SIGHT))
+    rays, light, appearance = compute_pixel_rays(lens), compute_light(weather), build_appearance(scene)
+    state = compute_lamp_state(scene, float(light.lamps), low_sight=bool(light.extinction > LOW_SIGHT))
     angle = np.float32(1 / lens.intrinsics()[0, 0])
     world = _World(
-        scene, appearance, light, state, lamps_of(scene, state) if light.lamps > 0 else no_lamps(), angle, hidden
+        scene, appearance, light, state, collect_lamps(scene, state) if light.lamps > 0 else no_lamps(), angle, hidden
     )
     seen = _meet(world, world_from_camera, rays)
-    open_sky = openness(scene, seen, lens, hidden)
+    open_sky = compute_ambient_occlusion(scene, seen, lens, hidden)
     radiance, painted = _radiance(world, seen, open_sky, lens.width)
     if light.wetness > MIRRORS:
         _mirror(world, world_from_camera, lens, rays, seen, radiance)
-    kind = edges.rough_pixels(seen, radiance, light.exposure, appearance, lens)
+    kind = edges.find_edges(seen, radiance, light.exposure, appearance, lens)
     edges.mark_thin(kind, scene.town, world_from_camera, lens, seen)
     further, pixel = antialias.further_rays(rays, kind, lens)
     if len(pixel):
@@ -116,19 +116,19 @@ def _meet(
     world_from_camera: NDArray[np.float64],
     rays: NDArray[np.float32],
     near_m: NDArray[np.float32] | None = None,
-) -> Survey:
+) -> GBuffer:
     hits = world.scene.cast(world_from_camera, rays, near_m=near_m, far_m=FAR_M, hidden=world.hidden)
-    return survey(world.scene, world.appearance, world_from_camera, rays, hits)
+    return fill_gbuffer(world.scene, world.appearance, world_from_camera, rays, hits)
 
 
 def _radiance(
-    world: _World, seen: Survey, open_sky: NDArray[np.float32], width: int | None = None
+    world: _World, seen: GBuffer, open_sky: NDArray[np.float32], width: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     scene, light, hidden = world.scene, world.light, world.hidden
-    lit = sunlit(scene, seen, light, hidden)
+    lit = compute_sun_visibility(scene, seen, light, hidden)
     if width is not None:  # the rays are those of a whole image
         lit = soften(lit, seen, width)
-    lamplight = lamp_light_on(scene, seen, world.lamps, hidden) if light.lamps > 0 else NO_LAMPS
+    lamplight = compute_lamplight(scene, seen, world.lamps, hidden) if light.lamps > 0 else NO_LAMPS
     radiance, painted = np.empty((len(seen), 3), np.float32), np.empty(len(seen), np.bool_)
     tables = (light, world.appearance, world.state)
     shade(seen, *tables, lit, lamplight, open_sky, world.pixel_angle, radiance, painted)
@@ -141,7 +141,7 @@ def _further(
     rays: NDArray[np.float32],
     pixel: NDArray[np.int32],
     width: int,
-    seen: Survey,
+    seen: GBuffer,
     open_sky: NDArray[np.float32],
     radiance: NDArray[np.float32],
 ) -> NDArray[np.float32]:
@@ -152,7 +152,7 @@ def _further(
     antialias.donors(hits, pixel, seen, scene.surfaces.first, appearance.material, width, donor)
     out, rest = radiance[donor], np.flatnonzero(donor < 0)
     unknown = Hits(hits.distance[rest], hits.instance[rest], hits.face[rest])
-    found = survey(scene, appearance, world_from_camera, rays[rest], unknown)
+    found = fill_gbuffer(scene, appearance, world_from_camera, rays[rest], unknown)
     finer = world._replace(pixel_angle=world.pixel_angle / antialias.ROOKS)
     out[rest], _ = _radiance(finer, found, open_sky[pixel[rest]])
     return out
@@ -163,7 +163,7 @@ def _mirror(
     world_from_camera: NDArray[np.float64],
     lens: Lens,
     rays: NDArray[np.float32],
-    seen: Survey,
+    seen: GBuffer,
     radiance: NDArray[np.float32],
 ) -> None:
     """Add planar reflections to wet roads: rays cast from the camera mirrored at the plane of the road, z = 0."""

@@ -19,7 +19,7 @@ _TEXT_WIDTH = {"stop": 1.34, "speed_30": 0.98, "speed_60": 0.98, "speed_90": 0.9
 
 
 @lru_cache(maxsize=1)
-def pictures() -> NDArray[np.float32]:
+def draw_signs() -> NDArray[np.float32]:
     """Return mip-maps (kinds, LEVELS, SIDE, SIDE, 3), rows from the top; level l fills SIDE / 2^l rows and columns."""
     out = np.zeros((len(SIGN_KINDS), LEVELS, SIDE, SIDE, 3), np.float32)
     for kind, name in enumerate(SIGN_KINDS):
@@ -31,7 +31,7 @@ def pictures() -> NDArray[np.float32]:
 
 
 @inlined
-def sign_at(kind, right, up, footprint, drawn):
+def sample_sign(kind, right, up, footprint, drawn):
     """Return red, green, blue of a plate at `right`, `up` of its centre [m], for a pixel's `footprint` [m]."""
     texel = np.float32(2 * SIGN_RADIUS_M / SIDE)
     level = np.log2(max(footprint / texel, np.float32(1)))

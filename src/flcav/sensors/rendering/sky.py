@@ -3,14 +3,14 @@
 import numpy as np
 
 from flcav.compiled import inlined
-from flcav.sensors.rendering.noise import noise_at
+from flcav.sensors.rendering.noise import sample_noise
 
 SKYLINE = 0.16  # sine of the elevation up to which houses hide the sky, in reflections
 TOP_OF_FOG_M = 500.0  # height of the layer of fog
 
 
 @inlined
-def sky_at(x, y, z, light):
+def compute_clear_sky(x, y, z, light):
     """Return red, green, blue of the sky without clouds or sun's disc, in the unit direction x, y, z, world frame."""
     low = 1 - max(z, np.float32(0))
     low = low * low * low
@@ -28,19 +28,21 @@ def sky_at(x, y, z, light):
 
 
 @inlined
-def heaven_at(x, y, z, light, table):
+def compute_sky(x, y, z, light, table):
     """Return red, green, blue of a ray that hits nothing: sky, sun, clouds, and the air in between."""
-    red, green, blue = sky_at(x, y, z, light)
+    red, green, blue = compute_clear_sky(x, y, z, light)
     beside = x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2]
     sun = min(max((beside - np.float32(0.99992)) / np.float32(0.00004), np.float32(0)), np.float32(1)) * np.float32(30)
     if z > np.float32(0.01) and light.cover > 0.02:
         far = 1 / (z + np.float32(0.06))
         u, v = x * far * np.float32(16), y * far * np.float32(16)
-        shape = noise_at(table, u, v) * np.float32(0.72) + noise_at(table, u * 4.1 + 31.0, v * 4.1) * np.float32(0.28)
+        shape = sample_noise(table, u, v) * np.float32(0.72) + sample_noise(
+            table, u * 4.1 + 31.0, v * 4.1
+        ) * np.float32(0.28)
         edge = np.float32(0.86 - 0.80 * light.cover)
         thick = min(max((shape - edge) / np.float32(0.22), np.float32(0)), np.float32(1))
         thick *= min(z * 9, np.float32(1))
-        lit = noise_at(table, u + light.to_sun[0] * 2.2, v + light.to_sun[1] * 2.2)
+        lit = sample_noise(table, u + light.to_sun[0] * 2.2, v + light.to_sun[1] * 2.2)
         bright = np.float32(0.72) + np.float32(0.62) * max(np.float32(0), 1 - thick * np.float32(0.55)) * (
             1 - lit * np.float32(0.5)
         )
@@ -59,10 +61,10 @@ def heaven_at(x, y, z, light, table):
 
 
 @inlined
-def mirrored_at(x, y, z, light, table):
+def compute_environment(x, y, z, light, table):
     """Return red, green, blue of the environment of a mirror in the unit direction x, y, z: sky, dim houses, ground."""
-    red, green, blue = sky_at(x, y, abs(z), light)
-    height = np.float32(SKYLINE) * (np.float32(0.4) + np.float32(1.2) * noise_at(table, x * 9.0, y * 9.0))
+    red, green, blue = compute_clear_sky(x, y, abs(z), light)
+    height = np.float32(SKYLINE) * (np.float32(0.4) + np.float32(1.2) * sample_noise(table, x * 9.0, y * 9.0))
     above = min(max((z - height) * np.float32(25), np.float32(0)), np.float32(1))
     level = min(max(z * np.float32(25), np.float32(0)), np.float32(1))  # houses above, ground below the horizon
     dim = np.float32(1) + np.float32(0.7) * level

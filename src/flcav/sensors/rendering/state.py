@@ -22,7 +22,7 @@ STREET_REACH_M, BEAM_REACH_M = 20.0, 45.0  # distances at which their light is c
 CELL_M = 8.0  # side of the cells of the lamps' grid
 
 
-class State(NamedTuple):
+class LampState(NamedTuple):
     """Lit signal lenses by thing of the town, and lamp brightness by instance."""
 
     lens: NDArray[np.uint8]  # (K,) of each of the town's things: flags RED, AMBER and GREEN
@@ -41,7 +41,7 @@ class Lamps(NamedTuple):
     listed: NDArray[np.int32]  # lists of lamps, cell after cell
 
 
-def state_of(scene: Scene, lamps_on: float, low_sight: bool) -> State:
+def compute_lamp_state(scene: Scene, lamps_on: float, low_sight: bool) -> LampState:
     """Return the lit lenses and vehicle lamps at the scene's instant.
 
     `lamps_on` (0 to 1) is the brightness of lamps by the sun's elevation; with `low_sight` (rain or fog), vehicles have
@@ -57,10 +57,10 @@ def state_of(scene: Scene, lamps_on: float, low_sight: bool) -> State:
     stopped = np.nan_to_num(np.linalg.norm(trace.velocity[index], axis=1), nan=9.0) < 0.1
     braking = ((along < BRAKING_MS2) | stopped) & ~parked
     tail = np.where(braking, 1.0, 0.25 * on)
-    return State(np.array(lens, np.uint8), *(np.append(0.0, row).astype(np.float32) for row in (on, tail)))
+    return LampState(np.array(lens, np.uint8), *(np.append(0.0, row).astype(np.float32) for row in (on, tail)))
 
 
-def lamps_of(scene: Scene, state: State) -> Lamps:
+def collect_lamps(scene: Scene, state: LampState) -> Lamps:
     """Return the lamps that illuminate the scene: all street lamps, then the head lamps that are on."""
     street = scene.town.lamps - (0.0, 0.0, 0.08)
     places, beams = [street], [np.zeros_like(street)]

@@ -12,7 +12,7 @@ from flcav.compiled import compiled
 from flcav.geometry import inverse, transform_points
 from flcav.sensors.camera.lens import Lens, project
 from flcav.sensors.rendering.appearance import Appearance
-from flcav.sensors.rendering.gbuffer import Survey
+from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.world.map.town import Town
 from flcav.world.materials import Material
 
@@ -28,8 +28,8 @@ FARTHEST_M = 220.0  # of thin objects
 POST_M, SIGN_M, SIGNAL_M = 0.1, 0.42, 0.6  # half widths of thin objects
 
 
-def rough_pixels(
-    seen: Survey, radiance: NDArray[np.float32], exposure: np.float32, appearance: Appearance, lens: Lens
+def find_edges(
+    seen: GBuffer, radiance: NDArray[np.float32], exposure: np.float32, appearance: Appearance, lens: Lens
 ) -> NDArray[np.uint8]:
     """Return (N,) EDGE for pixels at visible edges, else 0, by their G-buffer and `radiance` (N, 3)."""
     out = np.zeros(len(seen), np.uint8)
@@ -38,7 +38,7 @@ def rough_pixels(
 
 
 def mark_thin(
-    kind: NDArray[np.uint8], town: Town, world_from_camera: NDArray[np.float64], lens: Lens, seen: Survey
+    kind: NDArray[np.uint8], town: Town, world_from_camera: NDArray[np.float64], lens: Lens, seen: GBuffer
 ) -> None:
     """Set THIN in `kind` (N,) for pixels that lamps, masts, signs or signal heads may cross with nothing nearer."""
     bars = thin_bars(town)

@@ -7,11 +7,11 @@ approximation of the Fresnel term. The air blends radiance into its own by exp(-
 import numpy as np
 
 from flcav.compiled import compiled
-from flcav.sensors.rendering.facade import wall_at
-from flcav.sensors.rendering.ground import asphalt, grass, paint_at, paving
-from flcav.sensors.rendering.noise import fade, hashed, noise_at
-from flcav.sensors.rendering.signs import sign_at
-from flcav.sensors.rendering.sky import heaven_at, mirrored_at
+from flcav.sensors.rendering.facade import shade_facade
+from flcav.sensors.rendering.ground import asphalt, find_paint, grass, paving
+from flcav.sensors.rendering.noise import fade, hash_pair, sample_noise
+from flcav.sensors.rendering.signs import sample_sign
+from flcav.sensors.rendering.sky import compute_environment, compute_sky
 from flcav.sensors.rendering.state import AMBER, GREEN, RED
 from flcav.world.materials import Material
 from flcav.world.static import Part
@@ -43,7 +43,7 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
         row = survey.row[ray]
         painted[ray] = False
         if row < 0:
-            red, green, blue = heaven_at(dx, dy, dz, light, table)
+            red, green, blue = compute_sky(dx, dy, dz, light, table)
             radiance[ray, 0], radiance[ray, 1], radiance[ray, 2] = red, green, blue
             continue
         instance, material = survey.instance[ray], appearance.material[row]
@@ -62,10 +62,10 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             tone = asphalt(x, y, slant, table)
             red, green, blue = red * tone, green * tone, blue * tone
             level = max(np.sqrt(dx * dx + dy * dy), np.float32(1e-6))
-            share, piece = paint_at(x, y, dx / level, dy / level, across, slant, appearance.markings)
+            share, piece = find_paint(x, y, dx / level, dy / level, across, slant, appearance.markings)
             if share > 0:
                 painted[ray] = share > ROAD_LINE
-                worn = np.float32(0.72) + np.float32(0.28) * noise_at(table, x * 1.7, y * 1.7)
+                worn = np.float32(0.72) + np.float32(0.28) * sample_noise(table, x * 1.7, y * 1.7)
                 share *= min(worn + np.float32(0.25) * tone, np.float32(1))
                 colour = appearance.markings.colour
                 red += share * (colour[piece, 0] * tone - red)
@@ -80,7 +80,7 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             if nz > np.float32(0.5):
                 tone = paving(x, y, slant, table)
             else:
-                tone = np.float32(0.95) + np.float32(0.25) * noise_at(table, (x + y) * 1.3, z * 2.0)
+                tone = np.float32(0.95) + np.float32(0.25) * sample_noise(table, (x + y) * 1.3, z * 2.0)
             red, green, blue = red * tone, green * tone, blue * tone
         elif instance > 0:
             if material == HEADLAMP:
@@ -97,13 +97,13 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             green = (green + np.float32(0.020) * dry) * tone
             blue = blue * tone
         elif material == WALL and appearance.part[row] == BUILDING:
-            red, green, blue, glass, window = wall_at(
+            red, green, blue, glass, window = shade_facade(
                 appearance.part_row[row], x, y, z, nx, ny, across, slant, appearance.facades, table
             )
             if glass > 0:
                 mirror, gloss = np.float32(0.09) * glass, np.float32(0)
-                if light.lamps > 0 and hashed(appearance.part_row[row] + 77, window) < np.float32(0.34):
-                    warm = hashed(window, appearance.part_row[row])
+                if light.lamps > 0 and hash_pair(appearance.part_row[row] + 77, window) < np.float32(0.34):
+                    warm = hash_pair(window, appearance.part_row[row])
                     glow = np.float32(light.lamps) * glass * (np.float32(0.010) + np.float32(0.030) * warm)
                     shine_r, shine_g, shine_b = (
                         glow,
@@ -111,11 +111,11 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
                         glow * np.float32(0.34),
                     )
         elif material == WALL:
-            tone = np.float32(0.85) + np.float32(0.3) * noise_at(table, (x + y) * 1.9, z * 1.9)
+            tone = np.float32(0.85) + np.float32(0.3) * sample_noise(table, (x + y) * 1.9, z * 1.9)
             red, green, blue = red * tone, green * tone, blue * tone
         elif material == ROOF and appearance.part[row] == BUILDING:
             colour, building = appearance.facades.roof, appearance.part_row[row]
-            tone = np.float32(0.85) + np.float32(0.3) * noise_at(table, x * 2.3, y * 2.3 + z)
+            tone = np.float32(0.85) + np.float32(0.3) * sample_noise(table, x * 2.3, y * 2.3 + z)
             near = fade(np.float32(0.25), slant)
             if near > 0 and nz > np.float32(0.2) and nz < np.float32(0.97):
                 tone *= 1 - near * np.float32(0.28) * np.float32(abs((z * 4.5) % 1.0 - 0.5) * 2)
@@ -126,20 +126,20 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             )
         elif material == LEAF:
             near = fade(np.float32(0.10), across)
-            tone = np.float32(0.62) + np.float32(0.75) * hashed(row, 5)
+            tone = np.float32(0.62) + np.float32(0.75) * hash_pair(row, 5)
             if appearance.part[row] == CLUTTER:
-                tone = np.float32(0.55) + np.float32(0.8) * noise_at(table, (x + y) * 5.0, z * 5.0 + (x - y) * 3.0)
+                tone = np.float32(0.55) + np.float32(0.8) * sample_noise(table, (x + y) * 5.0, z * 5.0 + (x - y) * 3.0)
             if near > 0:
                 tone *= 1 + near * np.float32(1.5) * (
-                    noise_at(table, (x + y) * 19.0, z * 19.0 + x * 7.0) - np.float32(0.5)
+                    sample_noise(table, (x + y) * 19.0, z * 19.0 + x * 7.0) - np.float32(0.5)
                 )
-            autumn = hashed(appearance.part_row[row], 11)
+            autumn = hash_pair(appearance.part_row[row], 11)
             red, green, blue = red * tone * (np.float32(0.75) + autumn * np.float32(0.7)), green * tone, blue * tone
             through = np.float32(0.55)
         elif material == SIGN:
             place, plate = appearance.plates.place, appearance.part_row[row]
             right = (x - place[plate, 0]) * place[plate, 3] + (y - place[plate, 1]) * place[plate, 4]
-            red, green, blue = sign_at(
+            red, green, blue = sample_sign(
                 appearance.plates.kind[plate], right, z - place[plate, 2], across, appearance.plates.drawn
             )
         elif material >= LENS_RED and material <= LENS_GREEN:
@@ -154,7 +154,7 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             shine_r = np.float32(light.lamps * 2.0)
             shine_g, shine_b = shine_r * np.float32(0.75), shine_r * np.float32(0.42)
         elif material == BARK:
-            tone = np.float32(0.6) + np.float32(0.8) * noise_at(table, (x + y) * 22.0, z * 3.0)
+            tone = np.float32(0.6) + np.float32(0.8) * sample_noise(table, (x + y) * 22.0, z * 3.0)
             red, green, blue = red * tone, green * tone, blue * tone
 
         if light.wetness > 0 and (nz > np.float32(0.3) or instance == 0):
@@ -186,7 +186,7 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             mirror += (1 - mirror) * grazing * np.float32(0.8)
             turned = 2 * facing
             rx, ry, rz = dx + turned * nx, dy + turned * ny, dz + turned * nz
-            env_r, env_g, env_b = mirrored_at(rx, ry, rz, light, table)
+            env_r, env_g, env_b = compute_environment(rx, ry, rz, light, table)
             if gloss > 0 and sunny > 0:
                 beside = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
                 if beside > np.float32(0.6):

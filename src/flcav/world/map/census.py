@@ -1,6 +1,6 @@
 """Town statistics and traffic density.
 
-`census` counts a town's streets, buildings and furniture. `mean_actors` is the traffic density around candidate sites,
+`summarise_town` counts a town's streets, buildings and furniture. `measure_traffic_density` is the traffic density around candidate sites,
 the criterion of conventional sensor placement.
 """
 
@@ -17,7 +17,7 @@ from flcav.world.trace import Trace
 Array = NDArray[np.float64]
 
 
-def mean_actors(sites: Array, traces: Trace | Sequence[Trace], range_m: float) -> Array:
+def measure_traffic_density(sites: Array, traces: Trace | Sequence[Trace], range_m: float) -> Array:
     """Return the traffic density (P,): the mean number of actors within `range_m` of each site, over all instants.
 
     `sites` (P, 3) are in the world frame [m]. Every present actor counts, moving or parked, vehicle or pedestrian; its
@@ -33,7 +33,7 @@ def mean_actors(sites: Array, traces: Trace | Sequence[Trace], range_m: float) -
     return total / max(instants, 1)
 
 
-def census(town: Town) -> dict[str, float]:
+def summarise_town(town: Town) -> dict[str, float]:
     """Return the statistics of a town by name.
 
     `width_m` and `height_m` are the extents of its bounds; `driving_km` and `sidewalk_km` the total length of these

@@ -10,8 +10,8 @@ from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from flcav.world.map.layers import Arrow, ArrowKind, Crossing, MapLane, MapLayers
-from flcav.world.map.markings import markings
-from flcav.world.map.paint import ARROW_M, glyph, outlines, stripes, strokes
+from flcav.world.map.markings import generate_markings
+from flcav.world.map.paint import ARROW_M, list_outlines, outline_arrow, outline_dashes, outline_stripes
 from flcav.world.map.roads import Edge, Lane, RoadNet, read_net
 from flcav.world.map.town import Town
 
@@ -48,12 +48,12 @@ def rasterise(
             return np.zeros(shape, np.bool_)
         counts = [len(polygon) for polygon in polygons]
         points = np.concatenate(polygons) @ patch_from_world[:2, :2].T + patch_from_world[:2, 3]
-        return fill((corner - points) / resolution_m, np.array(counts), shape)
+        return fill_polygons((corner - points) / resolution_m, np.array(counts), shape)
 
     return np.stack([layer(polygons) for polygons in _polygons(layers).values()])
 
 
-def fill(points: Array, counts: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def fill_polygons(points: Array, counts: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Return the mask (H, W) of pixels whose centres (i + 0.5, j + 0.5) lie in any of the polygons.
 
     Scan-line fill by the nonzero winding rule, vectorised over all edges. `points` (N, 2) are the polygons' vertices as
@@ -91,12 +91,12 @@ def _polygons(layers: MapLayers) -> dict[str, list[Array]]:
     parts = {
         "road": layers.roads,
         "sidewalk": layers.sidewalks,
-        "lane": outlines(strips),
-        "marking": (piece for row in layers.markings if row.kind not in across for piece in strokes(row)),
-        "stop_line": (piece for row in layers.markings if row.kind in across for piece in strokes(row)),
+        "lane": list_outlines(strips),
+        "marking": (piece for row in layers.markings if row.kind not in across for piece in outline_dashes(row)),
+        "stop_line": (piece for row in layers.markings if row.kind in across for piece in outline_dashes(row)),
         "crossing": (row.outline for row in layers.crossings),
-        "stripe": (piece for row in layers.crossings for piece in stripes(row)),
-        "arrow": (glyph(row) for row in layers.arrows),
+        "stripe": (piece for row in layers.crossings for piece in outline_stripes(row)),
+        "arrow": (outline_arrow(row) for row in layers.arrows),
     }
     return {name: list(parts[name]) for name in RASTER_LAYERS}
 
@@ -118,7 +118,7 @@ def map_layers(town: Town) -> MapLayers:
         roads=town.roads,
         sidewalks=town.sidewalks,
         lanes=tuple(_lanes(net)),
-        markings=tuple(markings(net, roads, crossed)),
+        markings=tuple(generate_markings(net, roads, crossed)),
         crossings=crossings,
         arrows=tuple(_arrows(net)),
     )
@@ -152,7 +152,7 @@ def _crossings(net: RoadNet, roads: BaseGeometry) -> Iterator[Crossing]:
         if edge.function == "crossing":
             lane = edge.lanes[0]
             area = LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
-            on_road = list(outlines(area.intersection(roads)))
+            on_road = list(list_outlines(area.intersection(roads)))
             if on_road:
                 largest = max(on_road, key=lambda outline: Polygon(outline).area)
                 yield Crossing(edge.id, largest, lane.shape, lane.width)

@@ -34,14 +34,14 @@ SHORTEST_M = 0.3  # shorter pieces of a line are left out
 SAME_LINE_M = 0.7  # left sides of two edges nearer than this are one line: the directions of one street
 
 
-def markings(net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry) -> Iterator[Marking]:
+def generate_markings(net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry) -> Iterator[Marking]:
     """Yield the road markings of a net, clipped to `roads` and left out on `crossings`.
 
     Both areas are shapely geometry in the world frame [m].
     """
     paper = roads.buffer(-0.01).difference(crossings)
     shapely.prepare(paper)
-    for marking in _drawn(net):
+    for marking in _generate_unclipped(net):
         width = marking.width_m / 2
         inside = paper.buffer(-width) if width > LINE_M else paper  # wide ones lie wholly on the road
         for part in _lines(LineString(marking.line).intersection(inside)):
@@ -50,7 +50,7 @@ def markings(net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry) -> Iter
                 yield Marking(marking.kind, line, marking.width_m, marking.dash_m, marking.gap_m, marking.colour)
 
 
-def _drawn(net: RoadNet) -> Iterator[Marking]:
+def _generate_unclipped(net: RoadNet) -> Iterator[Marking]:
     """Yield all markings of a net before they are clipped, edge by edge."""
     bends = _bends(net)
     facing: dict[tuple[str, str], list[Edge]] = {}
@@ -66,7 +66,7 @@ def _drawn(net: RoadNet) -> Iterator[Marking]:
         lanes = [lane for lane in edge.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
         if not lanes:
             continue
-        approach = APPROACH_M if not inside and _controlled(net, edge) else 0.0
+        approach = APPROACH_M if not inside and _is_controlled(net, edge) else 0.0
         yield from _between_lanes(lanes, approach)
         across = facing.get(("", bends[edge.id]) if inside else (edge.end, edge.start), [])
         yield from _left_side(edge, lanes, across, approach)
@@ -93,7 +93,7 @@ def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: floa
     line = _beside(lanes[-1], lanes[-1].width / 2)
     for other in across:
         theirs = [lane for lane in other.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
-        if other is edge or not theirs or not _same(line, _beside(theirs[-1], theirs[-1].width / 2)):
+        if other is edge or not theirs or not _coincide(line, _beside(theirs[-1], theirs[-1].width / 2)):
             continue
         if edge.id > other.id:
             return  # the other direction has it
@@ -144,7 +144,7 @@ def _entry(net: RoadNet, edge: Edge) -> Iterator[Marking]:
         yield Marking("yield_line", line, YIELD_LINE_M, YIELD_DASH_M, YIELD_GAP_M)
 
 
-def _controlled(net: RoadNet, edge: Edge) -> bool:
+def _is_controlled(net: RoadNet, edge: Edge) -> bool:
     """Return whether an edge leads to a traffic light, a stop sign or a give-way sign."""
     junction = net.junctions.get(edge.end)
     return junction is not None and (
@@ -178,7 +178,7 @@ def _beside(lane: Lane, left_m: float) -> Array:
     return np.asarray(max(parts, key=lambda part: part.length).coords) if parts else lane.shape
 
 
-def _same(one: Array, other: Array) -> bool:
+def _coincide(one: Array, other: Array) -> bool:
     """Return whether two polylines (K, 2) coincide within `SAME_LINE_M`, at three points of the other."""
     line = LineString(one)
     whole = LineString(other)

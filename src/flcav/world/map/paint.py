@@ -29,26 +29,26 @@ class Paint(NamedTuple):
     colour: str
 
 
-def painted(layers: MapLayers) -> tuple[Paint, ...]:
+def outline_paint(layers: MapLayers) -> tuple[Paint, ...]:
     """Return the road paint of a map as polygons in the world frame: markings, then crossings, then arrows."""
     return (
-        *(Paint("marking", piece, marking.colour) for marking in layers.markings for piece in strokes(marking)),
-        *(Paint("crossing", piece, "white") for crossing in layers.crossings for piece in stripes(crossing)),
-        *(Paint("arrow", piece, "white") for arrow in layers.arrows for piece in [glyph(arrow)]),
+        *(Paint("marking", piece, marking.colour) for marking in layers.markings for piece in outline_dashes(marking)),
+        *(Paint("crossing", piece, "white") for crossing in layers.crossings for piece in outline_stripes(crossing)),
+        *(Paint("arrow", piece, "white") for arrow in layers.arrows for piece in [outline_arrow(arrow)]),
     )
 
 
-def strokes(marking: Marking) -> Iterator[Array]:
+def outline_dashes(marking: Marking) -> Iterator[Array]:
     """Yield the polygons (K, 2) of a marking: one per dash, or one of a continuous line."""
     line = LineString(marking.line)
     period = marking.dash_m + marking.gap_m if marking.dash_m else line.length
     starts = np.arange(0.0, line.length - 1e-6, period)
     for start in starts:
         piece = substring(line, start, min(start + (marking.dash_m or line.length), line.length))
-        yield from outlines(piece.buffer(marking.width_m / 2, cap_style="flat", join_style="mitre"))
+        yield from list_outlines(piece.buffer(marking.width_m / 2, cap_style="flat", join_style="mitre"))
 
 
-def stripes(crossing: Crossing) -> Iterator[Array]:
+def outline_stripes(crossing: Crossing) -> Iterator[Array]:
     """Yield the polygons (K, 2) of a zebra crossing's stripes, whose long sides lie in driving direction."""
     line, outline = LineString(crossing.centre_line), Polygon(crossing.outline)
     count = max(int((line.length + STRIPE_M) / (2 * STRIPE_M)), 1)
@@ -56,10 +56,10 @@ def stripes(crossing: Crossing) -> Iterator[Array]:
     for start in first + 2 * STRIPE_M * np.arange(count):
         piece = substring(line, start, start + STRIPE_M)
         if isinstance(piece, LineString):
-            yield from outlines(piece.buffer(crossing.width_m / 2, cap_style="flat").intersection(outline))
+            yield from list_outlines(piece.buffer(crossing.width_m / 2, cap_style="flat").intersection(outline))
 
 
-def glyph(arrow: Arrow) -> Array:
+def outline_arrow(arrow: Arrow) -> Array:
     """Return the outline (K, 2) of a lane arrow, world frame [m]."""
     cos, sin = np.cos(arrow.yaw), np.sin(arrow.yaw)
     return _glyph(arrow.kind) @ np.array([[cos, sin], [-sin, cos]]) + (arrow.x, arrow.y)
@@ -78,10 +78,10 @@ def _glyph(kind: ArrowKind) -> Array:
             bow = LineString([(back / 2, 0.0), (-0.5, side * 0.05), (0.0, side * 0.25), (0.3, side * 0.55)])
             pieces.append(bow.buffer(SHAFT_M / 2, cap_style="flat"))
             pieces.append(Polygon([(-0.35, side * 0.62), (0.85, side * 0.42), (0.75, side * 1.25)]))
-    return next(iter(outlines(shapely.union_all(pieces).buffer(0.001))))
+    return next(iter(list_outlines(shapely.union_all(pieces).buffer(0.001))))
 
 
-def outlines(shape: BaseGeometry | Iterable[BaseGeometry]) -> Iterator[Array]:
+def list_outlines(shape: BaseGeometry | Iterable[BaseGeometry]) -> Iterator[Array]:
     """Yield the outer rings of a shape's polygons: (K, 2) vertices, counter-clockwise, the first not repeated."""
     parts = shape if not isinstance(shape, BaseGeometry) else getattr(shape, "geoms", [shape])
     for part in parts:

@@ -14,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 
 from flcav.world.map.parameters import CLUTTER, Interval, PoleParameters, StreetParameters, TownParameters
 from flcav.world.map.roads import Edge, RoadNet
-from flcav.world.map.surfaces import Surfaces, footprint
+from flcav.world.map.surfaces import GroundSurfaces, make_footprint
 
 Array = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ class Verge:
         return float(x), float(y), yaw
 
 
-def verges(net: RoadNet, parameters: TownParameters) -> Iterator[Verge]:
+def list_verges(net: RoadNet, parameters: TownParameters) -> Iterator[Verge]:
     """Yield the verge of each sidewalk of all streets, in the net's order."""
     for edge in net.streets:
         for lane in edge.lanes_of("sidewalk"):
@@ -91,7 +91,7 @@ def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) 
             right = verge.half_width + street.frontage_m + _draw(random, street.setback_m) + width / 2
             for candidate in (length, street.building_length_m[0]):
                 x, y, yaw = verge.at(along + candidate / 2, right)
-                if plot.build(footprint(x, y, yaw, candidate, width)):
+                if plot.build(make_footprint(x, y, yaw, candidate, width)):
                     out.append((x, y, yaw, candidate, width, height))
                     along += candidate + max(CLEARANCE_M, _draw(random, street.building_gap_m))
                     break
@@ -109,12 +109,12 @@ def place_clutter(rows: list[Verge], plot: Plot, random: np.random.Generator) ->
             kind = kinds[int(random.choice(len(kinds), p=weights / weights.sum()))]
             length, width, height = np.array(CLUTTER[kind]) * random.uniform(0.85, 1.15, size=3)
             x, y, yaw = verge.at(along, verge.half_width + 0.15 + width / 2)
-            if plot.build(footprint(x, y, yaw, length, width)):
+            if plot.build(make_footprint(x, y, yaw, length, width)):
                 out.setdefault(kind, []).append((x, y, yaw, float(length), float(width), float(height)))
     return tuple((kind, _rows(out[kind], 6)) for kind in sorted(out))
 
 
-def place_trees(rows: list[Verge], ground: Surfaces, plot: Plot, random: np.random.Generator) -> Array:
+def place_trees(rows: list[Verge], ground: GroundSurfaces, plot: Plot, random: np.random.Generator) -> Array:
     """Return the trees (T, 4) x, y, height, crown radius [m]: along the streets and on the traffic islands."""
     out = []
 

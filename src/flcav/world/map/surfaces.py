@@ -18,7 +18,7 @@ SLIVER_M = 0.25  # narrower pieces are dropped, narrower gaps closed, shorter la
 
 
 @dataclass(frozen=True)
-class Surfaces:
+class GroundSurfaces:
     """The ground surfaces of a town, as shapely geometry in the world frame [m]."""
 
     roads: MultiPolygon  # carriageways and junctions
@@ -26,7 +26,7 @@ class Surfaces:
     islands: MultiPolygon  # traffic islands: holes of the roads without a sidewalk in them
 
 
-def surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Surfaces:
+def build_ground_surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> GroundSurfaces:
     """Return the ground surfaces of a net; `frontage_m` is the width of paving behind the sidewalk, by street type."""
     driven = [
         LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
@@ -59,10 +59,10 @@ def surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Surfaces:
             if not hole.intersects(walked_area.buffer(-SLIVER_M))
         ]
     )
-    return Surfaces(roads, _clean(sidewalks.union(islands)), islands)
+    return GroundSurfaces(roads, _clean(sidewalks.union(islands)), islands)
 
 
-def simple_polygons(area: BaseGeometry) -> tuple[Array, ...]:
+def split_into_polygons(area: BaseGeometry) -> tuple[Array, ...]:
     """Return a partition of `area` into polygons (K, 2) without holes, counter-clockwise, first vertex not repeated."""
     pieces: list[Array] = []
     for part in _polygons(area):
@@ -70,13 +70,13 @@ def simple_polygons(area: BaseGeometry) -> tuple[Array, ...]:
             x = Polygon(part.interiors[0]).representative_point().x
             _, low, _, high = part.bounds
             cut = LineString([(x, low - 1), (x, high + 1)])
-            pieces.extend(simple_polygons(split(part, cut)))
+            pieces.extend(split_into_polygons(split(part, cut)))
         else:
             pieces.append(np.asarray(shapely.geometry.polygon.orient(part).exterior.coords)[:-1])
     return tuple(pieces)
 
 
-def kerb_lines(ground: Surfaces) -> tuple[Array, ...]:
+def find_kerbs(ground: GroundSurfaces) -> tuple[Array, ...]:
     """Return the kerbs: polylines (K, 2) along which road meets sidewalk, world frame [m]."""
     shared = ground.roads.boundary.intersection(ground.sidewalks.buffer(0.02))
     lines = [line for line in getattr(shared, "geoms", [shared]) if isinstance(line, LineString) and line.length > 0]
@@ -97,7 +97,7 @@ def _polygons(area: BaseGeometry) -> Iterable[Polygon]:
     return [part for part in parts if isinstance(part, Polygon) and not part.is_empty]
 
 
-def footprint(x: float, y: float, yaw: float, length: float, width: float) -> Polygon:
+def make_footprint(x: float, y: float, yaw: float, length: float, width: float) -> Polygon:
     """Return the rectangle with centre x, y [m], heading `yaw` [rad] and these extents [m] as a polygon."""
     rectangle = box(-length / 2, -width / 2, length / 2, width / 2)
     cos, sin = float(np.cos(yaw)), float(np.sin(yaw))

@@ -14,7 +14,7 @@ from flcav.world.map import street_furniture as placement
 from flcav.world.map.parameters import GeoReference, TownParameters
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.signals import Signals, place_signals
-from flcav.world.map.surfaces import kerb_lines, simple_polygons, surfaces
+from flcav.world.map.surfaces import build_ground_surfaces, find_kerbs, split_into_polygons
 
 Array = NDArray[np.float64]
 
@@ -115,13 +115,15 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
 
 def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:
     """Return the town of a net: ground first, then buildings, clutter, trees, poles, signs, lamps and signals."""
-    ground = surfaces(net, {kind: street.frontage_m for kind, street in parameters.streets.items()})
-    rows = list(placement.verges(net, parameters))
+    ground = build_ground_surfaces(net, {kind: street.frontage_m for kind, street in parameters.streets.items()})
+    rows = list(placement.list_verges(net, parameters))
     paved = ground.roads.union(ground.sidewalks)
     land = placement.Plot(paved)
     buildings = placement.place_buildings(rows, land, stream(parameters.seed, "buildings"))
     walked = shapely.union_all([verge.line.buffer(verge.half_width, cap_style="flat") for verge in rows])
-    facades = [placement.footprint(x, y, yaw, length, width).buffer(0.1) for x, y, yaw, length, width, _ in buildings]
+    facades = [
+        placement.make_footprint(x, y, yaw, length, width).buffer(0.1) for x, y, yaw, length, width, _ in buildings
+    ]
     open_land = placement.Plot(shapely.union_all([ground.roads, walked, *facades]))
     clutter = placement.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
     trees = placement.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
@@ -135,9 +137,9 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
         parameters=parameters,
         geo=parameters.geo,
         bounds=(low_x - MARGIN_M, low_y - MARGIN_M, high_x + MARGIN_M, high_y + MARGIN_M),
-        roads=simple_polygons(ground.roads),
-        sidewalks=simple_polygons(ground.sidewalks),
-        kerbs=kerb_lines(ground),
+        roads=split_into_polygons(ground.roads),
+        sidewalks=split_into_polygons(ground.sidewalks),
+        kerbs=find_kerbs(ground),
         buildings=buildings,
         trees=trees,
         clutter=clutter,

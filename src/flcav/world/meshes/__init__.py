@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import lru_cache
 
-from flcav.world.meshes.mesh import Mesh, fitted
+from flcav.world.meshes.mesh import Mesh, fit_to_size
 from flcav.world.meshes.people import bicycle, motorcycle, pedestrian
 from flcav.world.meshes.vehicles import bus, car, truck
 from flcav.world.shapes import SHAPES, Shape
@@ -28,4 +28,4 @@ def actor_mesh(category: str, shape: int) -> Mesh:
     It has exactly the outer dimensions of the shape. Raises `KeyError` and `IndexError` for an unknown shape.
     """
     wanted = SHAPES[category][shape]
-    return fitted(MAKERS[category](wanted), wanted.length, wanted.width, wanted.height)
+    return fit_to_size(MAKERS[category](wanted), wanted.length, wanted.width, wanted.height)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.world.materials import Material
-from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join, mirrored, moved, sheet
+from flcav.world.meshes.mesh import Mesh, add_mirror_image, box, ellipsoid, join_meshes, sheet, transform_mesh
 
 Array = NDArray[np.float64]
 Outline = tuple[tuple[float, float], ...]
@@ -38,19 +38,19 @@ def vehicle_body(profile: Profile, length: float, width: float, height: float) -
     """Return the mesh of a vehicle of about these outer dimensions [m], mirrors included, in its body frame."""
     half_width = width / 2 - MIRROR_M
     lower = _Lower.of(profile, length, half_width, height)
-    parts = [mirrored(_flank(lower)), _floor(lower), _end(lower, front=False), _end(lower, front=True)]
+    parts = [add_mirror_image(_flank(lower)), _floor(lower), _end(lower, front=False), _end(lower, front=True)]
     parts += [
-        mirrored(_cabin_side(profile, lower, length, height)),
-        mirrored(_interior(profile, lower, length, height)),
+        add_mirror_image(_cabin_side(profile, lower, length, height)),
+        add_mirror_image(_interior(profile, lower, length, height)),
     ]
     parts += [_driver(profile, lower, length, height)]
     for axle in profile.axles:
-        parts += [mirrored(_arch(axle * length, profile, half_width))]
-        parts += [mirrored(moved(wheel(profile.wheel_radius, 0.22), axle * length, half_width - 0.13))]
+        parts += [add_mirror_image(_arch(axle * length, profile, half_width))]
+        parts += [add_mirror_image(transform_mesh(wheel(profile.wheel_radius, 0.22), axle * length, half_width - 0.13))]
     foot = profile.roof[-1][0] * length - 0.35
     mirror = (foot, half_width + MIRROR_M / 2 - 0.03, np.interp(foot, lower.x, lower.belt) + 0.07)
-    parts.append(mirrored(box(mirror, (0.11, MIRROR_M + 0.06, 0.12), Material.PAINT)))
-    return join(parts)
+    parts.append(add_mirror_image(box(mirror, (0.11, MIRROR_M + 0.06, 0.12), Material.PAINT)))
+    return join_meshes(parts)
 
 
 def wheel(radius: float, width: float, sides: int = 12) -> Mesh:
@@ -61,7 +61,7 @@ def wheel(radius: float, width: float, sides: int = 12) -> Mesh:
     out = np.array((0.0, face, 0.0))
     tread = [hub - out + 0 * circle, hub - out + circle, hub + out + circle, hub + out + circle * 0.68]
     disc = [hub + out + circle * 0.68, hub + out * 0.7 + circle * 0.6, hub + out * 0.8 + circle * 0]
-    return join((sheet(np.stack(tread), Material.TYRE), sheet(np.stack(disc), Material.RIM)))
+    return join_meshes((sheet(np.stack(tread), Material.TYRE), sheet(np.stack(disc), Material.RIM)))
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def _arch(x: float, profile: Profile, half_width: float) -> Mesh:
     outer, inner = (np.array((x, y, hub)) for y in (half_width * 0.95, half_width - 0.38))
     closed = np.concatenate((rim, rim[:1]))
     liner = sheet(np.stack((outer + rim, inner + rim)), Material.TRIM)
-    return join((liner, sheet(np.stack((inner + closed, inner + 0 * closed)), Material.TRIM)))
+    return join_meshes((liner, sheet(np.stack((inner + closed, inner + 0 * closed)), Material.TRIM)))
 
 
 def _cabin_side(profile: Profile, lower: _Lower, length: float, height: float) -> Mesh:
@@ -178,7 +178,7 @@ def _cabin_side(profile: Profile, lower: _Lower, length: float, height: float) -
     roof = [np.stack((x, shoulder * part, top + 0.02 * (1 - part)), axis=1) for part in (1.0, 0.85, 0.0)]
     roof_material = np.full((len(x) - 1, 2), Material.PAINT, np.uint8)
     roof_material[upright, 1] = Material.GLASS
-    return join((sheet(side, side_material), sheet(np.stack(roof, axis=1), roof_material)))
+    return join_meshes((sheet(side, side_material), sheet(np.stack(roof, axis=1), roof_material)))
 
 
 def _cabin_frame(profile: Profile, lower: _Lower, length: float) -> tuple[float, float, float]:
@@ -205,7 +205,7 @@ def _interior(profile: Profile, lower: _Lower, length: float, height: float) -> 
         top = min(0.44, 0.82 * room)  # of the headrest, above the waist
         parts.append(box((row, side, waist - 0.23 + top / 2), (0.14, 0.48, top + 0.12), Material.INTERIOR))
         parts.append(box((row, side, waist + top - 0.07), (0.09, 0.24, 0.14), Material.INTERIOR))
-    return join(parts)
+    return join_meshes(parts)
 
 
 def _driver(profile: Profile, lower: _Lower, length: float, height: float) -> Mesh:
@@ -214,12 +214,12 @@ def _driver(profile: Profile, lower: _Lower, length: float, height: float) -> Me
     x, side = end - FRONT_SEAT_M + 0.16, float(lower.half.max()) * 0.45
     chin = min(0.22, 0.85 * _headroom(profile, length, height, x, waist) - 0.24)
     torso = box((x, side, waist + chin - 0.22), (0.20, 0.40, 0.44), Material.CLOTH)
-    return join((torso, ellipsoid((x + 0.02, side, waist + chin + 0.11), (0.10, 0.08, 0.12), Material.SKIN, 6)))
+    return join_meshes((torso, ellipsoid((x + 0.02, side, waist + chin + 0.11), (0.10, 0.08, 0.12), Material.SKIN, 6)))
 
 
 def roof_sign(x: float, z: float) -> Mesh:
     """Return the roof sign of a taxi, at `x` and with its foot at height `z` [m]."""
-    return join(
+    return join_meshes(
         (
             box((x, 0, z + 0.02), (0.10, 0.30, 0.06), Material.TRIM),
             box((x, 0, z + 0.11), (0.14, 0.55, 0.14), Material.SIGN),

@@ -3,14 +3,14 @@
 import numpy as np
 
 from flcav.world.materials import Material
-from flcav.world.meshes.mesh import Mesh, box, join, moved, sheet
+from flcav.world.meshes.mesh import Mesh, box, join_meshes, sheet, transform_mesh
 
 STOREY_M = 3.0  # height of a storey
 BAY_M = 4.5  # width of a bay of the facade
 GABLED_BELOW_M = 9.0  # buildings lower than this have a gabled roof
 
 
-def building(length: float, width: float, height: float, rng: np.random.Generator) -> Mesh:
+def make_building(length: float, width: float, height: float, rng: np.random.Generator) -> Mesh:
     """Return a building of these dimensions [m] about its ground centre, `length` along x; `rng` draws its facades."""
     walls = height * 0.68 if height < GABLED_BELOW_M else height - 0.5
     parts = [box((0, 0, walls / 2), (length, width, walls), Material.WALL)]
@@ -19,8 +19,8 @@ def building(length: float, width: float, height: float, rng: np.random.Generato
         for side in (-1, 1):
             front = _facade(along, depth, walls, rng)
             if front is not None:
-                parts.append(moved(front, 0, 0, 0, np.pi / 2 * turned + (np.pi if side < 0 else 0)))
-    return join(parts)
+                parts.append(transform_mesh(front, 0, 0, 0, np.pi / 2 * turned + (np.pi if side < 0 else 0)))
+    return join_meshes(parts)
 
 
 def _facade(along: float, depth: float, walls: float, rng: np.random.Generator) -> Mesh | None:
@@ -41,7 +41,7 @@ def _facade(along: float, depth: float, walls: float, rng: np.random.Generator) 
                 parts.append(box((x, depth / 2 + 0.97, z + 0.5), (2.4, 0.06, 0.9), Material.METAL))
             else:
                 parts.append(box((x, depth / 2 + 0.06, z + 0.9), (1.5, 0.12, 0.12), Material.ROOF))
-    return join(parts) if parts else None
+    return join_meshes(parts) if parts else None
 
 
 def _parapet(length: float, width: float, walls: float) -> Mesh:
@@ -56,7 +56,7 @@ def _gable(length: float, width: float, walls: float, height: float) -> Mesh:
     slopes = [[(end, y * (across / 2 + 0.3), z) for y, z in ((-1, walls), (0, height), (1, walls))] for end in x]
     ends = [[(end, y * across / 2, z) for y, z in ((-1, walls), (0, height - 0.1), (1, walls))] for end in x * 0.97]
     walled = [Mesh(np.array(end, np.float32), np.array([[0, 1, 2]], np.int32), _one(Material.WALL)) for end in ends]
-    return moved(join((sheet(slopes, Material.ROOF), *walled)), 0, 0, 0, np.pi / 2 if turned else 0.0)
+    return transform_mesh(join_meshes((sheet(slopes, Material.ROOF), *walled)), 0, 0, 0, np.pi / 2 if turned else 0.0)
 
 
 def _one(material: Material) -> np.ndarray:

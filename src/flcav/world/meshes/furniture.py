@@ -9,22 +9,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flcav.world.materials import Material
-from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join, sheet, tube
+from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join_meshes, sheet, tube
 
 LEAVES = 360  # triangles of a crown; each stands for a cluster of leaves
 LEAF = 0.38  # size of a cluster over the crown's radius: the crown stops about two rays in three
 
 
-def tree(height: float, crown_radius: float, rng: np.random.Generator) -> Mesh:
+def make_tree(height: float, crown_radius: float, rng: np.random.Generator) -> Mesh:
     """Return a tree of these dimensions [m] about the foot of its trunk; `rng` draws its leaves."""
     crown_foot = 0.32 * height
     middle = np.array((0.0, 0.0, (height + crown_foot) / 2))
     radii = np.array((crown_radius, crown_radius, (height - crown_foot) / 2))
     trunk = tube((0, 0, 0), middle, 0.05 + 0.018 * height, Material.BARK, end_radius=0.05, sides=6, capped=False)
-    return join((trunk, leaves(middle, radii, LEAVES, LEAF * crown_radius, rng)))
+    return join_meshes((trunk, scatter_leaves(middle, radii, LEAVES, LEAF * crown_radius, rng)))
 
 
-def leaves(center: ArrayLike, radii: ArrayLike, count: int, size_m: float, rng: np.random.Generator) -> Mesh:
+def scatter_leaves(center: ArrayLike, radii: ArrayLike, count: int, size_m: float, rng: np.random.Generator) -> Mesh:
     """Return `count` loose triangles of about `size_m` in an ellipsoid, densest towards its surface.
 
     `center` (3,) and half axes `radii` (3,) are in metres; the triangles have random orientations.
@@ -54,7 +54,7 @@ def signal_head(height: float) -> Mesh:
     for place, material in zip((1, 0, -1), LENSES):
         middle = np.array((front + 0.005, 0.0, height + place * LENS_PITCH_M))
         parts += [_lens(middle, material), _visor(middle)]
-    return join(parts)
+    return join_meshes(parts)
 
 
 def signal_mast(height: float, reach: float = 0.0) -> Mesh:
@@ -64,7 +64,7 @@ def signal_mast(height: float, reach: float = 0.0) -> Mesh:
     mast = tube(foot, top, 0.075, Material.METAL, sides=8)
     bracket = box((-LIGHT_MAST_BEHIND_M / 2 - 0.04, reach, height), (LIGHT_MAST_BEHIND_M, 0.08, 0.08), Material.METAL)
     if not reach:
-        return join((mast, bracket))
+        return join_meshes((mast, bracket))
     arm = tube(
         (-LIGHT_MAST_BEHIND_M, 0, height),
         (-LIGHT_MAST_BEHIND_M, reach, height),
@@ -73,7 +73,7 @@ def signal_mast(height: float, reach: float = 0.0) -> Mesh:
         end_radius=0.04,
         sides=6,
     )
-    return join((mast, arm, bracket))
+    return join_meshes((mast, arm, bracket))
 
 
 def _lens(middle: np.ndarray, material: Material) -> Mesh:
@@ -92,29 +92,29 @@ SIGN_RADIUS_M = 0.36  # circumscribed radius of a sign's plate
 MAST_BEHIND_M = 0.40  # from a roadside sensor back to its mast
 
 
-def clutter(kind: str, length: float, width: float, height: float) -> Mesh:
+def make_clutter(kind: str, length: float, width: float, height: float) -> Mesh:
     """Return a piece of street clutter of these dimensions [m], `length` along x; a box for an unknown kind."""
     return CLUTTER.get(kind, _box)(length, width, height)
 
 
-def lamp(height: float) -> Mesh:
+def make_lamp(height: float) -> Mesh:
     """Return a street lamp of this height [m]; the underside of its head is luminous."""
     post = tube((0, 0, 0), (0, 0, height), 0.08, Material.METAL, end_radius=0.05, sides=6)
     head = box((0, 0, height), (0.9, 0.9, 0.12), Material.METAL)
     head.material[head.vertices[head.faces, 2].max(axis=1) < height] = Material.LAMP
-    return join((post, head))
+    return join_meshes((post, head))
 
 
 def sensor_mast(height: float) -> Mesh:
     """Return the mast of a roadside sensor that is `height` [m] above the origin and faces +x."""
     mast = tube((-MAST_BEHIND_M, 0, 0), (-MAST_BEHIND_M, 0, height + 0.1), 0.09, Material.METAL, sides=8)
     arm = box((-MAST_BEHIND_M / 2 - 0.06, 0, height - 0.12), (MAST_BEHIND_M - 0.12, 0.06, 0.06), Material.METAL)
-    return join((mast, arm))
+    return join_meshes((mast, arm))
 
 
 def sign(kind: str, height: float) -> Mesh:
     """Return a traffic sign with its post; the centre of its plate is `height` [m] above the origin and faces +x."""
-    return join((sign_plate(kind, height), sign_post(height)))
+    return join_meshes((sign_plate(kind, height), sign_post(height)))
 
 
 def sign_plate(kind: str, height: float) -> Mesh:
@@ -131,7 +131,7 @@ def sign_plate(kind: str, height: float) -> Mesh:
         index = np.arange(corners)
         faces = np.stack((index, (index + 1) % corners, np.full(corners, corners)), axis=1)
         plates.append(Mesh(vertices.astype(np.float32), faces.astype(np.int32), np.full(corners, material, np.uint8)))
-    return join(plates)
+    return join_meshes(plates)
 
 
 def sign_post(height: float) -> Mesh:
@@ -154,20 +154,20 @@ def _bins(length: float, width: float, height: float) -> Mesh:
     for x in (np.arange(count) - (count - 1) / 2) * step:
         parts.append(box((x, 0, 0.46 * height), (step * 0.85, width * 0.85, 0.92 * height), Material.TRIM))
         parts.append(box((x, 0, 0.95 * height), (step * 0.9, width, 0.10 * height), Material.METAL))
-    return join(parts)
+    return join_meshes(parts)
 
 
 def _planter(length: float, width: float, height: float) -> Mesh:
     tub = box((0, 0, 0.25 * height), (length, width, 0.5 * height), Material.WALL)
     bush = ellipsoid((0, 0, 0.55 * height), (0.46 * length, 0.45 * width, 0.45 * height), Material.LEAF)
-    return join((tub, bush))
+    return join_meshes((tub, bush))
 
 
 def _kiosk(length: float, width: float, height: float) -> Mesh:
     body = box((0, 0, 0.45 * height), (0.88 * length, 0.85 * width, 0.9 * height), Material.WALL)
     roof = box((0, 0, 0.95 * height), (length, width, 0.1 * height), Material.ROOF)
     counter = box((0, 0.45 * width, 0.45 * height), (0.6 * length, 0.1 * width, 0.05 * height), Material.METAL)
-    return join((body, roof, counter))
+    return join_meshes((body, roof, counter))
 
 
 def _shelter(length: float, width: float, height: float) -> Mesh:
@@ -178,13 +178,13 @@ def _shelter(length: float, width: float, height: float) -> Mesh:
     for x in (-length / 2 + 0.05, length / 2 - 0.05):
         for y in (-width / 2 + 0.05, width / 2 - 0.05):
             parts.append(box((x, y, height / 2 - 0.06), (0.08, 0.08, height - 0.12), Material.METAL))
-    return join(parts)
+    return join_meshes(parts)
 
 
 def _container(length: float, width: float, height: float) -> Mesh:
     body = box((0, 0, 0.44 * height), (0.94 * length, 0.94 * width, 0.8 * height), Material.METAL)
     lid = box((0, 0, 0.92 * height), (length, width, 0.16 * height), Material.TRIM)
-    return join((body, lid))
+    return join_meshes((body, lid))
 
 
 CLUTTER: dict[str, Callable[[float, float, float], Mesh]] = {

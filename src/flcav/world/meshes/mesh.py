@@ -55,7 +55,7 @@ class Mesh:
         return self.vertices.min(axis=0).astype(np.float64), self.vertices.max(axis=0).astype(np.float64)
 
 
-def join(parts: Sequence[Mesh]) -> Mesh:
+def join_meshes(parts: Sequence[Mesh]) -> Mesh:
     """Return all `parts` as one mesh."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     return Mesh(
@@ -65,20 +65,20 @@ def join(parts: Sequence[Mesh]) -> Mesh:
     )
 
 
-def moved(mesh: Mesh, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Mesh:
+def transform_mesh(mesh: Mesh, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Mesh:
     """Return `mesh` rotated by `yaw` [rad] about z and then translated by x, y, z [m]."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
     return Mesh((mesh.vertices @ turn + (x, y, z)).astype(np.float32), mesh.faces, mesh.material)
 
 
-def mirrored(mesh: Mesh) -> Mesh:
+def add_mirror_image(mesh: Mesh) -> Mesh:
     """Return `mesh` together with its mirror image in the x-z plane, as one mesh."""
     other = Mesh(mesh.vertices * np.array([1, -1, 1], np.float32), mesh.faces[:, ::-1], mesh.material)
-    return join((mesh, other))
+    return join_meshes((mesh, other))
 
 
-def fitted(mesh: Mesh, length: float, width: float, height: float) -> Mesh:
+def fit_to_size(mesh: Mesh, length: float, width: float, height: float) -> Mesh:
     """Return `mesh` scaled to exactly these outer dimensions [m], standing on z = 0, centred on the origin."""
     low, high = mesh.bounds()
     unit = (mesh.vertices - low) / (high - low)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flcav.world.materials import Material
-from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join, sheet, tube
+from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join_meshes, sheet, tube
 from flcav.world.shapes import Shape
 
 Point = tuple[float, float, float]
@@ -22,7 +22,7 @@ class Side(NamedTuple):
     hand: Point
 
 
-def figure(waist: Point, neck: Point, sides: tuple[Side, Side], *, helmet: bool = False) -> Mesh:
+def make_figure(waist: Point, neck: Point, sides: tuple[Side, Side], *, helmet: bool = False) -> Mesh:
     """Return a person facing +x with these joints [m]; a `helmet` for riders."""
     low, high = np.array(waist), np.array(neck)
     head = high + np.array((0.05, 0.0, 0.19))
@@ -41,7 +41,7 @@ def figure(waist: Point, neck: Point, sides: tuple[Side, Side], *, helmet: bool 
         parts.append(box((x + 0.06, y, z - 0.02), (0.26, 0.095, 0.09), Material.TRIM))
         parts.append(tube(side.shoulder, side.elbow, 0.052, Material.CLOTH, end_radius=0.042, sides=6))
         parts.append(tube(side.elbow, side.hand, 0.042, Material.SKIN, end_radius=0.035, sides=6))
-    return join(parts)
+    return join_meshes(parts)
 
 
 def pedestrian(shape: Shape) -> Mesh:
@@ -57,7 +57,7 @@ def pedestrian(shape: Shape) -> Mesh:
         )
         for left, step in ((1, 1), (-1, -1))
     )
-    return figure((0.0, 0.0, 0.88), (0.0, 0.0, 1.50), (sides[0], sides[1]))
+    return make_figure((0.0, 0.0, 0.88), (0.0, 0.0, 1.50), (sides[0], sides[1]))
 
 
 def bicycle(shape: Shape) -> Mesh:
@@ -80,7 +80,7 @@ def bicycle(shape: Shape) -> Mesh:
     parts.append(box((-0.60, 0, 0.68), (0.03, 0.07, 0.07), Material.TAILLAMP))
     neck = (-0.18 + lean, 0.0, 0.97 + np.sqrt(0.55**2 - lean**2))
     parts.append(_rider(saddle, neck, knee_x=0.18, feet=((0.02, 0.18), (-0.14, 0.42)), hand=(0.38, 0.25, 1.02)))
-    return join(parts)
+    return join_meshes(parts)
 
 
 def motorcycle(shape: Shape) -> Mesh:
@@ -106,7 +106,7 @@ def motorcycle(shape: Shape) -> Mesh:
     parts.append(box((-0.82, 0, 0.56), (0.02, 0.20, 0.15), Material.PLATE))
     feet = ((0.10, 0.40), (0.10, 0.40))
     parts.append(_rider((-0.25, 0, 0.86), (-0.08, 0, 1.38), knee_x=0.16, feet=feet, hand=(0.40, 0.32, 1.04)))
-    return join(parts)
+    return join_meshes(parts)
 
 
 def _rider(
@@ -128,7 +128,7 @@ def _rider(
                 hand=(hand[0], hand[1] * left, hand[2]),
             )
         )
-    return figure((saddle[0], 0.0, saddle[2] + 0.02), neck, (sides[0], sides[1]), helmet=True)
+    return make_figure((saddle[0], 0.0, saddle[2] + 0.02), neck, (sides[0], sides[1]), helmet=True)
 
 
 def _ring(x: float, radius: float, thickness: float) -> Mesh:
@@ -148,4 +148,4 @@ def _spoked_wheel(x: float, radius: float, thickness: float) -> Mesh:
         reach = np.array((np.cos(angle), 0.0, np.sin(angle))) * (radius - thickness)
         hub = np.array((x, 0.0, radius))
         parts.append(tube(hub - reach, hub + reach, 0.004, Material.METAL, sides=3, capped=False))
-    return join(parts)
+    return join_meshes(parts)

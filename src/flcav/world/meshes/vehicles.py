@@ -2,7 +2,7 @@
 
 from flcav.world.materials import Material
 from flcav.world.meshes.bodywork import Profile, roof_sign, vehicle_body, wheel
-from flcav.world.meshes.mesh import Mesh, box, join, mirrored, moved
+from flcav.world.meshes.mesh import Mesh, add_mirror_image, box, join_meshes, transform_mesh
 from flcav.world.shapes import Shape
 
 TAXI_SIGN_M = 0.18  # height of a taxi's roof sign
@@ -110,7 +110,7 @@ def car(shape: Shape) -> Mesh:
     """Return the car or van `shape`, in its body frame; a taxi has a roof sign."""
     if shape.name == "taxi":
         top = shape.height - TAXI_SIGN_M
-        return join((vehicle_body(PROFILES["taxi"], shape.length, shape.width, top), roof_sign(-0.2, top)))
+        return join_meshes((vehicle_body(PROFILES["taxi"], shape.length, shape.width, top), roof_sign(-0.2, top)))
     return vehicle_body(PROFILES[shape.name], shape.length, shape.width, shape.height)
 
 
@@ -147,7 +147,7 @@ def truck(shape: Shape) -> Mesh:
     """Return the truck `shape`, in its body frame: a cab, and a closed box or an open tipper behind it."""
     length, width, height = shape[1:]
     cab_height = min(2.75, height - 0.15)
-    parts = [moved(vehicle_body(_CAB, CAB_M, width, cab_height), length / 2 - CAB_M / 2, 0)]
+    parts = [transform_mesh(vehicle_body(_CAB, CAB_M, width, cab_height), length / 2 - CAB_M / 2, 0)]
     rear = -length / 2
     bed = length - CAB_M - 0.25
     middle = rear + bed / 2
@@ -157,10 +157,12 @@ def truck(shape: Shape) -> Mesh:
     )
     parts.append(_rear_lights(rear, width))
     parts.append(box((rear + 0.05, 0, 0.50), (0.10, width * 0.92, 0.12), Material.METAL))
-    parts.append(mirrored(box((middle + bed * 0.12, width / 2 - 0.12, 0.68), (bed * 0.40, 0.05, 0.40), Material.METAL)))
+    parts.append(
+        add_mirror_image(box((middle + bed * 0.12, width / 2 - 0.12, 0.68), (bed * 0.40, 0.05, 0.40), Material.METAL))
+    )
     for x in (rear + 1.15, rear + 2.25):
-        parts.append(mirrored(moved(wheel(WHEEL_M, 0.50), x, width / 2 - 0.30)))
-    return join(parts)
+        parts.append(add_mirror_image(transform_mesh(wheel(WHEEL_M, 0.50), x, width / 2 - 0.30)))
+    return join_meshes(parts)
 
 
 def bus(shape: Shape) -> Mesh:
@@ -169,9 +171,9 @@ def bus(shape: Shape) -> Mesh:
     parts = [vehicle_body(_BUS, length, width, height)]
     row = -length / 2 + 1.2
     while row < length / 2 - 2.2:
-        parts.append(mirrored(box((row, width * 0.27, height * 0.42), (0.12, 0.90, 0.70), Material.INTERIOR)))
+        parts.append(add_mirror_image(box((row, width * 0.27, height * 0.42), (0.12, 0.90, 0.70), Material.INTERIOR)))
         row += 0.95
-    return join(parts)
+    return join_meshes(parts)
 
 
 def _cargo(middle: float, bed: float, width: float, height: float) -> Mesh:
@@ -183,14 +185,14 @@ def _tipper_body(middle: float, bed: float, width: float, height: float) -> Mesh
     wall = (rim + floor) / 2, rim - floor
     inner = width - 0.06
     parts = [box((middle, 0, floor), (bed, inner, 0.10), Material.METAL)]
-    parts.append(mirrored(box((middle, inner / 2 - thick / 2, wall[0]), (bed, thick, wall[1]), Material.PAINT)))
+    parts.append(add_mirror_image(box((middle, inner / 2 - thick / 2, wall[0]), (bed, thick, wall[1]), Material.PAINT)))
     parts.append(box((middle - bed / 2 + thick / 2, 0, wall[0]), (thick, inner, wall[1]), Material.PAINT))
     front = middle + bed / 2 - thick / 2
     parts.append(box((front, 0, (height + floor) / 2), (thick, inner, height - floor), Material.PAINT))
     parts.append(box((middle, 0, floor + 0.45), (bed * 0.9, inner * 0.9, 0.8), Material.GROUND))
-    return join(parts)
+    return join_meshes(parts)
 
 
 def _rear_lights(rear: float, width: float) -> Mesh:
-    lamp = mirrored(box((rear + 0.01, width * 0.40, 0.86), (0.04, 0.26, 0.16), Material.TAILLAMP))
-    return join((lamp, box((rear + 0.01, 0, 0.66), (0.03, 0.50, 0.12), Material.PLATE)))
+    lamp = add_mirror_image(box((rear + 0.01, width * 0.40, 0.86), (0.04, 0.26, 0.16), Material.TAILLAMP))
+    return join_meshes((lamp, box((rear + 0.01, 0, 0.66), (0.03, 0.50, 0.12), Material.PLATE)))

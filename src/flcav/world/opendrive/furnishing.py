@@ -58,11 +58,11 @@ def furnish(net: RoadNet, *, description: str, seed: int, geo: GeoReference, sou
         pedestrians=_count(net, "sidewalk", PEDESTRIANS_PER_KM),
         mix=MIX,
         streets={kind: StreetParameters(**STREETS[kind]) for kind in kinds},
-        poles=tuple(candidate_poles(net)),
+        poles=tuple(find_candidate_poles(net)),
     )
 
 
-def candidate_poles(net: RoadNet) -> list[PoleParameters]:
+def find_candidate_poles(net: RoadNet) -> list[PoleParameters]:
     """Return the candidate sites of roadside sensors, numbered from north to south, then from west to east.
 
     There is one at each junction of three or more streets, on the widest street that leads there, and one midway along

@@ -12,7 +12,7 @@ EQUATOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
 UTM_SCALE, UTM_FALSE_EASTING_M, UTM_FALSE_NORTHING_M = 0.9996, 500_000.0, 10_000_000.0
 
 
-def geo_reference(projection: str, x: float, y: float) -> GeoReference | None:
+def locate_origin(projection: str, x: float, y: float) -> GeoReference | None:
     """Return the geodetic position of the point (x, y) [m] in a map with the PROJ string `projection`.
 
     None for a projection other than +proj=tmerc and +proj=utm, and for values that are no numbers or out of range. The

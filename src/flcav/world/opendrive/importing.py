@@ -15,14 +15,14 @@ from pathlib import Path
 import yaml
 
 from flcav.config import InputError
-from flcav.extras import installation
+from flcav.extras import format_install_command
 from flcav.world.map.parameters import GeoReference, MapSource
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town, load_town
 from flcav.world.opendrive.document import read_document
 from flcav.world.opendrive.furnishing import furnish
-from flcav.world.opendrive.georeference import geo_reference
-from flcav.world.opendrive.streets import rewrite
+from flcav.world.opendrive.georeference import locate_origin
+from flcav.world.opendrive.streets import rewrite_streets
 
 PARTS = ("nod", "edg", "con")  # netconvert's plain XML files: nodes, edges, connections
 OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
@@ -44,7 +44,7 @@ JOINING = {
 }
 
 
-def take_apart(xodr: Path, prefix: Path) -> None:
+def split_map(xodr: Path, prefix: Path) -> None:
     """Split an OpenDRIVE map: write its `PARTS` as `prefix.nod.xml` and so on, and its net as `prefix.net.xml`.
 
     Heights are dropped, since towns are flat. Raises `InputError` where netconvert is missing or refuses the map.
@@ -60,7 +60,7 @@ def take_apart(xodr: Path, prefix: Path) -> None:
     _run(options, xodr)
 
 
-def join(prefix: Path, net: Path, origin: Path) -> None:
+def join_parts(prefix: Path, net: Path, origin: Path) -> None:
     """Join the `PARTS` beside `prefix` to the net file `net`; raises `InputError` naming `origin` where that fails."""
     options = {OPTIONS[part]: f"{prefix}.{part}.xml" for part in PARTS}
     _run(options | JOINING | {"output-file": str(net)}, origin)
@@ -72,7 +72,9 @@ def _run(options: dict[str, str], origin: Path) -> None:
     """Run netconvert; raises `InputError` where it is missing, or with its first error where it fails."""
     found = importlib.util.find_spec("sumo")
     if found is None or not found.submodule_search_locations:
-        raise InputError(f"importing towns needs SUMO's netconvert, which is not installed: {installation('towns')}")
+        raise InputError(
+            f"importing towns needs SUMO's netconvert, which is not installed: {format_install_command('towns')}"
+        )
     binary = Path(next(iter(found.submodule_search_locations))) / "bin" / "netconvert"
     command = [str(binary), *(word for name, value in options.items() for word in (f"--{name}", value))]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -82,14 +84,14 @@ def _run(options: dict[str, str], origin: Path) -> None:
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedTown:
     """An imported town, and notes on what differs from the map."""
 
     town: Town
     notes: tuple[str, ...]  # sentences
 
 
-def import_town(xodr: Path, out: Path) -> Imported:
+def import_town(xodr: Path, out: Path) -> ImportedTown:
     """Write the town of an OpenDRIVE map as the folder `out` and return it; the same map gives the same town.
 
     Raises `InputError`, and does not make `out`, where it exists already, where the file is no OpenDRIVE map that
@@ -103,12 +105,12 @@ def import_town(xodr: Path, out: Path) -> Imported:
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as scratch:
         prefix, folder = Path(scratch) / "map", Path(scratch) / out.name
         folder.mkdir()
-        take_apart(xodr, prefix)
-        streets = rewrite(prefix, document, xodr)
-        join(prefix, folder / "town.net.xml", xodr)
+        split_map(xodr, prefix)
+        streets = rewrite_streets(prefix, document, xodr)
+        join_parts(prefix, folder / "town.net.xml", xodr)
         net = read_net(folder / "town.net.xml")
         dx, dy = streets.offset_m
-        geo = geo_reference(document.geo_reference, -dx, -dy)
+        geo = locate_origin(document.geo_reference, -dx, -dy)
         if geo is None:
             geo = GeoReference()
             notes.append(
@@ -131,4 +133,4 @@ def import_town(xodr: Path, out: Path) -> Imported:
         (folder / "town.yaml").write_text(text, encoding="utf-8")
         load_town(folder)
         shutil.move(folder, out)
-    return Imported(load_town(out), tuple(notes))
+    return ImportedTown(load_town(out), tuple(notes))

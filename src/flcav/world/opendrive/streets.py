@@ -33,7 +33,7 @@ ALLOWED = {  # attributes of a SUMO lane, by kind
 
 
 @dataclass(frozen=True)
-class Rewritten:
+class MapChanges:
     """The changes made to a map."""
 
     offset_m: tuple[float, float]  # town = map + offset
@@ -49,7 +49,7 @@ class _Lane:
     before: int | None  # its index in the map; None for an added lane
 
 
-def rewrite(prefix: Path, document: Document, origin: Path) -> Rewritten:
+def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChanges:
     """Rewrite the plain files beside `prefix` in place; raises `InputError` naming `origin` without a driving lane."""
     nodes, edges, connections = (ElementTree.parse(f"{prefix}.{part}.xml") for part in ("nod", "edg", "con"))
     rows = edges.getroot().findall("edge")
@@ -78,7 +78,7 @@ def rewrite(prefix: Path, document: Document, origin: Path) -> Rewritten:
     offset = _move(nodes.getroot(), edges.getroot())
     for part, tree in (("nod", nodes), ("edg", edges), ("con", connections)):
         tree.write(f"{prefix}.{part}.xml")
-    return Rewritten(offset, add)
+    return MapChanges(offset, add)
 
 
 def _write_widths(rows: list[ElementTree.Element], net: Path) -> None:

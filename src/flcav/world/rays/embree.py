@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import pose
 from flcav.world.rays import loader as c
-from flcav.world.rays.packets import LANES, block_packets, trace_groups, trace_packets
+from flcav.world.rays.packets import LANES, occlude_packets, trace_groups, trace_packets
 from flcav.world.rays.raycaster import Hits
 
 _ARGUMENTS = c.IntersectArguments(flags=c.QUERY_COHERENT, feature_mask=0xFFFFFFFF)
@@ -114,12 +114,12 @@ class Assembly:
         """Return the first hit of each ray with the placed instances: see `raycaster.Target.trace`."""
         return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
 
-    def blocked(
+    def find_occluded(
         self, origins: NDArray[np.float32], directions: NDArray[np.float32], far_m: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
         """Return whether each ray is occluded before its end: see `raycaster.Assembly.blocked`."""
         out = np.empty(len(far_m), np.bool_)
-        block_packets(
+        occlude_packets(
             _address("rtcOccluded16"),
             self.handle,
             ctypes.addressof(_BLOCK_ARGUMENTS),

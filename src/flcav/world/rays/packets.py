@@ -108,7 +108,7 @@ def trace_groups(
 
 
 @compiled
-def block_packets(occluded, scene, arguments, origins, directions, far, blocked):
+def occlude_packets(occluded, scene, arguments, origins, directions, far, blocked):
     """Write to `blocked` (N,) whether each ray is occluded before its end `far` (N,) [m]; never where `far` <= 0.
 
     `occluded`, `scene` and `arguments` are addresses. `origins` (N, 3) and unit `directions` (N, 3), or (1, 3) for all,

@@ -48,7 +48,7 @@ class Assembly(Target, Protocol):
         """Apply all placements since the last commit. Not to be called while another thread traces."""
         ...
 
-    def blocked(
+    def find_occluded(
         self, origins: NDArray[np.float32], directions: NDArray[np.float32], far_m: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
         """Return (N,) whether each ray is occluded before its end `far_m` (N,) [m]; never where that is not positive.

@@ -26,7 +26,7 @@ def cast_stalled(stage: Stage, scenario: Scenario) -> str | None:
     """Return the nearest moving vehicle ahead of a vehicle under test, in its lane or on its next edges."""
     found: list[tuple[float, str]] = []
     for ego in stage.egos(scenario):
-        spot, way = stage.spot(ego), stage.onward(ego)[1:STREETS]
+        spot, way = stage.spot(ego), stage.list_remaining_edges(ego)[1:STREETS]
         for name in stage.sumo.vehicle.getIDList():
             other = stage.spot(name)
             if name.startswith("cav") or not spot or not other or other.left < STANDS_BEFORE_M:
@@ -53,19 +53,19 @@ def stall(stage: Stage, scenario: Scenario, victim: str) -> Generator[None, None
         stage.sumo.vehicle.setSpeed(victim, -1.0)
 
 
-class Pair(NamedTuple):
+class CrashPair(NamedTuple):
     """The two vehicles of a rear-end crash."""
 
     behind: str
     ahead: str
 
 
-def cast_crash(stage: Stage, scenario: Scenario) -> Pair | None:
+def cast_crash(stage: Stage, scenario: Scenario) -> CrashPair | None:
     """Return two moving motor vehicles in one lane, one behind the other, near a vehicle under test."""
     egos = stage.egos(scenario)
     for behind in stage.sumo.vehicle.getIDList():
         near = any(math.dist(stage.state(behind)[:2], stage.state(ego)[:2]) <= SEEN_M for ego in egos)
-        ahead = stage.leader(behind, APART_M[1]) if near and not behind.startswith("cav") else None
+        ahead = stage.find_leader(behind, APART_M[1]) if near and not behind.startswith("cav") else None
         if ahead is None or ahead[0].startswith("cav") or ahead[1] < APART_M[0]:
             continue
         spot, other = stage.spot(behind), stage.spot(ahead[0])
@@ -73,11 +73,11 @@ def cast_crash(stage: Stage, scenario: Scenario) -> Pair | None:
             continue
         heavy = all(not stage.sumo.vehicle.getTypeID(name).startswith("bicycle") for name in (behind, ahead[0]))
         if heavy and min(stage.state(behind)[3], stage.state(ahead[0])[3]) >= FAST:
-            return Pair(behind, ahead[0])
+            return CrashPair(behind, ahead[0])
     return None
 
 
-def crash(stage: Stage, scenario: Scenario, pair: Pair) -> Generator[None, None, None]:
+def crash(stage: Stage, scenario: Scenario, pair: CrashPair) -> Generator[None, None, None]:
     """Let the front vehicle brake sharply and the rear one not react; after the impact both stand, slightly turned."""
     vehicle = stage.sumo.vehicle
     for name in pair:

@@ -57,13 +57,13 @@ class Director:
     def _play(self, number: int, scenario: Scenario) -> Generator[None, None, None]:
         """Try to cast a scenario every `LOOKS_AGAIN` steps, then note its event and run its script."""
         cast, act = SCRIPTS[scenario.kind]
-        while (roles := cast(self.stage, scenario)) is None or self._busy & set(named(roles)):
+        while (roles := cast(self.stage, scenario)) is None or self._busy & set(list_actors(roles)):
             for _ in range(LOOKS_AGAIN):
                 yield
         there, known = set(self.stage.sumo.vehicle.getIDList()), set(self.stage.props)
         playing = act(self.stage, scenario, roles)
         next(playing)
-        actors = [name for name in named(roles) if name in there]
+        actors = [name for name in list_actors(roles) if name in there]
         actors += [name for name in self.stage.props if name not in known]
         self._busy |= {name for name in actors if not name.startswith("cav")}
         self._needed[number] = {name for name in actors if name in there and not name.startswith("cav")}
@@ -79,6 +79,6 @@ class Director:
         return [(name, kind, states[step]) for name, (kind, states) in self.stage.props.items() if step in states]
 
 
-def named(roles: Any) -> list[str]:
+def list_actors(roles: Any) -> list[str]:
     """Return the names of vehicles among the roles of a scenario: a name, or a tuple with some."""
     return [roles] if isinstance(roles, str) else [role for role in roles if isinstance(role, str)]

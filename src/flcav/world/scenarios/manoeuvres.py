@@ -42,16 +42,16 @@ def cast_cut_in(stage: Stage, scenario: Scenario) -> CutIn | None:
     """Return a vehicle under test with a free lane ahead, and a vehicle on the next lane or free space at the kerb."""
     for ego in stage.free_egos(scenario):
         spot = stage.spot(ego)
-        if not spot or stage.state(ego)[3] < FAST or spot.left < NEXT_ROOM_M or stage.leader(ego, 15.0):
+        if not spot or stage.state(ego)[3] < FAST or spot.left < NEXT_ROOM_M or stage.find_leader(ego, 15.0):
             continue
         neighbour = _beside(stage, spot)
         if neighbour is not None:
             return CutIn(ego, spot, neighbour)
-        if spot.left < ROOM_M or stage.state(ego)[3] > TOO_FAST or stage.leader(ego, 25.0):
+        if spot.left < ROOM_M or stage.state(ego)[3] > TOO_FAST or stage.find_leader(ego, 25.0):
             continue
         kind = scenario.actors.get("car", DEFAULT_CAR)
         x, y, _ = stage.point(spot.lane, _stands_at(spot, kind), _kerb(spot.lane, kind))
-        if spot.lane is spot.edge.lanes_of("driving")[0] and stage.untouched(x, y, CLEAR_M):
+        if spot.lane is spot.edge.lanes_of("driving")[0] and stage.is_untouched(x, y, CLEAR_M):
             return CutIn(ego, spot, None)
     return None
 
@@ -108,9 +108,9 @@ def _pull_out(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None,
     kind = scenario.actors.get("car", DEFAULT_CAR)
     name, lane, along = stage.cast(kind), roles.spot.lane, _stands_at(roles.spot, kind)
     aside = _kerb(lane, kind)
-    stage.stood(name, *stage.point(lane, along, aside))
+    stage.place_from_start(name, *stage.point(lane, along, aside))
     speed = 0.7 * stage.state(roles.ego)[3]
-    stage.enter(name, kind, (lane, along), stage.onward(roles.ego), 1.0)
+    stage.enter(name, kind, (lane, along), stage.list_remaining_edges(roles.ego), 1.0)
     steps = round(MOVES_OVER_S / STEP_S)
     for i in range(steps):
         left, rate = ease(i / steps)
@@ -139,7 +139,7 @@ def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
             continue
         light, _, distance, state = lights[0]
         near = any(math.dist(stage.state(name)[:2], stage.state(ego)[:2]) <= SEEN_M for ego in egos)
-        first = stage.leader(name, distance + 12.0) is None
+        first = stage.find_leader(name, distance + 12.0) is None
         moving = LIGHT_M[0] <= distance <= LIGHT_M[1] and stage.state(name)[3] > FAST
         waited = stage.sumo.vehicle.getWaitingTime(name) > IMPATIENT_S
         if near and first and state == "r" and (moving or waited):

@@ -41,7 +41,7 @@ def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
     for ego in stage.egos(scenario):
         if stage.state(ego)[3] < ROLLS:
             continue
-        ahead = [stage.net.edges[edge] for edge in stage.onward(ego)[:STREETS]]
+        ahead = [stage.net.edges[edge] for edge in stage.list_remaining_edges(ego)[:STREETS]]
         oncoming = {(edge.end, edge.start) for edge in ahead}
         for name in stage.sumo.vehicle.getIDList():
             spot = stage.spot(name)
@@ -53,7 +53,7 @@ def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
             if (
                 (spot.edge.start, spot.edge.end) not in oncoming
                 or not follows_on_lane
-                or stage.leader(name, _takes_m(stage.state(name)[3]))
+                or stage.find_leader(name, _takes_m(stage.state(name)[3]))
             ):
                 continue
             if _meets(stage.state(name), stage.state(ego)) and _way_is_free(stage, name) and _alone(stage, name):
@@ -111,7 +111,7 @@ def overtake(stage: Stage, scenario: Scenario, roles: Overtaking) -> Generator[N
     vehicle, slow, lane = stage.sumo.vehicle, roles.slow, roles.spot.lane
     kind = scenario.actors.get("car", KIND)
     name, length = stage.cast(kind), length_of(kind)
-    way = stage.onward(slow)  # from this lane on; the slow vehicle may leave it first
+    way = stage.list_remaining_edges(slow)  # from this lane on; the slow vehicle may leave it first
     slow_length = vehicle.getLength(slow)
     for step, (x, y, angle, speed) in stage.trail(slow, BEHIND_M + slow_length):
         stage.place(name, x, y, math.radians(90.0 - angle), speed, step)

@@ -36,10 +36,10 @@ def cast_behind_van(stage: Stage, scenario: Scenario) -> BehindVan | None:
         if not spot or speed < FAST or spot.lane is not spot.edge.lanes_of("driving")[0]:
             continue
         along = spot.along + min(max(AHEAD_M[0], 3.2 * speed), AHEAD_M[1])
-        if along + 12.0 > spot.along + spot.left or stage.leader(ego, along - spot.along + 6.0):
+        if along + 12.0 > spot.along + spot.left or stage.find_leader(ego, along - spot.along + 6.0):
             continue
         x, y, _ = stage.point(spot.lane, along - BEFORE_VAN_M - length_of(kinds[0]) / 2, _beside(spot, kinds[0]))
-        if stage.untouched(x, y, CLEAR_M):
+        if stage.is_untouched(x, y, CLEAR_M):
             return BehindVan(ego, spot, along, kinds)
     return None
 
@@ -58,8 +58,8 @@ def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[Non
     van, pedestrian = (stage.cast(kind) for kind in roles.kinds)
     hidden = _beside(roles.spot, roles.kinds[0])
     stands = stage.point(lane, roles.along - BEFORE_VAN_M, hidden)
-    stage.stood(van, *stands)
-    stage.stood(pedestrian, *_walker(stage, roles, hidden))
+    stage.place_from_start(van, *stands)
+    stage.place_from_start(pedestrian, *_walker(stage, roles, hidden))
     at, far = hidden, _far_kerb(stage, roles.spot.edge, lane.width) + WALK_ON_M
     running = False
     while True:

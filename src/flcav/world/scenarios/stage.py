@@ -110,12 +110,12 @@ class Stage:
         angle = 90.0 - math.degrees(heading)
         self.props[name][1][self.step if step is None else step] = (x, y, angle, speed)
 
-    def stood(self, name: str, x: float, y: float, heading: float) -> None:
+    def place_from_start(self, name: str, x: float, y: float, heading: float) -> None:
         """Let a prop stand at x, y [m] with this heading [rad] from the start of the run up to now."""
         for step in range(self.step + 1):
             self.place(name, x, y, heading, 0.0, step)
 
-    def untouched(self, x: float, y: float, radius_m: float) -> bool:
+    def is_untouched(self, x: float, y: float, radius_m: float) -> bool:
         """Return whether no vehicle of SUMO has ever been within `radius_m` of x, y [m]."""
         return not any(
             math.hypot(state[0] - x, state[1] - y) < radius_m for states in self.past.values() for _, state in states
@@ -137,11 +137,11 @@ class Stage:
         """Let a vehicle of SUMO act at every step, so that it obeys a script at once."""
         self.sumo.vehicle.setActionStepLength(name, ALERT)
 
-    def onward(self, name: str) -> list[str]:
+    def list_remaining_edges(self, name: str) -> list[str]:
         """Return the edges of the rest of a vehicle's route, from the one it is on."""
         return list(self.sumo.vehicle.getRoute(name)[max(self.sumo.vehicle.getRouteIndex(name), 0) :])
 
-    def leader(self, name: str, within_m: float) -> tuple[str, float] | None:
+    def find_leader(self, name: str, within_m: float) -> tuple[str, float] | None:
         """Return the vehicle ahead of a vehicle and the gap between their bumpers [m]; None beyond `within_m`."""
         found = self.sumo.vehicle.getLeader(name, within_m)
         if not found or not found[0]:

@@ -106,13 +106,13 @@ def write_demand(
     walked = [edge for edge in net.streets if edge.lanes_of("sidewalk")]
     traffic = np.array([parameters.streets[edge.type].traffic for edge in driven])
     footfall = np.array([parameters.streets[edge.type].footfall for edge in walked])
-    watched = pole_approaches(net, parameters)
+    watched = weigh_pole_approaches(net, parameters)
     watching = np.array([watched.get(edge.id, 0.0) for edge in driven])
     reach = FASTEST * until_s
     trips: list[tuple[float, Element]] = []
     for i in range(cavs):
         random = stream(seed, "cav", i)
-        edges = tour(driven, watching if watching.any() else traffic, reach, random)
+        edges = draw_tour(driven, watching if watching.any() else traffic, reach, random)
         trips.append((0.0, _vehicle(f"cav{i}", CAV_TYPE, 0.0, edges)))
     categories = list(parameters.mix)
     shares = np.array([parameters.mix[category] for category in categories])
@@ -120,18 +120,20 @@ def write_demand(
         random = stream(seed, "vehicle", i)
         kind = draw_type(categories[int(random.choice(len(categories), p=shares / shares.sum()))], parameters, random)
         depart = round(float(random.uniform(0.0, fill_s)), 1)
-        trips.append((depart, _vehicle(f"veh{i}", kind, depart, tour(driven, traffic, reach, random))))
+        trips.append((depart, _vehicle(f"veh{i}", kind, depart, draw_tour(driven, traffic, reach, random))))
     for i in range(parameters.pedestrians):
         random = stream(seed, "pedestrian", i)
         kind = draw_type("pedestrian", parameters, random)
         depart = round(float(random.uniform(0.0, fill_s)), 1)
-        trips.append((depart, _person(f"ped{i}", kind, depart, tour(walked, footfall, FASTEST_WALK * until_s, random))))
+        trips.append(
+            (depart, _person(f"ped{i}", kind, depart, draw_tour(walked, footfall, FASTEST_WALK * until_s, random)))
+        )
     for _, trip in sorted(trips, key=lambda item: item[0]):
         root.append(trip)
     return tostring(root, encoding="unicode")
 
 
-def pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str, float]:
+def weigh_pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str, float]:
     """Return the weights, by edge, of the edges that lead past the candidate poles; each pole adds 1 in total.
 
     The edges of a straight pole are both directions of its street; those of another lead into the junction it faces.
@@ -148,7 +150,7 @@ def pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str, float
     return out
 
 
-def tour(edges: list[Edge], weight: Array, length_m: float, random: np.random.Generator) -> list[str]:
+def draw_tour(edges: list[Edge], weight: Array, length_m: float, random: np.random.Generator) -> list[str]:
     """Return the ids of edges to visit in order, drawn by `weight` (N,), at least `length_m` long as the crow flies."""
     middle = np.array([edge.lanes[0].shape.mean(axis=0) for edge in edges])
     share = weight / weight.sum()
@@ -185,7 +187,7 @@ def _person(name: str, kind: str, depart: float, edges: list[str]) -> Element:
     return person
 
 
-def types() -> Iterator[tuple[str, str, int]]:
+def list_vehicle_types() -> Iterator[tuple[str, str, int]]:
     """Yield each of SUMO's vehicle types with its category and its row of `SHAPES[category]`."""
     for category, shapes in SHAPES.items():
         for i, shape in enumerate(shapes):

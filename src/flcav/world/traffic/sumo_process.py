@@ -68,7 +68,7 @@ class Walkers:
 STEP_S = 0.1
 
 
-def run(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenarios: list[Scenario]) -> None:
+def run_sumo(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenarios: list[Scenario]) -> None:
     """Simulate up to the last of `steps` (T,), ascending, of 0.1 s each, and write the states at these to `out` (.npz).
 
     Arrays: `id` and `type` (A,) of each actor; `row` (N, 2) instant and actor of each state; `state` (N, 4) SUMO's
@@ -163,7 +163,7 @@ def _simulate(folder: Path) -> NoReturn:
             os.dup2(said.fileno(), sys.stderr.fileno())
         job = json.loads((folder / "job.json").read_text())
         scenarios = [Scenario.model_validate(scenario) for scenario in job["scenarios"]]
-        run(Path(job["net"]), Path(job["routes"]), job["seed"], job["steps"], folder / "out.npz", scenarios)
+        run_sumo(Path(job["net"]), Path(job["routes"]), job["seed"], job["steps"], folder / "out.npz", scenarios)
         code = 0
     except BaseException:
         traceback.print_exc()

@@ -13,14 +13,14 @@ from shapely.geometry.base import BaseGeometry
 
 from flcav.config import InputError
 from flcav.geometry import wrap_angle
-from flcav.seeds import child_seed, stream
+from flcav.seeds import derive_seed, stream
 from flcav.world.map.roads import read_net
-from flcav.world.map.surfaces import footprint
+from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import KERB_M, Town
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.shapes import SHAPES
 from flcav.world.trace import Event, Trace
-from flcav.world.traffic.demand import Parked, park, types, write_demand
+from flcav.world.traffic.demand import Parked, list_vehicle_types, park, write_demand
 from flcav.world.traffic.sumo import simulate_in
 from flcav.world.traffic.sumo_process import STEP_S
 
@@ -52,10 +52,10 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
     demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, until_s=float(times_s[-1]), fill_s=FILL_S)
     before, now, after = (_windows(steps + offset) for offset in (-1, 0, 1))
     read = np.unique((before, now, after))
-    raw = _run(town.net, demand, child_seed(seed, "sumo"), read, scenarios)
-    parked = _beside(raw, park(net, town.parameters, stream(seed, "parked")))
+    raw = _run(town.net, demand, derive_seed(seed, "sumo"), read, scenarios)
+    parked = _drop_obstructing(raw, park(net, town.parameters, stream(seed, "parked")))
     rows = tuple(np.searchsorted(read, window) for window in (before, now, after))
-    trace = _trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
+    trace = _build_trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
     under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
     if under_way.sum() < cavs * len(times_s):
         raise InputError(f"not all of {cavs} CAVs are under way at {times_s[0]} s: begin later, or take fewer")
@@ -85,7 +85,7 @@ def _run(
             return dict(arrays)
 
 
-def _trace(
+def _build_trace(
     town: Town,
     time_s: Array,
     raw: dict[str, NDArray],
@@ -98,7 +98,7 @@ def _trace(
     rates = _rates(earlier, state, later)
     seen = np.flatnonzero(~np.isnan(state[..., 0]).all(axis=0))
     order = np.array(sorted(seen, key=lambda i: _natural(str(raw["id"][i]))), dtype=np.int64)
-    known = {name: (category, shape) for name, category, shape in types()}
+    known = {name: (category, shape) for name, category, shape in list_vehicle_types()}
     kinds = [known[str(raw["type"][i])] for i in order] + [(car.category, car.shape) for car in parked]
     size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], dtype=np.float64).reshape(-1, 3)
     half_length = size[: len(order), 0] / 2  # from an actor's front, SUMO's reference point, to its centre
@@ -201,7 +201,7 @@ def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
     return next(motions), next(motions)
 
 
-def _beside(raw: dict[str, NDArray], parked: list[Parked]) -> list[Parked]:
+def _drop_obstructing(raw: dict[str, NDArray], parked: list[Parked]) -> list[Parked]:
     """Return the parked vehicles that do not overlap the paths of actors created for scenarios."""
     scripted = np.flatnonzero(np.char.startswith(raw["id"], "scripted"))
     ways = []
@@ -211,11 +211,13 @@ def _beside(raw: dict[str, NDArray], parked: list[Parked]) -> list[Parked]:
         length, width = next(row[1:3] for row in SHAPES[category] if row.name == shape)
         yaw = np.pi / 2 - np.radians(at[:, 2])
         middle = at[:, :2] - length / 2 * np.stack((np.cos(yaw), np.sin(yaw)), axis=1)
-        ways += [footprint(x, y, turn, length, width).buffer(0.3) for (x, y), turn in zip(middle, yaw)]
+        ways += [make_footprint(x, y, turn, length, width).buffer(0.3) for (x, y), turn in zip(middle, yaw)]
     taken = shapely.union_all(ways)
     room = [(car, SHAPES[car.category][car.shape]) for car in parked]
     return [
-        car for car, size in room if not footprint(car.x, car.y, car.yaw, size.length, size.width).intersects(taken)
+        car
+        for car, size in room
+        if not make_footprint(car.x, car.y, car.yaw, size.length, size.width).intersects(taken)
     ]
 
 

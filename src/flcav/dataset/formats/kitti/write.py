@@ -16,12 +16,12 @@ from flcav.dataset.formats.exporter import (
     Exported,
     ExportOptions,
     check_rectified,
-    lacks,
-    points_in_each_box,
+    count_points_in_boxes,
+    missing_data_error,
     read_frame,
     split_scenes,
 )
-from flcav.dataset.formats.mounts import front_camera
+from flcav.dataset.formats.mounts import find_front_camera
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, transform_points, wrap_angle
@@ -55,7 +55,7 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
     counts = exported.counts
     for i, key in enumerate(dataset.keys):
         frame = read_frame(dataset, i, options)
-        camera = front_camera({name: frame.calibration.agent_from_sensor[name] for name in frame.images})
+        camera = find_front_camera({name: frame.calibration.agent_from_sensor[name] for name in frame.images})
         if camera is None or not frame.lidar:
             exported.left_out["no level camera that looks ahead" if frame.lidar else "no LiDAR", frame.agent] += 1
         else:
@@ -67,7 +67,7 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
             rows.append((number, split, frame.key, frame.agent, f"{frame.time_s:.3f}", camera))
         progress(i + 1, len(dataset), "")
     if not rows:
-        raise lacks(dataset, "KITTI", "agents with a LiDAR and a level camera that looks ahead")
+        raise missing_data_error(dataset, "KITTI", "agents with a LiDAR and a level camera that looks ahead")
     for split in SPLITS:
         _write_lines(out / "ImageSets" / f"{split}.txt", numbers[split])
     _write_lines(out / "ImageSets" / "trainval.txt", sorted(numbers["train"] + numbers["val"]))
@@ -80,11 +80,11 @@ def _write_frame(frame: Frame, camera: str, folder: Path, number: str, min_point
     lidar = next(iter(frame.lidar))
     mounts = frame.calibration.agent_from_sensor
     check_rectified(frame, camera, "KITTI")
-    objects, regions = label_lines(frame, camera, lidar, min_points)
+    objects, regions = format_label_lines(frame, camera, lidar, min_points)
     _write_lines(folder / "label_2" / f"{number}.txt", objects + regions or [NOTHING])
     _write_lines(
         folder / "calib" / f"{number}.txt",
-        calibration_lines(
+        format_calibration(
             frame.calibration.intrinsics[camera],
             camera_from_lidar=inverse(frame.world_from_sensor(camera)) @ frame.world_from_sensor(lidar),
             lidar_from_imu=inverse(mounts[lidar]) @ mounts.get(next(iter(frame.imu), ""), np.eye(4)),
@@ -95,7 +95,7 @@ def _write_frame(frame: Frame, camera: str, folder: Path, number: str, min_point
     return len(objects), len(regions)
 
 
-def label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -> tuple[list[str], list[str]]:
+def format_label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -> tuple[list[str], list[str]]:
     """Return the lines of a label file: of labelled actors, and of DontCare regions around other visible actors.
 
     Labelled are actors in the image and ahead of the camera with at least `min_points` LiDAR points in their box, and
@@ -114,7 +114,7 @@ def label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -> tuple
     rotation = wrap_angle(np.arctan2(-ahead[:, 2], ahead[:, 0]))
     alpha = wrap_angle(rotation - np.arctan2(bottom[:, 0], bottom[:, 2]))
     level = occlusion_levels(views.occlusion, views.pixels)
-    points, shows = points_in_each_box(frame, lidar, frame.lidar[lidar]), views.pixels > 0
+    points, shows = count_points_in_boxes(frame, lidar, frame.lidar[lidar]), views.pixels > 0
     labelled = within & (bottom[:, 2] > 0) & (points >= min_points) & (shows | (points > 0))
     lines = []
     for i in np.flatnonzero(labelled):
@@ -143,7 +143,7 @@ def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) 
     return np.where(pixels > 0, level, UNKNOWN)
 
 
-def calibration_lines(
+def format_calibration(
     intrinsics: NDArray[np.float64], camera_from_lidar: NDArray[np.float64], lidar_from_imu: NDArray[np.float64]
 ) -> list[str]:
     """Return the lines of a calibration file, in the order that readers expect.

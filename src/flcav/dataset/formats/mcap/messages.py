@@ -38,7 +38,7 @@ from flcav.dataset.formats.mounts import quaternion
 from flcav.dataset.payloads import encode_png
 from flcav.geometry import pose
 from flcav.sensors.frame import Frame
-from flcav.sensors.radar.radar import echo_directions
+from flcav.sensors.radar.radar import compute_echo_directions
 
 
 def scene_update(frame: Frame, stamp: Timestamp) -> SceneUpdate:
@@ -127,7 +127,7 @@ RADAR_FIELDS = ("x", "y", "z", "range_m", "azimuth_rad", "elevation_rad", "doppl
 IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^2], [rad/s], body frame
 
 
-class Json(NamedTuple):
+class JsonMessage(NamedTuple):
     """A JSON message, for data without a schema of Foxglove's."""
 
     kind: str
@@ -138,11 +138,11 @@ class Logged(NamedTuple):
     """A message, its topic below the agent's name, and its simulation time [s]."""
 
     topic: str
-    message: Message | Json
+    message: Message | JsonMessage
     time_s: float
 
 
-def messages(frame: Frame) -> Iterator[Logged]:
+def make_messages(frame: Frame) -> Iterator[Logged]:
     """Yield the messages of everything in a frame: transforms, measurements of each sensor, weather, annotations."""
     true, spin_s = frame.calibration, frame.time_s
 
@@ -178,16 +178,16 @@ def messages(frame: Frame) -> Iterator[Logged]:
         yield Logged(f"{name}/fix", fix, looks_s(name))
     for name, reading in frame.imu.items():
         halves = (dict(zip("xyz", half.tolist())) for half in np.split(np.asarray(reading, np.float64), 2))
-        imu = Json("Imu", {"frame_id": f"{frame.agent}/{name}", **dict(zip(IMU_FIELDS, halves))})
+        imu = JsonMessage("Imu", {"frame_id": f"{frame.agent}/{name}", **dict(zip(IMU_FIELDS, halves))})
         yield Logged(f"{name}/imu", imu, looks_s(name))
     if frame.weather is not None:
-        yield Logged("weather", Json("Weather", frame.weather.model_dump(mode="json")), spin_s)
+        yield Logged("weather", JsonMessage("Weather", frame.weather.model_dump(mode="json")), spin_s)
     yield Logged("objects", scene_update(frame, _stamp(spin_s)), spin_s)
 
 
 def radar_points(echoes: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return (N, 8) columns RADAR_FIELDS of (N, 5) radar returns: x, y, z [m] in the radar's frame are prepended."""
-    return np.concatenate((echoes[:, :1] * echo_directions(echoes), echoes), axis=1).astype(np.float32)
+    return np.concatenate((echoes[:, :1] * compute_echo_directions(echoes), echoes), axis=1).astype(np.float32)
 
 
 def _cloud(points: NDArray[np.float32], names: tuple[str, ...], **place: Any) -> PointCloud:

@@ -11,7 +11,7 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from flcav.dataset.formats.exporter import Exported, ExportOptions, read_frame
-from flcav.dataset.formats.mcap.messages import Json, messages
+from flcav.dataset.formats.mcap.messages import JsonMessage, make_messages
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
 
@@ -25,7 +25,7 @@ def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: R
             log = _Log(Writer(file))
             for i in dataset.select(scenes=[scene]):
                 frame = read_frame(dataset, i, options)
-                for logged in messages(frame):
+                for logged in make_messages(frame):
                     log.write(f"/{frame.agent}/{logged.topic}", logged.message, logged.time_s)
                     counts["messages"] += 1
                 counts["objects"] += len(frame.annotations)
@@ -46,18 +46,18 @@ class _Log:
         self._schema = cache(lambda kind: register_schema(writer, kind))
         self._json_schema = cache(lambda kind, schema: writer.register_schema(kind, "jsonschema", schema))
 
-    def write(self, topic: str, message: Message | Json, time_s: float) -> None:
+    def write(self, topic: str, message: Message | JsonMessage, time_s: float) -> None:
         if topic not in self._channels:
             self._channels[topic] = self._open(topic, message)
-        if isinstance(message, Json):
+        if isinstance(message, JsonMessage):
             data = json.dumps(message.values, allow_nan=False).encode()
         else:
             data = message.SerializeToString(deterministic=True)
         stamp = round(time_s * 1e9)
         self.writer.add_message(self._channels[topic], log_time=stamp, publish_time=stamp, data=data)
 
-    def _open(self, topic: str, message: Message | Json) -> int:
-        if isinstance(message, Json):
+    def _open(self, topic: str, message: Message | JsonMessage) -> int:
+        if isinstance(message, JsonMessage):
             schema = json.dumps(_schema_of(message.values)).encode()
             return self.writer.register_channel(topic, "json", self._json_schema(f"flcav.{message.kind}", schema))
         return self.writer.register_channel(topic, "protobuf", self._schema(type(message)))

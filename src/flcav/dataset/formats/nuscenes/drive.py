@@ -8,14 +8,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import check_rectified, points_in_each_box
-from flcav.dataset.formats.mounts import channels, optical_yaw, quaternion
-from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, lidar_bin, radar_pcd
-from flcav.dataset.formats.nuscenes.tables import CAMERAS, CATEGORIES, RADARS, Row, attribute, chain, token, visibility
+from flcav.dataset.formats.exporter import check_rectified, count_points_in_boxes
+from flcav.dataset.formats.mounts import assign_channels, optical_yaw, quaternion
+from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, encode_lidar, encode_radar
+from flcav.dataset.formats.nuscenes.tables import (
+    CAMERAS,
+    CATEGORIES,
+    RADARS,
+    Row,
+    attribute,
+    link_rows,
+    token,
+    visibility,
+)
 from flcav.dataset.payloads import encode_png
 from flcav.geometry import pose, transform_points, yaw_of
 from flcav.sensors.frame import Frame
-from flcav.sensors.radar.radar import echo_directions
+from flcav.sensors.radar.radar import compute_echo_directions
 
 Array = NDArray[np.float64]
 
@@ -33,7 +42,7 @@ class Drive:
     location: str
     out: Path
     global_from_world: Array  # (4, 4)
-    elevations: Mapping[str, Array]  # LiDAR -> elevations of its channels [rad]: see `lidar_bin`
+    elevations: Mapping[str, Array]  # LiDAR -> elevations of its channels [rad]: see `encode_lidar`
     samples: list[Row] = field(default_factory=list)
     sensors: dict[str, Row] = field(default_factory=dict)  # by channel
     calibrated: dict[str, Row] = field(default_factory=dict)  # by channel
@@ -62,13 +71,17 @@ class Drive:
         mounts = frame.calibration.agent_from_sensor
         for i, (name, points) in enumerate(frame.lidar.items()):
             channel = "LIDAR_TOP" if i == 0 else f"LIDAR_{name.upper()}"
-            self._add_data(frame, name, channel, "pcd.bin", lidar_bin(points, self.elevations.get(name, NO_CHANNELS)))
-        for name, channel in channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS).items():
+            self._add_data(
+                frame, name, channel, "pcd.bin", encode_lidar(points, self.elevations.get(name, NO_CHANNELS))
+            )
+        for name, channel in assign_channels(
+            {name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS
+        ).items():
             check_rectified(frame, name, "nuScenes")
             self._add_data(frame, name, channel, "png", encode_png(frame.images[name].rgb))
-        for name, channel in channels({name: yaw_of(mounts[name]) for name in frame.radar}, RADARS).items():
+        for name, channel in assign_channels({name: yaw_of(mounts[name]) for name in frame.radar}, RADARS).items():
             radar_from_world = frame.world_from_sensor(name)[:3, :3].T
-            self._add_data(frame, name, channel, "pcd", radar_pcd(frame.radar[name], radar_from_world @ velocity))
+            self._add_data(frame, name, channel, "pcd", encode_radar(frame.radar[name], radar_from_world @ velocity))
         self._add_annotations(frame)
 
     def _add_data(self, frame: Frame, name: str, channel: str, suffix: str, data: bytes) -> None:
@@ -114,10 +127,10 @@ class Drive:
     def _add_annotations(self, frame: Frame) -> None:
         truth, boxes = frame.annotations, frame.annotations.boxes
         top, cloud = next(iter(frame.lidar.items()))
-        lidar = points_in_each_box(frame, top, cloud)
+        lidar = count_points_in_boxes(frame, top, cloud)
         radar = np.zeros_like(lidar)
         for name, echoes in frame.radar.items():
-            radar += points_in_each_box(frame, name, echoes[:, :1] * echo_directions(echoes))
+            radar += count_points_in_boxes(frame, name, echoes[:, :1] * compute_echo_directions(echoes))
         center = transform_points(self.global_from_world, boxes.center)
         for i, (track, category) in enumerate(zip(truth.track.tolist(), boxes.label.tolist())):
             length, width, height = boxes.size[i].tolist()
@@ -141,7 +154,7 @@ class Drive:
     def rows(self) -> dict[str, list[Row]]:
         """Return table -> rows of the scene, and link consecutive rows (`prev`, `next`)."""
         for rows in (self.samples, *self.data.values(), *self.annotations.values()):
-            chain(rows)
+            link_rows(rows)
         scene = {
             "token": token(self.name),
             "log_token": token(self.name, "log"),

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from flcav.sensors.radar.radar import echo_directions
+from flcav.sensors.radar.radar import compute_echo_directions
 from flcav.world.map.town import Town
 
 OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # nuScenes': x right, y ahead
@@ -20,7 +20,7 @@ MOVING_M_S = 0.5  # speed over ground from which a radar return counts as moving
 MOVING, STATIONARY, UNAMBIGUOUS, CERTAIN = 0, 1, 3, 1
 
 
-def lidar_bin(points: NDArray[np.float32], elevations: NDArray[np.float64]) -> bytes:
+def encode_lidar(points: NDArray[np.float32], elevations: NDArray[np.float64]) -> bytes:
     """Return the bytes of (N, 5) float32 x, y, z [m] in nuScenes' LiDAR frame, intensity 0 to 255, ring.
 
     `points` is (N, 4) x, y, z, intensity [0, 1] in our LiDAR frame (x ahead, y left). The ring is the index of the
@@ -34,7 +34,7 @@ def lidar_bin(points: NDArray[np.float32], elevations: NDArray[np.float64]) -> b
     return np.column_stack((-y, x, z, intensity * 255, ring)).astype("<f4").tobytes()
 
 
-def radar_pcd(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> bytes:
+def encode_radar(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> bytes:
     """Return a binary PCD file of (N, 5) radar returns: range [m], azimuth, elevation [rad], Doppler [m/s], RCS [dBsm].
 
     `velocity` is the radar's own (3,) [m/s], in its frame. Only the radial velocity of a return is measured: `vx`, `vy`
@@ -46,7 +46,7 @@ def radar_pcd(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> byt
         rows["x"] = np.nan
     else:
         distance, _, _, doppler, rcs = echoes.T.astype(np.float64)
-        ray = echo_directions(echoes)
+        ray = compute_echo_directions(echoes)
         over_ground = doppler + ray @ velocity
         for axis, name in enumerate("xyz"):
             rows[name] = distance * ray[:, axis]

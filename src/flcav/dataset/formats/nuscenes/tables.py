@@ -101,7 +101,7 @@ def attribute(category: str, track: str, speed_m_s: float) -> str:
     return token("attribute", name)
 
 
-def chain(rows: list[Row]) -> None:
+def link_rows(rows: list[Row]) -> None:
     """Set `prev` and `next` of each of the consecutive `rows` to the tokens of its neighbours, "" at the ends."""
     for row, before, after in zip(rows, [None, *rows], [*rows[1:], None]):
         row["prev"] = before["token"] if before else ""

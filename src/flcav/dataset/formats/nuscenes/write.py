@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import Exported, ExportOptions, lacks, read_frame, split_scenes
+from flcav.dataset.formats.exporter import Exported, ExportOptions, missing_data_error, read_frame, split_scenes
 from flcav.dataset.formats.mounts import agent_velocities
 from flcav.dataset.formats.nuscenes.drive import Drive
 from flcav.dataset.formats.nuscenes.files import RESOLUTION_M, map_mask
@@ -21,7 +21,7 @@ from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
 from flcav.progress import Report
-from flcav.sensors.lidar.lidar import Lidar, ray_pattern
+from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
             for i in selected:
                 frame = read_frame(dataset, i, options)
                 if not frame.lidar:
-                    raise lacks(dataset, "nuScenes", "a LiDAR on every agent", agent)
+                    raise missing_data_error(dataset, "nuScenes", "a LiDAR on every agent", agent)
                 drive.add(frame, velocities[agent, frame.index])
                 counts.update(samples=1, objects=len(frame.annotations))
                 progress(counts["samples"], len(dataset), "")
@@ -80,7 +80,9 @@ def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:
     for name, lidar in lidars.items() if isinstance(lidars, Mapping) else ():
         assert isinstance(lidar, Mapping)
         settings = Lidar.model_validate(lidar["settings"])
-        first = ray_pattern(settings)[:: settings.azimuth_steps].astype(np.float64)  # (C, 3) first ray of each channel
+        first = build_ray_pattern(settings)[:: settings.azimuth_steps].astype(
+            np.float64
+        )  # (C, 3) first ray of each channel
         elevations[name] = np.arcsin(first[::-1, 2])
     return elevations
 
