@@ -1,6 +1,6 @@
 """Put trained weights into the package: `python tools/ship_weights.py signs out/seed-1/weights.safetensors --half`.
 
-They lie in the task's folder, `find_shipped/weights.safetensors` with the card beside it as text. With `--half` numbers are
+They lie in the task's folder, `shipped/weights.safetensors` with the card beside it as text. With `--half` numbers are
 stored in 16 bits, which halves the file; what loads them calculates in 32 bits as ever.
 """
 

@@ -75,7 +75,7 @@ def build_town_mesh(town: Town) -> Mesh:
 
 
 def list_signs_and_signals(town: Town) -> SignsAndSignals:
-    """Return the signs and signal heads of a town, with their faces in `build_town_mesh`; posts and masts do not count."""
+    """Return the signs and signal heads of a town, with their faces in `build_town_mesh`; without posts and masts."""
     world, signs, signals = build_static_world(town), town.signs, town.signals
     face = np.full(len(world.part), -1, np.int32)
     for part, first in ((Part.SIGN, 0), (Part.SIGNAL, len(signs.kind))):

@@ -78,7 +78,7 @@ MARGINS: dict[str, float] = {
     "rain_mm_h": 1.0,
     "visibility_m": 5000.0,
 }
-# The same gaps as units of `find_nearest_class`: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H) and visibility.
+# The same gaps in units of `find_nearest_class`: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H), of sight.
 SEPARATION: dict[str, float] = {"sun_elevation_deg": 10.0, "cloud_cover": 0.2, "rain_mm_h": 0.59, "visibility_m": 0.85}
 DRIZZLE_MM_H = 0.1  # added to the rain rate before its logarithm
 

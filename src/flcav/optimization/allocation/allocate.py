@@ -84,8 +84,8 @@ def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
     It is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS` tasks. Robust plans minimise the upper
     bands of the learning curves. `marginal_error_per_gb` is the derivative of the continuous optimum by each budget,
     times 1000 MB: a shadow price at these budgets, not a forecast of what 1000 MB more bring, for which see
-    `budget_sweep.compute_savings`. Raises `Infeasible`, naming the budget, the cost of the least plan within the limits and the
-    excess, and `InputError` where the solver cannot handle the problem's numbers.
+    `budget_sweep.compute_savings`. Raises `Infeasible`, naming the budget, the cost of the least plan within the limits
+    and the excess, and `InputError` where the solver cannot handle the problem's numbers.
 
     >>> from flcav import allocate, load_problem
     >>> plan = allocate(load_problem("recipes/allocation/objects.yaml"))

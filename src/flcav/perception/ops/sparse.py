@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from flcav.perception.ops import blocks
 from flcav.perception.ops.rulebook import (
     Groups,
+    Rulebook,
     Triple,
     build_strided_rulebook,
     build_submanifold_rulebook,

@@ -40,7 +40,7 @@ class Sources:
         self._hashes: dict[frozenset[Place], dict[str, str]] = {}
 
     def hashes(self, starts: Iterable[Place]) -> dict[str, str]:
-        """Return, by module, a hash of the definitions in it that are reachable from `find_definitions`."""
+        """Return, by module, a hash of the definitions in it that are reachable from `starts`."""
         key = frozenset(starts)
         if key not in self._hashes:
             self._hashes[key] = {
@@ -51,7 +51,7 @@ class Sources:
         return self._hashes[key]
 
     def _reached(self, starts: Iterable[Place]) -> dict[str, list[str]]:
-        """Return, by module, the text of the statements reachable from `find_definitions`, in the order of the source."""
+        """Return, by module, the text of the statements reachable from `starts`, in the order of the source."""
         found: dict[str, set[_Statement]] = {}
         others: dict[str, set[str]] = {}
         left, seen = list(starts), set(starts)

@@ -31,7 +31,7 @@ class Exposure(NamedTuple):
     semantic: NDArray[np.uint8]  # (H, W) one of SEMANTICS
     instance: NDArray[
         np.int32
-    ]  # (H, W) 0 none, a + 1 = the trace's actor a, -(t + 1) = thing t of `list_signs_and_signals`
+    ]  # (H, W) 0 none, a + 1: the trace's actor a, -(t + 1): thing t of `list_signs_and_signals`
 
 
 def photograph(

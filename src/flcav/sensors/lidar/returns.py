@@ -173,7 +173,7 @@ def detect(
 ):
     """Detect returns: write the first M rows of `points` (N, 4) and `actor` (N,), and return M.
 
-    A return of power P = `compute_brightness` / `distance`^2 is detected with a probability that rises linearly from 0 at
+    A return of power P = `brightness` / `distance`^2 is detected with a probability that rises linearly from 0 at
     0.7 P_min to `keep` at 1.3 P_min; `inverse_threshold` is 1 / P_min, `chance` (N,) in [0, 1) decides. `noise` (N,) is
     the quantile of a normal range error of standard deviation hypot(`noise_m`, `noise_share` * distance). A point is
     x, y, z [m] in the sensor's frame and the brightness, at most 1. `source` (N,) is the actor each return comes from.

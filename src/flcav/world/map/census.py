@@ -1,7 +1,7 @@
 """Town statistics and traffic density.
 
-`summarise_town` counts a town's streets, buildings and furniture. `measure_traffic_density` is the traffic density around candidate sites,
-the criterion of conventional sensor placement.
+`summarise_town` counts a town's streets, buildings and furniture. `measure_traffic_density` returns the traffic density
+around candidate sites, the criterion of conventional sensor placement.
 """
 
 from collections.abc import Sequence
