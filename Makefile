@@ -26,6 +26,7 @@ lint: $(STAMP)
 # The site, out/docs/index.html. Only pages that changed are written anew; whatever Sphinx warns of is an error.
 docs: $(STAMP)
 	$(BIN)/python -m sphinx -b html -c docs -d out/doctrees --fail-on-warning --keep-going --quiet . out/docs
+	$(BIN)/python tools/check_site.py out/docs
 
 check: lint docs
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
