@@ -23,8 +23,9 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-# The site, out/docs/index.html. Only pages that changed are written anew; whatever Sphinx warns of is an error.
+# The site, out/docs/index.html. Only pages that changed are read anew; whatever Sphinx warns of is an error.
 docs: $(STAMP)
+	rm -rf out/docs
 	$(BIN)/python -m sphinx -b html -c docs -d out/doctrees --fail-on-warning --keep-going --quiet . out/docs
 	$(BIN)/python tools/check_site.py out/docs
 

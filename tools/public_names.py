@@ -4,9 +4,12 @@ Docstrings are plain text with `code` and doctest examples; they are escaped, so
 markup. Fields of records and models are listed with their types, defaults and the comments beside them.
 """
 
+import ast
 import dataclasses
 import importlib
+import inspect
 import re
+import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -42,7 +45,7 @@ def autodoc_of(package: str, name: str) -> str:
     """Return the autodoc directive of a public name."""
     value = getattr(importlib.import_module(package), name)
     if isinstance(value, type):
-        return f".. autoclass:: {package}.{name}\n   :members:\n"
+        return f".. autoclass:: {package}.{name}\n   :members:\n   :exclude-members: model_config\n"
     if callable(value):
         return f".. autofunction:: {package}.{name}\n"
     listed = ", ".join(f"``{each}``" for each in value)
@@ -58,11 +61,22 @@ def describe(app: Sphinx, what: str, name: str, value: Any, options: Any, lines:
     lines[:] = [*text.split("\n"), ""]
 
 
-def shorten(app: Sphinx, what: str, name: str, value: Any, *said: Any) -> tuple[str, str] | None:
-    """Leave out the signature of a class whose fields are listed, and of a protocol, which nobody calls."""
+def as_written(app: Sphinx, what: str, name: str, value: Any, *said: Any) -> tuple[str, str] | None:
+    """Return the signature of a function as its source writes it, with the names of types that are there.
+
+    None is given of a class whose fields are listed, and of a protocol, which nobody calls.
+    """
     if what == "class" and (has_fields(value) or getattr(value, "_is_protocol", False)):
         return "", ""
-    return None
+    if what not in ("function", "method"):
+        return None
+    node = ast.parse(textwrap.dedent(inspect.getsource(value))).body[0]
+    assert isinstance(node, ast.FunctionDef)
+    arguments = node.args
+    if what == "method" and arguments.args and arguments.args[0].arg in ("self", "cls"):
+        del arguments.args[0]
+    returns = ast.unparse(node.returns).strip("'") if node.returns else ""  # 'Town' within the class itself
+    return f"({ast.unparse(arguments)})", returns
 
 
 def as_rst(paragraph: str) -> str:
@@ -116,5 +130,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Add the directive to Sphinx."""
     app.add_directive("public-names", PublicNames)
     app.connect("autodoc-process-docstring", describe)
-    app.connect("autodoc-process-signature", shorten)
+    app.connect("autodoc-process-signature", as_written)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
