@@ -23,6 +23,7 @@ myst_enable_extensions = ["deflist"]
 
 suppress_warnings = ["ref.python"]  # `Task` in a signature: more than one package has one
 
+highlight_language = "none"  # of a block that names none: commands of a shell, drawings
 default_role = "literal"  # docstrings are plain text with `code`
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
