@@ -6,7 +6,7 @@ export OMP_NUM_THREADS := 1
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: demo test test-peers lint check bench format clean
+.PHONY: demo test test-peers lint docs check bench format clean
 demo: $(STAMP)
 	$(BIN)/flcav demo --out out/demo
 
@@ -23,7 +23,13 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-check: lint
+# The site, out/docs/index.html. Only pages that changed are read anew; whatever Sphinx warns of is an error.
+docs: $(STAMP)
+	rm -rf out/docs
+	$(BIN)/python -m sphinx -b html -c docs -d out/doctrees --fail-on-warning --keep-going --quiet . out/docs
+	$(BIN)/python tools/check_site.py out/docs
+
+check: lint docs
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 bench: $(STAMP)
@@ -36,7 +42,7 @@ format: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "flcav needs Python 3.11 or newer: make PYTHON=python3.x"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,towns]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,docs,towns]"
 	touch $(STAMP)
 
 clean:

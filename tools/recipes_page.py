@@ -1,16 +1,13 @@
 """Write docs/recipes.md from the models of recipes and the comments of their fields: python tools/recipes_page.py."""
 
-import ast
-import inspect
-import io
 import re
-import tokenize
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
+from fields import written_fields
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from pydantic.fields import FieldInfo
 
@@ -105,19 +102,8 @@ def fields_of(model: type[Config], without: type[Config] = Config) -> str:
 
 
 def comments(model: type[Config]) -> dict[str, str]:
-    """Return the comment of each field of a model, inherited fields included."""
-    found = {}
-    for owner in reversed(model.__mro__):
-        if not issubclass(owner, Config) or owner is Config:
-            continue
-        source = inspect.getsource(owner)
-        tokens = tokenize.generate_tokens(io.StringIO(source).readline)
-        lines = {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
-        for node in ast.parse(source).body[0].body:  # type: ignore[attr-defined]
-            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-                around = range(node.lineno, (node.end_lineno or node.lineno) + 1)
-                found[node.target.id] = " ".join(lines[line] for line in around if line in lines)
-    return found
+    """Return the comment beside each field of a model, those it inherits included."""
+    return {name: field.comment for name, field in written_fields(model).items()}
 
 
 def said_and_unit(name: str, comment: str) -> tuple[str, str]:

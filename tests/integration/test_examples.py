@@ -113,3 +113,22 @@ def test_the_loop(tmp_path: Path):
         with Image.open(tmp_path / "loop" / name) as picture:
             assert min(picture.size) > 300
     assert "<html" in (tmp_path / "loop/plan.html").read_text()
+
+
+def test_the_loop_is_the_same_as_a_page_and_as_a_program():
+    page = (EXAMPLES.parent / "docs" / "loop.md").read_text()
+    program = (EXAMPLES / "07_the_loop.sh").read_text()
+    typed = "\n".join(line for line in program.splitlines() if line.startswith("flcav "))
+    typed = typed.replace('"$map"', "recipes/maps/quarter.xodr").replace(" --json > run.json", "")
+    known = "scenes=6 steps=70\n"
+    assert re.findall(r"^\$ (flcav .*)$", page, re.M) == echoed(f"{known}cat << END\n{typed}\nEND").splitlines()
+    (written,) = re.findall(r"^cat > run.yaml << YAML\n(.*?)^YAML$", program, re.M | re.S)
+    files = dict(re.findall(r"^```yaml (\S+)\n(.*?)^```$", page, re.M | re.S))
+    assert files["run.yaml"] == echoed(f"{known}cat << END\n{written}END")
+    (drive,) = re.findall(r"^drive\(\) \{ (echo .*) > .*$", program, re.M)
+    for name, seed, scenes in (("learn.yaml", 11, 6), ("look.yaml", 12, 4)):
+        assert files[name] == echoed(f"{known}set -- {seed} {scenes}\n{drive}")
+
+
+def echoed(script: str) -> str:
+    return subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True).stdout

@@ -1,0 +1,42 @@
+"""The Python pages: every public name is on one of them, and a docstring becomes markup that says what it said."""
+
+import re
+from pathlib import Path
+
+import pytest
+from docutils.core import publish_doctree
+from public_names import as_rst, public_names
+
+import flcav
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = "".join((DOCS / name).read_text(encoding="utf-8") for name in ("api.md", "api-packages.md"))
+DOCUMENTED = re.findall(r"^```\{public-names\} (\S+)$", PAGES, re.M)
+PACKAGES = sorted(path.parent.name for path in Path(flcav.__path__[0]).glob("*/__init__.py"))
+
+
+def test_every_package_with_public_names_is_documented():
+    texts = {name: (Path(flcav.__path__[0]) / name / "__init__.py").read_text(encoding="utf-8") for name in PACKAGES}
+    giving = {f"flcav.{name}" for name, text in texts.items() if "__all__" in text}
+    with_more = {package for package in giving if public_names(package)}
+    assert {*DOCUMENTED} == {"flcav", *with_more}
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("Return `a`s of *args, see x_.", "Return as of *args, see x_."),
+        (
+            "wireless = samples * sample + |k|;\nwireline = model",
+            "wireless = samples * sample + |k|;\nwireline = model",
+        ),
+        ("Rows:\n    one\n    two", "Rows:\n    one\n    two"),
+    ],
+)
+def test_a_docstring_is_shown_as_it_was_written(text: str, shown: str):
+    tree = publish_doctree(as_rst(text), settings_overrides={"report_level": 2, "halt_level": 2})
+    assert " ".join(tree.astext().split()) == " ".join(shown.split())
+
+
+def test_examples_are_left_alone():
+    assert as_rst(">>> a_ * 2\n4") == ">>> a_ * 2\n4"

@@ -1,0 +1,163 @@
+"""Write docs/commands.md, every command with its options and an example that is run: python tools/commands_page.py."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import click
+import typer
+import yaml
+from PIL import Image
+from pydantic import BaseModel, ConfigDict
+
+import flcav
+from flcav.cli.main import app
+from flcav.markdown import table
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "commands.md"
+SHOWN = Path(__file__).with_name("commands.yaml")
+WIDEST = 1000  # pixels of a picture
+INTRO = """\
+# Commands
+
+Every command of `flcav`, with what it takes and an example with what it printed. `flcav COMMAND --help` says
+the same. The exit code is 0 where all went well, 2 for bad input (one sentence on stderr says what is wrong), 130 after
+Ctrl-C, and 1 for anything else. `--json` prints one JSON object and nothing else.
+
+This page is made by `python tools/commands_page.py`, which runs the examples of `tools/commands.yaml` one after the
+other in one folder, with a copy of the repository's `recipes/` in it. In what they print, `...` stands for the folder
+that flcav is installed in.
+"""
+
+
+class Example(BaseModel):
+    """Lines of a shell for a command: those that are run, or those that are only shown."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    run: tuple[str, ...] = ()
+    shown: tuple[str, ...] = ()
+    picture: str = ""  # a file that it writes, shown below
+
+
+class Section(BaseModel):
+    """Commands that belong together."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    title: str
+    said: str
+    files: Mapping[str, str] = {}
+    commands: Mapping[str, Example]
+
+
+def sections() -> tuple[Section, ...]:
+    """Return what the page shows, in order."""
+    return tuple(map(Section.model_validate, yaml.safe_load(SHOWN.read_text(encoding="utf-8"))))
+
+
+def commands_of(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
+    """Yield each command that does something, by the words that call it."""
+    inner: Mapping[str, click.Command] = getattr(command, "commands", {})
+    if not inner:
+        yield " ".join(words), command
+    for name, each in inner.items():
+        yield from commands_of(each, (*words, name))
+
+
+def page(printed: Mapping[str, str]) -> str:
+    """Return the page; `printed` holds the example of each command, as a block of a console."""
+    known = dict(commands_of(typer.main.get_command(app)))
+    parts = [INTRO]
+    for section in sections():
+        parts.append(f"## {section.title}\n\n{section.said}\n")
+        parts += (f"`{name}`:\n\n```yaml\n{text}```\n" for name, text in section.files.items() if name.endswith("yaml"))
+        parts += (f"`{name}`:\n\n```csv\n{text}```\n" for name, text in section.files.items() if name.endswith("csv"))
+        for name, example in section.commands.items():
+            shown = f"![What flcav {name} draws]({picture_of(name)})\n" if example.picture else ""
+            parts += filter(None, (described(name, known[name], printed[name]), shown))
+    return "\n".join(parts)
+
+
+def described(name: str, command: click.Command, printed: str) -> str:
+    """Return the part of the page about a command."""
+    said = "\n\n".join(" ".join(each.split()) for each in (command.help or "").split("\n\n"))
+    options = table(("option", "what it is", "default"), map(row, command.params))
+    return f"### flcav {name}\n\n{said}\n\n{options}\n\n{printed}\n"
+
+
+def picture_of(name: str) -> str:
+    """Return where the picture of a command's example lies, beside the page."""
+    return f"commands/{name.replace(' ', '-')}.png"
+
+
+def row(parameter: click.Parameter) -> tuple[str, str, str]:
+    """Return an option's or an argument's name, help and default."""
+    argument = isinstance(parameter, click.Argument)
+    name = parameter.make_metavar(click.Context(click.Command(""))) if argument else ", ".join(parameter.opts)
+    value = parameter.default
+    none = value is None or value is False or value == []
+    default = "required" if parameter.required else "" if none else f"`{value}`"
+    said = " ".join(getattr(parameter, "help", None or "").split())
+    if isinstance(parameter.type, click.Choice) and not argument:
+        said = f"{said} One of {', '.join(f'`{each}`' for each in parameter.type.choices)}."
+    return f"`{name}`", said.replace("|", "\\|").replace("[", "\\["), default
+
+
+def examples_in(text: str) -> dict[str, str]:
+    """Return the example of each command on a page."""
+    return dict(re.findall(r"^### flcav (.*?)\n.*?^(```console\n.*?^```)$", text, re.M | re.S))
+
+
+def run_examples(folder: Path) -> dict[str, str]:
+    """Run every example in a folder and return what was typed and printed; raises RuntimeError where one fails."""
+    shutil.copytree(ROOT / "recipes", folder / "recipes")
+    printed: dict[str, str] = {}
+    for section in sections():
+        for name, text in section.files.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        for name, example in section.commands.items():
+            blocks = [f"$ {line}\n{output_of(line, folder)}" for line in example.run]
+            blocks += [f"$ {line}\n" for line in example.shown]
+            printed[name] = "```console\n" + "".join(blocks) + "```"
+            if example.picture:
+                copy_picture(folder / example.picture, PAGE.parent / picture_of(name))
+    return printed
+
+
+def copy_picture(path: Path, to: Path) -> None:
+    """Write a picture as PNG of 64 colours, at most `WIDEST` pixels wide."""
+    with Image.open(path) as picture:
+        picture.thumbnail((WIDEST, WIDEST))
+        to.parent.mkdir(exist_ok=True)
+        picture.convert("RGB").quantize(64).save(to, optimize=True)
+
+
+def output_of(line: str, folder: Path) -> str:
+    """Return what a line of a shell prints."""
+    print(f"$ {line}", flush=True)
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    settings = os.environ | {"PATH": path, "COLUMNS": "90", "NO_COLOR": "1", "TERM": "dumb"}
+    settings["MPLCONFIGDIR"] = str(folder.with_name("matplotlib"))  # a list of fonts of its own: none is missing
+    done = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", line],
+        cwd=folder,
+        env=settings,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    if done.returncode:
+        raise RuntimeError(f"{line}: exit code {done.returncode}\n{done.stdout}")
+    told = done.stdout.replace(str(Path(flcav.__file__).parent), "...")
+    return "".join(f"{each.rstrip()}\n" for each in told.splitlines())
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as scratch:
+        PAGE.write_text(page(run_examples(Path(scratch) / "examples")), encoding="utf-8")
+    print(PAGE)
