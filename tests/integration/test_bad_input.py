@@ -22,8 +22,7 @@ from flcav.cli.main import run
 from flcav.dataset.recording.recorder import record
 from flcav.perception.objects.model import second_paper, second_tiny
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.weights import save_network
-from flcav.perception.weights import config_key
+from flcav.perception.weights import config_key, save_network
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.world.map.town import load_town
@@ -61,7 +60,7 @@ def data(recorded: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    save_network(second_tiny(), tmp_path / "tiny.safetensors")
+    save_network(OBJECTS, second_tiny(), tmp_path / "tiny.safetensors")
     return tmp_path / "tiny.safetensors"
 
 

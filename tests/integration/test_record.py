@@ -14,7 +14,7 @@ from PIL import Image
 
 from flcav.cli.main import run
 from flcav.config import read_config
-from flcav.dataset.recording import jobs as tasks
+from flcav.dataset.recording import jobs
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.sources.embedded import EmbeddedSource
@@ -179,7 +179,7 @@ def test_a_full_disk_exits_1_and_leaves_no_dataset(
     def full(path: Path, data: memoryview) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(tasks, "fill", full)
+    monkeypatch.setattr(jobs, "fill", full)
     assert flcav("record", recipe, "--out", tmp_path / "data") == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith(f"flcav: {tmp_path / 'data'}")

@@ -152,6 +152,7 @@ def test_more_returns_than_points(folder: Path):
         ("annotations", "category", "Car", "unknown class 'Car'"),
         ("annotations", "category", "bus", "is annotated as bus, it is a"),
         ("annotations", "x", float("nan"), "not finite"),
+        ("annotations", "y", 1e300, r"a number beyond 1e\+09"),
         ("annotations", "vx", lambda value: value + 1, "speed 1.00 m/s different"),
         ("annotations", "length", 0.0, "no volume"),
         ("annotations", "occlusion", 1.5, "occlusion outside 0 to 1"),

@@ -12,7 +12,7 @@ from packaging.requirements import Requirement
 from flcav.config import InputError
 from flcav.dataset.recording import ray_engine
 from flcav.extras import format_install_command
-from flcav.world.opendrive import importing as netconvert
+from flcav.world.opendrive import importing
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
 
@@ -36,5 +36,5 @@ def test_ray_says_how_to_get_it(monkeypatch, tmp_path):
 def test_importing_towns_says_how_to_get_netconvert(monkeypatch, tmp_path):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError) as told:
-        netconvert.split_map(tmp_path / "map.xodr", tmp_path / "parts")
+        importing.split_map(tmp_path / "map.xodr", tmp_path / "parts")
     assert str(told.value).endswith(format_install_command("towns"))

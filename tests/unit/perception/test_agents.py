@@ -18,11 +18,10 @@ from flcav.perception.objects import evaluate as evaluation
 from flcav.perception.objects.area import narrow_range
 from flcav.perception.objects.model import second_small, second_tiny, small_config, tiny_config
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.weights import save_network
 from flcav.perception.trajectory.config import CONFIGURATIONS as TRAJECTORIES
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import read_card
+from flcav.perception.weights import read_card, save_network
 from flcav.sensors.frame import Calibration, Frame
 
 from .frames import cloud_in, detections, frame
@@ -164,7 +163,7 @@ def test_every_command_says_whose_frames_it_uses(street, tmp_path, said):
 
 def test_what_is_left_out_is_neither_tested_nor_looked_at(street, tmp_path, said):
     weights = tmp_path / "weights.safetensors"
-    save_network(second_tiny(), weights)
+    save_network(OBJECTS, second_tiny(), weights)
     for wanted, agents in (((), ["cav0", "cav1"]), (("--agents", "pole3"), ["pole3"])):
         result = json.loads(
             said("evaluate", "objects", "--data", street.folder, "--weights", weights, "--json", *wanted)
@@ -231,7 +230,7 @@ def test_one_scene_has_no_interval(recorded, tmp_path, said, monkeypatch):
     hits = detections((10, 3, 0.8))
     monkeypatch.setattr(evaluation, "detect_all", lambda *_, **__: [hits])
     weights = tmp_path / "weights.safetensors"
-    save_network(second_tiny(), weights)
+    save_network(OBJECTS, second_tiny(), weights)
     for scenes, words in ((("a",), "AP 1.000 (no interval: one scene)"), (("a", "b"), "AP 1.000 [1.000, 1.000]")):
         data = recorded(scene=scenes)
         options = ("evaluate", "objects", "--data", data.folder, "--weights", weights)

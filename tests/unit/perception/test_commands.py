@@ -19,8 +19,7 @@ from flcav.dataset.store import Dataset
 from flcav.perception.objects import calibrate
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.weights import load_network, save_network
-from flcav.perception.weights import read_card, to_arrays
+from flcav.perception.weights import load_network, read_card, save_network, to_arrays
 
 from .frames import cloud_in, detections, frame
 
@@ -61,7 +60,7 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
-    save_network(second_tiny(), path)
+    save_network(OBJECTS, second_tiny(), path)
     return path
 
 
@@ -94,7 +93,7 @@ def test_scores_are_calibrated_on_the_validation_data(data, tmp_path, monkeypatc
     options = ("train", "objects", "--data", data, "--epochs", 1, "--seed", 3)
     assert called(*options, "--out", tmp_path / "without") == 0
     assert called(*options, "--out", tmp_path / "with", "--validation", data) == 0
-    without, held = (load_network(tmp_path / name / "weights.safetensors") for name in ("without", "with"))
+    without, held = (load_network(OBJECTS, tmp_path / name / "weights.safetensors") for name in ("without", "with"))
     assert (without.config.calibration, held.config.calibration) == (None, ((2.0, -0.25),))
     assert all(np.array_equal(to_arrays(held)[name], array) for name, array in to_arrays(without).items())
     card = read_card(tmp_path / "with" / "weights.safetensors")
@@ -176,5 +175,7 @@ def test_a_killed_training_ends_where_an_uninterrupted_one_does(data, tmp_path):
     process.wait()
     assert not (tmp_path / "cut" / "weights.safetensors").exists()
     subprocess.run(command(tmp_path / "cut"), check=True, env=environment, capture_output=True)
-    whole, cut = (to_arrays(load_network(tmp_path / name / "weights.safetensors")) for name in ("whole", "cut"))
+    whole, cut = (
+        to_arrays(load_network(OBJECTS, tmp_path / name / "weights.safetensors")) for name in ("whole", "cut")
+    )
     assert all(np.array_equal(whole[name], cut[name]) for name in whole)

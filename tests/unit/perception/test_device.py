@@ -14,8 +14,7 @@ from flcav.perception.device import CPU, select_device
 from flcav.perception.objects import Sample
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import Second, second, tiny_config
-from flcav.perception.ops import norm
-from flcav.perception.ops import rulebook as rules
+from flcav.perception.ops import norm, rulebook
 from flcav.perception.ops.rulebook import build_strided_rulebook, build_submanifold_rulebook, encode_cells
 from flcav.perception.ops.sparse import sparse_convolution
 
@@ -87,14 +86,14 @@ def test_the_tensor_rules_ask_for_all_sizes_at_once(keys, monkeypatch):
     with SizesAsked() as asked:
         keys.nonzero()
         assert asked.found == ["aten.nonzero.default"]
-        rules._build_submanifold_rulebook(keys, SHAPE[1] + 2, SHAPE[2] + 2)
-        rules._build_strided_rulebook(keys, SHAPE, *STRIDED, (5, 7, 6), SAMPLES)
+        rulebook._build_submanifold_rulebook(keys, SHAPE[1] + 2, SHAPE[2] + 2)
+        rulebook._build_strided_rulebook(keys, SHAPE, *STRIDED, (5, 7, 6), SAMPLES)
     assert asked.found == ["aten.nonzero.default"]
     assert len(waits) == 2
 
 
 def test_the_grouped_product_follows_autocast(keys):
-    made = rules._build_submanifold_rulebook(keys, SHAPE[1] + 2, SHAPE[2] + 2)
+    made = rulebook._build_submanifold_rulebook(keys, SHAPE[1] + 2, SHAPE[2] + 2)
     features = torch.randn(len(keys), 8, requires_grad=True)
     weight = torch.randn(27, 8, 6, requires_grad=True)
     full = sparse_convolution(features, weight, made)
@@ -111,7 +110,7 @@ def test_the_grouped_product_follows_autocast(keys):
 @pytest.mark.parametrize("bfloat16", [False, True])
 def test_the_network_is_the_same_from_tensor_operations(sample, bfloat16, monkeypatch):
     compiled = loss_and_gradient(network(CPU), sample)
-    monkeypatch.setattr(rules, "_compiled", lambda keys: False)
+    monkeypatch.setattr(rulebook, "_compiled", lambda keys: False)
     monkeypatch.setattr(norm, "_written_out", lambda x: False)
     loss, gradient = apart(compiled, loss_and_gradient(network(CPU, bfloat16), sample))
     assert loss <= (0.02 if bfloat16 else 1e-4)

@@ -9,8 +9,8 @@ from flcav.config import InputError
 from flcav.perception.objects import detect, detect_all, second, second_paper, second_tiny
 from flcav.perception.objects.loss import predict
 from flcav.perception.objects.model import head_shape
-from flcav.perception.objects.weights import load_network, load_weights, save_network
-from flcav.perception.weights import from_arrays, to_arrays
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.weights import from_arrays, load_network, load_weights, save_network, to_arrays
 
 from .toy import spin, toy_sample
 
@@ -69,8 +69,8 @@ def test_nothing_in_range_is_no_error(tiny):
 
 def test_weights_return_as_they_were_saved(tiny, cloud, tmp_path):
     path = tmp_path / "weights.safetensors"
-    save_network(tiny, path)
-    back = load_network(path)
+    save_network(OBJECTS, tiny, path)
+    back = load_network(OBJECTS, path)
     assert back.config == tiny.config
     assert np.array_equal(detect(back, cloud).array(), detect(tiny, cloud).array())
 
@@ -78,9 +78,9 @@ def test_weights_return_as_they_were_saved(tiny, cloud, tmp_path):
 @pytest.mark.parametrize("other", [second_paper, lambda: second_tiny(ground_z_m=-2.5)])
 def test_weights_of_another_network_are_refused(tiny, tmp_path, other):
     path = tmp_path / "weights.safetensors"
-    save_network(tiny, path)
+    save_network(OBJECTS, tiny, path)
     with pytest.raises(InputError, match="weights of another network"):
-        load_weights(other(), path)
+        load_weights(OBJECTS, other(), path)
 
 
 def test_files_that_are_no_weights_are_refused(tmp_path):
@@ -89,7 +89,7 @@ def test_files_that_are_no_weights_are_refused(tmp_path):
     broken.write_bytes(b"not weights at all")
     for path, sentence in ((foreign, "another network"), (broken, "damaged"), (tmp_path / "none", "no such file")):
         with pytest.raises(InputError, match=sentence):
-            load_network(path)
+            load_network(OBJECTS, path)
 
 
 def test_arrays_carry_the_whole_state(tiny):

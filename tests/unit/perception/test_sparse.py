@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from flcav.perception.ops import rulebook as rules_module
+from flcav.perception.ops import rulebook
 from flcav.perception.ops.rulebook import build_strided_rulebook, build_submanifold_rulebook, decode_keys, encode_cells
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d, sparse_convolution
 
@@ -88,12 +88,12 @@ def assert_same_pairs(compiled, plain):
 def test_the_grouped_sum_of_other_devices_equals_the_compiled_one(shape, samples, share):
     x = scene(shape, samples, share)[3]
     compiled = build_submanifold_rulebook(x.keys, shape)
-    plain = rules_module._build_submanifold_rulebook(x.keys, shape[1] + 2, shape[2] + 2)
+    plain = rulebook._build_submanifold_rulebook(x.keys, shape[1] + 2, shape[2] + 2)
     pairs = [(compiled, plain)]
     for kernel, stride, padding in STRIDED:
         one, _, out_shape = build_strided_rulebook(x.keys, shape, kernel, stride, padding, samples)
         pairs.append(
-            (one, rules_module._build_strided_rulebook(x.keys, shape, kernel, stride, padding, out_shape, samples)[0])
+            (one, rulebook._build_strided_rulebook(x.keys, shape, kernel, stride, padding, out_shape, samples)[0])
         )
     for one, other in pairs:
         weight = torch.randn(len(one.counts), 5, 6, dtype=torch.float64, requires_grad=True)
@@ -109,13 +109,11 @@ def test_the_grouped_sum_of_other_devices_equals_the_compiled_one(shape, samples
 def test_compiled_rules_equal_the_tensor_rules(shape, samples, share):
     x = scene(shape, samples, share)[3]
     compiled = build_submanifold_rulebook(x.keys, shape)
-    plain = rules_module._build_submanifold_rulebook(x.keys, shape[1] + 2, shape[2] + 2)
+    plain = rulebook._build_submanifold_rulebook(x.keys, shape[1] + 2, shape[2] + 2)
     assert_same_pairs(compiled, plain)
     for kernel, stride, padding in STRIDED:
         compiled, keys, out_shape = build_strided_rulebook(x.keys, shape, kernel, stride, padding, samples)
-        plain, plain_keys = rules_module._build_strided_rulebook(
-            x.keys, shape, kernel, stride, padding, out_shape, samples
-        )
+        plain, plain_keys = rulebook._build_strided_rulebook(x.keys, shape, kernel, stride, padding, out_shape, samples)
         assert torch.equal(keys, plain_keys)
         assert_same_pairs(compiled, plain)
 

@@ -65,7 +65,7 @@ def fit(
     from flcav.cli.tables import read_table
     from flcav.config import InputError
     from flcav.optimization.allocation.problem_file import collect_fitted_fields
-    from flcav.optimization.curves import fitting as learning_curve
+    from flcav.optimization.curves import fitting
     from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
     from flcav.optimization.curves.history import parse_histories
 
@@ -77,9 +77,7 @@ def fit(
     answers, shown, found_of = [], [], {}
     for task, points in parse_histories(read_table(history, ()).to_pydict(), str(history), unnamed).items():
         try:
-            found = learning_curve.fit(
-                points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta
-            )
+            found = fitting.fit(points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
         except InputError as error:
             raise InputError(f"{history}: task {task!r}: {error}") from None
         band = bootstrap_bands(found, level=level, repeats=repeats, seed=seed, k=k)

@@ -22,6 +22,7 @@ LONGEST_SPIN_S = 2 * OFFSET_S
 GAP_DEG = 30.0  # widest azimuth sector without returns in a complete sweep
 FORCE = 200.0  # limit of the specific force [m/s^2]
 RATE = 20.0  # limit of the angular rate [rad/s]
+FARTHEST = 1e9  # [m], [m/s]: beyond, squares of numbers say nothing
 EXACT = 1e-6  # tolerance between values that are stored twice [s], [m], [rad], [m/s]
 
 
@@ -48,6 +49,10 @@ def check_values(frame: Frame) -> Iterator[str]:
     numbers = np.column_stack((truth.boxes.array(), truth.velocity, truth.occlusion))
     for track in truth.track[~np.isfinite(numbers).all(axis=1)]:
         yield f"{frame.key}: the annotation of '{track}' has a number that is not finite"
+    with np.errstate(invalid="ignore"):
+        far = (np.abs(numbers) > FARTHEST).any(axis=1)
+    for track in truth.track[far & np.isfinite(numbers).all(axis=1)]:
+        yield f"{frame.key}: the annotation of '{track}' has a number beyond {FARTHEST:g}"
     for track in truth.track[(truth.boxes.size <= 0).any(axis=1)]:
         yield f"{frame.key}: the box of '{track}' has no volume"
     for track in truth.track[(truth.returns < 0) | (truth.occlusion < 0) | (truth.occlusion > 1)]:
@@ -84,7 +89,7 @@ def check_points(frame: Frame, trace: Trace | None = None) -> Iterator[str]:
     """Check that each actor's enlarged box contains as many points as the annotation counts returns.
 
     Points of a rolling LiDAR are compensated for the motion of the carrier and the actor by `trace`. The check is
-    skipped without `trace` for such a LiDAR, and where a point is not finite.
+    skipped without `trace` for such a LiDAR, and where a point or a box is not finite or beyond `FARTHEST`.
     """
     if not frame.lidar or (frame.point_times and trace is None):
         return
@@ -93,6 +98,8 @@ def check_points(frame: Frame, trace: Trace | None = None) -> Iterator[str]:
     motions = _motions(frame, trace) if trace is not None and frame.point_times else {}
     everything, times_s = _in_world(frame, motions.get(frame.agent))
     boxes, returns = frame.annotations.boxes, frame.annotations.returns
+    if not (np.abs(boxes.array()) <= FARTHEST).all():
+        return
     away = np.linalg.norm(boxes.center - frame.world_from_agent[:3, 3], axis=1)
     rain = rain_range_noise(frame.weather.rain_mm_h) if frame.weather else 0.0
     for i in np.flatnonzero(returns > 0):

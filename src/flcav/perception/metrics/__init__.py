@@ -2,7 +2,6 @@
 
 from flcav.perception.metrics.average_precision import (
     average_precision,
-    bootstrap_difference,
     bootstrap_interval,
     interval_words,
     orientation_similarity,
@@ -15,7 +14,6 @@ from flcav.perception.metrics.matching import Matches, match
 __all__ = [
     "Matches",
     "average_precision",
-    "bootstrap_difference",
     "bootstrap_interval",
     "calibration_error",
     "fit_logistic",

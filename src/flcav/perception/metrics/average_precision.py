@@ -51,18 +51,6 @@ def bootstrap_interval(
     return bootstrap_over_scenes(lambda times: weighted_precision(matches, times), scene_of_frame, n, rng=rng)
 
 
-def bootstrap_difference(
-    before: Matches, after: Matches, scene_of_frame: ArrayLike, n: int = REDRAWS, *, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Return the 95 % percentile bootstrap interval (low, high) of AP(after) - AP(before): a paired difference.
-
-    Both are evaluated on the same `n` resamples of the scenes; scene_of_frame (F,): scene of each frame.
-    """
-    return bootstrap_over_scenes(
-        lambda times: weighted_precision(after, times) - weighted_precision(before, times), scene_of_frame, n, rng=rng
-    )
-
-
 def interval_words(low: float | None, high: float | None) -> str:
     """Return an interval over scenes as text: "[0.123, 0.456]", or that there is none where a limit is None."""
     return "(no interval: one scene)" if low is None or high is None else f"[{low:.3f}, {high:.3f}]"

@@ -9,7 +9,6 @@ STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 STEP_S = 0.25  # time between two points of a track
 PAST, FUTURE = 8, 12  # steps before and after the present: 2 s and 3 s
 Maps = Annotated[int, Field(ge=1, le=4096)]  # number of feature maps
-HORIZON_S = FUTURE * STEP_S
 
 
 @dataclass(frozen=True, config=STRICT)

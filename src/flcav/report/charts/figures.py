@@ -6,13 +6,12 @@ from matplotlib.figure import Figure
 
 from flcav.intervals import MeanOverSeeds
 from flcav.report import style
-from flcav.report.charts import runs as charts
+from flcav.report.charts import runs
 from flcav.report.charts.runs import Row
-from flcav.report.pictures import clouds as sweeps
-from flcav.report.pictures import maps
+from flcav.report.pictures import clouds, maps
 
 WIDTH = 3.8  # [inch] of a figure that a phone shows
-EXTENT: sweeps.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of the network `tiny`
+EXTENT: clouds.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of the network `tiny`
 
 
 @style.styled
@@ -27,22 +26,22 @@ def town_map(scene: maps.ErrorMap) -> Figure:
 
 
 @style.styled
-def before_after(sweep: sweeps.Sweep, extent: sweeps.Extent = EXTENT) -> Figure:
+def before_after(sweep: clouds.Sweep, extent: clouds.Extent = EXTENT) -> Figure:
     """Return one sweep twice, one above the other, with the detections of each of two networks."""
     figure = style.canvas(WIDTH, 2 * WIDTH)
     for axes, found in zip(figure.subplots(2), (sweep.before, sweep.after), strict=True):
-        sweeps.draw_detections(axes, sweep, found, extent)
+        clouds.draw_detections(axes, sweep, found, extent)
         axes.set_title(found.title, fontweight="bold", pad=20)
-        style.key(axes, sweeps.key(found), loc="lower left", bbox_to_anchor=(-0.02, 0.98))
+        style.key(axes, clouds.key(found), loc="lower left", bbox_to_anchor=(-0.02, 0.98))
         axes.set(xlabel="metres to the right", ylabel="metres ahead")
     return figure
 
 
 @style.styled
 def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figure:
-    """Return a measure after every round, a line per town; for the rows see `charts.runs.draw_by_round`."""
+    """Return a measure after every round, a line per town; for the rows see `runs.runs.draw_by_round`."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
-    charts.draw_by_round(figure.add_subplot(), rounds, tested, measure)
+    runs.draw_by_round(figure.add_subplot(), rounds, tested, measure)
     return figure
 
 
@@ -50,7 +49,7 @@ def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figu
 def megabytes(ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
     """Return the traffic of each stage on each link, against the budgets (link -> MB)."""
     figure = style.canvas(WIDTH, 0.55 * WIDTH)
-    charts.draw_megabytes(figure.add_subplot(), ledger_by_stage, budgets)
+    runs.draw_megabytes(figure.add_subplot(), ledger_by_stage, budgets)
     return figure
 
 
@@ -60,7 +59,7 @@ def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
     figure = style.canvas(6.4, 0.9 + 0.32 * sum(map(len, towns.values())))
     panels = figure.subplots(len(towns), sharex=True, squeeze=False)[:, 0]
     for axes, (town, rows) in zip(panels, towns.items(), strict=True):
-        charts.draw_arms(axes, town, rows)
+        runs.draw_arms(axes, town, rows)
         axes.set_title(town, fontweight="bold")
     figure.axes[-1].set_xlabel("AP50 (95 % interval)")
     return figure
@@ -68,7 +67,7 @@ def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
 
 @style.styled
 def overview(
-    scene: maps.ErrorMap, sweep: sweeps.Sweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
+    scene: maps.ErrorMap, sweep: clouds.Sweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
 ) -> Figure:
     """Return the overview of a run: map of errors, a sweep before and after, and a measure after every round."""
     figure = style.canvas(9.6, 4.4)
@@ -79,12 +78,12 @@ def overview(
     axes.set_title(f"{scene.town.name}: mistakes, and the pole placed for them", fontweight="bold")
     style.key(left, axes.get_legend_handles_labels()[0])
     for axes, found in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
-        sweeps.draw_detections(axes, sweep, found, EXTENT)
+        clouds.draw_detections(axes, sweep, found, EXTENT)
         axes.set_title(found.title, fontweight="bold")
         axes.set(xticks=[], yticks=[0, 20, 40])
     middle.supylabel("metres ahead", fontsize=style.TEXT, color=style.MUTED)
-    style.key(middle, sweeps.key(), columnspacing=0.8)
+    style.key(middle, clouds.key(), columnspacing=0.8)
     axes = right.add_subplot()
-    charts.draw_by_round(axes, rounds, tested, measure)
+    runs.draw_by_round(axes, rounds, tested, measure)
     axes.set_title(f"{measure} through the stages", fontweight="bold", pad=22)
     return figure

@@ -14,8 +14,7 @@ from flcav.optimization.allocation.problem import AllocationTask, Problem
 from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, explain_objective
 from flcav.optimization.vehicles import VehicleShare
 from flcav.report import style
-from flcav.report.charts import curves as layers_chart
-from flcav.report.charts import plans as plan_charts
+from flcav.report.charts import curves, plans
 from flcav.report.pages import html
 
 STAGES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
@@ -41,11 +40,11 @@ def plan_page(
     """Return the page as self-contained HTML; `graph`: the three-layer graph that the problem was made from, if any."""
     results = plan_results(problem, plan, shares, more)
     pictures = {
-        "megabytes": plan_charts.megabytes(results["parts"], results["links"]),
-        "budgets": plan_charts.best_by_budget(results["sweep"], results["measure"]["name"]),
+        "megabytes": plans.megabytes(results["parts"], results["links"]),
+        "budgets": plans.best_by_budget(results["sweep"], results["measure"]["name"]),
     }
     if graph is not None:
-        pictures["layers"] = layers_chart.three_layers(graph)
+        pictures["layers"] = curves.three_layers(graph)
     return html.render(results, {name: style.png(figure) for name, figure in pictures.items()}, "plan.html.j2")
 
 
@@ -106,7 +105,7 @@ def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
     return terms | {name: TERMS[name] for name in used}
 
 
-def _parts(problem: Problem, plan: Allocation) -> list[plan_charts.Part]:
+def _parts(problem: Problem, plan: Allocation) -> list[plans.Part]:
     """Return megabytes by link, task and stage; tasks beyond the `SHOWN` largest are one part."""
     ordered = sorted(plan.tasks, key=lambda row: -(row.wireless_mb + row.wireline_mb))
     shown = {row.name for row in ordered[: SHOWN if len(ordered) > SHOWN + 1 else len(ordered)]}

@@ -23,8 +23,7 @@ from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.charts.runs import STAGES, Row
 from flcav.report.pages import html
-from flcav.report.pictures import clouds as sweeps
-from flcav.report.pictures import maps
+from flcav.report.pictures import clouds, maps
 
 CHART_NAMES: dict[str, str] = dict(zip((PRETRAIN, EDGE, CLOUD), STAGES, strict=True))
 OBJECTS = "objects"
@@ -181,7 +180,7 @@ def _sent(run: Run) -> Sequence[Row]:
     ]
 
 
-def _sweep(work: Path, names: Names, run: Run) -> sweeps.Sweep:
+def _sweep(work: Path, names: Names, run: Run) -> clouds.Sweep:
     looked = SweepComparison.load(work / LOOK)
     region = run.recipe.with_role("federate")[0]
     data: Dataset = Frames.open(work / names.recording(region, "test", OBJECTS)).data
@@ -189,11 +188,11 @@ def _sweep(work: Path, names: Names, run: Run) -> sweeps.Sweep:
     lidar = choose_lidar(frame)
     ground_m = -float(frame.world_from_sensor(lidar)[2, 3])
     before, after = _detections("pretrained", looked.before), _detections("after the last stage", looked.after)
-    return sweeps.Sweep(frame.lidar[lidar], ground_m, _boxes(looked.targets), before, after)
+    return clouds.Sweep(frame.lidar[lidar], ground_m, _boxes(looked.targets), before, after)
 
 
-def _detections(title: str, seen: SweepDetections) -> sweeps.Detections:
-    return sweeps.Detections(
+def _detections(title: str, seen: SweepDetections) -> clouds.Detections:
+    return clouds.Detections(
         title, _boxes(seen.boxes), np.array(seen.hit, dtype=bool), np.array(seen.found, dtype=bool)
     )
 

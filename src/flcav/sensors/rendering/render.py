@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.camera.lens import Lens, compute_pixel_rays
-from flcav.sensors.rendering import rain
-from flcav.sensors.rendering import supersampling as antialias
-from flcav.sensors.rendering import supersampling as edges
+from flcav.sensors.rendering import rain, supersampling
 from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
 from flcav.sensors.rendering.appearance import Appearance, build_appearance
 from flcav.sensors.rendering.gbuffer import GBuffer, fill_gbuffer
@@ -96,12 +94,12 @@ def render(
     radiance, painted = _radiance(world, seen, open_sky, lens.width)
     if light.wetness > MIRRORS:
         _mirror(world, world_from_camera, lens, rays, seen, radiance)
-    kind = edges.find_edges(seen, radiance, light.exposure, appearance, lens)
-    edges.mark_thin(kind, scene.town, world_from_camera, lens, seen)
-    further, pixel = antialias.further_rays(rays, kind, lens)
+    kind = supersampling.find_edges(seen, radiance, light.exposure, appearance, lens)
+    supersampling.mark_thin(kind, scene.town, world_from_camera, lens, seen)
+    further, pixel = supersampling.further_rays(rays, kind, lens)
     if len(pixel):
         more = _further(world, world_from_camera, further, pixel, lens.width, seen, open_sky, radiance)
-        antialias.average(radiance, more, pixel, np.float32(antialias.BRIGHTEST / light.exposure))
+        supersampling.average(radiance, more, pixel, np.float32(supersampling.BRIGHTEST / light.exposure))
     image = radiance.reshape(lens.height, lens.width, 3)
     if weather.rain_mm_h > 0:
         rain.add_streaks(image, weather.rain_mm_h, 0.75 * np.array(light.horizon) + 0.05 * np.array(light.sun), rng)
@@ -149,11 +147,11 @@ def _further(
     scene, appearance = world.scene, world.appearance
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=world.hidden)
     donor = np.empty(len(rays), np.int32)
-    antialias.donors(hits, pixel, seen, scene.surfaces.first, appearance.material, width, donor)
+    supersampling.donors(hits, pixel, seen, scene.surfaces.first, appearance.material, width, donor)
     out, rest = radiance[donor], np.flatnonzero(donor < 0)
     unknown = Hits(hits.distance[rest], hits.instance[rest], hits.face[rest])
     found = fill_gbuffer(scene, appearance, world_from_camera, rays[rest], unknown)
-    finer = world._replace(pixel_angle=world.pixel_angle / antialias.ROOKS)
+    finer = world._replace(pixel_angle=world.pixel_angle / supersampling.ROOKS)
     out[rest], _ = _radiance(finer, found, open_sky[pixel[rest]])
     return out
 

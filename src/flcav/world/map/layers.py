@@ -3,9 +3,9 @@
 Lines and outlines are two-dimensional, in the world frame [m]; angles are in radians. The road surface is at z = 0.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,40 +78,3 @@ class MapLayers:
     markings: tuple[Marking, ...]
     crossings: tuple[Crossing, ...]
     arrows: tuple[Arrow, ...]
-
-    def to_records(self) -> dict[str, list[Record]]:
-        """Return each layer as a list of plain JSON values, polygons as `{"outline": [[x, y], ...]}`."""
-        out: dict[str, list[Record]] = {}
-        for layer in fields(self):
-            rows = getattr(self, layer.name)
-            out[layer.name] = [
-                {"outline": row.tolist()} if isinstance(row, np.ndarray) else _plain(row) for row in rows
-            ]
-        return out
-
-    @classmethod
-    def from_records(cls, records: Mapping[str, Sequence[Record]]) -> "MapLayers":
-        """Return the map of records: the inverse of `to_records`. Raises `KeyError` for a missing layer."""
-        kinds = {"lanes": MapLane, "markings": Marking, "crossings": Crossing, "arrows": Arrow}
-        layers: dict[str, Any] = {}
-        for layer in fields(cls):
-            rows = [{name: _value(value) for name, value in row.items()} for row in records[layer.name]]
-            kind = kinds.get(layer.name)
-            layers[layer.name] = tuple(kind(**row) if kind else row["outline"] for row in rows)
-        return cls(**layers)
-
-
-def _plain(row: Any) -> Record:
-    """Return a record of the map as plain JSON values by field name."""
-    values = ((field.name, getattr(row, field.name)) for field in fields(row))
-    return {
-        name: value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
-        for name, value in values
-    }
-
-
-def _value(value: Any) -> Any:
-    """Return a JSON value as a field of a record has it: lists of points as arrays (K, 2), other lists as tuples."""
-    if not isinstance(value, list):
-        return value
-    return np.array(value, dtype=np.float64) if value and isinstance(value[0], list) else tuple(value)

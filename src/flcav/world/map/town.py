@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, read_config, shorten
 from flcav.seeds import stream
-from flcav.world.map import street_furniture as placement
+from flcav.world.map import street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.signals import Signals, place_signals
@@ -116,20 +116,21 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
 def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:
     """Return the town of a net: ground first, then buildings, clutter, trees, poles, signs, lamps and signals."""
     ground = build_ground_surfaces(net, {kind: street.frontage_m for kind, street in parameters.streets.items()})
-    rows = list(placement.list_verges(net, parameters))
+    rows = list(street_furniture.list_verges(net, parameters))
     paved = ground.roads.union(ground.sidewalks)
-    land = placement.Plot(paved)
-    buildings = placement.place_buildings(rows, land, stream(parameters.seed, "buildings"))
+    land = street_furniture.Plot(paved)
+    buildings = street_furniture.place_buildings(rows, land, stream(parameters.seed, "buildings"))
     walked = shapely.union_all([verge.line.buffer(verge.half_width, cap_style="flat") for verge in rows])
     facades = [
-        placement.make_footprint(x, y, yaw, length, width).buffer(0.1) for x, y, yaw, length, width, _ in buildings
+        street_furniture.make_footprint(x, y, yaw, length, width).buffer(0.1)
+        for x, y, yaw, length, width, _ in buildings
     ]
-    open_land = placement.Plot(shapely.union_all([ground.roads, walked, *facades]))
-    clutter = placement.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
-    trees = placement.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
-    poles = placement.place_poles(net, parameters.poles)
+    open_land = street_furniture.Plot(shapely.union_all([ground.roads, walked, *facades]))
+    clutter = street_furniture.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
+    trees = street_furniture.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
+    poles = street_furniture.place_poles(net, parameters.poles)
     mounts = np.array([row[1] for row in poles], dtype=np.float64).reshape(-1, 3)
-    signs = placement.place_signs(net)
+    signs = street_furniture.place_signs(net)
     low_x, low_y, high_x, high_y = shapely.union_all([paved, *facades]).bounds
     return Town(
         name=name,
@@ -154,6 +155,6 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
             yaw=np.array([row[1] for row in signs], dtype=np.float64),
             kind=tuple(row[2] for row in signs),
         ),
-        lamps=placement.place_lamps(rows, mounts, stream(parameters.seed, "lamps")),
+        lamps=street_furniture.place_lamps(rows, mounts, stream(parameters.seed, "lamps")),
         signals=place_signals(net, mounts),
     )

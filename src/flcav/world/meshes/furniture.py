@@ -112,11 +112,6 @@ def sensor_mast(height: float) -> Mesh:
     return join_meshes((mast, arm))
 
 
-def sign(kind: str, height: float) -> Mesh:
-    """Return a traffic sign with its post; the centre of its plate is `height` [m] above the origin and faces +x."""
-    return join_meshes((sign_plate(kind, height), sign_post(height)))
-
-
 def sign_plate(kind: str, height: float) -> Mesh:
     """Return the plate of a traffic sign, front and back: an octagon for stop, a triangle for yield, else a disc.
 
