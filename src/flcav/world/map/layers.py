@@ -3,18 +3,15 @@
 Lines and outlines are two-dimensional, in the world frame [m]; angles are in radians. The road surface is at z = 0.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.files import Json
 from flcav.world.map.roads import LaneKind
 
 Array = NDArray[np.float64]
-Record = Mapping[str, Json]  # one lane, marking, crossing, arrow or polygon as plain JSON values
 
 MarkingKind = Literal["solid", "dashed", "stop_line", "yield_line", "edge"]
 ArrowKind = Literal["straight", "left", "right", "straight_left", "straight_right", "left_right", "straight_left_right"]
