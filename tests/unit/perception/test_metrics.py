@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flcav.geometry import Boxes, concatenate
+from flcav.geometry import Boxes
 from flcav.perception.metrics import (
     Matches,
     average_precision,
-    bootstrap_difference,
     bootstrap_interval,
     match,
     orientation_similarity,
@@ -155,13 +154,3 @@ def test_one_scene_says_nothing_of_others():
     empty = replace(matches, targets=np.where(np.arange(12) < 3, matches.targets, 0))
     scenes = ["full"] * 3 + ["empty"] * 9
     assert np.isnan(bootstrap_interval(empty, scenes, 50, rng=np.random.default_rng(1))).all()
-
-
-def test_difference_is_paired():
-    before = random_matches(np.random.default_rng(2))
-    assert bootstrap_difference(before, before, np.arange(12), 50, rng=np.random.default_rng(1)) == (0, 0)
-    truth = [cars(0, 20)] * 8
-    worse = match([cars(0, scores=[0.9])] * 8, truth, [Boxes.empty()] * 8, 0.5)
-    better = match([concatenate([cars(0, 20, scores=[0.9, 0.8])])] * 8, truth, [Boxes.empty()] * 8, 0.5)
-    low, high = bootstrap_difference(worse, better, np.arange(8), 50, rng=np.random.default_rng(1))
-    assert low == high == pytest.approx(0.5)
