@@ -1,15 +1,30 @@
 """Rigid transforms and oriented 3D boxes."""
 
 from flcav.geometry.boxes import Boxes, concatenate, points_in_boxes
-from flcav.geometry.poses import inverse, is_rigid, pose, transform_points, wrap_angle, yaw_of
+from flcav.geometry.poses import (
+    heading_vectors,
+    inverse,
+    is_rigid,
+    left_vectors,
+    pose,
+    rotate,
+    rotations_about_z,
+    transform_points,
+    wrap_angle,
+    yaw_of,
+)
 
 __all__ = [
     "Boxes",
     "concatenate",
+    "heading_vectors",
     "inverse",
     "is_rigid",
+    "left_vectors",
     "points_in_boxes",
     "pose",
+    "rotate",
+    "rotations_about_z",
     "transform_points",
     "wrap_angle",
     "yaw_of",

@@ -4,10 +4,14 @@ World frame: ENU (x east, y north, z up) [m]. Body frame: x forward, y left, z u
 [rad].
 """
 
+import math
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Coordinate = TypeVar("Coordinate", float, Array)
 
 
 def pose(x: float, y: float, z: float = 0.0, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Array:
@@ -52,6 +56,33 @@ def is_rigid(target_from_source: Array) -> bool:
         and np.linalg.det(rotation) > 0
         and np.array_equal(target_from_source[3], (0, 0, 0, 1))
     )
+
+
+def heading_vectors(yaw: ArrayLike) -> Array:
+    """Return (..., 2) unit vectors x, y of the headings `yaw` (...) [rad]."""
+    return np.stack((np.cos(yaw), np.sin(yaw)), axis=-1)
+
+
+def left_vectors(yaw: ArrayLike) -> Array:
+    """Return (..., 2) unit vectors x, y that point to the left of the headings `yaw` (...) [rad]."""
+    return np.stack((-np.sin(yaw), np.cos(yaw)), axis=-1)
+
+
+def rotations_about_z(yaw: ArrayLike) -> Array:
+    """Return (..., 3, 3) rotation matrices by `yaw` (...) [rad] about z."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    zero, one = np.zeros_like(cos), np.ones_like(cos)
+    rows = ((cos, -sin, zero), (sin, cos, zero), (zero, zero, one))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotate(x: Coordinate, y: Coordinate, yaw: float) -> tuple[Coordinate, Coordinate]:
+    """Return vectors x, y of the plane rotated by `yaw` [rad]: from a body's frame to the one its heading is given in.
+
+    By -`yaw` they go back: what is (x, y) there, is so far ahead and to the left of the body.
+    """
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return x * cos - y * sin, x * sin + y * cos
 
 
 def yaw_of(target_from_source: Array) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flcav.config import Config
-from flcav.geometry import pose
+from flcav.geometry import heading_vectors, pose
 from flcav.sensors.camera.camera import Camera
 from flcav.sensors.camera.infrared import Infrared
 from flcav.sensors.lidar.lidar import Lidar
@@ -151,7 +151,7 @@ def car_surround() -> Rig:
     directions = {"front": 0, "front_left": 55, "front_right": -55, "back_left": 110, "back_right": -110, "back": 180}
     cameras = {}
     for name, yaw_deg in directions.items():
-        x, y = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+        x, y = heading_vectors(np.radians(yaw_deg))
         mount = Mount(x=round(float(x), 3), y=round(0.5 * float(y), 3), z=1.5, yaw_deg=yaw_deg)
         cameras[name] = MountedCamera(mount=mount, settings=Camera(fov_deg=110.0 if name == "back" else 70.0))
     return car(cameras)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import pose
+from flcav.geometry import pose, rotations_about_z
 from flcav.world.map.town import Town
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
@@ -89,7 +89,7 @@ class Scene:
 
     def world_from_instance(self) -> NDArray[np.float64]:
         """Return the rotations of the instances (I, 3, 3); the identity for the town and for absent actors."""
-        return _rotate_about_z(np.concatenate(([0.0], np.nan_to_num(self.poses()[:, 3]))))
+        return rotations_about_z(np.concatenate(([0.0], np.nan_to_num(self.poses()[:, 3]))))
 
     def cast(
         self,
@@ -153,18 +153,12 @@ class Scene:
         moved = np.flatnonzero(~same.all(axis=1))
         nowhere = set(moved[np.isnan(wanted[moved, 0])].tolist())
         world_from_actor = np.tile(np.eye(4), (len(moved), 1, 1))
-        world_from_actor[:, :3, :3] = _rotate_about_z(wanted[moved, 3])
+        world_from_actor[:, :3, :3] = rotations_about_z(wanted[moved, 3])
         world_from_actor[:, :3, 3] = wanted[moved, :3]
         for actor, matrix in zip(moved.tolist(), world_from_actor):
             self._assembly.place(actor + 1, None if actor in nowhere else matrix)
         self._placed = wanted
         self._assembly.commit()
-
-
-def _rotate_about_z(yaw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotations (K, 3, 3) by `yaw` (K,) [rad] about z."""
-    cos, sin, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
-    return np.array([[cos, -sin, zero], [sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
 
 
 class _Model(NamedTuple):

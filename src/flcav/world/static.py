@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from flcav.geometry import left_vectors
 from flcav.seeds import stream
 from flcav.world.map.town import KERB_M, Town
 from flcav.world.materials import Material
@@ -179,7 +180,7 @@ def _signals(town: Town) -> Iterator[Owned]:
     """Yield the signal heads with their masts."""
     signals = town.signals
     for row, ((x, y, z), yaw, foot) in enumerate(zip(signals.position, signals.yaw, signals.foot)):
-        left = np.array((-np.sin(yaw), np.cos(yaw)))
+        left = left_vectors(yaw)
         reach = float(left @ ((x, y) - foot))
         yield Part.SIGNAL, row, transform_mesh(signal_head(z), x, y, 0.0, yaw)
         yield Part.POST, row, transform_mesh(signal_mast(z, reach), foot[0], foot[1], 0.0, yaw)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from flcav.geometry import Boxes, concatenate, points_in_boxes
+from flcav.geometry import Boxes, concatenate, heading_vectors, points_in_boxes
 from flcav.perception.objects.config import Augmentation, SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import MIN_RETURNS, in_range
@@ -43,7 +43,7 @@ def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Samp
     if how.shift_m:
         sample = shift_sample(sample, rng.uniform(-how.shift_m, how.shift_m, size=2))
     if how.tilt_rad or how.lift_m:
-        slope = np.tan(rng.uniform(0, how.tilt_rad)) * _unit(rng.uniform(0, 2 * np.pi))
+        slope = np.tan(rng.uniform(0, how.tilt_rad)) * heading_vectors(rng.uniform(0, 2 * np.pi))
         sample = tilt_sample(sample, slope, rng.uniform(-how.lift_m, how.lift_m))
     kept = np.ones(len(sample.points), dtype=bool)
     if how.drop:
@@ -55,7 +55,7 @@ def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Samp
 
 def transform_sample(sample: Sample, mirror: float, turn_rad: float, scale: float) -> Sample:
     """Return the sample with y times `mirror` (1 or -1), then turned counter-clockwise by `turn_rad`, then scaled."""
-    cos, sin = np.cos(turn_rad) * scale, np.sin(turn_rad) * scale
+    cos, sin = heading_vectors(turn_rad) * scale
     plane = np.array([[cos, sin], [-mirror * sin, mirror * cos]])  # right factor of rows (x, y)
     points = sample.points.copy()
     points[:, :2] = points[:, :2] @ plane.astype(np.float32)
@@ -78,7 +78,7 @@ def resize_objects(sample: Sample, factor: NDArray[np.float64]) -> Sample:
     foot = boxes.center - boxes.size * (0, 0, 0.5)
     changed = np.flatnonzero((factor != 1).any(1))
     for row, inside in zip(changed, points_in_boxes(sample.points, boxes[changed]), strict=True):
-        along = _unit(boxes.yaw[row])
+        along = heading_vectors(boxes.yaw[row])
         frame = np.array([[*along, 0], [-along[1], along[0], 0], [0, 0, 1]])  # rows: axes of the box
         stretch = frame.T @ np.diag(factor[row]) @ frame
         points[inside, :3] = (sample.points[inside, :3] - foot[row]) @ stretch + foot[row]
@@ -135,10 +135,6 @@ def keep_returns(sample: Sample, kept: NDArray[np.bool_]) -> Sample:
 
 def _count_returns(points: NDArray[np.float32], boxes: Boxes) -> NDArray[np.int64]:
     return points_in_boxes(points, boxes).sum(1)
-
-
-def _unit(angle: float) -> NDArray[np.float64]:
-    return np.array((np.cos(angle), np.sin(angle)))
 
 
 @dataclass(frozen=True)

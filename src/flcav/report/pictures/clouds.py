@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, heading_vectors
 from flcav.perception.images import CameraView
 from flcav.report import style
 from flcav.report.pictures.camera import boxes_on_picture, show_view
@@ -60,7 +60,7 @@ def draw_boxes(
     axes: Axes, boxes: Boxes, colour: str, *, fill: float = 0.0, width: float = 1.2, dashed: bool = False
 ) -> None:
     """Draw the footprints of `boxes`, filled with opacity `fill`, each with a tick in its heading."""
-    ahead = np.stack((np.cos(boxes.yaw), np.sin(boxes.yaw)), axis=1)
+    ahead = heading_vectors(boxes.yaw)
     tip = boxes.center[:, :2] + ahead * (boxes.size[:, :1] / 2 + 0.6)
     ticks = on_page(np.stack((boxes.center[:, :2], tip), axis=1))
     outlines = on_page(boxes.corners()[:, :4, :2])

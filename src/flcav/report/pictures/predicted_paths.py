@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
+from flcav.geometry import heading_vectors, left_vectors
 from flcav.perception.marks import Paths, RoadUser
 from flcav.report import style
 
@@ -46,7 +47,7 @@ def _ground(layers: NDArray[np.bool_]) -> Array:
 def _draw_user(axes: Axes, user: RoadUser, observer: Array) -> None:
     length, width = user.length / 2, user.width / 2
     corners = np.array([(length, width), (length, -width), (-length, -width), (-length, width)])
-    turn = np.array([(np.cos(user.yaw), np.sin(user.yaw)), (-np.sin(user.yaw), np.cos(user.yaw))])
+    turn = np.stack((heading_vectors(user.yaw), left_vectors(user.yaw)))
     here = np.array([user.x, user.y])
     outline = _on_page(corners @ turn + here, observer)
     axes.add_patch(Polygon(outline, facecolor="white", edgecolor=style.INK, linewidth=0.8, zorder=4))

@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from shapely.geometry import MultiPoint
 
+from flcav.geometry import heading_vectors
 from flcav.report import style
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.paint import outline_paint
@@ -102,7 +103,7 @@ def shadow(house: Array, height: float) -> Array:
 def footprint(x: float, y: float, yaw: float, length: float, width: float) -> Array:
     """Return the corners (4, 2) of a rectangle with centre (x, y) and heading `yaw` [m, rad]."""
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2 * (length, width)
-    cos, sin = np.cos(yaw), np.sin(yaw)
+    cos, sin = heading_vectors(yaw)
     return corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.geometry import heading_vectors
 from flcav.sensors.frame import Array, SignViews
 from flcav.sensors.labels.views import find_thing_regions
 from flcav.world.scene import Scene
@@ -28,7 +29,8 @@ def view_signs(scene: Scene, world_from_camera: Array, instance: NDArray[np.int3
     camera = world_from_camera[:3, 3]
     sight = camera - things.position
     distance = np.linalg.norm(sight, axis=1)
-    facing = (sight[:, 0] * np.cos(things.yaw) + sight[:, 1] * np.sin(things.yaw)) / np.maximum(distance, 1e-9)
+    normal = heading_vectors(things.yaw)
+    facing = (sight[:, 0] * normal[:, 0] + sight[:, 1] * normal[:, 1]) / np.maximum(distance, 1e-9)
     seen = np.flatnonzero((regions.pixels > 0) & (facing > READABLE))
     state_of = dict(zip(scene.trace.light.tolist(), scene.trace.light_state[scene.index].tolist()))
     states = [STATES.get(state_of.get(things.link[row], ""), "off") if things.link[row] else "" for row in seen]

@@ -8,6 +8,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.geometry import left_vectors
 from flcav.sensors.rendering.facade import Facades, facades_of
 from flcav.sensors.rendering.ground import Markings, build_markings
 from flcav.sensors.rendering.noise import make_noise
@@ -129,7 +130,7 @@ def _appearance(scene: Scene) -> Appearance:
         if category in ("bicycle", "motorcycle"):
             semantic[faces][np.isin(surfaces.material[faces], _RIDER)] = SEMANTICS["rider"]
     signs = town.signs
-    place = np.c_[signs.position, -np.sin(signs.yaw), np.cos(signs.yaw)]
+    place = np.c_[signs.position, left_vectors(signs.yaw)]
     return Appearance(
         material=surfaces.material,
         semantic=semantic,

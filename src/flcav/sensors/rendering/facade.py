@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.compiled import inlined
+from flcav.geometry import heading_vectors
 from flcav.seeds import stream
 from flcav.sensors.rendering.noise import fade, hash_pair, overlap, sample_noise
 from flcav.world.meshes.buildings import BAY_M, GABLED_BELOW_M, STOREY_M
@@ -51,7 +52,7 @@ def facades_of(name: str, buildings: NDArray[np.float64]) -> Facades:
     roof = np.array(ROOFS)[rng.integers(len(ROOFS), size=count)]
     roof[~gabled] = (0.30, 0.29, 0.28)
     return Facades(
-        np.stack((buildings[:, 0], buildings[:, 1], np.cos(yaw), np.sin(yaw)), axis=1).astype(np.float32),
+        np.column_stack((buildings[:, :2], heading_vectors(yaw))).astype(np.float32),
         np.stack((buildings[:, 3], buildings[:, 4], walls), axis=1).astype(np.float32),
         np.array([style for style, _ in WALLS], np.uint8)[kind],
         np.clip(np.array([colour for _, colour in WALLS])[kind] * tint, 0.02, 0.85).astype(np.float32),

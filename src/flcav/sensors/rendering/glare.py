@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.compiled import compiled
-from flcav.geometry import inverse, transform_points
+from flcav.geometry import heading_vectors, inverse, transform_points
 from flcav.sensors.camera.lens import Lens, project
 from flcav.sensors.rendering.light import DARK, Light
 from flcav.sensors.rendering.state import AMBER, GREEN, RED, LampState, lamp_places
@@ -111,11 +111,12 @@ def _glowing(
         out.extend((np.array((x, y, z - 0.2)), STREET_COLOUR, street) for x, y, z in scene.town.lamps)
         things = scene.things
         for number, (place, yaw, kind) in enumerate(zip(things.position, things.yaw, things.kind)):
-            ahead = (eye - place) @ (np.cos(yaw), np.sin(yaw), 0.0)
+            cos, sin = heading_vectors(yaw)
+            ahead = (eye - place) @ (cos, sin, 0.0)
             if kind == "signal" and ahead > 0:
                 for place_up, lens in ((1, RED), (0, AMBER), (-1, GREEN)):
                     if state.lens[number] & lens:
-                        lit = place + np.array((0.2 * np.cos(yaw), 0.2 * np.sin(yaw), place_up * LENS_PITCH_M))
+                        lit = place + np.array((0.2 * cos, 0.2 * sin, place_up * LENS_PITCH_M))
                         out.append((lit, SIGNAL_COLOURS[lens], SIGNAL * float(light.lamps)))
     return out
 

@@ -17,6 +17,7 @@ from shapely.geometry import LineString, Polygon
 from shapely.ops import substring
 
 from flcav.compiled import inlined
+from flcav.geometry import heading_vectors
 from flcav.sensors.rendering.noise import fade, hash_pair, overlap, sample_noise
 from flcav.world.map.layers import Arrow, ArrowKind, MapLayers, Marking
 from flcav.world.map.paint import outline_arrow, outline_stripes
@@ -97,7 +98,7 @@ def _box(outline: NDArray[np.float64]) -> Rectangle:
 
 
 def _arrow(arrow: Arrow) -> Iterator[Rectangle]:
-    cos, sin = float(np.cos(arrow.yaw)), float(np.sin(arrow.yaw))
+    cos, sin = heading_vectors(arrow.yaw).tolist()
     for x, y, half_length, half_width in _strips(arrow.kind):
         yield arrow.x + cos * x - sin * y, arrow.y + sin * x + cos * y, cos, sin, half_length, half_width
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.compiled import compiled, inlined
-from flcav.geometry import transform_points
+from flcav.geometry import heading_vectors, transform_points
 from flcav.world.materials import Material
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
@@ -52,7 +52,7 @@ def compute_lamp_state(scene: Scene, lamps_on: float, low_sight: bool) -> LampSt
     lens = [LENSES.get(letters.get(link, ""), 0) for link in scene.things.link]
     parked = np.char.startswith(trace.actor, "parked")
     on = np.where(parked | ~trace.present[index], 0.0, max(lamps_on, 0.8 if low_sight else 0.0))
-    forward = np.stack((np.cos(trace.yaw[index]), np.sin(trace.yaw[index])), axis=1)
+    forward = heading_vectors(trace.yaw[index])
     along = np.nan_to_num((trace.acceleration[index, :, :2] * forward).sum(axis=1))
     stopped = np.nan_to_num(np.linalg.norm(trace.velocity[index], axis=1), nan=9.0) < 0.1
     braking = ((along < BRAKING_MS2) | stopped) & ~parked

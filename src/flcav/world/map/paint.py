@@ -12,6 +12,7 @@ from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 from shapely.ops import substring
 
+from flcav.geometry import heading_vectors
 from flcav.world.map.layers import Arrow, ArrowKind, Crossing, MapLayers, Marking
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ def outline_stripes(crossing: Crossing) -> Iterator[Array]:
 
 def outline_arrow(arrow: Arrow) -> Array:
     """Return the outline (K, 2) of a lane arrow, world frame [m]."""
-    cos, sin = np.cos(arrow.yaw), np.sin(arrow.yaw)
+    cos, sin = heading_vectors(arrow.yaw)
     return _glyph(arrow.kind) @ np.array([[cos, sin], [-sin, cos]]) + (arrow.x, arrow.y)
 
 

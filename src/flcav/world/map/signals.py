@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely.geometry import LineString
 
+from flcav.geometry import left_vectors
 from flcav.world.map.parameters import StreetParameters
 from flcav.world.map.roads import Connection, Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
@@ -68,6 +69,6 @@ def _approach(edge: Edge, connections: tuple[Connection, ...], sensors: Array) -
     clear = all(np.hypot(*(sensor[:2] - (x, y))) > SENSOR_CLEAR_M for sensor in sensors)
     if len(driven) >= ARM_LANES and clear:
         middle = np.mean([np.asarray(lane.shape)[-1] for lane in driven], axis=0)
-        left = np.array((-np.sin(heading), np.cos(heading)))
+        left = left_vectors(heading)
         reach = float(left @ (middle - (x, y)))
         yield (x + reach * left[0], y + reach * left[1], ARM_HEAD_M), yaw, (x, y), link

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from flcav.geometry import heading_vectors
 from flcav.world.map.parameters import CLUTTER, Interval, PoleParameters, StreetParameters, TownParameters
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.surfaces import GroundSurfaces, make_footprint
@@ -67,8 +68,9 @@ class Verge:
         yaw = float(np.arctan2(b.y - a.y, b.x - a.x))
         here = self.line.interpolate(inside)
         on = along_m - inside
-        x = here.x + on * np.cos(yaw) + right_m * np.sin(yaw)
-        y = here.y + on * np.sin(yaw) - right_m * np.cos(yaw)
+        cos, sin = heading_vectors(yaw)
+        x = here.x + on * cos + right_m * sin
+        y = here.y + on * sin - right_m * cos
         return float(x), float(y), yaw
 
 

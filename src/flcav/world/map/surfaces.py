@@ -10,6 +10,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import linemerge, split
 
+from flcav.geometry import heading_vectors
 from flcav.world.map.roads import CARRIAGEWAY, RoadNet
 
 Array = NDArray[np.float64]
@@ -100,5 +101,5 @@ def _polygons(area: BaseGeometry) -> Iterable[Polygon]:
 def make_footprint(x: float, y: float, yaw: float, length: float, width: float) -> Polygon:
     """Return the rectangle with centre x, y [m], heading `yaw` [rad] and these extents [m] as a polygon."""
     rectangle = box(-length / 2, -width / 2, length / 2, width / 2)
-    cos, sin = float(np.cos(yaw)), float(np.sin(yaw))
+    cos, sin = heading_vectors(yaw).tolist()
     return shapely.affinity.affine_transform(rectangle, [cos, -sin, sin, cos, x, y])

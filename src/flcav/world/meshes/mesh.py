@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flcav.geometry import rotations_about_z
 from flcav.world.materials import Material
 
 Array = NDArray[np.float64]
@@ -67,8 +68,7 @@ def join_meshes(parts: Sequence[Mesh]) -> Mesh:
 
 def transform_mesh(mesh: Mesh, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Mesh:
     """Return `mesh` rotated by `yaw` [rad] about z and then translated by x, y, z [m]."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    turn = np.ascontiguousarray(rotations_about_z(yaw).T)
     return Mesh((mesh.vertices @ turn + (x, y, z)).astype(np.float32), mesh.faces, mesh.material)
 
 

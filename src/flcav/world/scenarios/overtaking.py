@@ -4,6 +4,7 @@ import math
 from collections.abc import Generator
 from typing import NamedTuple
 
+from flcav.geometry import rotate
 from flcav.world.scenarios.manoeuvres import ease, length_of
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Spot, Stage, State, braking_m
@@ -83,9 +84,7 @@ def _way_is_free(stage: Stage, name: str) -> bool:
     heading = math.radians(90.0 - angle)
     for other in stage.sumo.vehicle.getIDList():
         other_x, other_y, _, speed = stage.state(other)
-        dx, dy = other_x - x, other_y - y
-        ahead = dx * math.cos(heading) + dy * math.sin(heading)
-        left = -dx * math.sin(heading) + dy * math.cos(heading)
+        ahead, left = rotate(other_x - x, other_y - y, -heading)
         if -10.0 < ahead < _takes_m(own_speed) + braking_m(speed) and 1.0 < left < 12.0:
             return False
     return True

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flcav.geometry import rotate
 from flcav.world.map.roads import Edge, Lane, RoadNet
 from flcav.world.scenarios.scenario import NEAR_M, Scenario
 
@@ -164,10 +165,8 @@ class Stage:
         for name in set(self.sumo.vehicle.getIDList()) - careless:
             front_x, front_y, angle, speed = self.state(name)
             heading = math.radians(90.0 - angle)
-            dx, dy = x - front_x, y - front_y
-            ahead = dx * math.cos(heading) + dy * math.sin(heading)
-            aside = np.abs(-dx * math.sin(heading) + dy * math.cos(heading))
-            if ((ahead > -1.0) & (ahead < braking_m(speed)) & (aside < half_width_m)).any():
+            ahead, left = rotate(x - front_x, y - front_y, -heading)
+            if ((ahead > -1.0) & (ahead < braking_m(speed)) & (np.abs(left) < half_width_m)).any():
                 self.take(name)
                 self.sumo.vehicle.setSpeed(name, 0.0)
                 self._braking.add(name)

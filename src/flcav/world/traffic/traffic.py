@@ -12,7 +12,7 @@ from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from flcav.config import InputError
-from flcav.geometry import wrap_angle
+from flcav.geometry import heading_vectors, wrap_angle
 from flcav.seeds import derive_seed, stream
 from flcav.world.map.roads import read_net
 from flcav.world.map.surfaces import make_footprint
@@ -108,7 +108,8 @@ def _build_trace(
     rates = np.concatenate((rates[:, order], np.zeros((len(time_s), *still.shape))), axis=1)
 
     x, y, yaw, speed = np.moveaxis(state, 2, 0)
-    forward = np.stack((np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)), axis=2)
+    forward = np.zeros((*yaw.shape, 3))
+    forward[..., :2] = heading_vectors(yaw)
     pedestrian = np.array([category == "pedestrian" for category, _ in kinds])
     velocity, acceleration = speed[..., None] * forward, rates[..., :3]
     walking = np.flatnonzero(pedestrian)  # SUMO moves people aside without turning them
@@ -170,7 +171,7 @@ def _rates(before: Array, now: Array, after: Array) -> Array:
 
     def motion(state: Array) -> Array:
         _, _, yaw, speed = np.moveaxis(state, 2, 0)
-        return np.stack((speed * np.cos(yaw), speed * np.sin(yaw), 0 * speed, yaw), axis=2)
+        return np.concatenate((speed[..., None] * heading_vectors(yaw), np.stack((0 * speed, yaw), axis=2)), axis=2)
 
     changes = np.stack((motion(now) - motion(before), motion(after) - motion(now)))
     changes[..., 3] = wrap_angle(changes[..., 3])
@@ -181,8 +182,7 @@ def _rates(before: Array, now: Array, after: Array) -> Array:
 
 def _centre(state: Array, half_length: Array) -> Array:
     """Return the centres (T, A, 2) of actors whose front x, y, yaw and speed are `state` (T, A, 4)."""
-    yaw = state[..., 2]
-    return state[..., :2] - half_length[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), axis=2)
+    return state[..., :2] - half_length[:, None] * heading_vectors(state[..., 2])
 
 
 def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
@@ -210,7 +210,7 @@ def _drop_obstructing(raw: dict[str, NDArray], parked: list[Parked]) -> list[Par
         category, _, shape = str(raw["type"][actor]).partition(".")
         length, width = next(row[1:3] for row in SHAPES[category] if row.name == shape)
         yaw = np.pi / 2 - np.radians(at[:, 2])
-        middle = at[:, :2] - length / 2 * np.stack((np.cos(yaw), np.sin(yaw)), axis=1)
+        middle = at[:, :2] - length / 2 * heading_vectors(yaw)
         ways += [make_footprint(x, y, turn, length, width).buffer(0.3) for (x, y), turn in zip(middle, yaw)]
     taken = shapely.union_all(ways)
     room = [(car, SHAPES[car.category][car.shape]) for car in parked]

@@ -24,7 +24,7 @@ from flcav.dataset.formats.exporter import (
 from flcav.dataset.formats.mounts import find_front_camera
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import inverse, transform_points, wrap_angle
+from flcav.geometry import heading_vectors, inverse, transform_points, wrap_angle
 from flcav.progress import Report
 from flcav.sensors.frame import Frame
 
@@ -109,7 +109,7 @@ def format_label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -
     camera_from_world = inverse(frame.world_from_sensor(camera))
     boxes = truth.boxes
     bottom = transform_points(camera_from_world, boxes.center - boxes.size * (0, 0, 0.5))
-    heading = np.stack((np.cos(boxes.yaw), np.sin(boxes.yaw), np.zeros(len(boxes))), axis=1)
+    heading = np.column_stack((heading_vectors(boxes.yaw), np.zeros(len(boxes))))
     ahead = heading @ camera_from_world[:3, :3].T
     rotation = wrap_angle(np.arctan2(-ahead[:, 2], ahead[:, 0]))
     alpha = wrap_angle(rotation - np.arctan2(bottom[:, 0], bottom[:, 2]))
