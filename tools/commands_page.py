@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 import flcav
 from flcav.cli.main import app
-from flcav.markdown import table
+from flcav.markdown import format_table
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "commands.md"
@@ -86,7 +86,7 @@ def page(printed: Mapping[str, str]) -> str:
 def described(name: str, command: click.Command, printed: str) -> str:
     """Return the part of the page about a command."""
     said = "\n\n".join(" ".join(each.split()) for each in (command.help or "").split("\n\n"))
-    options = table(("option", "what it is", "default"), map(row, command.params))
+    options = format_table(("option", "what it is", "default"), map(row, command.params))
     return f"### flcav {name}\n\n{said}\n\n{options}\n\n{printed}\n"
 
 

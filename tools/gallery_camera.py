@@ -13,7 +13,7 @@ from PIL import Image
 from flcav.geometry import pose
 from flcav.report.pictures.camera import thermal_grey
 from flcav.sensors.camera.camera import Camera, photograph
-from flcav.sensors.camera.infrared import Infrared, thermal_image
+from flcav.sensors.camera.infrared import Infrared, render_thermal
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
@@ -106,7 +106,7 @@ def infrared() -> Picture:
     scene, out = scene_of("grid"), []
     own, at = ego(scene)
     for name in ("clear", "night"):
-        image = thermal_image(
+        image = render_thermal(
             scene, at @ BODY_FROM_OPTICAL, Infrared(), WEATHERS[name], np.random.default_rng(0), hidden=own
         )
         out.append(thermal_grey(image))

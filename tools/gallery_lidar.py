@@ -12,7 +12,7 @@ from flcav.report import style
 from flcav.report.pictures.birdseye import HEIGHT_COLOURS, HEIGHTS_M, View, draw_view
 from flcav.report.pictures.clouds import GROUND_M, draw_boxes, on_page
 from flcav.sensors.lidar.lidar import Lidar, scan
-from flcav.sensors.radar.radar import Radar, radar_sweep
+from flcav.sensors.radar.radar import Radar, sweep_radar
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
 from flcav.world.traffic.traffic import simulate
@@ -45,7 +45,7 @@ def truth(scene: Scene, own: int) -> Boxes:
     size = scene.trace.size[others]
     center = np.column_stack((x, y, z + size[:, 2] / 2))
     boxes = Boxes(center, size, yaw, scene.trace.category[others])
-    return boxes.transformed(inverse(scene.world_from_actor(own)))
+    return boxes.transform(inverse(scene.world_from_actor(own)))
 
 
 def sweep(scene: Scene, own: int, lidar: Lidar, weather: Weather | None = None) -> np.ndarray:
@@ -80,14 +80,14 @@ def radar_over_lidar(scene: Scene, own: int, path: Path) -> None:
     points = sweep(scene, own, LIDAR)
     velocity = scene.trace.velocity[0, own]
     at = scene.world_from_actor(own) @ BUMPER
-    found, actor = radar_sweep(scene, at, velocity, Radar(range_m=100.0), np.random.default_rng(0), hidden=own)
+    found, actor = sweep_radar(scene, at, velocity, Radar(range_m=100.0), np.random.default_rng(0), hidden=own)
     distance, azimuth, elevation, doppler, rcs = found.T
     level = distance * np.cos(elevation)
     place = np.column_stack((level * np.cos(azimuth), level * np.sin(azimuth))) + BUMPER[:2, 3]
     ahead = velocity @ scene.world_from_actor(own)[:3, :3]
     speed = doppler + np.cos(elevation) * (np.cos(azimuth) * ahead[0] + np.sin(azimuth) * ahead[1])
     axes.set(xlim=(-40, 40), ylim=(-8, 82), aspect="equal")
-    style.bare(axes)
+    style.hide_axes(axes)
     axes.scatter(*on_page(points[:, :2]).T, s=0.5, color=style.POINT, linewidths=0, zorder=1)
     draw_boxes(axes, truth(scene, own), style.INK, width=0.7)
     size = 5 + 3 * np.clip(rcs + 20, 0, 30)
@@ -112,7 +112,7 @@ def rolling(scene: Scene, own: int, path: Path) -> None:
     figure = style.canvas(8.0, 8.6)
     axes = figure.add_subplot()
     axes.set(xlim=(-20, 20), ylim=(-20, 20), aspect="equal")
-    style.bare(axes)
+    style.hide_axes(axes)
     names = {"all at one instant": (LIDAR, style.BLUE), "over 0.1 s, as a real sensor": (ROLLING, style.VERMILLION)}
     for name, (lidar, colour) in names.items():
         points = sweep(scene, own, lidar)

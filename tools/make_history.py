@@ -19,7 +19,7 @@ from typing import NamedTuple, Self
 from flcav.config import InputError
 from flcav.pipeline.planning import append_points
 from flcav.pipeline.recipe import RunRecipe, load_run_recipe
-from flcav.pipeline.running import points_of, run
+from flcav.pipeline.running import make_history_points, run
 
 AMPLE_MB = 1e6
 
@@ -79,7 +79,7 @@ def main(arguments: Sequence[str]) -> None:
     asked = {"-".join(map(str, each)): recipe_of(recipe, options.task, each) for each in chosen}
     for name, each in asked.items():
         result = run(each, options.runs / name, beside=options.recipe.parent, jobs=options.jobs, notify=_print)
-        append_points(options.out, points_of(result, f"seed{each.seed}"))
+        append_points(options.out, make_history_points(result, f"seed{each.seed}"))
 
 
 def _print(step: str, done: int, total: int, note: str) -> None:

@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from pydantic.fields import FieldInfo
 
 from flcav.config import Config
-from flcav.markdown import table
+from flcav.markdown import format_table
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.camera.camera import Camera
 from flcav.sensors.camera.infrared import Infrared
@@ -79,26 +79,30 @@ def page() -> str:
         {model.__name__: model for model in EXPLAINED},
         fields=fields_of,
         towns=", ".join(f"`{name}`" for name in TOWNS),
-        rigs=table(("rig", "its sensors"), ((f"`{name}`", "; ".join(sensors_of(rig))) for name, rig in RIGS.items())),
-        beams=table(("`beams`", "beams", "elevations", "`azimuth_steps`", "`range_m`"), beams()),
+        rigs=format_table(
+            ("rig", "its sensors"), ((f"`{name}`", "; ".join(sensors_of(rig))) for name, rig in RIGS.items())
+        ),
+        beams=format_table(("`beams`", "beams", "elevations", "`azimuth_steps`", "`range_m`"), beams()),
         presets=WEATHERS,
-        preset_table=table(
+        preset_table=format_table(
             ("preset", *(f"`{name}`" for name in values)),
             ((f"`{preset}`", *(number(getattr(weather, name)) for name in values)) for preset, weather in weathers),
         ),
-        class_table=table(("class", "region"), ((f"`{name}`", "; ".join(region(name))) for name in WEATHER_CLASSES)),
+        class_table=format_table(
+            ("class", "region"), ((f"`{name}`", "; ".join(region(name))) for name in WEATHER_CLASSES)
+        ),
     )
 
 
 def fields_of(model: type[Config], without: type[Config] = Config) -> str:
-    """Return a table of the model's fields, without those of `without`."""
+    """Return a format_table of the model's fields, without those of `without`."""
     said = comments(model)
     rows = []
     for name, field in model.model_fields.items():
         if name not in without.model_fields:
             text, unit = said_and_unit(name, said[name])
             rows.append((f"`{name}`", unit, value_of(field), default_of(field), text))
-    return table(HEADER, rows)
+    return format_table(HEADER, rows)
 
 
 def comments(model: type[Config]) -> dict[str, str]:
@@ -178,7 +182,7 @@ def sensors_of(rig: Rig) -> Iterator[str]:
 
 
 def beams() -> Iterator[tuple[Any, ...]]:
-    """Yield a table row for each named set of beams."""
+    """Yield a format_table row for each named set of beams."""
     for name, known in BEAMS.items():
         high, low = max(known.elevations_deg), min(known.elevations_deg)
         limits = f"{high:g}° to {low:g}°"

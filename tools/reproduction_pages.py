@@ -30,14 +30,14 @@ from flcav.experiments.studies.run import EvaluationT, Study, StudyResult, resul
 from flcav.files import Json, write_bytes
 from flcav.pipeline.results import Run
 from flcav.pipeline.running import RESULTS
-from flcav.records import of_json
+from flcav.records import from_json
 
 Tables = Mapping[str, str]
 T = TypeVar("T")
 
 
 def _told(kind: type[T], tables: Callable[[T], Tables]) -> Callable[[Json, str], Tables]:
-    return lambda values, origin: tables(of_json(kind, values, origin))
+    return lambda values, origin: tables(from_json(kind, values, origin))
 
 
 def _of_study(

@@ -16,12 +16,13 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
 
     The machine code is cached beside the source, else in the user's cache folder (or in NUMBA_CACHE_DIR, where that is
     set); where none of these can be written, it lasts as long as the process. The cache is invalid when a source
-    changes: Numba checks the function's own file; for the files of the compiled functions that it calls, a hash of
-    their bytes is appended to the qualified name, which is part of the cache's key.
+    changes: a hash of the bytes of the function's own file, and of the files of the compiled functions that it calls,
+    is appended to the qualified name, which is part of the cache's key. (Numba alone reads an index before it compares
+    the time of the file, and breaks off where the index names a class that the file no longer has.)
     """
-    if sources := _inlined_files(function):
-        digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources)))
-        function.__qualname__ += f"_{digest.hexdigest()[:12]}"
+    sources = {Path(function.__code__.co_filename)} | _inlined_files(function)
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources)))
+    function.__qualname__ += f"_{digest.hexdigest()[:12]}"
     try:
         return numba.njit(nogil=True, cache=True)(function)
     except RuntimeError:  # no folder for the cache can be written

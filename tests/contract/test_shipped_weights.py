@@ -45,7 +45,7 @@ def test_they_load_and_their_card_says_how_they_came_about(task):
     assert all(entry.recipe["town"] and entry.frames > 0 for entry in card.data)
     assert card.data
     evaluation = get_type_hints(task.evaluate)["return"]
-    assert 0 < evaluation.of_json(card.metrics, "card").score <= 1
+    assert 0 < evaluation.from_json(card.metrics, "card").score <= 1
     assert path.with_name("card.md").read_text(encoding="utf-8") == card.markdown()
 
 

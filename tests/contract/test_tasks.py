@@ -184,7 +184,7 @@ def test_two_clients_federate(task, samples):
 def assert_comes_back(result):
     values = result.as_json()
     assert json.loads(json.dumps(values, allow_nan=False)) == values
-    assert type(result).of_json(values, "test") == result
+    assert type(result).from_json(values, "test") == result
 
 
 @each_task

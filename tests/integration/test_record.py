@@ -179,7 +179,7 @@ def test_a_full_disk_exits_1_and_leaves_no_dataset(
     def full(path: Path, data: memoryview) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(jobs, "fill", full)
+    monkeypatch.setattr(jobs, "write_in_pieces", full)
     assert flcav("record", recipe, "--out", tmp_path / "data") == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith(f"flcav: {tmp_path / 'data'}")

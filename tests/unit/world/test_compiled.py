@@ -40,3 +40,23 @@ def test_what_is_kept_is_made_anew_when_an_inlined_function_of_another_file_chan
     assert ran(tmp_path) == ["2", "1"]
     (tmp_path / "inner.py").write_text(INNER.format(2))
     assert ran(tmp_path) == ["3", "0"]
+
+
+RECORD = """
+from typing import NamedTuple
+from flcav.compiled import compiled
+class {0}(NamedTuple):
+    x: int
+@compiled
+def outer(record):
+    return record.x
+print(outer({0}(1)), sum(outer.stats.cache_hits.values()))
+"""
+
+
+def test_what_is_kept_of_a_class_that_is_called_otherwise_now_is_made_anew(tmp_path: Path) -> None:
+    (tmp_path / "outer.py").write_text("from records import *\n")
+    for name in ("Before", "After"):
+        (tmp_path / "records.py").write_text(RECORD.format(name))
+        assert ran(tmp_path) == ["1", "0"]
+        assert ran(tmp_path) == ["1", "1"]
