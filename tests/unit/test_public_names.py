@@ -4,10 +4,12 @@ import re
 from pathlib import Path
 
 import pytest
-from docutils.core import publish_doctree
-from public_names import as_rst, public_names
 
 import flcav
+
+pytest.importorskip("sphinx", reason="sphinx is not installed: the extra 'docs'")
+from docutils.core import publish_doctree
+from public_names import as_rst, public_names
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = "".join((DOCS / name).read_text(encoding="utf-8") for name in ("api.md", "api-packages.md"))

@@ -3,6 +3,7 @@
 Each check yields one sentence per problem.
 """
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -149,7 +150,7 @@ def check_traffic(frame: Frame, trace: Trace) -> Iterator[str]:
             yield f"{frame.key}: '{track}' is annotated but not in town"
             continue
         a = actor[track]
-        away = np.linalg.norm(truth.boxes.center[i] - trace.position[t, a] - (0, 0, trace.size[a, 2] / 2))
+        away = math.dist(truth.boxes.center[i], trace.position[t, a] + (0, 0, trace.size[a, 2] / 2))  # never overflows
         turned = np.abs(wrap_angle(truth.boxes.yaw[i] - trace.yaw[t, a]))
         grown = np.abs(truth.boxes.size[i] - trace.size[a]).max()
         faster = np.abs(truth.velocity[i] - trace.velocity[t, a]).max()
