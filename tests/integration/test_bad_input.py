@@ -341,3 +341,26 @@ def test_a_demo_into_the_folder_of_another(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert one_sentence(done.stderr).startswith(f"{tmp_path / 'work'}: holds the steps of another")
     assert left_in(tmp_path) == ["work/suburb-pool-objects/done.json"]
+
+
+def test_a_pole_far_from_the_town_of_the_map_is_named(tmp_path: Path, refused: Callable[..., str]) -> None:
+    (tmp_path / "errors.csv").write_text("x,y,z\n10,20,1\n")
+    (tmp_path / "poles.csv").write_text("id,x,y,z\n1,30,20,6\n2,1000000000,20,6\n")
+    files = ("--errors", tmp_path / "errors.csv", "--poles", tmp_path / "poles.csv")
+    drawn = ("--town", "grid", "--map", tmp_path / "map.png")
+    assert "poles.csv: row 2 lies at 1e+09, 20, far from grid" in refused(
+        "place", *files, "--range", "40", "--count", "1", *drawn
+    )
+    assert not (tmp_path / "map.png").exists()
+
+
+def test_a_listed_file_with_a_name_too_long_is_missing(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = data / "files.parquet"
+    rows = pq.read_table(path)
+    names = pa.array(["x" * 5000, *rows["path"].to_pylist()[1:]], rows.schema.field("path").type)
+    pq.write_table(rows.set_column(rows.column_names.index("path"), rows.schema.field("path"), names), path)
+    with pytest.raises(SystemExit) as ended:
+        run(["validate", str(data)])
+    told = capsys.readouterr()
+    assert (ended.value.code, told.err) == (1, "")
+    assert "xxx: missing" in told.out

@@ -7,6 +7,8 @@ import typer
 from flcav.cli.options import Method
 from flcav.cli.terminal import print_json
 
+FAR = 10  # times the size of a town: what lies beyond is on no map of it
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to `app`."""
@@ -47,6 +49,14 @@ def place(
     mistakes, sites = read_table(errors, axes), read_table(poles, ("id", *axes))
     weight = numbers(mistakes, ("weight",), errors)[:, 0] if "weight" in mistakes.column_names else None
     where, mounts = numbers(mistakes, axes, errors), numbers(sites, axes, poles)
+    if here is not None:
+        low_x, low_y, high_x, high_y = here.bounds
+        middle, reach = np.array([low_x + high_x, low_y + high_y]) / 2, FAR * max(high_x - low_x, high_y - low_y)
+        for file, places in ((errors, where), (poles, mounts)):
+            for row in np.flatnonzero((np.abs(places[:, :2] - middle) > reach).any(axis=1))[:1]:
+                raise InputError(
+                    f"{file}: row {row + 1} lies at {places[row, 0]:g}, {places[row, 1]:g}, far from {town}"
+                )
     result = placement.place(where, mounts, range_m, count, weight=weight, method=method.value)
     ids = sites["id"].to_pylist()
     chosen = [ids[pole] for pole in result.chosen]
