@@ -47,7 +47,7 @@ class PlanRequest:
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """What the plans of all tasks have in common: budgets, bounds, and the topology of the federation."""
+    """Budgets, bounds and topology of the federation, common to the plans of all tasks."""
 
     budgets_mb: Price
     headroom: float

@@ -16,7 +16,7 @@ LEARNING = ("flwr", "scipy", "torch")  # packages that affect results, beside th
 
 @dataclass(frozen=True)
 class Provenance:
-    """What has to be equal for equal results."""
+    """Code, versions and processor that must be equal for equal results."""
 
     revision: str | None  # of git; None without a checkout
     uncommitted: bool  # whether the package's files have changed since that revision

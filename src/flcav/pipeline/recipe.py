@@ -140,7 +140,7 @@ class Limits(Config):
 
 
 class Placement(Config):
-    """How the sites of roadside sensors are chosen."""
+    """Settings of the choice of sites for roadside sensors."""
 
     rule: Literal["vrcsp", "densest", "none"] = "vrcsp"  # most errors covered; densest traffic; no sensor
     count: int = Field(default=1, ge=1, le=100)  # sensors of a region
@@ -150,7 +150,7 @@ class Placement(Config):
 
 
 class Federation(Config):
-    """How the clients' models are aggregated."""
+    """Settings of the aggregation of clients' models."""
 
     strategy: str = "fedavg"  # name of a strategy, or module:NAME of a user's own
     edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)

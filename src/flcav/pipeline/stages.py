@@ -37,7 +37,7 @@ BLOCKS, ROUND = "blocks.json", "round.json"
 
 @dataclass(frozen=True)
 class Learning:
-    """What a task's training in a run is given: network configuration, schedule, and seed."""
+    """Settings of a task's training in a run: network configuration, schedule, and seed."""
 
     task: Task
     network: str | None  # name of the configuration

@@ -28,7 +28,7 @@ class Weather(Config):
 
     @property
     def night(self) -> bool:
-        """Whether the sun is below civil twilight, so that lamps are on."""
+        """True where the sun is below civil twilight, so that lamps are on."""
         return self.sun_elevation_deg < NIGHT_DEG
 
     @property

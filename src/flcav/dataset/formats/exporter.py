@@ -1,4 +1,4 @@
-"""What all exporters share: their signature, options and results, and the split of scenes into train, val and test."""
+"""Protocol, options and results of exporters, and the split of scenes into train, val and test."""
 
 import math
 from collections import Counter

@@ -56,7 +56,7 @@ class Decay(CurveConfig):
 
     @property
     def infinite_at_0(self) -> bool:
-        """Whether the error is infinite before the first sample or round."""
+        """True where the error is infinite before the first sample or round."""
         return self.a > 0 and self.x0 == 0
 
     def at(self, resource: ArrayLike) -> Array:

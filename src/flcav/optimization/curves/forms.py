@@ -30,7 +30,7 @@ class Form(Protocol[CurveT]):
 
     @property
     def simplest(self) -> bool:
-        """Whether no other form of the same model has fewer parameters."""
+        """True for the form of its model with the fewest parameters."""
         ...
 
     def bounds(self) -> tuple[list[float], list[float]]:
@@ -65,7 +65,7 @@ class AdditiveForm:
 
     @property
     def simplest(self) -> bool:
-        """Whether neither the floor nor any x0 is fitted."""
+        """True where neither the floor nor any x0 is fitted."""
         return not self.floor and not self.shifted
 
     def bounds(self) -> tuple[list[float], list[float]]:
@@ -143,7 +143,7 @@ class EffectiveForm:
 
     @property
     def simplest(self) -> bool:
-        """Whether the floor is not fitted."""
+        """True where the floor is not fitted."""
         return not self.floor
 
     def bounds(self) -> tuple[list[float], list[float]]:

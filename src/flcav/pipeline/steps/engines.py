@@ -27,7 +27,7 @@ class Workers:
 
 
 class Engine(Protocol):
-    """What executes steps: processes, or a cluster."""
+    """An executor of steps: processes, or a cluster."""
 
     def hands(self, folder: Path, jobs: int) -> contextlib.AbstractContextManager[Workers]:
         """Return a context of `jobs` workers for the steps in `folder`; leaving it by an exception stops them."""
