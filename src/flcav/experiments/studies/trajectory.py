@@ -11,7 +11,7 @@ from flcav.perception.trajectory import study
 from flcav.perception.trajectory.evaluate import ALL, PathErrors, TrajectoryEvaluation
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.report import style
-from flcav.report.charts.studies import ErrorBar, path_errors
+from flcav.report.charts.studies import Bar, path_errors
 from flcav.verdicts import describe_aim
 
 WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # aims: largest ratio to constant velocity's final error
@@ -105,9 +105,9 @@ def _draw(results: StudyResult[TrajectoryEvaluation]) -> bytes:
     return style.png(path_errors(panels))
 
 
-def _bar(name: str, seeds: Sequence[float | None]) -> ErrorBar:
+def _bar(name: str, seeds: Sequence[float | None]) -> Bar:
     known = [value for value in seeds if value is not None]
-    return ErrorBar(name, float(np.mean(known)), known)
+    return Bar(name, float(np.mean(known)), tuple(known))
 
 
 STUDY = Study(TRAJECTORY, TRAJECTORY.study(), draw=_draw)

@@ -79,16 +79,7 @@ def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precis
     return figure
 
 
-@dataclass(frozen=True)
-class ErrorBar:
-    """One error [m], drawn as a bar with a dot per seed."""
-
-    name: str  # of the predictor
-    mean: float
-    seeds: Sequence[float]
-
-
-Panels = Mapping[str, Mapping[str, Sequence[ErrorBar]]]  # test -> slice, with its number of samples -> bars
+Panels = Mapping[str, Mapping[str, Sequence[Bar]]]  # test -> slice, with its number of samples -> bars
 
 COLOURS = (style.RULE, style.BLUE, style.SKY)
 THICK = 0.26
@@ -110,7 +101,7 @@ def path_errors(panels: Panels) -> Figure:
     return figure
 
 
-def _draw(axes: Axes, slices: Mapping[str, Sequence[ErrorBar]]) -> None:
+def _draw(axes: Axes, slices: Mapping[str, Sequence[Bar]]) -> None:
     for place, bars in enumerate(slices.values()):
         for number, (bar, colour) in enumerate(zip(bars, COLOURS, strict=True)):
             y = place + (number - 1) * (THICK + 0.02)
