@@ -1,11 +1,18 @@
 """`flcav place`: roadside sensors that cover most of the registered errors (VRCSP)."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from flcav.cli.options import Method
 from flcav.cli.terminal import print_json
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from flcav.world.map.town import Town
 
 FAR = 10  # times the size of a town: what lies beyond is on no map of it
 
@@ -50,13 +57,8 @@ def place(
     weight = numbers(mistakes, ("weight",), errors)[:, 0] if "weight" in mistakes.column_names else None
     where, mounts = numbers(mistakes, axes, errors), numbers(sites, axes, poles)
     if here is not None:
-        low_x, low_y, high_x, high_y = here.bounds
-        middle, reach = np.array([low_x + high_x, low_y + high_y]) / 2, FAR * max(high_x - low_x, high_y - low_y)
-        for file, places in ((errors, where), (poles, mounts)):
-            for row in np.flatnonzero((np.abs(places[:, :2] - middle) > reach).any(axis=1))[:1]:
-                raise InputError(
-                    f"{file}: row {row + 1} lies at {places[row, 0]:g}, {places[row, 1]:g}, far from {town}"
-                )
+        _check_near(here, where, errors)
+        _check_near(here, mounts, poles)
     result = placement.place(where, mounts, range_m, count, weight=weight, method=method.value)
     ids = sites["id"].to_pylist()
     chosen = [ids[pole] for pole in result.chosen]
@@ -82,3 +84,17 @@ def place(
     for pole, near in zip(ids, placement.coverage(where, mounts, range_m).sum(axis=1).tolist(), strict=True):
         typer.echo(f"    pole {pole}: {near} errors within {range_m:g} m{', placed' if pole in chosen else ''}")
     typer.echo(f"cover {result.covered} of {mistakes.num_rows} errors, weight {result.covered_weight:.6g} ({proof})")
+
+
+def _check_near(town: "Town", places: "NDArray[np.float64]", file: Path) -> None:
+    """Raise `InputError` naming the first of `places` (N, 3) [m] of `file` that no map of the town can show."""
+    import numpy as np
+
+    from flcav.config import InputError
+
+    low_x, low_y, high_x, high_y = town.bounds
+    middle, reach_m = np.array([low_x + high_x, low_y + high_y]) / 2, FAR * max(high_x - low_x, high_y - low_y)
+    far = np.flatnonzero((np.abs(places[:, :2] - middle) > reach_m).any(axis=1))
+    if len(far):
+        x, y = places[far[0], :2]
+        raise InputError(f"{file}: row {far[0] + 1} lies at {x:g}, {y:g}, far from {town.name}")
