@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flcav.intervals import Estimate, MeanOverSeeds, bootstrap_over_scenes, mean_over_seeds
+from flcav.intervals import (
+    Estimate,
+    MeanOverSeeds,
+    Spread,
+    bootstrap_over_scenes,
+    mean_over_seeds,
+    measure_spread,
+    widen,
+    widen_share,
+)
 
 
 def test_the_interval_over_scenes_is_that_of_redrawing_them_one_by_one():
@@ -50,3 +59,38 @@ def test_an_estimate_is_told_with_its_interval_where_it_has_one():
     assert Estimate(0.1, -0.2, 0.4).describe() == "0.100 (-0.200 to 0.400)"
     assert Estimate(0.1, -0.2, 0.4).describe(sign=True) == "+0.100 (-0.200 to +0.400)"
     assert Estimate(0.1, None, None).describe() == "0.100"
+
+
+def test_the_spread_is_the_standard_deviation_of_several_trainings():
+    values = [0.61, 0.66, 0.58]
+    assert measure_spread(values) == Spread(pytest.approx(stats.tstd(values)), 3)
+    assert measure_spread([0.6]) is None
+
+
+def test_widened_intervals_contain_the_mean_over_trainings_and_scenes_as_often_as_they_say():
+    rng, hit, narrow = np.random.default_rng(5), [], []
+    for _ in range(4000):
+        scenes, trained = rng.normal(scale=0.02), rng.normal(scale=0.03, size=10)
+        of_scenes = Estimate(scenes + trained[0], scenes + trained[0] - 1.96 * 0.02, scenes + trained[0] + 1.96 * 0.02)
+        found = widen(of_scenes, Spread(float(trained[1:].std(ddof=1)), 9))
+        assert found.low is not None
+        assert found.high is not None
+        hit.append(found.low <= 0 <= found.high)
+        narrow.append(abs(of_scenes.mean) <= 1.96 * 0.02)
+    assert np.mean(hit) == pytest.approx(0.95, abs=0.015)
+    assert np.mean(narrow) < 0.8
+
+
+@pytest.mark.parametrize("mean", [0.02, 0.5, 0.97])
+def test_a_widened_share_stays_a_share_and_agrees_with_the_plain_one_in_the_middle(mean: float):
+    estimate, spread = Estimate(mean, mean - 0.015, mean + 0.015), Spread(0.02, 9)
+    found = widen_share(estimate, spread)
+    assert found.low is not None
+    assert found.high is not None
+    assert 0 < found.low < mean - 0.015
+    assert mean + 0.015 < found.high < 1
+    if mean == 0.5:
+        plain = widen(estimate, spread)
+        assert (found.low, found.high) == pytest.approx((plain.low, plain.high), abs=0.001)
+    assert widen_share(Estimate(1.0, 1.0, 1.0), spread) == Estimate(1.0, 1.0, 1.0)
+    assert widen(Estimate(0.3, None, None), spread) == Estimate(0.3, None, None)

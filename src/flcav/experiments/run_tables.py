@@ -26,7 +26,7 @@ def _tests(run: Run) -> str:
     for task in run.recipe.tasks:
         for region, own in run.recipe.regions.items():
             tests = [test for test in run.tested if (test.task, test.region) == (task, region)]
-            reached = {name_stage(test.arm, test.stage): test.result.estimate.describe() for test in tests}
+            reached = {name_stage(test.arm, test.stage): test.estimate.describe() for test in tests}
             one = tests[0].result
             place = [task, f"{region} ({own.role})", one.measure, f"{one.frames} / {one.scenes}"]
             rows.append([*place, *(reached.get(column, "") for column in columns)])

@@ -4,12 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, Arm, Federation, Placement, RunRecipe
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, Arm, Federation, Placement, RunRecipe, Training
 
 PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
-PLANNED = ("plan",)  # fields of `Setting` that decide the plan, pretraining and registered errors
+PLANNED = ("plan",)  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
 PLACED = ("plan", "placement")  # those that decide where sensors stand
-LEARNED = ("plan", "placement", "labels", "federation")  # those that decide a federation
+PRETRAINED = ("plan", "training", "repeat")  # those that decide pretraining
+LEARNED = ("plan", "training", "repeat", "placement", "labels", "federation")  # those that decide a federation
 
 
 @dataclass(frozen=True)
@@ -17,27 +18,47 @@ class Setting:
     """The complete settings of one arm, those it takes over from the recipe included."""
 
     name: str
+    repeat: int  # 0: the arm itself; n: its n-th retraining
     plan: PlanRule
     placement: Placement
     labels: Mapping[str, str]  # kind of labels, by task
     federation: Federation
+    training: Mapping[str, Training]  # by task
     central: Literal["pretrain", "federate"] | None
     regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
 
 
 def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:
-    """Return the settings of the run itself and of its arms by name, the run first; `labels`: the run's, by task."""
-    return {name: _setting(recipe, labels, name, arm) for name, arm in {MAIN: Arm(), **recipe.arms}.items()}
+    """Return the settings of the run itself and of its arms by name, the run first; `labels`: the run's, by task.
+
+    After them come those of every arm's retrainings, by `name_repeat`.
+    """
+    arms = {MAIN: Arm(), **recipe.arms}
+    return {
+        name_repeat(name, repeat): _setting(recipe, labels, name_repeat(name, repeat), repeat, arm)
+        for repeat in range(1 + recipe.retrainings)
+        for name, arm in arms.items()
+    }
 
 
-def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, arm: Arm) -> Setting:
+def name_repeat(arm: str, repeat: int) -> str:
+    """Return the name of an arm's n-th retraining; of the arm itself for 0."""
+    return f"{arm}-again{repeat}" if repeat else arm
+
+
+def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: int, arm: Arm) -> Setting:
     return Setting(
         name,
+        repeat,
         arm.plan,
         Placement.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
         dict(labels) | dict(arm.labels),
         Federation.model_validate(recipe.federation.model_dump() | dict(arm.federation)),
+        {
+            task: Training.model_validate(recipe.training_of(task).model_dump() | dict(arm.training))
+            for task in recipe.tasks
+        },
         arm.central,
         arm.regions or recipe.with_role("federate"),
         (CENTRAL,) if arm.central else arm.stages,
@@ -60,7 +81,7 @@ class Names:
 
     def pretrain(self, arm: str, task: str) -> str:
         """Return stage I of a task."""
-        return f"{PRETRAIN}-{task}" + self._suffix(arm, PLANNED)
+        return f"{PRETRAIN}-{task}" + self._suffix(arm, PRETRAINED)
 
     def errors(self, arm: str, region: str, task: str) -> str:
         """Return the step that registers a task's errors in a region."""

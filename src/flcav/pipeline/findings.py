@@ -1,7 +1,8 @@
 """Findings of a run: verdicts on the claims of the method, as sentences with the numbers behind them.
 
-A claim says that a difference of a measure is positive. Its 95 % interval is a paired bootstrap over scenes. The claim
-held if the interval lies above 0, did not hold if it lies below, and is undecided if the interval contains 0.
+A claim says that a difference of a measure is positive. Its 95 % interval is a paired bootstrap over scenes, widened by
+the spread of retraining. The claim held if the interval lies above 0, did not hold if it lies below, and is undecided
+if the interval contains 0 or the spread is not known: another training on the same frames might say otherwise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -64,9 +65,14 @@ def _finding(
     over = f"{after.frames} test frames of {after.scenes} scenes"
     if low is None or high is None:
         return Finding(place, question, UNDECIDED, f"{told}, over {over}: too few scenes for an interval.")
-    decided = verdict(low, high)
     rests = f" ({caveat})" if caveat else ""
-    sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over}; {explain_verdict(decided)}{rests}."
+    if each.spread is None:
+        unknown = "how much another training on the same frames would differ is not known, so this run does not decide"
+        sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over} alone; {unknown}{rests}."
+        return Finding(place, question, UNDECIDED, sentence)
+    decided = verdict(low, high)
+    of = f"{over} and over retraining (standard deviation {each.spread.sd:.3f} of {each.spread.trainings} trainings)"
+    sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {of}; {explain_verdict(decided)}{rests}."
     return Finding(place, question, decided, sentence)
 
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError, shorten
-from flcav.pipeline.arms import Names, Setting, resolve_settings
+from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import find_path, hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
 from flcav.pipeline.planning import read_history
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, SPLITS_OF, Region, RunRecipe, SplitName
+from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.steps import Step
 from flcav.pipeline.work import (
     central_step,
@@ -28,6 +29,7 @@ from flcav.pipeline.work import (
     rounds_step,
     test_step,
 )
+from flcav.seeds import derive_seed
 
 LOOK, OBJECTS = "look", "objects"
 
@@ -47,6 +49,7 @@ class Graph:
             for task, kind in setting.labels.items():
                 choose_labels(task, kind)
         self.names = Names(self.settings)
+        self.spreads = read_spreads(recipe.spread, self.beside) if recipe.spread is not None else {}
         self.federating = recipe.with_role("federate")
         self._steps: dict[str, Step] = {}
         self._add_recordings()
@@ -72,12 +75,12 @@ class Graph:
     def tested(self, arm: Setting) -> list[tuple[str, str, str]]:
         """Return stage, region and task of every test of an arm.
 
-        Pretrained networks (of an arm with its own plan) and those of cloud FL are tested in every region, others in
-        the regions that federate in the arm.
+        Pretrained networks (of the run itself, and others) and those of cloud FL are tested in every region, others in
+        the regions that federate in the arm. Of a retraining it is what it is of the arm itself.
         """
-        tests = []
+        tests, main = [], name_repeat(MAIN, arm.repeat)
         for task in self.recipe.tasks:
-            if arm.name == MAIN or self.names.plan(arm.name) != self.names.plan(MAIN):
+            if arm.name == main or self.names.pretrain(arm.name, task) != self.names.pretrain(main, task):
                 tests += [(PRETRAIN, region, task) for region in self.recipe.regions]
             for stage in arm.stages:
                 where = tuple(self.recipe.regions) if stage == CLOUD else arm.regions
@@ -132,10 +135,15 @@ class Graph:
         own = {name: task.history for name, task in self.recipe.tasks.items()}
         return {name: read_history(name, history, self.beside) for name, history in own.items() if history is not None}
 
-    def _learning(self, task: str) -> dict[str, Any]:
-        own = self.recipe.tasks[task]
-        training = self.recipe.training_of(task).model_dump(mode="json")
-        return {"task": task, "network": own.network, "training": training, "seed": self.recipe.seed}
+    def _learning(self, arm: Setting, task: str) -> dict[str, Any]:
+        """Return the settings of `flcav.pipeline.stages.Learning`; a retraining has a seed of its own."""
+        seed = self.recipe.seed
+        return {
+            "task": task,
+            "network": self.recipe.tasks[task].network,
+            "training": arm.training[task].model_dump(mode="json"),
+            "seed": derive_seed(seed, "retraining", arm.repeat) if arm.repeat else seed,
+        }
 
     @property
     def _budget_mb(self) -> list[float]:
@@ -158,7 +166,7 @@ class Graph:
             thresholded = any(LABEL_SOURCES[each.labels[task]].from_detections for each in self.settings.values())
             arguments = {"plan": plan, "pools": own, "validation": validation, "budget_mb": self._budget_mb}
             step = names.pretrain(arm.name, task)
-            arguments |= {"thresholded": thresholded, **self._learning(task)}
+            arguments |= {"thresholded": thresholded, **self._learning(arm, task), "upload_seed": recipe.seed}
             self._add(_step(step, pretrain_step, arguments, [plan, *own.values(), *validation]))
         for region in arm.regions:
             self._add_placement(arm, region)
@@ -209,7 +217,7 @@ class Graph:
                 continue
             rests = {region: self._rests_on(arm, region, task) for region in arm.regions}
             federation = arm.federation.model_dump(mode="json")
-            common = {**self._learning(task), "labels": arm.labels[task], "federation": federation}
+            common = {**self._learning(arm, task), "labels": arm.labels[task], "federation": federation}
             for region, steps in rests.items():
                 own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
                 name = self.names.edge(arm.name, region, task)
@@ -226,7 +234,7 @@ class Graph:
         starts = self.recipe.with_role("pretrain")
         pools = {name: self.names.recording(name, "pool", task) for name in starts}
         arguments = {
-            **self._learning(task),
+            **self._learning(arm, task),
             "region": region,
             "vehicles": self._vehicles()[region],
             "source": arm.central,

@@ -1,19 +1,15 @@
 """Allocation of both uplink budgets to the samples and rounds of all tasks, by learning curves of earlier runs."""
 
-import csv
 import io
-from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.csv
 
-from flcav.config import InputError, parse_config, shorten
+from flcav.config import InputError, parse_config
 from flcav.federation.runtimes.embedded import update_bytes
-from flcav.files import atomic_path
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import TaskPlan as Allotted
@@ -25,11 +21,10 @@ from flcav.optimization.curves.history import JOINT, History, parse_histories
 from flcav.perception.task import Task, find_configuration, fresh
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.frames import find_path
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
 from flcav.pipeline.results import Plan, TaskPlan
+from flcav.pipeline.tables import read_table
 
-HISTORIES = resources.files("flcav.pipeline") / "histories"
 POINT: tuple[str, ...] = ("task", *JOINT, "weight", "run")  # columns of a history that a run writes
 
 
@@ -145,20 +140,7 @@ def read_history(task: str, name: str, beside: Path) -> str:
 
     Raises `InputError` where there is no such table, or it has no rows of the task.
     """
-    known = sorted(entry.name.removesuffix(".csv") for entry in HISTORIES.iterdir() if ".csv" in entry.name)
-    if name in known:
-        text = (HISTORIES / f"{name}.csv").read_text(encoding="utf-8")
-    else:
-        path = find_path(name, beside)
-        if path is None or not path.is_file():
-            raise InputError(
-                f"tasks.{task}.history: {shorten(name)} is no history of the package ({', '.join(known)}), and no file "
-                f"beside the recipe, in {beside.absolute()}"
-            )
-        try:
-            text = path.read_text(encoding="utf-8")
-        except ValueError as error:
-            raise InputError(f"{path}: not a CSV table ({error})") from None
+    text = read_table(f"tasks.{task}.history", name, "history", "histories", beside)
     parse_history(task, text, name)
     return text
 
@@ -178,16 +160,3 @@ def parse_history(task: str, text: str, origin: str) -> History:
 def load_history(name: str) -> History:
     """Return the package's learning history of the task `name`."""
     return parse_history(name, read_history(name, name, Path()), name)
-
-
-def append_points(path: Path, points: list[Mapping[str, Any]]) -> None:
-    """Append the points that the history at `path` lacks (columns: `POINT`); `flcav fit` reads the file."""
-    held: list[dict[str, str]] = []
-    if path.exists():
-        with path.open(newline="", encoding="utf-8") as file:
-            held = list(csv.DictReader(file))
-    told = [{name: str(value) for name, value in point.items()} for point in points]
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, POINT, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows([*held, *(point for point in told if point not in held)])

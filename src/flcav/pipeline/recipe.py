@@ -163,6 +163,7 @@ class Arm(Config):
     placement: Mapping[str, Any] = {}  # fields of `Placement` that differ
     federation: Mapping[str, Any] = {}  # fields of `Federation` that differ
     labels: Mapping[str, str] = {}  # kind of labels, by task
+    training: Mapping[str, Any] = {}  # fields of `Training` that differ, of every task
     central: Literal["pretrain", "federate"] | None = None  # role of the regions whose ground truth is trained on
     stages: tuple[Literal["edge", "cloud"], ...] = ("edge", "cloud")
     regions: tuple[str, ...] | None = None  # federating ones; None: all
@@ -192,6 +193,8 @@ class RunRecipe(Config):
     """
 
     seed: int = Field(default=1, ge=0, lt=2**31)
+    retrainings: int = Field(default=0, ge=0, le=100)  # of every arm, on the same frames with other random numbers
+    spread: str | None = None  # spread of retraining of a run without: a name of the package's, or a CSV file
     size: Literal["toy", "demo", "full"] = "demo"  # preset of `splits` and `training` where they are None
     splits: Splits | None = None
     training: Training | None = None
@@ -244,9 +247,14 @@ class RunRecipe(Config):
             for each in getattr(arm, field) or ():
                 if each not in known:
                     raise ValueError(f"arms.{name}.{field}: '{each}' is none of {', '.join(known)}")
-        for model, part in ((Placement, "placement"), (Federation, "federation")):
+        parts: list[tuple[type[Config], Config, str]] = [
+            (Placement, self.placement, "placement"),
+            (Federation, self.federation, "federation"),
+            *((Training, self.training_of(task), "training") for task in self.tasks),
+        ]
+        for model, own, part in parts:
             try:
-                parse_config(model, getattr(self, part).model_dump() | dict(getattr(arm, part)), f"arms.{name}.{part}")
+                parse_config(model, own.model_dump() | dict(getattr(arm, part)), f"arms.{name}.{part}")
             except InputError as error:
                 raise ValueError(str(error)) from None
 

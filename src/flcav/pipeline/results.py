@@ -7,7 +7,7 @@ from typing import Self
 
 from flcav.config import read_json
 from flcav.files import write_json
-from flcav.intervals import Estimate
+from flcav.intervals import Estimate, Spread
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
 from flcav.records import Record
@@ -174,7 +174,10 @@ class Test:
     region: str
     task: str
     step: str  # its folder holds the outcomes
-    result: Tested
+    result: Tested  # its interval is over scenes alone
+    estimate: Estimate  # the interval is over scenes and, where the spread is known, over retrainings
+    spread: Spread | None  # over retrainings: of this run's own, or of the recipe's table; None: not known
+    retrained: tuple[float, ...] = ()  # the measure of each retraining of the arm, on the same frames
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,10 @@ class Difference:
     before_stage: str
     region: str
     task: str
-    estimate: Estimate
+    estimate: Estimate  # the interval is over scenes and, where the spread is known, over retrainings
+    over_scenes: Estimate  # the interval is over scenes alone
+    spread: Spread | None  # as in `Test`
+    retrained: tuple[float, ...] = ()  # the difference in each retraining
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import Estimate, mean_over_seeds
+from flcav.intervals import Estimate, mean_over_seeds, measure_spread, widen, widen_share
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
-from flcav.pipeline.arms import Setting
+from flcav.pipeline.arms import Setting, name_repeat
 from flcav.pipeline.findings import findings, name_stage
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.labels import LABEL_SOURCES
-from flcav.pipeline.planning import POINT, append_points
+from flcav.pipeline.planning import POINT
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import (
@@ -37,9 +37,11 @@ from flcav.pipeline.results import (
     Tested,
     Watched,
 )
+from flcav.pipeline.spread import COLUMNS, difference_key, spread_rows, test_key
 from flcav.pipeline.steps import Notify, Stale, run_side_by_side, run_steps, stopwatch
+from flcav.pipeline.tables import append_rows
 
-WORK, RESULTS, SUMMARY, HISTORY = "work", "results.json", "summary.json", "history.csv"
+WORK, RESULTS, SUMMARY, HISTORY, SPREAD = "work", "results.json", "summary.json", "history.csv", "spread.csv"
 
 
 def _silent(step: str, done: int, total: int, note: str) -> None:
@@ -124,7 +126,10 @@ def run_seeds(
 def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float) -> Run:
     """Collect the results of finished steps, write them to `out`, and add their points to the history."""
     result = replace(collect_results(graph, out / WORK), elapsed_s=round(elapsed_s, 1))
-    append_points(history, make_history_points(result, f"seed{graph.recipe.seed}"))
+    name = f"seed{graph.recipe.seed}"
+    append_rows(history, POINT, make_history_points(result, name))
+    if graph.recipe.retrainings:
+        append_rows(history.with_name(SPREAD), COLUMNS, spread_rows(result, name))
     result.save(out, RESULTS)
     return result
 
@@ -160,18 +165,19 @@ def seed_folders(folder: Path) -> dict[int, Path]:
 def collect_results(graph: Graph, work: Path) -> Run:
     """Collect the results of the finished steps in `work`, and write each arm's ledger to `ledgers` beside it."""
     recipe, names, main = graph.recipe, graph.names, graph.settings[MAIN]
-    tests = []
-    for arm in graph.settings.values():
-        for stage, region, task in graph.tested(arm):
-            step = test_folder(graph, arm.name, stage, region, task)
-            tests.append(Test(arm.name, stage, region, task, step, Tested.load(work / step)))
+    settings = {name: setting for name, setting in graph.settings.items() if not setting.repeat}
+    tests = [
+        _test(graph, work, arm.name, stage, region, task)
+        for arm in settings.values()
+        for stage, region, task in graph.tested(arm)
+    ]
     watched = [
         Watched.load(work / names.rounds(names.stage(MAIN, stage, region, task), region))
         for stage, region, task in graph.watched()
     ]
-    arms = {name: _arm(graph, work, arm) for name, arm in graph.settings.items()}
+    arms = {name: _arm(graph, work, arm) for name, arm in settings.items()}
     differences = _differences(graph, work)
-    rules = {name: arm.placement.rule for name, arm in graph.settings.items()}
+    rules = {name: arm.placement.rule for name, arm in settings.items()}
     roles = {name: region.role for name, region in recipe.regions.items()}
     rests = {task: LABEL_SOURCES[kind].caveat for task, kind in main.labels.items()}
     return Run(
@@ -186,6 +192,20 @@ def collect_results(graph: Graph, work: Path) -> Run:
         provenance=provenance(recipe.seed),
         caveats=tuple(dict.fromkeys(filter(None, rests.values()))),
     )
+
+
+def _test(graph: Graph, work: Path, arm: str, stage: str, region: str, task: str) -> Test:
+    step = test_folder(graph, arm, stage, region, task)
+    result = Tested.load(work / step)
+    again = [test_folder(graph, name_repeat(arm, n), stage, region, task) for n in _retrainings(graph)]
+    retrained = tuple(Tested.load(work / each).estimate.mean for each in again)
+    spread = measure_spread((result.estimate.mean, *retrained)) or graph.spreads.get(test_key(task, region, arm, stage))
+    estimate = result.estimate if spread is None else widen_share(result.estimate, spread)
+    return Test(arm, stage, region, task, step, result, estimate, spread, retrained)
+
+
+def _retrainings(graph: Graph) -> range:
+    return range(1, 1 + graph.recipe.retrainings)
 
 
 def test_folder(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:
@@ -238,7 +258,7 @@ def _differences(graph: Graph, work: Path) -> list[Difference]:
     main = graph.settings[MAIN]
     pairs: list[tuple[tuple[str, str], tuple[str, str], str, str]] = []
     for arm in graph.settings.values():
-        for stage, region, task in graph.tested(arm):
+        for stage, region, task in () if arm.repeat else graph.tested(arm):
             if stage != PRETRAIN:
                 earlier = EDGE if stage == CLOUD and region in arm.regions else PRETRAIN
                 pairs.append(((arm.name, stage), (arm.name, earlier), region, task))
@@ -248,11 +268,29 @@ def _differences(graph: Graph, work: Path) -> list[Difference]:
     for after, before, region, task in pairs:
         steps = test_folder(graph, *after, region, task), test_folder(graph, *before, region, task)
         if steps[0] != steps[1] and steps not in found:
-            estimate = compare_tests(task, work / steps[1], work / steps[0], graph.recipe.seed)
-            told = [name_stage(_owner(graph, *each, region, task), each[1]) for each in (after, before)]
-            name = f"{region}, {task}: {' - '.join(told)}"
-            found[steps] = Difference(name, *after, *before, region, task, estimate)
+            found[steps] = _difference(graph, work, after, before, region, task)
     return list(found.values())
+
+
+def _difference(
+    graph: Graph, work: Path, after: tuple[str, str], before: tuple[str, str], region: str, task: str
+) -> Difference:
+    """Return the difference of two tests; `after` and `before` are arm and stage."""
+
+    def folder(tested: tuple[str, str], repeat: int) -> Path:
+        return work / test_folder(graph, name_repeat(tested[0], repeat), tested[1], region, task)
+
+    def mean(tested: tuple[str, str], repeat: int) -> float:
+        return Tested.load(folder(tested, repeat)).estimate.mean
+
+    over_scenes = compare_tests(task, folder(before, 0), folder(after, 0), graph.recipe.seed)
+    retrained = tuple(mean(after, n) - mean(before, n) for n in _retrainings(graph))
+    spread = measure_spread((over_scenes.mean, *retrained))
+    told = [name_stage(_owner(graph, *each, region, task), each[1]) for each in (after, before)]
+    name = f"{region}, {task}: {' - '.join(told)}"
+    found = Difference(name, *after, *before, region, task, over_scenes, over_scenes, spread, retrained)
+    spread = spread or graph.spreads.get(difference_key(found))
+    return found if spread is None else replace(found, estimate=widen(over_scenes, spread), spread=spread)
 
 
 def _owner(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:

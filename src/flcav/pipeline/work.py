@@ -125,6 +125,7 @@ def pretrain_step(
     network: str | None,
     training: Fields,
     seed: int,
+    upload_seed: int,
     budget_mb: tuple[float, float],
     plan: str,
     pools: Mapping[str, str],
@@ -137,7 +138,9 @@ def pretrain_step(
     opened = {region: Frames.open(work.inputs[step]) for region, step in pools.items()}
     watched = [Frames.open(work.inputs[step]) for step in validation]
     config = learning.config
-    chosen = choose_uploads({region: split.vehicles for region, split in opened.items()}, own.tasks[task].samples, seed)
+    chosen = choose_uploads(
+        {region: split.vehicles for region, split in opened.items()}, own.tasks[task].samples, upload_seed
+    )
     book = Ledger(_share_budget(own, budget_mb, task))
     samples: list[Any] = []
     for region, frames in chosen.items():

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from flcav.intervals import Estimate
+from flcav.intervals import Estimate, Spread
 from flcav.pipeline import results
 from flcav.pipeline.findings import findings
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
@@ -24,7 +24,7 @@ MEANS = {
 
 def result_of(arm: str, stage: str, mean: float) -> results.Test:
     found = results.Tested("grid", "objects", "AP50", Estimate(mean, None, None), {}, 96, 8)
-    return results.Test(arm, stage, "grid", "objects", "test", found)
+    return results.Test(arm, stage, "grid", "objects", "test", found, found.estimate, None)
 
 
 TESTS = [result_of(*key, mean) for key, mean in MEANS.items()]
@@ -35,7 +35,8 @@ def arm(*poles: int) -> ArmResult:
 
 
 def difference(stage: str, before: tuple[str, str], mean: float, low: float, high: float) -> Difference:
-    return Difference("", MAIN, stage, *before, "grid", "objects", Estimate(mean, low, high))
+    found = Estimate(mean, low, high)
+    return Difference("", MAIN, stage, *before, "grid", "objects", found, found, Spread(0.012, 9))
 
 
 def told(*differences: Difference, densest: int = 8):
@@ -57,8 +58,15 @@ def test_each_finding_tells_its_own_numbers_frames_and_verdict() -> None:
     assert "0.544 (edge FL (densest)) and 0.503 (edge FL)" in pole.sentence
     assert pole.question == "Does the placed pole beat the pole with the densest traffic?"
     for finding in (edge, cloud, pole):
-        assert "96 test frames of 8 scenes" in finding.sentence
+        assert "96 test frames of 8 scenes and over retraining (standard deviation 0.012 of 9" in finding.sentence
         assert CAVEAT in finding.sentence
+
+
+def test_without_a_spread_of_retraining_no_claim_has_held() -> None:
+    alone = replace(difference(EDGE, (MAIN, PRETRAIN), 0.091, 0.055, 0.127), spread=None)
+    (edge,) = told(alone)
+    assert edge.verdict == UNDECIDED
+    assert "is not known, so this run does not decide" in edge.sentence
 
 
 def test_a_densest_pole_that_was_chosen_leaves_nothing_to_compare() -> None:

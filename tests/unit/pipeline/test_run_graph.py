@@ -58,6 +58,36 @@ def test_an_arm_adds_what_it_does_differently_and_no_more() -> None:
     assert {name for name in plain if plain[name] == armed[name]} >= {"plan", "pretrain-objects", "grid-place"}
 
 
+def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
+    arms = {"densest": {"placement": {"rule": "densest"}, "stages": ["edge"]}}
+    plain = Graph(recipe_of(arms=arms), Path())
+    again = Graph(recipe_of(arms=arms, retrainings=2), Path())
+    added = {step.name: step for step in again.steps if step.name not in {each.name for each in plain.steps}}
+    trained = {"pretrain-objects", "grid-edge-fl-objects", "cloud-fl-objects", "grid-edge-fl-objects-densest"}
+    assert {name for name in added if not name.startswith("test-")} == {
+        f"{name.removesuffix('-densest')}-{arm}-again{n}"
+        for name in trained
+        for n in (1, 2)
+        for arm in ("densest" if "densest" in name else "main",)
+    }
+    seeds = {step.name: step.arguments["seed"] for step in again.steps if step.run.__name__ == "pretrain_step"}
+    assert len(set(seeds.values())) == len(seeds) == 3
+    uploads = {step.arguments["upload_seed"] for step in again.steps if "upload_seed" in step.arguments}
+    assert uploads == {1}
+    ours = {step.name: step.arguments for step in plain.steps}
+    assert all(step.arguments == ours[step.name] for step in again.steps if step.name in ours)
+
+
+def test_an_arm_may_train_otherwise_on_the_same_frames() -> None:
+    armed = Graph(recipe_of(arms={"slow": {"training": {"cooldown": [0.1, 0.01]}}}), Path())
+    steps = {step.name: step for step in armed.steps}
+    assert steps["pretrain-objects-slow"].arguments["training"]["cooldown"] == [0.1, 0.01]
+    assert "grid-place-slow" not in steps
+    assert steps["grid-edge-fl-objects-slow"].arguments["steps"]["place"] == "grid-place"
+    with pytest.raises(ValueError, match=r"arms\.slow\.training: field 'cooldowns'"):
+        recipe_of(arms={"slow": {"training": {"cooldowns": [0.1]}}})
+
+
 def test_another_plan_shares_recordings_that_no_plan_decides() -> None:
     armed = recipe_of(arms={"equal": {"plan": "equal-stages"}})
     names = Graph(armed, Path()).names

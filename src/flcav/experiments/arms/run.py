@@ -153,7 +153,7 @@ def one_seed(run: Run) -> ArmsSeed:
     own, plan = main.links, main.plan.tasks[TASK]
     ap = {town: {arm: _tested(run, town, *stage) for arm, stage in arms.items()} for town, arms in ARMS.items()}
     found = {
-        (each.region, each.arm, each.stage, each.before_arm, each.before_stage): each.estimate
+        (each.region, each.arm, each.stage, each.before_arm, each.before_stage): each.over_scenes
         for each in run.differences
     }
     differences = {

@@ -64,7 +64,7 @@ def one_seed(run: Run) -> AllocationSeed:
     arms = {name: run.arms[arm] for name, arm in ARM_OF.items()}
     plan_of = {name: arm.plan.tasks[TASK] for name, arm in arms.items()}
     found = {
-        (each.region, each.stage): each.estimate
+        (each.region, each.stage): each.over_scenes
         for each in run.differences
         if (each.arm, each.before_arm) == (MAIN, ARM_OF[EQUAL])
     }

@@ -53,7 +53,8 @@ def page(run: Run) -> dict[str, Any]:
             "region": test.region,
             "task": test.task,
             "measure": test.result.measure,
-            **vars(test.result.estimate),
+            **vars(test.estimate),
+            "spread": test.spread,
             "numbers": test.result.numbers,
             "frames": test.result.frames,
             "scenes": test.result.scenes,
@@ -63,6 +64,7 @@ def page(run: Run) -> dict[str, Any]:
     ]
     return {
         "seed": recipe.seed,
+        "retrained": recipe.retrainings,
         "tasks": list(recipe.tasks),
         "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
         "first": first,
@@ -151,9 +153,9 @@ def _chart(run: Run, task: str) -> tuple[list[Row], list[Row]]:
         {
             "stage": CHART_NAMES[test.stage],
             "town": test.region,
-            "score": test.result.estimate.mean,
-            "low": test.result.estimate.low,
-            "high": test.result.estimate.high,
+            "score": test.estimate.mean,
+            "low": test.estimate.low,
+            "high": test.estimate.high,
         }
         for test in run.tested
         if (test.arm, test.task) == (MAIN, task)

@@ -1,0 +1,45 @@
+"""Tables (CSV) that a recipe names: one of the package by its name, or a user's own file beside the recipe."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from flcav.config import InputError, shorten
+from flcav.files import atomic_path
+from flcav.pipeline.frames import find_path
+
+
+def read_table(field: str, name: str, noun: str, folder: str, beside: Path) -> str:
+    """Return the text of a table: one of the package by its name, in `folder`, or a file below `beside`.
+
+    Raises `InputError`, naming the recipe's `field` and the table by its `noun`, where there is none.
+    """
+    own = resources.files("flcav.pipeline") / folder
+    known = sorted(entry.name.removesuffix(".csv") for entry in own.iterdir() if ".csv" in entry.name)
+    if name in known:
+        return (own / f"{name}.csv").read_text(encoding="utf-8")
+    path = find_path(name, beside)
+    if path is None or not path.is_file():
+        raise InputError(
+            f"{field}: {shorten(name)} is no {noun} of the package ({', '.join(known)}), and no file beside the "
+            f"recipe, in {beside.absolute()}"
+        )
+    try:
+        return path.read_text(encoding="utf-8")
+    except ValueError as error:
+        raise InputError(f"{path}: not a CSV table ({error})") from None
+
+
+def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Append the rows that the table at `path` lacks, in these columns."""
+    held: list[dict[str, str]] = []
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as file:
+            held = list(csv.DictReader(file))
+    told = [{name: str(value) for name, value in row.items()} for row in rows]
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([*held, *(row for row in told if row not in held)])
