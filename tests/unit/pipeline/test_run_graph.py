@@ -84,7 +84,7 @@ def test_an_arm_may_train_otherwise_on_the_same_frames() -> None:
     assert steps["pretrain-objects-slow"].arguments["training"]["cooldown"] == [0.1, 0.01]
     assert "grid-place-slow" not in steps
     assert steps["grid-edge-fl-objects-slow"].arguments["steps"]["place"] == "grid-place"
-    with pytest.raises(ValueError, match=r"arms\.slow\.training: field 'cooldowns'"):
+    with pytest.raises(ValueError, match=r"arms\.slow\.training: unknown field 'cooldowns'"):
         recipe_of(arms={"slow": {"training": {"cooldowns": [0.1]}}})
 
 
