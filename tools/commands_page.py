@@ -26,9 +26,10 @@ WIDEST = 1000  # pixels of a picture
 INTRO = """\
 # Commands
 
-Every command of `flcav` with its arguments and options, and an example with its output. `flcav COMMAND --help` prints the same
-descriptions. The exit code is 0 for success, 2 for bad input (with one sentence about it on stderr), 130 after Ctrl-C, and 1 for
-any other failure. `--json` prints one JSON object and nothing else. Terms are in the [glossary](glossary.md).
+Every command of `flcav` with its arguments and options, and an example with its output. `flcav COMMAND --help`
+prints the same descriptions. The exit code is 0 for success, 2 for bad input (with one sentence about it on stderr),
+130 after Ctrl-C, and 1 for any other failure. `--json` prints one JSON object and nothing else. Terms are in the
+[glossary](glossary.md).
 
 This page is made by `python tools/commands_page.py`, which runs the examples of `tools/commands.yaml` one after the
 other in one folder, with a copy of the repository's `recipes/` in it. In their output `...` stands for the folder
