@@ -87,7 +87,7 @@ def page(printed: Mapping[str, str]) -> str:
 def described(name: str, command: click.Command, printed: str) -> str:
     """Return the part of the page about a command."""
     said = "\n\n".join(" ".join(each.split()) for each in (command.help or "").split("\n\n"))
-    options = format_table(("option", "what it is", "default"), map(row, command.params))
+    options = format_table(("option", "description", "default"), map(row, command.params))
     return f"### flcav {name}\n\n{said}\n\n{options}\n\n{printed}\n"
 
 
