@@ -20,8 +20,8 @@ from pydantic import Field, model_validator
 
 from flcav.config import InputError, parse_config, read_yaml
 from flcav.files import write_json
-from flcav.optimization.allocation.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
 from flcav.optimization.curves.curves import Additive, Effective, Positive
+from flcav.optimization.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
 
 OwnCurve = Annotated[Additive | Effective, Field(discriminator="model")]
 KINDS = ("task", "network", "modality", "vehicle")  # of nodes; each layer joins two neighbours of this list

@@ -19,9 +19,9 @@ from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import TaskPlan as Allotted
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.baselines import baseline
-from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.fitting import fit_additive
 from flcav.optimization.curves.history import JOINT, History, parse_histories
+from flcav.optimization.problem import Problem
 from flcav.perception.task import Task, find_configuration, fresh
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule

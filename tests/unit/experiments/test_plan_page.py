@@ -9,10 +9,10 @@ import pytest
 from flcav.experiments.fig3a.run import article_graph
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.budget_sweep import compute_savings
-from flcav.optimization.allocation.problem import Budgets, Limits, Problem, Uplink
+from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.allocation.problem_file import STEPS, TERMS
-from flcav.optimization.fleet import allocate_fleet
 from flcav.optimization.graph import load_problem
+from flcav.optimization.problem import Budgets, Limits, Problem, Uplink
 from flcav.report.pages.plan_page import SHOWN, plan_page, plan_results
 
 RECIPES = Path(__file__).parents[3] / "recipes"

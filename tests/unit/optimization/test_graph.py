@@ -7,6 +7,7 @@ import yaml
 
 from flcav.config import InputError, parse_config
 from flcav.optimization.allocation.allocate import allocate
+from flcav.optimization.allocation.vehicles import split_plan
 from flcav.optimization.graph import (
     Layers,
     build_graph,
@@ -17,7 +18,6 @@ from flcav.optimization.graph import (
     save_graph,
     to_problem,
 )
-from flcav.optimization.vehicles import split_plan
 
 RECIPE = Path(__file__).parents[3] / "recipes" / "graphs" / "three_layers.yaml"
 

@@ -10,16 +10,15 @@ from flcav.config import InputError, parse_config
 from flcav.network.ledger import LINKS, Budget, Ledger, LedgerEntry
 from flcav.network.plan import MessageSizes, price
 from flcav.optimization.allocation.allocate import (
-    Infeasible,
     TaskPlan,
     allocate,
     resolve_problem,
-    stage_plan,
     weighted_error,
 )
-from flcav.optimization.allocation.area import area
 from flcav.optimization.allocation.baselines import BASELINES, baseline
 from flcav.optimization.allocation.replanning import PlanState, condition_problem, replan
+from flcav.optimization.solvers.area import area
+from flcav.optimization.solvers.instance import Infeasible, stage_plan
 
 LIMITS = {"samples": [20, 900], "edge_rounds": [0, 12], "cloud_rounds": [0, 8]}
 

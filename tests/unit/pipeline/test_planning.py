@@ -13,8 +13,8 @@ from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.plan import MessageSizes, Price, price
-from flcav.optimization.allocation.allocate import Infeasible
 from flcav.optimization.curves.history import History
+from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from flcav.optimization.allocation.allocate import Allocation
     from flcav.optimization.allocation.baselines import Baseline
     from flcav.optimization.allocation.budget_sweep import Saving
-    from flcav.optimization.allocation.problem import Problem
-    from flcav.optimization.vehicles import VehicleShare
+    from flcav.optimization.allocation.vehicles import VehicleShare
+    from flcav.optimization.problem import Problem
 
     Shares = Mapping[str, Sequence[VehicleShare]]
 
@@ -50,12 +50,12 @@ def allocate(
 ) -> None:
     """Split both uplink budgets over tasks and training stages so that they err least, by the problem's objective."""
     from flcav.config import read_config
-    from flcav.optimization.allocation.allocate import Infeasible
     from flcav.optimization.allocation.baselines import baseline as compared
     from flcav.optimization.allocation.budget_sweep import compute_savings
+    from flcav.optimization.allocation.fleet import allocate_fleet
     from flcav.optimization.allocation.replanning import PlanState, condition_problem
-    from flcav.optimization.fleet import allocate_fleet
     from flcav.optimization.graph import load_problem, read_graph
+    from flcav.optimization.solvers.instance import Infeasible
     from flcav.sources.recipe import find_recipe
 
     problem = find_recipe(problem)

@@ -12,20 +12,19 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 from flcav.network.plan import Price
 from flcav.optimization.allocation.allocate import (
-    Infeasible,
     TaskPlan,
     build_task_plans,
     evaluate_objective,
     resolve_problem,
     sum_prices,
 )
-from flcav.optimization.allocation.problem import Problem
+from flcav.optimization.allocation.vehicles import split_plan
+from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
-from flcav.optimization.solvers.instance import Instance, build_instance
+from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance
 from flcav.optimization.solvers.rounding import trim
 from flcav.optimization.solvers.separable import relax
 from flcav.optimization.solvers.weighted import list_terms, minimise_weighted_error
-from flcav.optimization.vehicles import split_plan
 
 Array = NDArray[np.float64]
 

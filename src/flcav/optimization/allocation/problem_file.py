@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.optimization.allocation.allocate import resolve_problem
-from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.curves import Additive, Effective
 from flcav.optimization.curves.fitting import QUANTITIES, CurveFit
+from flcav.optimization.problem import Problem
 
 MEASURES = {"weighted": "weighted error", "max-min": "largest error", "area": "area"}  # by objective; keys of `TERMS`
 STEPS = {  # the quantities that cost uplink megabytes

@@ -10,9 +10,9 @@ from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import Allocation, TaskPlan, resolve_problem
 from flcav.optimization.allocation.baselines import baseline
 from flcav.optimization.allocation.budget_sweep import FACTORS, LINKS, BudgetPoint, Saving, sweep_budgets
-from flcav.optimization.allocation.problem import AllocationTask, Problem
 from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, explain_objective
-from flcav.optimization.vehicles import VehicleShare
+from flcav.optimization.allocation.vehicles import VehicleShare
+from flcav.optimization.problem import AllocationTask, Problem
 from flcav.report import style
 from flcav.report.charts import curves, plans
 from flcav.report.pages import html
