@@ -24,24 +24,20 @@ from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.world.map.town import TOWNS
 
-
-def find_path(name: str, beside: Path) -> Path | None:
-    """Return the file or folder `name` in the folder `beside`, or else in the working directory; None for neither."""
-    sought = (beside / name, Path.cwd() / name)
-    return next((path for path in sought if os.path.exists(path)), None)  # noqa: PTH110 - which takes any name
-
-
 DATA = "data"
 SHORTEST_S = 10.0  # shortest scene for tracks: it takes a past, a future, and several presents
-
 Fields = Mapping[str, Any]  # fields of a `Recipe`, as YAML has them
-
-
 SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # fractions of a dataset's scenes
     "pretrain": {"pool": 0.7, "validation": 0.15, "test": 0.15},
     "federate": {"validation": 0.15, "registry": 0.2, "edge": 0.4, "test": 0.25},
     "unseen": {"validation": 0.3, "test": 0.7},
 }
+
+
+def find_path(name: str, beside: Path) -> Path | None:
+    """Return the file or folder `name` in the folder `beside`, or else in the working directory; None for neither."""
+    sought = (beside / name, Path.cwd() / name)
+    return next((path for path in sought if os.path.exists(path)), None)  # noqa: PTH110 - which takes any name
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,10 @@ from flcav.report.charts.figures import WIDTH
 TASKS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION, style.RULE)
 SHADES = {"samples": 1.0, "edge rounds": 0.62, "cloud rounds": 0.32}  # opacity by stage
 LINKS = {"both links": style.RULE, "wireless alone": style.BLUE, "wireline alone": style.VERMILLION}
+PLAN_COLOURS = {"equal-stages": style.ORANGE, "joint": style.BLUE}
+PLAN_NAMES = {"equal-stages": "equal stages", "joint": "joint plan"}
+STAGES = {"pretrain": "pretrained", "edge": "edge FL", "cloud": "edge +\ncloud FL"}
+ASIDE = 0.07  # offset that keeps intervals of two plans apart
 
 
 class Part(TypedDict):
@@ -81,12 +85,6 @@ def best_by_budget(sweep: Mapping[str, Sequence[Mapping[str, float]]], measure: 
     return figure
 
 
-COLOURS = {"equal-stages": style.ORANGE, "joint": style.BLUE}
-NAMES = {"equal-stages": "equal stages", "joint": "joint plan"}
-STAGES = {"pretrain": "pretrained", "edge": "edge FL", "cloud": "edge +\ncloud FL"}
-ASIDE = 0.07  # offset that keeps intervals of two plans apart
-
-
 @dataclass(frozen=True)
 class StageReached:
     """A number after a stage: prediction, mean over seeds with its interval, and value by seed."""
@@ -106,7 +104,9 @@ def predicted_and_realised(ap: Mapping[str, ByStage], differences: ByStage, town
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     _draw_ap(left, ap, town)
     _draw_differences(right, differences)
-    handles = [Line2D([], [], color=colour, marker="o", label=NAMES[name]) for name, colour in COLOURS.items()]
+    handles = [
+        Line2D([], [], color=colour, marker="o", label=PLAN_NAMES[name]) for name, colour in PLAN_COLOURS.items()
+    ]
     handles += [
         Line2D([], [], color=style.MUTED, linestyle=(0, (3, 2)), marker="D", mfc="white", label="predicted"),
         Line2D([], [], color=style.MUTED, marker="o", label="trained: mean, 95 % over seeds"),
@@ -117,7 +117,7 @@ def predicted_and_realised(ap: Mapping[str, ByStage], differences: ByStage, town
 
 
 def _draw_ap(axes: Axes, ap: Mapping[str, ByStage], town: str) -> None:
-    for side, (name, colour) in zip((-ASIDE, ASIDE), COLOURS.items(), strict=True):
+    for side, (name, colour) in zip((-ASIDE, ASIDE), PLAN_COLOURS.items(), strict=True):
         places = [number + side for number in range(len(STAGES))]
         reached = [ap[name][stage] for stage in STAGES]
         predicted = [each.predicted for each in reached]
