@@ -50,6 +50,11 @@ def test_a_robust_plan_is_best_for_the_bands_and_never_better_for_the_curves(see
     assert [t.upper_error for t in nominal.tasks] == [None] * 3
 
 
+def test_an_unknown_baseline_is_refused_by_name():
+    with pytest.raises(InputError, match="baseline 'best': unknown; known baselines: equal-stages, equal-tasks"):
+        baseline(parsed(written(1, 1, "additive", LIMITS)), "best")
+
+
 @pytest.mark.parametrize("name", BASELINES)
 @pytest.mark.parametrize(
     ("tasks", "model", "k"), [(1, "additive", 1), (3, "effective", 1), (2, "shared", 2), (5, "additive", 0)]

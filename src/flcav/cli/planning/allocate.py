@@ -1,7 +1,7 @@
 """`flcav allocate`: samples, edge rounds and cloud rounds per task under both uplink budgets (MLGRA)."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,8 @@ if TYPE_CHECKING:
     from flcav.optimization.allocation.allocate import Allocation
     from flcav.optimization.allocation.baselines import Baseline
     from flcav.optimization.allocation.budget_sweep import Saving
-    from flcav.optimization.allocation.vehicles import VehicleShare
+    from flcav.optimization.allocation.vehicles import Shares
     from flcav.optimization.problem import Problem
-
-    Shares = Mapping[str, Sequence[VehicleShare]]
 
 
 class Compared(StrEnum):
@@ -71,9 +69,11 @@ def allocate(
     more = compute_savings(asked, plan)
     if out is not None:
         from flcav.files import write_bytes
+        from flcav.optimization.allocation.comparison import compare_plan
         from flcav.report.pages.plan_page import plan_page
 
-        write_bytes(out, plan_page(asked, plan, shares, more, read_graph(problem)).encode())
+        page = plan_page(compare_plan(asked, plan, shares, more), read_graph(problem))
+        write_bytes(out, page.encode())
     beside = None if baseline is None else compared(asked, baseline.value)
     if as_json:
         beside_it = {} if beside is None else {"baseline": _plain(beside)}

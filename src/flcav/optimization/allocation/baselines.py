@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 
+from flcav.config import InputError, shorten
 from flcav.network.plan import Price
 from flcav.optimization.allocation.allocate import (
     TaskPlan,
@@ -48,8 +49,10 @@ def baseline(problem: Problem, name: str) -> Baseline:
     """Return the plan of `BASELINES[name]` with its predicted objective.
 
     Baselines respect the fleet's budgets alone: `note` says where the vehicles' samples or links do not suffice. Raises
-    `Infeasible` as `allocate` does, KeyError for an unknown name.
+    `Infeasible` as `allocate` does, `InputError` for an unknown name.
     """
+    if name not in BASELINES:
+        raise InputError(f"baseline {shorten(name)}: unknown; known baselines: {', '.join(BASELINES)}")
     asked = resolve_problem(problem)
     plans = build_task_plans(problem, BASELINES[name](asked, build_instance(asked)))
     try:

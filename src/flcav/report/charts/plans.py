@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from flcav.intervals import MeanOverSeeds
+from flcav.optimization.allocation.budget_sweep import BudgetPoint
 from flcav.report import style
 from flcav.report.charts.figures import WIDTH
 
@@ -63,7 +64,7 @@ def megabytes(parts: Sequence[Part], links: Mapping[str, Mapping[str, float]]) -
 
 
 @style.styled
-def best_by_budget(sweep: Mapping[str, Sequence[Mapping[str, float]]], measure: str) -> Figure:
+def best_by_budget(sweep: Mapping[str, Sequence[BudgetPoint]], measure: str) -> Figure:
     """Return the optimal objective, called `measure`, against the budgets, scaled together and one at a time."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
     axes = figure.add_subplot()
@@ -71,8 +72,8 @@ def best_by_budget(sweep: Mapping[str, Sequence[Mapping[str, float]]], measure: 
     for name, colour in LINKS.items():
         points = sweep[name]
         line = {"color": colour, "linewidth": widths[name], "marker": "o", "markersize": widths[name] + 1.5}
-        axes.plot([p["factor"] for p in points], [p["objective"] for p in points], **line)
-    now = [p["objective"] for p in sweep["both links"] if p["factor"] == 1]
+        axes.plot([p.factor for p in points], [p.objective for p in points], **line)
+    now = [p.objective for p in sweep["both links"] if p.factor == 1]
     axes.plot([1] * len(now), now, "o", color=style.INK, markersize=8, markeredgecolor="white")
     axes.annotate("this plan", (1, now[0]), (8, 8), textcoords="offset points", fontweight="bold")
     style.key(
