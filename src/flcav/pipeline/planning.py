@@ -25,8 +25,7 @@ from flcav.optimization.problem import Problem
 from flcav.perception.task import Task, find_configuration, fresh
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.frames import find_path
-from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
+from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits, find_path
 from flcav.pipeline.results import Plan, TaskPlan
 
 HISTORIES = resources.files("flcav.pipeline") / "histories"
