@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from flcav.dataset.recording.workers import exit_with_parent
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps.step import Record, Step, Work, read_value, write_done, write_started
+from flcav.processes import exit_with_parent
 from flcav.progress import Report
 from flcav.threads import use_threads
 
