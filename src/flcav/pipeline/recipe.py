@@ -1,5 +1,9 @@
-"""The schema of a run recipe: tasks, regions, uplink budgets, sensor placement, federation, and arms to compare."""
+"""The schema of a run recipe: tasks, regions, uplink budgets, sensor placement, federation, and arms to compare.
 
+`find_path` is where the files that it names are looked for.
+"""
+
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -325,3 +329,9 @@ def load_run_recipe(path: Path | str) -> RunRecipe:
     (180.0, ['densest'])
     """
     return parse_config(RunRecipe, read_yaml(Path(path)), str(path))
+
+
+def find_path(name: str, beside: Path) -> Path | None:
+    """Return the file or folder `name` in the folder `beside`, or else in the working directory; None for neither."""
+    sought = (beside / name, Path.cwd() / name)
+    return next((path for path in sought if os.path.exists(path)), None)  # noqa: PTH110 - which takes any name

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from flcav.experiments.sim_to_real.clouds import CloudNumbers, SeenCar
 from flcav.experiments.sim_to_real.run import LabelledCar, RealScore, SimToReal
 from flcav.markdown import format_table
-from flcav.report.pictures.clouds import CloudNumbers, SeenCar
 
 
 def tables(results: SimToReal) -> dict[str, str]:

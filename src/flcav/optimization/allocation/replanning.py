@@ -10,8 +10,8 @@ from pydantic import Field
 
 from flcav.config import Config, InputError
 from flcav.optimization.allocation.allocate import Allocation, allocate
-from flcav.optimization.allocation.problem import AllocationTask, Budgets, Count, Fraction, Problem
 from flcav.optimization.curves.curves import Additive, Curve, Decay, Effective, NonNegative
+from flcav.optimization.problem import AllocationTask, Budgets, Count, Fraction, Problem
 from flcav.optimization.solvers.instance import price_counts
 
 LEAST_ERROR = 1e-6  # error assumed for an accuracy of 1: test sets are finite
