@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 from flcav.config import InputError
-from flcav.pipeline.planning import POINT
 from flcav.pipeline.recipe import RunRecipe, load_run_recipe
 from flcav.pipeline.running import make_history_points, run
-from flcav.pipeline.tables import append_rows
+from flcav.pipeline.tables import append_records
 
 AMPLE_MB = 1e6
 
@@ -80,7 +79,7 @@ def main(arguments: Sequence[str]) -> None:
     asked = {"-".join(map(str, each)): recipe_of(recipe, options.task, each) for each in chosen}
     for name, each in asked.items():
         result = run(each, options.runs / name, beside=options.recipe.parent, jobs=options.jobs, notify=_print)
-        append_rows(options.out, POINT, make_history_points(result, f"seed{each.seed}"))
+        append_records(options.out, make_history_points(result, f"seed{each.seed}"))
 
 
 def _print(step: str, done: int, total: int, note: str) -> None:

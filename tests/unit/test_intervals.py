@@ -63,7 +63,9 @@ def test_an_estimate_is_told_with_its_interval_where_it_has_one():
 
 def test_the_spread_is_the_standard_deviation_of_several_trainings():
     values = [0.61, 0.66, 0.58]
-    assert measure_spread(values) == Spread(pytest.approx(stats.tstd(values)), 3)
+    found = measure_spread(values)
+    assert found is not None
+    assert (found.sd, found.trainings) == (pytest.approx(stats.tstd(values)), 3)
     assert measure_spread([0.6]) is None
 
 

@@ -15,9 +15,9 @@ from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import TaskPlan as Allotted
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.baselines import baseline
-from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.fitting import fit_additive
-from flcav.optimization.curves.history import JOINT, History, parse_histories
+from flcav.optimization.curves.history import History, parse_histories
+from flcav.optimization.problem import Problem
 from flcav.perception.task import Task, find_configuration, fresh
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
@@ -25,7 +25,18 @@ from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
 from flcav.pipeline.results import Plan, TaskPlan
 from flcav.pipeline.tables import read_table
 
-POINT: tuple[str, ...] = ("task", *JOINT, "weight", "run")  # columns of a history that a run writes
+
+@dataclass(frozen=True)
+class HistoryPoint:
+    """A point of the learning history that a run writes: what a task spent, and the score it reached."""
+
+    task: str
+    samples: int
+    edge_rounds: int
+    cloud_rounds: int
+    accuracy: float
+    weight: int  # validation frames
+    run: str
 
 
 @dataclass(frozen=True)

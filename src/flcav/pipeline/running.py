@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from flcav.pipeline.arms import Setting, name_repeat
 from flcav.pipeline.findings import findings, name_stage
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.labels import LABEL_SOURCES
-from flcav.pipeline.planning import POINT
+from flcav.pipeline.planning import HistoryPoint
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import (
@@ -37,9 +36,9 @@ from flcav.pipeline.results import (
     Tested,
     Watched,
 )
-from flcav.pipeline.spread import COLUMNS, difference_key, spread_rows, test_key
+from flcav.pipeline.spread import difference_key, list_spreads, test_key
 from flcav.pipeline.steps import Notify, Stale, run_side_by_side, run_steps, stopwatch
-from flcav.pipeline.tables import append_rows
+from flcav.pipeline.tables import append_records
 
 WORK, RESULTS, SUMMARY, HISTORY, SPREAD = "work", "results.json", "summary.json", "history.csv", "spread.csv"
 
@@ -127,9 +126,9 @@ def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float) -> R
     """Collect the results of finished steps, write them to `out`, and add their points to the history."""
     result = replace(collect_results(graph, out / WORK), elapsed_s=round(elapsed_s, 1))
     name = f"seed{graph.recipe.seed}"
-    append_rows(history, POINT, make_history_points(result, name))
+    append_records(history, make_history_points(result, name))
     if graph.recipe.retrainings:
-        append_rows(history.with_name(SPREAD), COLUMNS, spread_rows(result, name))
+        append_records(history.with_name(SPREAD), list_spreads(result, name))
     result.save(out, RESULTS)
     return result
 
@@ -326,12 +325,12 @@ def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
     return closed
 
 
-def make_history_points(result: Run, run: str) -> list[Mapping[str, Any]]:
-    """Return a run's points of the learning history, named by `POINT`: samples, rounds, and the score they reached.
+def make_history_points(result: Run, run: str) -> list[HistoryPoint]:
+    """Return a run's points of the learning history: samples, rounds, and the score they reached.
 
     The score is the mean over regions on validation frames, weighted by frames.
     """
-    points: list[Mapping[str, Any]] = []
+    points: list[HistoryPoint] = []
     for task, own in result.arms[MAIN].plan.tasks.items():
         for stage in (EDGE, CLOUD):
             each = [watched for watched in result.watched if (watched.task, watched.stage) == (task, stage)]
@@ -339,7 +338,6 @@ def make_history_points(result: Run, run: str) -> list[Mapping[str, Any]]:
             for rounds in zip(*(watched.rounds for watched in each), strict=True):
                 number = rounds[0].round
                 counts = (number, 0) if stage == EDGE else (own.edge_rounds, number)
-                score = np.average([at.score for at in rounds], weights=frames)
-                point = (task, own.samples, *counts, f"{score:.4f}", sum(frames), run)
-                points.append(dict(zip(POINT, point, strict=True)))
+                score = float(np.average([at.score for at in rounds], weights=frames))
+                points.append(HistoryPoint(task, own.samples, *counts, score, sum(frames), run))
     return points

@@ -7,38 +7,49 @@ recipe of another run names (`spread`), or the package holds.
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from flcav.config import InputError
 from flcav.intervals import Spread
-from flcav.pipeline.results import Difference, Run, Test
+from flcav.pipeline.results import Difference, Run
 from flcav.pipeline.tables import read_table
 
-KEY = ("task", "region", "arm", "stage", "before_arm", "before_stage")  # the last two: empty for a measure
-COLUMNS = (*KEY, "sd", "trainings", "run")
-Spreads = Mapping[tuple[str, ...], Spread]  # by the values of `KEY`
+Key = tuple[str, str, str, str, str, str]  # task, region, arm, stage, and of a difference the arm and stage before
+Spreads = Mapping[Key, Spread]
 
 
-def test_key(task: str, region: str, arm: str, stage: str) -> tuple[str, ...]:
+@dataclass(frozen=True)
+class SpreadRow:
+    """The spread of a measure, or of a difference, as a row of the table."""
+
+    task: str
+    region: str
+    arm: str
+    stage: str
+    before_arm: str  # empty for a measure
+    before_stage: str  # empty for a measure
+    sd: float
+    trainings: int
+    run: str
+
+
+def test_key(task: str, region: str, arm: str, stage: str) -> Key:
     """Return the key of a test's measure."""
     return task, region, arm, stage, "", ""
 
 
-def spread_rows(run: Run, name: str) -> list[dict[str, str]]:
-    """Return the rows, by `COLUMNS`, of what a run with retrainings measured; `name` is the run's."""
-
-    def row(key: Sequence[str], of: Test | Difference) -> dict[str, str]:
-        assert of.spread is not None
-        return dict(zip(COLUMNS, (*key, f"{of.spread.sd:.5f}", str(of.spread.trainings), name), strict=True))
-
-    tests = [row(test_key(each.task, each.region, each.arm, each.stage), each) for each in run.tested if each.retrained]
-    return tests + [row(difference_key(each), each) for each in run.differences if each.retrained]
-
-
-def difference_key(each: Difference) -> tuple[str, ...]:
+def difference_key(each: Difference) -> Key:
     """Return the key of a difference."""
     return each.task, each.region, each.arm, each.stage, each.before_arm, each.before_stage
+
+
+def list_spreads(run: Run, name: str) -> list[SpreadRow]:
+    """Return what a run with retrainings measured; `name` is the run's."""
+    tests = [(test_key(each.task, each.region, each.arm, each.stage), each.spread) for each in run.tested]
+    both = [*tests, *((difference_key(each), each.spread) for each in run.differences)]
+    return [SpreadRow(*key, spread.sd, spread.trainings, name) for key, spread in both if spread is not None]
 
 
 def read_spreads(name: str, beside: Path) -> Spreads:
@@ -47,9 +58,9 @@ def read_spreads(name: str, beside: Path) -> Spreads:
     Raises `InputError` where there is no such table, or a row is not a spread.
     """
     rows = csv.DictReader(io.StringIO(read_table("spread", name, "spread", "spreads", beside)))
-    spreads: dict[tuple[str, ...], Spread] = {}
+    spreads: dict[Key, Spread] = {}
     for number, row in enumerate(rows, start=1):
-        if missing := [column for column in COLUMNS if row.get(column) is None]:
+        if missing := [field.name for field in fields(SpreadRow) if row.get(field.name) is None]:
             raise InputError(f"{name}: row {number}: column '{missing[0]}' is missing")
         try:
             spread = Spread(float(row["sd"]), int(row["trainings"]))
@@ -57,5 +68,5 @@ def read_spreads(name: str, beside: Path) -> Spreads:
             raise InputError(f"{name}: row {number}: sd and trainings must be numbers") from None
         if not (0 <= spread.sd < 1 and spread.trainings >= 2):
             raise InputError(f"{name}: row {number}: sd must be from 0 to 1, trainings 2 or more")
-        spreads[tuple(row[column] for column in KEY)] = spread
+        spreads[row["task"], row["region"], row["arm"], row["stage"], row["before_arm"], row["before_stage"]] = spread
     return spreads

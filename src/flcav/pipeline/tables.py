@@ -1,14 +1,18 @@
 """Tables (CSV) that a recipe names: one of the package by its name, or a user's own file beside the recipe."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from flcav.config import InputError, shorten
 from flcav.files import atomic_path
-from flcav.pipeline.frames import find_path
+from flcav.pipeline.recipe import find_path
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 def read_table(field: str, name: str, noun: str, folder: str, beside: Path) -> str:
@@ -32,14 +36,20 @@ def read_table(field: str, name: str, noun: str, folder: str, beside: Path) -> s
         raise InputError(f"{path}: not a CSV table ({error})") from None
 
 
-def append_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Append the rows that the table at `path` lacks, in these columns."""
+def append_records(path: Path, records: Sequence["DataclassInstance"]) -> None:
+    """Append the records that the table at `path` lacks, a column per field; numbers are rounded to 5 decimals."""
+    if not records:
+        return
     held: list[dict[str, str]] = []
     if path.exists():
         with path.open(newline="", encoding="utf-8") as file:
             held = list(csv.DictReader(file))
-    told = [{name: str(value) for name, value in row.items()} for row in rows]
+    told = [{name: _cell(value) for name, value in asdict(record).items()} for record in records]
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer = csv.DictWriter(file, list(told[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows([*held, *(row for row in told if row not in held)])
+
+
+def _cell(value: object) -> str:
+    return str(round(value, 5)) if isinstance(value, float) else str(value)

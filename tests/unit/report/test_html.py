@@ -62,9 +62,9 @@ def test_the_page_tells_the_numbers() -> None:
     for shown in (
         "objects, pretrained 0.412 0.371–0.450",
         "objects, edge + cloud FL 0.511 0.470–0.549",
-        "edge + cloud FL ring 0.468 0.427–0.506 0.278 0.960 96 8",
+        "edge + cloud FL ring 0.468 0.427–0.506 not known 0.278 0.960 96 8",
         "ideal road detector, upper bound",
-        "grid, objects: edge FL - pretrained +0.091 +0.055 to +0.127",
+        "grid, objects: edge FL - pretrained +0.091 +0.041 to +0.141 0.015 of 9",
         "wireless 230.0 216.0 214.7",
         "2 · placed 19 of 61 6.2",
         "8 · densest traffic 6 of 61 12.4",
