@@ -24,6 +24,12 @@ from flcav.world.scene import Scene
 Array = NDArray[np.float64]
 
 STEP_S = 0.1  # of the grid on which biases are simulated
+EQUATOR_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
+FLATTENING = 1 / 298.257223563
+POLE_M = EQUATOR_M * (1 - FLATTENING)  # semi-minor axis
+ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)  # first eccentricity, squared
+ITERATIONS = 4  # of Bowring's method
+GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
 
 
 def draw_gauss_markov(rng: np.random.Generator, time_s: float, deviation: Array, correlation_s: float) -> Array:
@@ -57,13 +63,6 @@ def _grid(rng: np.random.Generator, time_s: float, axes: int) -> Array:
 def _read(values: Array, time_s: float) -> Array:
     step, share = divmod(time_s / STEP_S, 1.0)
     return (1 - share) * values[int(step)] + share * values[int(step) + 1]
-
-
-EQUATOR_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
-FLATTENING = 1 / 298.257223563
-POLE_M = EQUATOR_M * (1 - FLATTENING)  # semi-minor axis
-ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)  # first eccentricity, squared
-ITERATIONS = 4  # of Bowring's method
 
 
 def convert_to_geodetic(origin: GeoReference, enu: Array) -> Array:
@@ -128,9 +127,6 @@ def measure_position(
     noise = rng.standard_normal(3) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
     bias = draw_gauss_markov(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
     return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + noise + bias)
-
-
-GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
 
 
 class Imu(Config):

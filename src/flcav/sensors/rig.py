@@ -25,6 +25,9 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 Reach = Annotated[float, Field(ge=-100, le=100)]  # [m]
 Turn = Annotated[float, Field(ge=-360, le=360)]  # [deg]
+# Velodyne's data sheet: range 50 m for pavement (reflectivity 0.1), 120 m for cars and foliage (0.8): 134 m for white.
+# Its intensities are compressed, and many returns from dark or glossy bodies have intensity 0.
+HDL64E = Lidar(beams="hdl64e", sensitivity_m=134.0, roughness_rad=0.6, intensity_gamma=0.5, intensity_floor=0.15)
 
 
 class Mount(Config):
@@ -164,11 +167,6 @@ def roadside() -> Rig:
         for name, yaw_deg in (("camera_left", 42.0), ("camera_right", -42.0))
     }
     return Rig(lidars=lidar_pole().lidars, cameras=cameras)
-
-
-# Velodyne's data sheet: range 50 m for pavement (reflectivity 0.1), 120 m for cars and foliage (0.8): 134 m for white.
-# Its intensities are compressed, and many returns from dark or glossy bodies have intensity 0.
-HDL64E = Lidar(beams="hdl64e", sensitivity_m=134.0, roughness_rad=0.6, intensity_gamma=0.5, intensity_floor=0.15)
 
 
 def kitti_lidar() -> Rig:

@@ -19,6 +19,7 @@ from flcav.world.static import SignsAndSignals, build_town_mesh, list_signs_and_
 from flcav.world.trace import Trace
 
 OFFSET_S = 0.1  # largest extrapolation from an instant of the trace: one step of the traffic
+TOWNS_KEPT = 4
 
 
 class Surfaces(NamedTuple):
@@ -195,7 +196,6 @@ def _actor_model(category: str, shape: int) -> _Model:
 
 
 _TOWNS: dict[str, _Model] = {}  # by hash of the town: the last TOWNS_KEPT
-TOWNS_KEPT = 4
 
 
 def _town_model(town: Town) -> _Model:

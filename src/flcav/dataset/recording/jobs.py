@@ -30,6 +30,7 @@ PART_FRAMES = 16  # frames of a part: few are lost by an interruption, and start
 TRAFFIC = "traffic.parquet"
 PAYLOADS = "payloads"  # folder of a part with the files that are moved into the dataset unchanged
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
 class Traffic(NamedTuple):
@@ -121,9 +122,6 @@ def _check_names(frame: Frame, scene: str) -> None:
     names = (frame.key, *frame.calibration.agent_from_sensor)
     if frame.scene != scene or TRACES in names or not all(_SAFE_NAME.fullmatch(name) for name in names):
         raise ValueError(f"{frame.key}: scene, agent or sensor names that a dataset cannot hold: {names}")
-
-
-AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
 class Engine(Protocol):

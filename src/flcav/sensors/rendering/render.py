@@ -27,6 +27,10 @@ from flcav.world.weather import Weather
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3)
 KEPT_BYTES = 64 << 20  # of freed memory that stays with the process
 LARGEST_BYTES = 32 << 20  # the largest M_MMAP_THRESHOLD that glibc accepts
+FAR_M = 1000.0  # length of primary rays
+LOW_SIGHT = 0.002  # extinction [1/m] above which vehicles have their lamps on by day
+MIRRORS = 0.2  # wetness above which roads reflect
+NO_LAMPS = np.zeros((0, 3), np.float32)
 
 
 @lru_cache(maxsize=1)
@@ -40,12 +44,6 @@ def keep_freed_memory() -> None:
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, LARGEST_BYTES)
         library.mallopt(_TRIM_THRESHOLD, KEPT_BYTES)
-
-
-FAR_M = 1000.0  # length of primary rays
-LOW_SIGHT = 0.002  # extinction [1/m] above which vehicles have their lamps on by day
-MIRRORS = 0.2  # wetness above which roads reflect
-NO_LAMPS = np.zeros((0, 3), np.float32)
 
 
 class Picture(NamedTuple):

@@ -18,6 +18,9 @@ from flcav.geometry import Boxes, inverse, transform_points, wrap_angle
 POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
 LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
 MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
+CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
+SUFFIXES = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}
+MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
 
 
 @dataclass(frozen=True)
@@ -130,11 +133,6 @@ def _lines(path: Path) -> list[str]:
         raise InputError(f"{path}: no such file") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
-
-
-CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
-SUFFIXES = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}
-MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,11 @@ from flcav.geometry import pose
 from flcav.sensors.frame import Frame
 from flcav.sensors.radar.radar import compute_echo_directions
 
+LIDAR_FIELDS = ("x", "y", "z", "intensity")
+TIME_FIELD = "time"  # of a point [s] after the cloud's time stamp, as in ROS drivers of spinning LiDARs
+RADAR_FIELDS = ("x", "y", "z", "range_m", "azimuth_rad", "elevation_rad", "doppler_m_s", "rcs_dbsm")
+IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^2], [rad/s], body frame
+
 
 def scene_update(frame: Frame, stamp: Timestamp) -> SceneUpdate:
     """Return the 3D boxes of a frame, world frame, which replace the earlier ones; fainter without a LiDAR return."""
@@ -119,12 +124,6 @@ def _colour(rgb: tuple[float, float, float], opacity: float) -> Color:
 
 def _metadata(about: dict[str, str]) -> list[KeyValuePair]:
     return [KeyValuePair(key=key, value=value) for key, value in about.items()]
-
-
-LIDAR_FIELDS = ("x", "y", "z", "intensity")
-TIME_FIELD = "time"  # of a point [s] after the cloud's time stamp, as in ROS drivers of spinning LiDARs
-RADAR_FIELDS = ("x", "y", "z", "range_m", "azimuth_rad", "elevation_rad", "doppler_m_s", "rcs_dbsm")
-IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^2], [rad/s], body frame
 
 
 class JsonMessage(NamedTuple):
