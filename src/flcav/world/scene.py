@@ -14,7 +14,7 @@ from flcav.world.map.town import Town
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
 from flcav.world.rays.embree import Embree, Solid
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.static import SignsAndSignals, build_town_mesh, list_signs_and_signals
 from flcav.world.trace import Trace
 
@@ -102,7 +102,7 @@ class Scene:
         hidden: int | None = None,
         threads: int = 1,
     ) -> Hits:
-        """Return the first hit of each ray (N, 3), without the actor `hidden`: see `raycaster.Target.trace`."""
+        """Return the first hit of each ray (N, 3), without the actor `hidden`: see `embree.Assembly.trace`."""
         self._hide(hidden)
         return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m, threads=threads)
 

@@ -24,7 +24,7 @@ from flcav.dataset.formats.exporter import (
 from flcav.dataset.formats.mounts import agent_velocities, assign_channels, optical_yaw
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import pose
+from flcav.geometry import pose, yaw_of
 from flcav.progress import Report
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Frame
@@ -113,9 +113,8 @@ def carla_pose(world_from_body: Array) -> list[float]:
     """
     matrix = MIRROR @ world_from_body @ MIRROR
     roll = np.arctan2(-matrix[2, 1], matrix[2, 2])
-    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
     pitch = np.arcsin(np.clip(matrix[2, 0], -1, 1))
-    return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw, pitch)).tolist()]
+    return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw_of(matrix), pitch)).tolist()]
 
 
 def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, dict[str, Any]], speed_m_s: float) -> None:

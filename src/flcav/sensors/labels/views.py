@@ -14,7 +14,6 @@ from flcav.world.scene import Scene
 
 OUTER_EDGES = np.array((-0.5, -0.5, 0.5, 0.5))  # from the centres of the outermost pixels
 SAMPLES = 4096  # pixels sampled of an amodal box for its occlusion, about; of larger ones every n-th row and column
-NO_PIXEL = np.zeros((0, 2), np.int64)
 
 
 class Regions(NamedTuple):

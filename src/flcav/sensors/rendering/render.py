@@ -20,7 +20,7 @@ from flcav.sensors.rendering.glare import add_glare, add_sun_glare
 from flcav.sensors.rendering.light import Light, compute_lamplight, compute_light, compute_sun_visibility, soften
 from flcav.sensors.rendering.state import Lamps, LampState, collect_lamps, compute_lamp_state, no_lamps
 from flcav.sensors.rendering.surface import shade
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 

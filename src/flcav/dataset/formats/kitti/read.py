@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.geometry import Boxes, inverse, transform_points, wrap_angle
+from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
 
 POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
 LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
@@ -108,7 +108,8 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
     height, width, length, x, y, z, rotation = numbers[:, 7:].T
     lidar_from_camera = inverse(calibration.camera_from_lidar)
     center = transform_points(lidar_from_camera, np.stack((x, y - height / 2, z), axis=1))
-    ahead = np.stack((np.cos(rotation), np.zeros_like(rotation), -np.sin(rotation)), axis=1)  # camera frame
+    cos, sin = heading_vectors(rotation).T
+    ahead = np.stack((cos, np.zeros_like(rotation), -sin), axis=1)  # camera frame
     ahead = ahead @ lidar_from_camera[:3, :3].T
     yaw = wrap_angle(np.arctan2(ahead[:, 1], ahead[:, 0]))
     size = np.stack((length, width, height), axis=1)
@@ -119,11 +120,6 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
         alpha=numbers[:, 2],
         rectangle=numbers[:, 3:7],
     )
-
-
-def read_labels(path: Path, calibration: Calibration) -> Boxes:
-    """Return the boxes of the labelled objects, LiDAR frame: see `read_objects`."""
-    return read_objects(path, calibration).boxes
 
 
 def _lines(path: Path) -> list[str]:
