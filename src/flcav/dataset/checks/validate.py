@@ -20,6 +20,7 @@ from flcav.dataset.store import Dataset
 from flcav.dataset.tables import read_table
 from flcav.files import sha256
 from flcav.progress import Report, ignore_progress
+from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
@@ -45,7 +46,8 @@ def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[st
         return [*problems, str(error)]
     problems += check_order(dataset.keys)
     problems += _other_counts(dataset)
-    problems += check_calibrations(dataset.calibrations, manifest.recipe)
+    error = CalibrationError.model_validate(manifest.recipe.get("calibration_error") or {})
+    problems += check_calibrations(dataset.calibrations, error)
 
     traces: dict[str, Trace | None] = {}
     sight = BlockedViews()

@@ -7,7 +7,7 @@ Actors have instance masks in COCO's compressed run-length encoding (RLE); signs
 import json
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from faster_coco_eval.core import mask as coco_mask
@@ -51,8 +51,15 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     return Exported(counts)
 
 
-def encode_run_lengths(mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return COCO's compressed run-length encoding of an (H, W) mask: {"size": [H, W], "counts": text}."""
+class RunLengths(TypedDict):
+    """A mask in COCO's compressed run-length encoding."""
+
+    size: list[int]  # H, W
+    counts: str
+
+
+def encode_run_lengths(mask: NDArray[np.bool_]) -> RunLengths:
+    """Return COCO's compressed run-length encoding of an (H, W) mask."""
     encoded = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
     return {"size": list(mask.shape), "counts": encoded["counts"].decode("ascii")}
 

@@ -135,7 +135,7 @@ def run_sumo(net: Path, routes: Path, seed: int, steps: list[int], out: Path, sc
         state=np.array(states, dtype=np.float64).reshape(-1, 4),
         light=np.array(lights, dtype=np.str_),
         light_state=np.array(light_states, dtype=np.str_).reshape(len(steps), len(lights)),
-        events=np.array(json.dumps(director.events if director else [])),
+        events=np.array(json.dumps([event._asdict() for event in director.events] if director else [])),
     )
 
 
