@@ -14,6 +14,8 @@ from flcav.world.weather import Weather
 
 Array = NDArray[np.float64]
 
+LONGEST_NAME = 100  # characters of a frame's key, and of the names in it: parts of file names
+
 # Numbers and names of CARLA's semantic tags (0.9.15)
 SEMANTICS: dict[str, int] = {
     "unlabeled": 0,
@@ -36,6 +38,11 @@ SEMANTICS: dict[str, int] = {
     "static": 20,
     "road_line": 24,
 }
+
+
+def format_key(scene: str, index: int, agent: str) -> str:
+    """Return the key of the frame of a scene, spin and agent: see `Frame.key`."""
+    return f"{scene}_{index:04d}_{agent}"
 
 
 @dataclass(frozen=True)
@@ -146,7 +153,7 @@ class Frame:
     @property
     def key(self) -> str:
         """Return `scene_index_agent`: unique in a dataset, safe as a file name."""
-        return f"{self.scene}_{self.index:04d}_{self.agent}"
+        return format_key(self.scene, self.index, self.agent)
 
     @property
     def agent_from_sensor(self) -> Mapping[str, Array]:

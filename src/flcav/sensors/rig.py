@@ -13,6 +13,7 @@ from flcav.config import Config
 from flcav.geometry import heading_vectors, pose
 from flcav.sensors.camera.camera import Camera
 from flcav.sensors.camera.infrared import Infrared
+from flcav.sensors.frame import LONGEST_NAME
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.navigation import Gnss, Imu
 from flcav.sensors.radar.radar import Radar
@@ -20,8 +21,7 @@ from flcav.sensors.radar.radar import Radar
 CAMERA_RANGE_M = 100.0  # of ground truth for rigs without LiDAR; what shows in an image is labelled at any distance
 TRIGGER_MS = 100.0  # largest offset of a trigger from the spin
 RESERVED = ("traces", "town")  # folders of a dataset, so no names of sensors
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-
+_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
 
 Reach = Annotated[float, Field(ge=-100, le=100)]  # [m]
 Turn = Annotated[float, Field(ge=-360, le=360)]  # [deg]
@@ -117,7 +117,8 @@ class Rig(Config):
                 raise ValueError(f"two sensors are called '{name}'; names must differ over all kinds")
             if not _NAME.fullmatch(name) or name in RESERVED:
                 raise ValueError(
-                    f"sensor name '{name}': must be letters, digits, - and _, and none of {', '.join(RESERVED)}"
+                    f"sensor name '{name}': must be letters, digits, - and _, {LONGEST_NAME} at most, and none of "
+                    f"{', '.join(RESERVED)}"
                 )
         return self
 

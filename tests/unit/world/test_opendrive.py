@@ -174,7 +174,7 @@ def test_bad_maps_get_one_sentence_and_leave_nothing(text: str, message: str, tm
     path = tmp_path / "map.xodr"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        import_town(path, tmp_path / "town")
+        import_town(path, tmp_path / "new" / "folders" / "town")
     assert "\n" not in str(caught.value)
     assert [found.name for found in tmp_path.iterdir()] == ["map.xodr"]
 
