@@ -100,9 +100,12 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
     """
     if out.exists():
         raise InputError(f"{out}: is there already; give a new folder")
+    beside = find_existing(out.parent)
+    if not beside.is_dir():
+        raise InputError(f"{beside}: is a file; a town needs a folder")
     document = read_document(xodr)
     notes = ["Heights of the map are left out: towns are flat."]
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=find_existing(out.parent)) as scratch:
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=beside) as scratch:
         prefix, folder = Path(scratch) / "map", Path(scratch) / out.name
         folder.mkdir()
         split_map(xodr, prefix)
