@@ -9,7 +9,6 @@ import weakref
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -273,8 +272,8 @@ def _self_test() -> None:
     assembly = Assembly([solid, solid])
     assembly.place(1, pose(10.0, 5.0, 0.0, yaw=np.pi / 2))  # the face, 2 m ahead of the body, now at (10, 7)
     assembly.commit()
-    alone: Any = solid.trace(np.eye(4), forward)
-    placed: Any = assembly.trace(pose(10.0, 0.0, 0.0, yaw=np.pi / 2), forward)
+    alone = solid.trace(np.eye(4), forward)
+    placed = assembly.trace(pose(10.0, 0.0, 0.0, yaw=np.pi / 2), forward)
     missed = assembly.trace(np.eye(4), forward)
     found = [float(alone.distance[0]), float(placed.distance[0]), int(placed.instance[0]), int(missed.instance[0])]
     if not np.allclose(found, [2.0, 7.0, 1, -1], atol=1e-5):
