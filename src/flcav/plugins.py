@@ -6,14 +6,16 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TypeVar
 
 from flcav.config import InputError
+
+Wanted = TypeVar("Wanted")
 
 PLACE = re.compile(r"\w+(\.\w+)*:\w+")
 
 
-def load_own(kind: str, name: str, known: Iterable[str], wanted: type) -> Any:
+def load_own(kind: str, name: str, known: Iterable[str], wanted: type[Wanted]) -> Wanted:
     """Return the object named `name`, written `module:NAME`; `kind` (a task, a strategy) names it in messages.
 
     The module is imported with the working directory on the path, as by `python -m`. A class is instantiated without
