@@ -11,7 +11,7 @@ from flcav.geometry import Boxes
 from flcav.intervals import mean_over_seeds
 from flcav.perception.card import Card
 from flcav.perception.images import CameraView
-from flcav.perception.objects.results import ObjectsEvaluation
+from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.report import style
 from flcav.report.pictures.clouds import CloudNumbers, SeenCar, Street, compare, real_frame
 

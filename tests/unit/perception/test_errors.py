@@ -14,8 +14,8 @@ from flcav.dataset.store import Dataset
 from flcav.perception.errors import FALSE_POSITIVE, FINAL_ERROR, MISS, PerceptionError, keep_first, save_errors
 from flcav.perception.signs import errors as sign_errors
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
-from flcav.perception.signs.detect import Detections
 from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.predict import Detections
 from flcav.perception.signs.samples import sample_from_frame
 from flcav.perception.trajectory import errors as path_errors
 from flcav.perception.trajectory.config import CONFIGURATIONS as PATHS

@@ -10,8 +10,9 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.intervals import REDRAWS
 from flcav.perception.metrics import Matches, match, orientation_similarity, right_headings, weighted_precision
-from flcav.perception.objects.evaluate import detect_frames, select_class
 from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect_frames
+from flcav.perception.objects.truth import select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.perception.outcomes import Outcomes, Times, Values
 from flcav.progress import Report, ignore_progress

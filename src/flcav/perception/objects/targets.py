@@ -21,6 +21,9 @@ from flcav.perception.objects.truth import in_range
 
 Array = NDArray[np.float64]
 
+IGNORE_IOU = 0.1  # an anchor is ignored where its IoU with an ignored box exceeds this
+IGNORE_MARGIN_M = 0.5  # and where its centre lies in an ignored box enlarged by this on each side
+
 
 def cell_size(config: SecondConfig) -> tuple[float, float]:
     """Return the size along x and along y [m] of a cell of the head's grid."""
@@ -56,10 +59,6 @@ def anchor_classes(config: SecondConfig) -> NDArray[np.int64]:
     classes = np.tile(np.repeat(np.arange(len(config.anchors)), HEADINGS), rows * columns)
     classes.flags.writeable = False
     return classes
-
-
-IGNORE_IOU = 0.1  # an anchor is ignored where its IoU with an ignored box exceeds this
-IGNORE_MARGIN_M = 0.5  # and where its centre lies in an ignored box enlarged by this on each side
 
 
 @dataclass(frozen=True)

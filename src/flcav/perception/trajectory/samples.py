@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 CAMERAS = 6  # typical number of cameras of a vehicle
 KEPT_BYTES = 2**30  # [B] of images cached in memory
+SEEN_M = 25.0  # largest distance from the observing vehicle to a road user that is predicted with cameras
+LOOKED_AT_AGAIN = 4  # number of cached sets of samples, so that validation does not extract its samples again
 
 Pictured = tuple[NDArray[np.uint8], Array, Array]  # images, intrinsics and camera_from_world of a frame's cameras
 
@@ -75,10 +77,6 @@ def rescaled(intrinsics: Array, rgb: Picture, settings: CrossView) -> Array:
     out[:2] *= scale[:, None]
     out[:2, 2] += (scale - 1) / 2
     return out
-
-
-SEEN_M = 25.0  # largest distance from the observing vehicle to a road user that is predicted with cameras
-LOOKED_AT_AGAIN = 4  # number of cached sets of samples, so that validation does not extract its samples again
 
 
 @dataclass(frozen=True)
