@@ -28,7 +28,7 @@ ALLOWED: Mapping[str, str] = {
     "flcav.pipeline.steps.step:Step.arguments": STEPS,
     "flcav.pipeline.steps.step:Step.run": STEPS,
     "flcav.pipeline.steps.step:Work.result": STEPS,
-    "flcav.plugins:load_own": OWN,
+    "flcav.plugins:load_named": OWN,
     "flcav.report.pictures.rerun_log:blueprint": EXTRA,
     "flcav.report.pictures.rerun_log:log_scene": EXTRA,
 }
