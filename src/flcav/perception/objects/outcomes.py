@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
@@ -40,7 +40,7 @@ class ObjectsOutcomes:
         if not truths:
             raise InputError("evaluation on 0 frames: at least one is wanted")
         hidden = [sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes]
-        arrays: dict[str, Any] = {CLASSES: np.array(classes), HIDDEN: np.array(hidden)}
+        arrays: dict[str, NDArray] = {CLASSES: np.array(classes), HIDDEN: np.array(hidden)}
         for name in classes:
             own = [select_class(boxes, name) for boxes in found]
             targets = [select_class(truth.targets, name) for truth in truths]

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.geometry import Boxes
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
@@ -34,7 +34,7 @@ class ObjectsTask(ObjectsOutcomes):
     family = "second"
     configurations = CONFIGURATIONS
     practice = Practice(batch=2, learning_rate=2e-3)
-    recording: Mapping[str, Any] = {}
+    recording: Mapping[str, Json] = {}
     labels = ("ideal-road", "own-detections")
     threshold = THRESHOLD
 

@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.perception.client import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.signs.augment import draw
@@ -34,7 +34,7 @@ class SignsTask(SignsOutcomes):
     family = "yolo"
     configurations = CONFIGURATIONS
     practice = Practice(batch=8, learning_rate=2e-3)
-    recording: Mapping[str, Any] = {
+    recording: Mapping[str, Json] = {
         "vehicle_rig": camera_ahead(640, 384, 45.0),
         "weather": {"classes": ["clear", "cloudy", "overcast", "light_rain"]},
     }

@@ -63,23 +63,21 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
     else:
         apart = into_frame(trace.position[None, instant, :, :2], observer[None])[0]
         wanted = (np.abs(apart) <= AROUND_M).all(axis=1)
-    columns = extract_columns(trace, key.time_s, load_roads(data), config.patch, wanted, complete=False)
-    count = len(columns["past"])
-    columns |= {"scene": np.full(count, key.scene), "frame": np.full(count, number)}
+    columns = extract_columns(trace, key, number, load_roads(data), config.patch, wanted, complete=False)
     users: list[RoadUser] = []
-    if count:
+    if len(columns.past):
         paths, probabilities = predict(network, Samples(data, columns, config.cameras))
         first = find_medoid(paths, probabilities)
-        present, plain = columns["pose"], constant_velocity(columns["past"])
-        for i, actor in enumerate(columns["actor"]):
+        present, plain = columns.pose, constant_velocity(columns.past)
+        for i, actor in enumerate(columns.actor):
             modes = [Mode(float(share), _in_world(way, present[i])) for share, way in zip(probabilities[i], paths[i])]
-            truth = columns["future"][i].astype(np.float64)
+            truth = columns.future[i].astype(np.float64)
             users.append(
                 RoadUser(
                     str(trace.actor[actor]),
                     str(trace.category[actor]),
                     *present[i].tolist(),
-                    speed=float(columns["past"][i, -1, 3]),
+                    speed=float(columns.past[i, -1, 3]),
                     length=float(trace.size[actor, 0]),
                     width=float(trace.size[actor, 1]),
                     modes=(modes.pop(first[i]), *sorted(modes, key=lambda mode: -mode.probability)),

@@ -3,12 +3,12 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.perception.errors import Registry
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
@@ -31,7 +31,7 @@ class TrajectoryTask(TrajectoryOutcomes):
     family = "trajectory-lstm"
     configurations = CONFIGURATIONS
     practice = Practice(batch=64, learning_rate=2e-3)
-    recording: Mapping[str, Any] = {
+    recording: Mapping[str, Json] = {
         "vehicle_rig": {"lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 4, "azimuth_steps": 90}}}},
         "every_s": 0.5,
     }
@@ -74,7 +74,8 @@ class TrajectoryTask(TrajectoryOutcomes):
         """Return displacement errors of single path, K modes and constant velocity by slice, see `evaluate_paths`."""
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
-        return evaluate_paths(paths, probabilities, samples.columns)
+        seen = samples.columns
+        return evaluate_paths(paths, probabilities, seen.past, seen.future, seen.at_junction, seen.scene)
 
     def sample_bytes(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> list[int]:
         """Return the size [B] of each frame's samples: past and future in float32; the map is not sent.
@@ -82,9 +83,9 @@ class TrajectoryTask(TrajectoryOutcomes):
         With rasters, each agent that observes an instant sends all samples of the instant.
         """
         columns = samples_of(data, config, frames).columns
-        each = 4 * int(np.prod(columns["past"].shape[1:]) + np.prod(columns["future"].shape[1:]))
+        each = 4 * int(np.prod(columns.past.shape[1:]) + np.prod(columns.future.shape[1:]))
         keys = [i if config.cameras else (data.keys[i].scene, data.keys[i].index) for i in range(len(data))]
-        counts = Counter(keys[i] for i in columns["frame"].tolist())
+        counts = Counter(keys[i] for i in columns.frame.tolist())
         return [each * counts[keys[i]] for i in frames]
 
     def infer(

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.perception.client import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
@@ -30,7 +30,7 @@ class WeatherTask(WeatherOutcomes):
     family = "lenet"
     configurations = CONFIGURATIONS
     practice = Practice(batch=32, learning_rate=4e-3)
-    recording: Mapping[str, Any] = {
+    recording: Mapping[str, Json] = {
         "vehicle_rig": camera_ahead(320, 192, 90.0),
         "weather": {"classes": list(WEATHER_CLASSES), "turn_s": 4.0},
     }
