@@ -1,8 +1,8 @@
 """Split 4 GB of wireless and 4 GB of wireline uplink over the three training stages of one task, then double both."""
 
 from flcav.optimization.allocation.allocate import allocate
-from flcav.optimization.allocation.problem import AllocationTask, Budgets, Limits, Problem
 from flcav.optimization.curves.curves import Additive, Decay
+from flcav.optimization.problem import AllocationTask, Budgets, Limits, Problem
 
 CURVE = Additive(
     floor=0.05,

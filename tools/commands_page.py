@@ -26,12 +26,13 @@ WIDEST = 1000  # pixels of a picture
 INTRO = """\
 # Commands
 
-Every command of `flcav`, with what it takes and an example with what it printed. `flcav COMMAND --help` says
-the same. The exit code is 0 where all went well, 2 for bad input (one sentence on stderr says what is wrong), 130 after
-Ctrl-C, and 1 for anything else. `--json` prints one JSON object and nothing else.
+Every command of `flcav` with its arguments and options, and an example with its output. `flcav COMMAND --help`
+prints the same descriptions. The exit code is 0 for success, 2 for bad input (with one sentence about it on stderr),
+130 after Ctrl-C, and 1 for any other failure. `--json` prints one JSON object and nothing else. Terms are in the
+[glossary](glossary.md).
 
 This page is made by `python tools/commands_page.py`, which runs the examples of `tools/commands.yaml` one after the
-other in one folder, with a copy of the repository's `recipes/` in it. In what they print, `...` stands for the folder
+other in one folder, with a copy of the repository's `recipes/` in it. In their output `...` stands for the folder
 that flcav is installed in.
 """
 
@@ -86,7 +87,7 @@ def page(printed: Mapping[str, str]) -> str:
 def described(name: str, command: click.Command, printed: str) -> str:
     """Return the part of the page about a command."""
     said = "\n\n".join(" ".join(each.split()) for each in (command.help or "").split("\n\n"))
-    options = format_table(("option", "what it is", "default"), map(row, command.params))
+    options = format_table(("option", "description", "default"), map(row, command.params))
     return f"### flcav {name}\n\n{said}\n\n{options}\n\n{printed}\n"
 
 

@@ -40,7 +40,7 @@ from flcav.world.weather import WEATHER_CLASSES, WEATHERS, Keyframe, Weather, We
 
 PAGE = Path(__file__).parents[1] / "docs" / "recipes.md"
 TEMPLATE = Path(__file__).with_name("recipes.md.j2")
-HEADER = ("field", "unit", "value", "default", "what it is")
+HEADER = ("field", "unit", "value", "default", "description")
 UNITS = {  # by suffix of a field's name
     **{"mm_h": "mm/h", "m_s": "m/s", "ms": "ms", "m": "m", "s": "s"},
     **{"deg": "°", "rad": "rad", "px": "px", "hz": "Hz", "k": "K"},

@@ -24,16 +24,16 @@ from safetensors.numpy import load_file
 from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.experiments.arms.run import ARMS, ArmsResult, run_arms
+from flcav.experiments.arms.run import ARMS, ArmsResult, compare_arms
 from flcav.experiments.fig6a.results import AllocationResult
-from flcav.experiments.fig6a.run import run_allocation
+from flcav.experiments.fig6a.run import compare_plans
 from flcav.network.ledger import LINKS, Ledger
 from flcav.pipeline.comparing import compare
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, load_run_recipe
 from flcav.pipeline.results import Placed, Pretrained, Run, StageResult, Watched
-from flcav.pipeline.running import RESULTS, SUMMARY, run
+from flcav.pipeline.running import RESULTS, SUMMARY, run, run_seeds
 from flcav.report.pages.run_page import write_report
 from flcav.verdicts import verdict
 from flcav.world.map.town import load_town
@@ -64,9 +64,8 @@ class Last:
 def studied(tmp_path_factory: pytest.TempPathFactory) -> Studied:
     """Return the folder of both comparisons of one seed, and their results."""
     out = tmp_path_factory.mktemp("toy") / "studies"
-    arms = run_arms(RECIPE, out, seeds=1, jobs=1, notify=lambda *told: None)
-    plans = run_allocation(RECIPE, out, seeds=1, jobs=1, notify=lambda *told: None)
-    return out, arms, plans
+    runs, _ = run_seeds(RECIPE, out, seeds=1)
+    return out, compare_arms(RECIPE, runs), compare_plans(RECIPE, runs)
 
 
 @pytest.fixture(scope="module")

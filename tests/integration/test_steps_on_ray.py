@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flcav.experiments.studies.run import open_split, record_split
+from flcav.experiments.splits import open_split, record_split
 from flcav.pipeline.steps import Step, Work, run_side_by_side, run_steps
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")
@@ -39,7 +39,7 @@ def points(work: Work, step: str) -> int:
     (work.folder / "deep" / "empty").mkdir(parents=True)
     (work.folder / "deep" / "large.bin").write_bytes(bytes(20_000_000))
     work.report(1, 2, "two")
-    data = open_split(work, step)
+    data = open_split(work.inputs[step])
     return sum(len(data.frame(i).lidar["lidar"]) for i in range(len(data)))
 
 

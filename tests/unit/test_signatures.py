@@ -15,22 +15,18 @@ import flcav
 VAGUE = frozenset({"Any", "object"})
 
 UNCHECKED = "whatever a user's file holds, a date of YAML too, before it is checked"
-EXTRA = "types of an extra (view, ray) that is not installed where types are checked"
 STEPS = "a step's function, arguments and JSON value: whatever the step is"
 OWN = "what a user's module holds, of the protocol that was asked for"
 ALLOWED: Mapping[str, str] = {
     "flcav.config:parse_config": UNCHECKED,
     "flcav.config:read_yaml": UNCHECKED,
     "flcav.config:shorten": UNCHECKED,
-    "flcav.dataset.recording.ray_engine:ray_session": EXTRA,
     "flcav.lazy:lazy_names": OWN,
     "flcav.pipeline.steps.run:run_steps": STEPS,
     "flcav.pipeline.steps.step:Step.arguments": STEPS,
     "flcav.pipeline.steps.step:Step.run": STEPS,
     "flcav.pipeline.steps.step:Work.result": STEPS,
     "flcav.plugins:load_named": OWN,
-    "flcav.report.pictures.rerun_log:blueprint": EXTRA,
-    "flcav.report.pictures.rerun_log:log_scene": EXTRA,
 }
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 import typer
@@ -11,6 +12,10 @@ from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale, join_choices, 
 from flcav.cli.terminal import when_interrupted
 from flcav.experiments.studies import STUDIES
 from flcav.threads import use_threads
+
+if TYPE_CHECKING:
+    from flcav.pipeline.recipe import RunRecipe
+    from flcav.pipeline.results import Run
 
 
 class Target(StrEnum):
@@ -119,31 +124,22 @@ def _fig3a(out: Path) -> None:
         typer.echo(sentence)
 
 
-@when_interrupted()
 def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.steps import live_steps
-    from flcav.experiments.arms.run import draw_arms, run_arms, study_recipe
+    from flcav.experiments.arms.run import compare_arms, draw_arms
     from flcav.files import write_bytes, write_json
 
-    with live_steps(Target.demo_arms.value) as notify:
-        recipe = study_recipe("arms", scale)
-        results = run_arms(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    results = compare_arms(*_run_seeds(Target.demo_arms, "arms", out, seeds, scale, jobs, engine, stale))
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "arms.png", draw_arms(results))
     for arm, closed in results.summary.gap_closed.items():
         typer.echo(f"{arm}: closes {closed.mean:.2f} of the gap ({closed.low:.2f} to {closed.high:.2f})")
 
 
-@when_interrupted()
 def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.cli.steps import live_steps
-    from flcav.experiments.arms.run import study_recipe
-    from flcav.experiments.fig6a.run import draw_allocation, run_allocation
+    from flcav.experiments.fig6a.run import compare_plans, draw_allocation
     from flcav.files import write_bytes, write_json
 
-    with live_steps(Target.fig6a_allocation.value) as notify:
-        recipe = study_recipe("allocation", scale)
-        results = run_allocation(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    results = compare_plans(*_run_seeds(Target.fig6a_allocation, "allocation", out, seeds, scale, jobs, engine, stale))
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "plans.png", draw_allocation(results))
     for finding in results.findings:
@@ -151,15 +147,31 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
 
 
 @when_interrupted()
+def _run_seeds(
+    target: Target, name: str, out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale
+) -> "tuple[RunRecipe, tuple[Run, ...]]":
+    """Run or finish the package's recipe `runs/<name>` with several seeds; of the demo's size unless scale is paper."""
+    from flcav.cli.steps import live_steps
+    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.pipeline.running import run_seeds
+    from flcav.sources.recipe import recipe_path
+
+    recipe = load_run_recipe(recipe_path(f"runs/{name}"))
+    if scale != "paper":
+        recipe = recipe.model_copy(update={"size": "demo"})
+    with live_steps(target.value) as notify:
+        runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    return recipe, runs
+
+
+@when_interrupted()
 def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.config import InputError
-    from flcav.experiments.sim_to_real.run import draw_frame, run_sim_to_real
+    from flcav.experiments.sim_to_real.run import draw_clouds, draw_frame, run_sim_to_real
     from flcav.files import write_bytes, write_json
     from flcav.perception.networks import resolve_network
     from flcav.perception.objects.task import OBJECTS
-    from flcav.report import style
-    from flcav.report.pictures.clouds import compare
 
     if kitti is None:
         raise InputError("--kitti is missing: sim-to-real needs a folder of real frames in KITTI's layout")
@@ -167,7 +179,7 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int,
         network = resolve_network(OBJECTS, weights)
         results = run_sim_to_real(network, kitti, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     write_json(out / "result.json", results.as_json())
-    write_bytes(out / "clouds.png", style.png(compare(results.clouds)))
+    write_bytes(out / "clouds.png", draw_clouds(results))
     for story in results.frames:
         write_bytes(out / f"{story.frame}.png", draw_frame(kitti, story))
     for row in results.scores:

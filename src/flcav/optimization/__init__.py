@@ -6,11 +6,11 @@ from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
     from flcav.optimization.allocation.allocate import Allocation, allocate
-    from flcav.optimization.allocation.problem import AllocationTask, Budgets, Limits, Problem
     from flcav.optimization.curves.fitting import Fit, fit
     from flcav.optimization.curves.history import History, article_histories
     from flcav.optimization.graph import load_problem
     from flcav.optimization.placement import Placement, place
+    from flcav.optimization.problem import AllocationTask, Budgets, Limits, Problem
 
 PLACES = {
     "Allocation": "flcav.optimization.allocation.allocate",
@@ -22,10 +22,10 @@ PLACES = {
     "fit": "flcav.optimization.curves.fitting",
     "Placement": "flcav.optimization.placement",
     "place": "flcav.optimization.placement",
-    "Budgets": "flcav.optimization.allocation.problem",
-    "Limits": "flcav.optimization.allocation.problem",
-    "Problem": "flcav.optimization.allocation.problem",
-    "AllocationTask": "flcav.optimization.allocation.problem",
+    "Budgets": "flcav.optimization.problem",
+    "Limits": "flcav.optimization.problem",
+    "Problem": "flcav.optimization.problem",
+    "AllocationTask": "flcav.optimization.problem",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)

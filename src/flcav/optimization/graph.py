@@ -19,9 +19,8 @@ import networkx as nx
 from pydantic import Field, model_validator
 
 from flcav.config import InputError, parse_config, read_yaml
-from flcav.files import write_json
-from flcav.optimization.allocation.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
 from flcav.optimization.curves.curves import Additive, Effective, Positive
+from flcav.optimization.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
 
 OwnCurve = Annotated[Additive | Effective, Field(discriminator="model")]
 KINDS = ("task", "network", "modality", "vehicle")  # of nodes; each layer joins two neighbours of this list
@@ -168,11 +167,6 @@ def extract_layers(graph: nx.Graph) -> Layers:
         raise InputError(f"graph: a node or an edge has no {error.args[0]!r}") from None
     values = {"tasks": tasks, "networks": networks, "modalities": modalities, "vehicles": vehicles}
     return parse_config(Layers, {**graph.graph, **values}, "graph")
-
-
-def save_graph(graph: nx.Graph, path: Path) -> None:
-    """Write the graph as node-link JSON."""
-    write_json(path, nx.node_link_data(graph, edges="links"))
 
 
 def load_graph(path: Path) -> nx.Graph:

@@ -1,6 +1,5 @@
 """Data splits of a run: recorded in a town, or divided by scenes out of a recorded dataset."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from flcav.files import sha256
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.client import as_shared
 from flcav.perception.tasks import task_named
-from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName
+from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName, find_path
 from flcav.pipeline.results import Recorded
 from flcav.progress import Report
 from flcav.seeds import derive_seed, stream
@@ -24,19 +23,9 @@ from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.world.map.town import TOWNS
 
-
-def find_path(name: str, beside: Path) -> Path | None:
-    """Return the file or folder `name` in the folder `beside`, or else in the working directory; None for neither."""
-    sought = (beside / name, Path.cwd() / name)
-    return next((path for path in sought if os.path.exists(path)), None)  # noqa: PTH110 - which takes any name
-
-
 DATA = "data"
 SHORTEST_S = 10.0  # shortest scene for tracks: it takes a past, a future, and several presents
-
 Fields = Mapping[str, Any]  # fields of a `Recipe`, as YAML has them
-
-
 SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # fractions of a dataset's scenes
     "pretrain": {"pool": 0.7, "validation": 0.15, "test": 0.15},
     "federate": {"validation": 0.15, "registry": 0.2, "edge": 0.4, "test": 0.25},

@@ -9,10 +9,10 @@ from typing import Any
 
 from flcav.config import InputError, shorten
 from flcav.pipeline.arms import Names, Setting, resolve_settings
-from flcav.pipeline.frames import find_path, hash_manifest, hash_town, recording_fields
+from flcav.pipeline.frames import hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
 from flcav.pipeline.planning import read_history
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, SPLITS_OF, Region, RunRecipe, SplitName
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, SPLITS_OF, Region, RunRecipe, SplitName, find_path
 from flcav.pipeline.steps import Step
 from flcav.pipeline.work import (
     central_step,

@@ -2,8 +2,8 @@
 
 import csv
 import io
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,29 @@ from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import TaskPlan as Allotted
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.baselines import baseline
-from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.fitting import fit_additive
-from flcav.optimization.curves.history import JOINT, History, parse_histories
+from flcav.optimization.curves.history import History, parse_histories
+from flcav.optimization.problem import Problem
 from flcav.perception.task import Task, find_configuration, fresh
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.frames import find_path
-from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
+from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits, find_path
 from flcav.pipeline.results import Plan, TaskPlan
 
 HISTORIES = resources.files("flcav.pipeline") / "histories"
-POINT: tuple[str, ...] = ("task", *JOINT, "weight", "run")  # columns of a history that a run writes
+
+
+@dataclass(frozen=True)
+class HistoryPoint:
+    """A point of the learning history that a run writes: what a task spent, and the score it reached."""
+
+    task: str
+    samples: int
+    edge_rounds: int
+    cloud_rounds: int
+    accuracy: float
+    weight: int  # validation frames
+    run: str
 
 
 @dataclass(frozen=True)
@@ -180,14 +191,19 @@ def load_history(name: str) -> History:
     return parse_history(name, read_history(name, name, Path()), name)
 
 
-def append_points(path: Path, points: list[Mapping[str, Any]]) -> None:
-    """Append the points that the history at `path` lacks (columns: `POINT`); `flcav fit` reads the file."""
+def append_points(path: Path, points: Sequence[HistoryPoint]) -> None:
+    """Append the points that the history (CSV) at `path` lacks; `flcav fit` reads the file."""
     held: list[dict[str, str]] = []
     if path.exists():
         with path.open(newline="", encoding="utf-8") as file:
             held = list(csv.DictReader(file))
-    told = [{name: str(value) for name, value in point.items()} for point in points]
+    told = [_row(point) for point in points]
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, POINT, lineterminator="\n")
+        writer = csv.DictWriter(file, [field.name for field in fields(HistoryPoint)], lineterminator="\n")
         writer.writeheader()
         writer.writerows([*held, *(point for point in told if point not in held)])
+
+
+def _row(point: HistoryPoint) -> dict[str, str]:
+    """Return the cells of a point by column."""
+    return {name: str(value) for name, value in asdict(point).items()} | {"accuracy": f"{point.accuracy:.4f}"}

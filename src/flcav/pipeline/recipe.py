@@ -1,5 +1,9 @@
-"""The schema of a run recipe: tasks, regions, uplink budgets, sensor placement, federation, and arms to compare."""
+"""The schema of a run recipe: tasks, regions, uplink budgets, sensor placement, federation, and arms to compare.
 
+`find_path` is where the files that it names are looked for.
+"""
+
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -31,10 +35,10 @@ SPLITS_OF: Mapping[Role, tuple[SplitName, ...]] = {  # splits of a region, by it
 class Split(Config):
     """Size of a data split in one region: `scenes` x `spins` x `cavs` frames."""
 
-    scenes: int = Field(ge=1, le=10**6)
+    scenes: int = Field(ge=1, le=10**6)  # traffic runs
     spins: int = Field(ge=1, le=10**6)  # frames of each vehicle in a scene
-    cavs: int = Field(ge=1, le=8)  # vehicles that record; of `edge`: default of a region's `vehicles`
-    every_s: float = Field(default=4.0, ge=2.0)  # between frames [s]; nearer ones would be alike
+    cavs: int = Field(ge=1, le=8)  # vehicles that record; of the split `edge` also the default of a region's `vehicles`
+    every_s: float = Field(default=4.0, ge=2.0)  # time between two frames [s]; nearer ones would be alike
 
 
 class Splits(Config):
@@ -43,7 +47,7 @@ class Splits(Config):
     pool: Split  # pretraining regions: candidates for the upload of stage I
     validation: Split  # every region: scored during training
     registry: Split  # federating regions: errors are registered here
-    edge: Split  # federating regions: their vehicles' training data
+    edge: Split  # federating regions: the vehicles' training data
     test: Split  # every region: scored once, at the end
 
     @field_validator("test")
@@ -57,23 +61,25 @@ class Splits(Config):
 class Training(Config):
     """Training schedule of a task's networks. Rates are fractions of the task's own learning rate."""
 
-    batch: int | None = Field(default=None, ge=1, le=4096)  # samples of an optimiser step; None: the task's
-    block_steps: int = Field(default=100, ge=1, le=10**6)  # optimiser steps of a pretraining block
-    max_blocks: int = Field(default=12, ge=1, le=10**4)  # before the cooldown; validation follows each block
-    patience: int = Field(default=3, ge=1)  # blocks; with less than `min_gain` over them: a plateau
-    min_gain: float = Field(default=0.01, ge=0)
-    cooldown: tuple[float, ...] = (0.3, 0.05)  # rates of the blocks after the plateau
-    local_steps: int = Field(default=16, ge=1, le=10**6)  # optimiser steps of a vehicle in a round
-    local_rate: float = Field(default=0.5, gt=0)  # rate of the first round
-    final_rate: float = Field(default=0.1, gt=0)  # rate of the last round
+    batch: int | None = Field(default=None, ge=1, le=4096)  # samples per optimiser step; default: the task's
+    block_steps: int = Field(default=100, ge=1, le=10**6)  # optimiser steps of one pretraining block
+    max_blocks: int = Field(default=12, ge=1, le=10**4)  # most blocks before the cooldown
+    patience: int = Field(
+        default=3, ge=1
+    )  # plateau: the best of these last blocks is less than `min_gain` above the best before
+    min_gain: float = Field(default=0.01, ge=0)  # least gain of the validation measure over `patience` blocks
+    cooldown: tuple[float, ...] = (0.3, 0.05)  # learning rates of the blocks after the plateau, one block each
+    local_steps: int = Field(default=16, ge=1, le=10**6)  # optimiser steps of one vehicle in one round
+    local_rate: float = Field(default=0.5, gt=0)  # learning rate of the first round
+    final_rate: float = Field(default=0.1, gt=0)  # learning rate of the last round
 
 
 class FixedPlan(Config):
     """A task's plan, given by hand instead of computed."""
 
-    samples: int = Field(ge=1, le=10**6)
-    edge_rounds: Count
-    cloud_rounds: Count
+    samples: int = Field(ge=1, le=10**6)  # samples uploaded for pretraining
+    edge_rounds: Count  # rounds of edge FL
+    cloud_rounds: Count  # rounds of cloud FL
 
 
 class Recording(Config):
@@ -95,23 +101,25 @@ class Recording(Config):
 class TaskRecipe(Config):
     """Settings of one perception task in a run."""
 
-    network: str | None = None  # name of the configuration; None: the task's first
-    weight: Positive = 1.0  # of the task's error in the plan's objective
-    labels: str | None = None  # kind of labels in stages II and III; None: the task's first
-    history: str | None = None  # points of learning curves: a name of the package's, or a CSV file
-    plan: FixedPlan | None = None  # instead of a history
-    recording: Recording = Recording()
-    training: Training | None = None  # None: the run's
+    network: str | None = None  # name of a network configuration; default: the task's first
+    weight: Positive = 1.0  # weight of the task's error in the plan's objective
+    labels: str | None = None  # kind of labels in stages II and III; default: the task's first
+    history: str | None = None  # history of the learning curve: a name of the package, or a CSV file
+    plan: FixedPlan | None = None  # a plan given by hand, instead of a history
+    recording: Recording = Recording()  # changes to how the task is recorded
+    training: Training | None = None  # training schedule; default: the run's
 
 
 class Region(Config):
     """A region with its vehicles and edge server: a town to simulate, or datasets already recorded."""
 
-    role: Role
-    town: str | None = None  # a town's name or folder; None: the region's name
-    data: str | Mapping[SplitName, str] | None = None  # a dataset divided by scenes, or one per split
+    role: Role  # pretrain, federate or unseen
+    town: str | None = None  # name or folder of a town; default: the region's name
+    data: str | Mapping[SplitName, str] | None = (
+        None  # recorded dataset whose scenes are divided over the splits, or one dataset per split
+    )
     vehicles: int | None = Field(default=None, ge=1, le=8)  # clients of the edge server
-    recording: Recording = Recording()
+    recording: Recording = Recording()  # changes to how the region is recorded
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -127,45 +135,53 @@ class Region(Config):
 class Budgets(Config):
     """Uplink budgets [MB; 1 MB = 10^6 bytes]."""
 
-    wireless: Positive
-    wireline: Positive
+    wireless: Positive  # from vehicles to edge servers
+    wireline: Positive  # from edge servers to the cloud
 
 
 class Limits(Config):
     """Bounds (least, most) of a plan's decision variables."""
 
-    samples: tuple[Count, Count | None] = (40, None)  # None: all that the pools hold
-    edge_rounds: tuple[Count, Count] = (1, 6)
-    cloud_rounds: tuple[Count, Count] = (1, 3)
+    samples: tuple[Count, Count | None] = (40, None)  # of pretraining; None: all that the pools hold
+    edge_rounds: tuple[Count, Count] = (1, 6)  # of edge FL
+    cloud_rounds: tuple[Count, Count] = (1, 3)  # of cloud FL
 
 
 class Placement(Config):
     """Settings of the choice of sites for roadside sensors."""
 
-    rule: Literal["vrcsp", "densest", "none"] = "vrcsp"  # most errors covered; densest traffic; no sensor
-    count: int = Field(default=1, ge=1, le=100)  # sensors of a region
-    range_m: float = Field(default=40.0, gt=0, le=1000)  # within which a sensor covers an error
-    group_range_m: float = Field(default=60.0, gt=0, le=10_000)  # of vehicles that federate to a sensor of any arm
-    tasks: tuple[str, ...] = ()  # whose errors are to be covered; default: objects where they are learned
+    rule: Literal["vrcsp", "densest", "none"] = (
+        "vrcsp"  # vrcsp: poles that cover most errors; densest: poles with most traffic; none: no sensors
+    )
+    count: int = Field(default=1, ge=1, le=100)  # sensors per region
+    range_m: float = Field(default=40.0, gt=0, le=1000)  # radius within which a sensor covers an error
+    group_range_m: float = Field(
+        default=60.0, gt=0, le=10_000
+    )  # vehicles train on frames recorded within this distance of a sensor of any arm
+    tasks: tuple[str, ...] = ()  # tasks whose errors are to be covered; default: objects, if the run has it
 
 
 class Federation(Config):
     """Settings of the aggregation of clients' models."""
 
-    strategy: str = "fedavg"  # name of a strategy, or module:NAME of a user's own
-    edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)
+    strategy: str = "fedavg"  # name of a strategy, or module:NAME of your own
+    edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)  # in every region
 
 
 class Arm(Config):
     """An arm of a comparison: how it differs from the run itself, and which stages it runs."""
 
-    plan: Literal["joint", "equal-stages", "equal-tasks", "max-throughput"] = "joint"
-    placement: Mapping[str, Any] = {}  # fields of `Placement` that differ
-    federation: Mapping[str, Any] = {}  # fields of `Federation` that differ
-    labels: Mapping[str, str] = {}  # kind of labels, by task
-    central: Literal["pretrain", "federate"] | None = None  # role of the regions whose ground truth is trained on
-    stages: tuple[Literal["edge", "cloud"], ...] = ("edge", "cloud")
-    regions: tuple[str, ...] | None = None  # federating ones; None: all
+    plan: Literal["joint", "equal-stages", "equal-tasks", "max-throughput"] = (
+        "joint"  # joint: optimal under both budgets; otherwise a baseline
+    )
+    placement: Mapping[str, Any] = {}  # fields of `Placement` that differ from the run
+    federation: Mapping[str, Any] = {}  # fields of `Federation` that differ from the run
+    labels: Mapping[str, str] = {}  # kinds of labels that differ from the run, by task
+    central: Literal["pretrain", "federate"] | None = (
+        None  # train centrally on the ground truth of the regions of this role
+    )
+    stages: tuple[Literal["edge", "cloud"], ...] = ("edge", "cloud")  # stages of federated learning to run
+    regions: tuple[str, ...] | None = None  # federating regions that take part; default: all
 
     @field_validator("stages")
     @classmethod
@@ -191,19 +207,19 @@ class RunRecipe(Config):
     (('grid',), 3, 'vrcsp')
     """
 
-    seed: int = Field(default=1, ge=0, lt=2**31)
-    size: Literal["toy", "demo", "full"] = "demo"  # preset of `splits` and `training` where they are None
-    splits: Splits | None = None
-    training: Training | None = None
-    tasks: Annotated[Mapping[str, TaskRecipe], Field(min_length=1)]
-    regions: Annotated[Mapping[Name, Region], Field(min_length=1)]
-    budgets_mb: Budgets
+    seed: int = Field(default=1, ge=0, lt=2**31)  # of all random draws
+    size: Literal["toy", "demo", "full"] = "demo"  # preset of `splits` and `training` where they are not given
+    splits: Splits | None = None  # sizes of the data splits; default: by `size`
+    training: Training | None = None  # training schedule; default: by `size`
+    tasks: Annotated[Mapping[str, TaskRecipe], Field(min_length=1)]  # tasks by name
+    regions: Annotated[Mapping[Name, Region], Field(min_length=1)]  # regions by name
+    budgets_mb: Budgets  # uplink budgets
     headroom: float = Field(default=0.02, ge=0, lt=0.5)  # fraction left unspent: samples differ in size
-    limits: Limits = Limits()
-    placement: Placement = Placement()
-    federation: Federation = Federation()
-    recording: Recording = Recording()
-    arms: Mapping[Name, Arm] = {}
+    limits: Limits = Limits()  # bounds of the plan's quantities
+    placement: Placement = Placement()  # placement of roadside sensors
+    federation: Federation = Federation()  # settings of aggregation
+    recording: Recording = Recording()  # changes to how all regions are recorded
+    arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
 
     @model_validator(mode="before")
     @classmethod
@@ -313,3 +329,9 @@ def load_run_recipe(path: Path | str) -> RunRecipe:
     (180.0, ['densest'])
     """
     return parse_config(RunRecipe, read_yaml(Path(path)), str(path))
+
+
+def find_path(name: str, beside: Path) -> Path | None:
+    """Return the file or folder `name` in the folder `beside`, or else in the working directory; None for neither."""
+    sought = (beside / name, Path.cwd() / name)
+    return next((path for path in sought if os.path.exists(path)), None)  # noqa: PTH110 - which takes any name

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from flcav.config import read_json
+from flcav.config import InputError, read_json
 from flcav.files import write_json
 from flcav.intervals import Estimate
 from flcav.pipeline.provenance import Provenance
@@ -112,6 +112,14 @@ class Placed(Saved):
     covered: int  # errors within range of a chosen pole
     range_m: float
     poles: tuple[Pole, ...]  # all candidates
+
+    @property
+    def first(self) -> int:
+        """Return the pole that was chosen first; raises `InputError` where no sensor was placed."""
+        if not self.chosen:
+            found = f"candidate poles: {len(self.poles)}, errors to cover: {self.errors}"
+            raise InputError(f"region {self.region!r}: no sensor was placed ({found})")
+        return self.chosen[0]
 
     @property
     def densest(self) -> int:

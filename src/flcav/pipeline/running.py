@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from flcav.pipeline.arms import Setting
 from flcav.pipeline.findings import findings, name_stage
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.labels import LABEL_SOURCES
-from flcav.pipeline.planning import POINT, append_points
+from flcav.pipeline.planning import HistoryPoint, append_points
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import (
@@ -288,12 +287,12 @@ def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
     return closed
 
 
-def make_history_points(result: Run, run: str) -> list[Mapping[str, Any]]:
-    """Return a run's points of the learning history, named by `POINT`: samples, rounds, and the score they reached.
+def make_history_points(result: Run, run: str) -> list[HistoryPoint]:
+    """Return a run's points of the learning history: samples, rounds, and the score they reached.
 
     The score is the mean over regions on validation frames, weighted by frames.
     """
-    points: list[Mapping[str, Any]] = []
+    points: list[HistoryPoint] = []
     for task, own in result.arms[MAIN].plan.tasks.items():
         for stage in (EDGE, CLOUD):
             each = [watched for watched in result.watched if (watched.task, watched.stage) == (task, stage)]
@@ -301,7 +300,6 @@ def make_history_points(result: Run, run: str) -> list[Mapping[str, Any]]:
             for rounds in zip(*(watched.rounds for watched in each), strict=True):
                 number = rounds[0].round
                 counts = (number, 0) if stage == EDGE else (own.edge_rounds, number)
-                score = np.average([at.score for at in rounds], weights=frames)
-                point = (task, own.samples, *counts, f"{score:.4f}", sum(frames), run)
-                points.append(dict(zip(POINT, point, strict=True)))
+                score = float(np.average([at.score for at in rounds], weights=frames))
+                points.append(HistoryPoint(task, own.samples, *counts, score, sum(frames), run))
     return points

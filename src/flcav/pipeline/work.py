@@ -23,6 +23,7 @@ from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule
+from flcav.pipeline.before_after import detect_before_after
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
     LABEL_SOURCES,
@@ -31,7 +32,7 @@ from flcav.pipeline.labels import (
     pseudo_label_samples,
     select_frames_near,
 )
-from flcav.pipeline.placing import detect_before_after, find_sites, place_sensors, read_traces
+from flcav.pipeline.placing import find_sites, place_sensors, read_traces
 from flcav.pipeline.planning import PlanRequest, PlanSettings, make_plan, model_mb, parse_history
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, Federation, Placement, Role, RunRecipe, SplitName, Training
 from flcav.pipeline.results import (

@@ -21,10 +21,10 @@ from flcav.sensors.rig import Mounted, Rig
 class CalibrationError(Config):
     """Standard deviations of the errors of calibration; a sensor's error is drawn once per dataset."""
 
-    position_m: float = Field(default=0.0, ge=0, le=10)  # along each axis of the sensor
-    rotation_deg: float = Field(default=0.0, ge=0, le=45)  # about each axis of the sensor
-    focal_px: float = Field(default=0.0, ge=0, le=1000)  # of both focal lengths alike
-    time_ms: float = Field(default=0.0, ge=0, le=1000)  # of the trigger time
+    position_m: float = Field(default=0.0, ge=0, le=10)  # error of the mount's position along each axis of the sensor
+    rotation_deg: float = Field(default=0.0, ge=0, le=45)  # error of the mount's rotation about each axis of the sensor
+    focal_px: float = Field(default=0.0, ge=0, le=1000)  # error of the focal length, the same for both axes
+    time_ms: float = Field(default=0.0, ge=0, le=1000)  # error of the trigger time
 
 
 def build_calibration(rig: Rig) -> Calibration:

@@ -106,13 +106,13 @@ def _from_earth(earth: Array) -> Array:
 class Gnss(Config):
     """Error model of a GNSS receiver; the defaults are those of a single-frequency receiver under open sky."""
 
-    noise_m: float = Field(default=0.3, ge=0, le=1000)  # standard deviation of the white noise, east and north
-    noise_up_m: float = Field(default=0.6, ge=0, le=1000)  # the same of the altitude
+    noise_m: float = Field(default=0.3, ge=0, le=1000)  # standard deviation of the white noise, of east and of north
+    noise_up_m: float = Field(default=0.6, ge=0, le=1000)  # standard deviation of the white noise, of altitude
     bias_m: float = Field(
         default=1.2, ge=0, le=1000
-    )  # standard deviation of what wanders (satellites, ionosphere), east, north
-    bias_up_m: float = Field(default=2.4, ge=0, le=1000)  # the same of the altitude
-    bias_s: float = Field(default=60.0, ge=0.001, le=1e6)  # time in which the bias is forgotten
+    )  # standard deviation of the Gauss-Markov bias (satellites, ionosphere), of east and of north
+    bias_up_m: float = Field(default=2.4, ge=0, le=1000)  # standard deviation of the Gauss-Markov bias, of altitude
+    bias_s: float = Field(default=60.0, ge=0.001, le=1e6)  # correlation time of the bias
 
 
 def measure_position(
@@ -136,13 +136,13 @@ GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
 class Imu(Config):
     """Error model of an IMU; the defaults are those of an automotive MEMS unit."""
 
-    rate_hz: float = Field(default=100.0, ge=0.1, le=10_000)  # samples a second: how much of the noise passes
-    force_noise: float = Field(default=1.5e-3, ge=0, le=1000)  # white noise of the specific force [m/s^2 / sqrt(Hz)]
-    rate_noise: float = Field(default=1.0e-4, ge=0, le=1000)  # the same of the angular rate [rad/s / sqrt(Hz)]
-    force_bias: float = Field(default=0.05, ge=0, le=1000)  # standard deviation when switched on [m/s^2]
-    rate_bias: float = Field(default=2.0e-3, ge=0, le=1000)  # the same of the angular rate [rad/s]
-    force_walk: float = Field(default=1.0e-4, ge=0, le=1000)  # growth of this bias [m/s^2 / sqrt(s)]
-    rate_walk: float = Field(default=5.0e-6, ge=0, le=1000)  # the same of the angular rate [rad/s / sqrt(s)]
+    rate_hz: float = Field(default=100.0, ge=0.1, le=10_000)  # sampling rate: noise up to half of it passes
+    force_noise: float = Field(default=1.5e-3, ge=0, le=1000)  # noise density of the specific force [m/s^2 / sqrt(Hz)]
+    rate_noise: float = Field(default=1.0e-4, ge=0, le=1000)  # noise density of the angular rate [rad/s / sqrt(Hz)]
+    force_bias: float = Field(default=0.05, ge=0, le=1000)  # standard deviation of initial bias, specific force [m/s^2]
+    rate_bias: float = Field(default=2.0e-3, ge=0, le=1000)  # standard deviation of initial bias, angular rate [rad/s]
+    force_walk: float = Field(default=1.0e-4, ge=0, le=1000)  # random walk of bias, specific force [m/s^2 / sqrt(s)]
+    rate_walk: float = Field(default=5.0e-6, ge=0, le=1000)  # random walk of bias, angular rate [rad/s / sqrt(s)]
 
 
 def measure_inertia(

@@ -33,12 +33,12 @@ class Mount(Config):
     A camera looks along x. A positive pitch is downwards.
     """
 
-    x: Reach = 0.0  # forward [m]
-    y: Reach = 0.0  # to the left [m]
-    z: Reach = 0.0  # up [m]
-    yaw_deg: Turn = 0.0  # turned to the left
-    pitch_deg: Turn = 0.0  # tilted downwards
-    roll_deg: Turn = 0.0  # leaning to the right
+    x: Reach = 0.0  # position, forward [m]
+    y: Reach = 0.0  # position, to the left [m]
+    z: Reach = 0.0  # position, up [m]
+    yaw_deg: Turn = 0.0  # yaw; positive turns to the left
+    pitch_deg: Turn = 0.0  # pitch; positive tilts downwards
+    roll_deg: Turn = 0.0  # roll; positive leans to the right
 
     def agent_from_sensor(self) -> NDArray[np.float64]:
         """Return the (4, 4) mount; of a camera with body axes (x forward, y left, z up), not optical ones."""
@@ -49,45 +49,45 @@ class Mount(Config):
 class Mounted(Config):
     """A sensor's mount and trigger time: base of all mounted sensors but LiDARs."""
 
-    mount: Mount = Mount()  # where it is
-    trigger_ms: float = Field(default=0.0, ge=-TRIGGER_MS, le=TRIGGER_MS)  # when it looks, after the LiDAR spin
+    mount: Mount = Mount()  # pose on the agent
+    trigger_ms: float = Field(default=0.0, ge=-TRIGGER_MS, le=TRIGGER_MS)  # trigger time after the spin
 
 
 class MountedLidar(Config):
     """A LiDAR and its mount. Its spin defines the time of the frame, so it has no trigger time."""
 
-    mount: Mount = Mount()  # where it is
-    settings: Lidar = Lidar()  # what it is built like
+    mount: Mount = Mount()  # pose on the agent
+    settings: Lidar = Lidar()  # settings of the LiDAR
 
 
 class MountedCamera(Mounted):
     """A colour camera, its mount and trigger time."""
 
-    settings: Camera = Camera()  # what it is built like
+    settings: Camera = Camera()  # settings of the camera
 
 
 class MountedInfrared(Mounted):
     """A thermal camera, its mount and trigger time."""
 
-    settings: Infrared = Infrared()  # what it is built like
+    settings: Infrared = Infrared()  # settings of the thermal camera
 
 
 class MountedRadar(Mounted):
     """A radar, its mount and trigger time."""
 
-    settings: Radar = Radar()  # what it is built like
+    settings: Radar = Radar()  # settings of the radar
 
 
 class MountedGnss(Mounted):
     """A GNSS receiver, its antenna's mount and trigger time."""
 
-    settings: Gnss = Gnss()  # how good it is
+    settings: Gnss = Gnss()  # error model of the receiver
 
 
 class MountedImu(Mounted):
     """An inertial measurement unit (IMU), its mount and trigger time."""
 
-    settings: Imu = Imu()  # how good it is
+    settings: Imu = Imu()  # error model of the unit
 
 
 class Rig(Config):
@@ -97,10 +97,12 @@ class Rig(Config):
     """
 
     lidars: dict[str, MountedLidar] = Field(default_factory=dict)  # spinning LiDARs
-    cameras: dict[str, MountedCamera] = Field(default_factory=dict)  # colour, with depth and classes of each pixel
+    cameras: dict[str, MountedCamera] = Field(
+        default_factory=dict
+    )  # colour cameras, with depth, semantic class and instance of each pixel
     infrareds: dict[str, MountedInfrared] = Field(default_factory=dict)  # thermal cameras
     radars: dict[str, MountedRadar] = Field(default_factory=dict)  # 77 GHz radars
-    gnss: dict[str, MountedGnss] = Field(default_factory=dict)  # satellite receivers
+    gnss: dict[str, MountedGnss] = Field(default_factory=dict)  # satellite navigation receivers
     imus: dict[str, MountedImu] = Field(default_factory=dict)  # accelerometers and gyroscopes
 
     @model_validator(mode="after")

@@ -67,21 +67,23 @@ class Recipe(Config):
     240
     """
 
-    town: str  # the name of a town, or the folder of one
-    seed: int = Field(default=0, ge=0, lt=2**63)  # of traffic, parked cars, sensor noise: the same seed, the same bytes
-    split: str = Field(default="train", pattern=r"^[A-Za-z0-9_-]+$")  # what the dataset is for; kept with it
-    scenes: int = Field(default=1, ge=1, le=MOST)  # traffic runs
-    frames: int | None = Field(default=None, ge=1, le=MOST)  # exactly so many, by as many scenes as they take
-    warmup_s: Warmup = 60.0  # until the first spin, as the town fills; two numbers: each scene draws one between them
-    spins_per_scene: int = Field(default=10, ge=1, le=MOST)  # every agent makes one frame at each
-    every_s: Duration = 1.0  # from one spin to the next, a multiple of 0.1
-    cavs: int = Field(default=1, ge=0, le=1000)  # connected vehicles with sensors: cav0, cav1, ...
-    poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()  # those with sensors, by number
-    vehicle_rig: NamedRig = RIGS["lidar32"]  # the name of a rig, or its sensors
-    pole_rig: NamedRig = RIGS["lidar_pole"]  # the same for every pole
-    weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])  # a name, values, or over time
-    calibration_error: CalibrationError = CalibrationError()  # how far off is what agents believe of their sensors
-    scenarios: tuple[Scenario, ...] = ()  # corner cases that happen in every scene
+    town: str  # name of a town of flcav, or folder of an imported one
+    seed: int = Field(
+        default=0, ge=0, lt=2**63
+    )  # seed of traffic, parked cars and sensor noise; the same seed gives the same bytes
+    split: str = Field(default="train", pattern=r"^[A-Za-z0-9_-]+$")  # data split, e.g. train, validation, test
+    scenes: int = Field(default=1, ge=1, le=MOST)  # scenes, each a traffic run of its own
+    frames: int | None = Field(default=None, ge=1, le=MOST)  # total number of frames; it overrides `scenes`
+    warmup_s: Warmup = 60.0  # traffic before the first spin; two numbers: drawn uniformly between them for each scene
+    spins_per_scene: int = Field(default=10, ge=1, le=MOST)  # LiDAR spins; every agent records a frame at each
+    every_s: Duration = 1.0  # time between two spins, a multiple of 0.1 s
+    cavs: int = Field(default=1, ge=0, le=1000)  # connected vehicles that record: cav0, cav1, ...
+    poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()  # numbers of the poles that record
+    vehicle_rig: NamedRig = RIGS["lidar32"]  # every vehicle's sensors: the name of a rig, or a rig
+    pole_rig: NamedRig = RIGS["lidar_pole"]  # every pole's sensors: the name of a rig, or a rig
+    weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])  # preset, values, keyframes, classes
+    calibration_error: CalibrationError = CalibrationError()  # errors of the calibration that agents assume
+    scenarios: tuple[Scenario, ...] = ()  # corner cases, in every scene
 
     @model_validator(mode="after")
     def _ends(self) -> "Recipe":

@@ -20,11 +20,11 @@ class Weather(Config):
     """The weather at one instant, as continuous parameters."""
 
     sun_elevation_deg: float = Field(default=45.0, ge=-90, le=90)  # above the horizon; night below -6
-    sun_azimuth_deg: float = 160.0  # clockwise from north
-    cloud_cover: float = Field(default=0.1, ge=0, le=1)  # share of the sky
+    sun_azimuth_deg: float = 160.0  # azimuth of the sun, clockwise from north
+    cloud_cover: float = Field(default=0.1, ge=0, le=1)  # fraction of the sky covered by clouds
     rain_mm_h: float = Field(default=0.0, ge=0, le=300)  # rain rate
-    visibility_m: float = Field(default=NO_FOG_M, ge=5, le=1e6)  # meteorological optical range, of haze and fog alone
-    wetness: float = Field(default=0.0, ge=0, le=1)  # of the road: 0 dry, 1 under water
+    visibility_m: float = Field(default=NO_FOG_M, ge=5, le=1e6)  # meteorological optical range, of haze and fog
+    wetness: float = Field(default=0.0, ge=0, le=1)  # wetness of the road: 0 dry, 1 under water
 
     @property
     def night(self) -> bool:
@@ -144,8 +144,8 @@ def _preset(name: Any) -> dict[str, Any]:
 class Keyframe(Config):
     """The weather at one time of a scene."""
 
-    at_s: float = Field(ge=0)  # after the scene's first spin
-    weather: Annotated[Weather, BeforeValidator(_expand_preset)]  # the name of a preset, or values
+    at_s: float = Field(ge=0)  # time after the scene's first spin
+    weather: Annotated[Weather, BeforeValidator(_expand_preset)]  # weather at that time: a preset, or values
 
 
 class WeatherSchedule(Config):
@@ -157,9 +157,11 @@ class WeatherSchedule(Config):
     the name of a preset, or as a `preset` with the fields that differ from it.
     """
 
-    keyframes: tuple[Keyframe, ...] = ()  # between them everything changes evenly
-    classes: tuple[str, ...] = ()  # one is drawn for each scene; "any": of the whole space
-    turn_s: float | None = Field(default=None, gt=0, exclude_if=lambda value: value is None)  # from class to class
+    keyframes: tuple[Keyframe, ...] = ()  # weather at given times, interpolated in between
+    classes: tuple[str, ...] = ()  # one is drawn per scene, and a weather from its region; "any": the whole space
+    turn_s: float | None = Field(
+        default=None, gt=0, exclude_if=lambda value: value is None
+    )  # time of a transition; with it, a scene passes through all classes in a random order
 
     @model_validator(mode="before")
     @classmethod

@@ -3,12 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flcav.config import InputError
 from flcav.experiments.fig6a.findings import allocation_findings
 from flcav.experiments.fig6a.results import EQUAL, JOINT, AllocationResult, AllocationSeed, Planned, Reached
 from flcav.experiments.fig6a.run import PLANS, STAGES, draw_allocation, summarise
 from flcav.experiments.fig6a.tables import tables
 from flcav.intervals import Estimate
-from flcav.pipeline.results import LinkUse
+from flcav.pipeline.results import LinkUse, Placed, Pole
 
 TOWNS = ("grid", "ring")
 PREDICTED = {EQUAL: (0.49, 0.60, 0.62), JOINT: (0.53, 0.63, 0.66)}
@@ -53,6 +54,15 @@ WRONG = results_of(
 
 def verdicts(results: AllocationResult) -> list[str]:
     return [finding.verdict for finding in results.findings]
+
+
+def test_a_region_without_a_sensor_is_named() -> None:
+    nothing = Placed("ring", "vrcsp", (), errors=0, covered=0, range_m=30.0, poles=(Pole(3, 0, 1.5),))
+    with pytest.raises(
+        InputError, match=r"region 'ring': no sensor was placed \(candidate poles: 1, errors to cover: 0\)"
+    ):
+        _ = nothing.first
+    assert replace(nothing, chosen=(3, 5)).first == 3
 
 
 def test_differences_are_paired_by_seed() -> None:

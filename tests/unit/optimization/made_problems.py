@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import parse_config
-from flcav.optimization.allocation.problem import Problem
+from flcav.optimization.problem import Problem
 
 LIMITS = {"samples": [100, 5000], "edge_rounds": [0, 100], "cloud_rounds": [0, 100]}
 SMALL = {"samples": [1, 8], "edge_rounds": [0, 4], "cloud_rounds": [0, 3]}

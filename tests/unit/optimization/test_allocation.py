@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from made_problems import SMALL, parsed, searched, written
 
 from flcav.config import InputError
-from flcav.optimization.allocation.allocate import Allocation, Infeasible, allocate, weighted_error
-from flcav.optimization.solvers.instance import build_instance
+from flcav.optimization.allocation.allocate import Allocation, allocate, weighted_error
+from flcav.optimization.solvers.instance import Infeasible, build_instance
 from flcav.optimization.solvers.separable import ContinuousOptimum, Separable, relax
 
 

@@ -12,7 +12,7 @@ from test_fleet import best_carried, fleet, problem
 from flcav.cli.main import run
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.budget_sweep import compute_savings, sweep_budgets
-from flcav.optimization.fleet import allocate_fleet
+from flcav.optimization.allocation.fleet import allocate_fleet
 
 
 def with_more(values: dict[str, Any], link: str, added: float) -> dict[str, Any]:

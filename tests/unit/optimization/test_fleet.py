@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from flcav.config import parse_config
-from flcav.optimization.allocation.allocate import Infeasible, TaskPlan, allocate
-from flcav.optimization.allocation.problem import Problem
-from flcav.optimization.fleet import allocate_fleet
-from flcav.optimization.solvers.instance import price_counts
-from flcav.optimization.vehicles import split_plan
+from flcav.optimization.allocation.allocate import TaskPlan, allocate
+from flcav.optimization.allocation.fleet import allocate_fleet
+from flcav.optimization.allocation.vehicles import split_plan
+from flcav.optimization.problem import Problem
+from flcav.optimization.solvers.instance import Infeasible, price_counts
 
 
 def problem(tasks: list[dict[str, Any]], **values: Any) -> Problem:

@@ -10,16 +10,15 @@ from flcav.config import InputError, parse_config
 from flcav.network.ledger import LINKS, Budget, Ledger, LedgerEntry
 from flcav.network.plan import MessageSizes, price
 from flcav.optimization.allocation.allocate import (
-    Infeasible,
     TaskPlan,
     allocate,
     resolve_problem,
-    stage_plan,
     weighted_error,
 )
-from flcav.optimization.allocation.area import area
 from flcav.optimization.allocation.baselines import BASELINES, baseline
 from flcav.optimization.allocation.replanning import PlanState, condition_problem, replan
+from flcav.optimization.solvers.area import area
+from flcav.optimization.solvers.instance import Infeasible, stage_plan
 
 LIMITS = {"samples": [20, 900], "edge_rounds": [0, 12], "cloud_rounds": [0, 8]}
 
@@ -49,6 +48,11 @@ def test_a_robust_plan_is_best_for_the_bands_and_never_better_for_the_curves(see
     )
     assert robust.objective <= nominal_by_bands * (1 + 1e-9)
     assert [t.upper_error for t in nominal.tasks] == [None] * 3
+
+
+def test_an_unknown_baseline_is_refused_by_name():
+    with pytest.raises(InputError, match="baseline 'best': unknown; known baselines: equal-stages, equal-tasks"):
+        baseline(parsed(written(1, 1, "additive", LIMITS)), "best")
 
 
 @pytest.mark.parametrize("name", BASELINES)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from flcav.config import parse_config
-from flcav.optimization.allocation.allocate import Infeasible, TaskPlan
-from flcav.optimization.allocation.problem import AllocationTask, Problem
-from flcav.optimization.vehicles import VehicleShare, split_plan
+from flcav.optimization.allocation.allocate import TaskPlan
+from flcav.optimization.allocation.vehicles import VehicleShare, split_plan
+from flcav.optimization.problem import AllocationTask, Problem
+from flcav.optimization.solvers.instance import Infeasible
 
 
 def problem(tasks: list[dict[str, Any]], horizon_s: float | None = None, k: int = 1) -> Problem:

@@ -15,7 +15,7 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames
 from flcav.perception.objects import predict as prediction
-from flcav.perception.objects.model import second_small, second_tiny, small_config, tiny_config
+from flcav.perception.objects.model import second, second_tiny, small_config, tiny_config
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import narrow_range
 from flcav.perception.trajectory.config import CONFIGURATIONS as TRAJECTORIES
@@ -185,7 +185,7 @@ def test_files_have_no_agents(street, tmp_path, capsys):
 
 
 def test_networks_of_different_ranges_are_asked_for_the_same_objects(street):
-    tiny, small = second_tiny(), second_small(classes=("Car",))
+    tiny, small = second_tiny(), second(small_config(("Car",)))
     own, same = [], []
     for network in (tiny, small):
         asked = narrow_range(network.config, "48,24")
@@ -198,7 +198,7 @@ def test_networks_of_different_ranges_are_asked_for_the_same_objects(street):
 def test_beyond_the_range_nothing_is_wrong(street, monkeypatch):
     hit, beyond = detections((10, 3, 0.8)), detections((44, 10, 0.9), (30, -26, 0.9))
     monkeypatch.setattr(prediction, "detect_all", lambda *_, **__: [concatenate([beyond, hit])])
-    network = second_small(classes=("Car",))
+    network = second(small_config(("Car",)))
     ap = [
         OBJECTS.evaluate(network, street, street.select(agents=["cav0"]), asked=asked).scores[0].ap
         for asked in (narrow_range(network.config, "40,24"), narrow_range(network.config, "51,28"))

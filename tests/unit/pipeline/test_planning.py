@@ -1,6 +1,7 @@
 """The plan of a run: both budgets, all tasks."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,13 +14,14 @@ from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.plan import MessageSizes, Price, price
-from flcav.optimization.allocation.allocate import Infeasible
 from flcav.optimization.curves.history import History
+from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.planning import (
     HISTORIES,
+    HistoryPoint,
     PlanRequest,
     PlanSettings,
     append_points,
@@ -131,9 +133,9 @@ def test_a_history_of_the_package_falls_with_every_resource(name: str) -> None:
 
 
 def test_points_are_added_once_and_read_again(tmp_path) -> None:
-    point = {"task": "t", "samples": 8, "edge_rounds": 1, "cloud_rounds": 0, "accuracy": ".5", "weight": 9, "run": "a"}
+    point = HistoryPoint("t", samples=8, edge_rounds=1, cloud_rounds=0, accuracy=0.5, weight=9, run="a")
     for _ in range(2):
-        append_points(tmp_path / "history.csv", [point, point | {"edge_rounds": 2, "accuracy": ".6"}])
+        append_points(tmp_path / "history.csv", [point, replace(point, edge_rounds=2, accuracy=0.6)])
     found = parse_history("t", (tmp_path / "history.csv").read_text(), "history.csv")
     assert found.resources.tolist() == [[8, 1, 0], [8, 2, 0]]
     assert json.dumps(found.accuracy.tolist()) == "[0.5, 0.6]"

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from flcav.experiments.splits import record_split
 from flcav.experiments.studies import STUDIES, study_named
-from flcav.experiments.studies.run import record_split
 from flcav.pipeline import work
 from flcav.pipeline.steps.source_hash import PACKAGES, Sources, find_definitions
 
@@ -193,7 +193,7 @@ def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches
     code = """
         import sys
         from pathlib import Path
-        from flcav.experiments.studies.run import record_split
+        from flcav.experiments.splits import record_split
         from flcav.pipeline.steps import Work
         ran = set()
         def trace(frame, event, argument):

@@ -56,7 +56,7 @@ def test_units_values_and_defaults_are_those_of_the_fields():
         "| `range_m` | m | number, ",
         "| `rain_mm_h` | mm/h | number, 0 to 300 | `0` | rain rate |",
         "| `force_noise` | m/s^2 / sqrt(Hz) | number, ",
-        "| `channels` | | whole number, 1 to 256 | `32` | beams above each other |",
+        "| `channels` | | whole number, 1 to 256 | `32` | number of beams, one above the other |",
         "| `drops` | | true, false | `true` |",
         "| `vehicle_rig` | | [rig](#rigs) | `lidar32` |",
         "| `town` | | text | **required** |",

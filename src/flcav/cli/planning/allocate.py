@@ -1,7 +1,7 @@
 """`flcav allocate`: samples, edge rounds and cloud rounds per task under both uplink budgets (MLGRA)."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,8 @@ if TYPE_CHECKING:
     from flcav.optimization.allocation.allocate import Allocation
     from flcav.optimization.allocation.baselines import Baseline
     from flcav.optimization.allocation.budget_sweep import Saving
-    from flcav.optimization.allocation.problem import Problem
-    from flcav.optimization.vehicles import VehicleShare
-
-    Shares = Mapping[str, Sequence[VehicleShare]]
+    from flcav.optimization.allocation.vehicles import Shares
+    from flcav.optimization.problem import Problem
 
 
 class Compared(StrEnum):
@@ -50,12 +48,12 @@ def allocate(
 ) -> None:
     """Split both uplink budgets over tasks and training stages so that they err least, by the problem's objective."""
     from flcav.config import read_config
-    from flcav.optimization.allocation.allocate import Infeasible
     from flcav.optimization.allocation.baselines import baseline as compared
     from flcav.optimization.allocation.budget_sweep import compute_savings
+    from flcav.optimization.allocation.fleet import allocate_fleet
     from flcav.optimization.allocation.replanning import PlanState, condition_problem
-    from flcav.optimization.fleet import allocate_fleet
     from flcav.optimization.graph import load_problem, read_graph
+    from flcav.optimization.solvers.instance import Infeasible
     from flcav.sources.recipe import find_recipe
 
     problem = find_recipe(problem)
@@ -71,9 +69,11 @@ def allocate(
     more = compute_savings(asked, plan)
     if out is not None:
         from flcav.files import write_bytes
+        from flcav.optimization.allocation.comparison import compare_plan
         from flcav.report.pages.plan_page import plan_page
 
-        write_bytes(out, plan_page(asked, plan, shares, more, read_graph(problem)).encode())
+        page = plan_page(compare_plan(asked, plan, shares, more), read_graph(problem))
+        write_bytes(out, page.encode())
     beside = None if baseline is None else compared(asked, baseline.value)
     if as_json:
         beside_it = {} if beside is None else {"baseline": _plain(beside)}

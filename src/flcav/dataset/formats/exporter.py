@@ -21,11 +21,11 @@ from flcav.sensors.frame import Frame
 class ExportOptions(Config):
     """Options of an export; `export.FORMATS` lists those that apply to each format."""
 
-    labels: Literal["signs", "actors"] = "signs"  # classes of a YOLO export, which has one list
-    validation: float = Field(default=0.2, ge=0, lt=1)  # share of the scenes in the validation split
-    min_pixels: int = Field(default=1, ge=1)  # least visible pixels of a 2D label
+    labels: Literal["signs", "actors"] = "signs"  # classes of a YOLO export, which has one list of classes
+    validation: float = Field(default=0.2, ge=0, lt=1)  # fraction of the scenes in the validation split
+    min_pixels: int = Field(default=1, ge=1)  # least visible pixels of an object with a 2D label
     min_points: int = Field(default=1, ge=0)  # least LiDAR points in the box of a labelled object
-    calibration: Literal["true", "assumed"] = "true"  # which of a frame's two calibrations is written
+    calibration: Literal["true", "assumed"] = "true"  # which of the two calibrations of a frame is written
 
 
 @dataclass(frozen=True)

@@ -5,20 +5,14 @@ cluster; without it, Ray is started on this machine.
 """
 
 import contextlib
-import logging
 import os
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from flcav.config import InputError
 from flcav.dataset.recording.jobs import Engine, Job, Part, perform
-from flcav.extras import format_install_command
+from flcav.processes import ray_session
 from flcav.sources.source import Source
-from flcav.threads import VARIABLES
-
-STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
 
 
 @contextlib.contextmanager
@@ -32,35 +26,6 @@ def start_ray_engine(source: Source, work: Path, jobs: int, wrote: Callable[[int
         shared = ray.put(source)
         actors = [ray.remote(num_cpus=1)(_Worker).remote(shared, work.absolute()) for _ in range(jobs)]
         yield _RayEngine(actors, wrote)
-
-
-@contextlib.contextmanager
-def ray_session(jobs: int) -> Iterator[Any]:
-    """Yield the module `ray`, connected to the cluster of RAY_ADDRESS or, without it, to a local one of `jobs` CPUs.
-
-    Its workers compute on one thread each. Raises `InputError` where Ray is not installed.
-    """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without it, Ray prints a warning
-    try:
-        import ray  # pyright: ignore[reportMissingImports]: an extra
-    except ImportError:
-        raise InputError(f"--engine ray needs Ray, which is not installed: {format_install_command('ray')}") from None
-    variables: dict[str, str] = dict.fromkeys(VARIABLES, "1")
-    local: dict[str, Any] = {}
-    if "RAY_ADDRESS" not in os.environ:
-        local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
-        variables["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # workers find modules as this process does
-    ray.init(
-        **local,
-        runtime_env={"env_vars": variables},
-        log_to_driver=False,
-        logging_level=logging.ERROR,
-    )
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
 
 
 class _Worker:

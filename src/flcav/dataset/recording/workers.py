@@ -3,8 +3,6 @@
 import contextlib
 import multiprocessing
 import os
-import signal
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -13,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flcav.dataset.recording.jobs import Engine, Job, perform
+from flcav.processes import exit_with_parent
 from flcav.sources.source import Source
 from flcav.threads import VARIABLES
 
@@ -95,19 +94,6 @@ def _begin(source: Source, work: Path, written: Any) -> None:
     global _job
     _job = source, work, written
     exit_with_parent()
-
-
-def exit_with_parent() -> None:
-    """Make this worker process ignore Ctrl-C, which the parent handles, and exit when the parent has ended."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_exit_after_parent, daemon=True).start()
-
-
-def _exit_after_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _perform(task: Job) -> None:

@@ -6,22 +6,17 @@ a seed, intervals are a bootstrap over test scenes; over seeds, Student's t, whi
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-from flcav.config import read_config
 from flcav.files import Json
 from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
 from flcav.pipeline.findings import name_stage
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Pole, Run
-from flcav.pipeline.running import run_seeds
-from flcav.pipeline.steps import Notify, Stale
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts import figures
-from flcav.sources.recipe import recipe_path
 
 TASK = "objects"
 ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: name in the tables -> arm, stage
@@ -125,24 +120,11 @@ class ArmsResult(Record):
     note: str = "road labels come from an ideal road detector: arms with a pole are upper bounds"
 
 
-def study_recipe(name: str, scale: str) -> RunRecipe:
-    """Return the package's recipe `runs/<name>`, unchanged for the scale "paper", of the demo's size for others."""
-    recipe = read_config(RunRecipe, recipe_path(f"runs/{name}"))
-    return recipe if scale == "paper" else recipe.model_copy(update={"size": "demo"})
+def compare_arms(recipe: RunRecipe, runs: Sequence[Run]) -> ArmsResult:
+    """Return the results of the arms of `recipe`, from a run of each seed.
 
-
-def run_arms(
-    recipe: RunRecipe,
-    out: Path,
-    *,
-    seeds: int,
-    jobs: int,
-    notify: Notify,
-    stale: Stale = "refuse",
-    engine: str = "processes",
-) -> ArmsResult:
-    """Run or finish all arms of each seed, in folders below `out`, and return the results."""
-    runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    Raises `InputError` where no sensor was placed in a region.
+    """
     rows = tuple(one_seed(run) for run in runs)
     return ArmsResult(rows, summarise(rows), recipe.model_dump(mode="json", exclude={"seed"}), provenance())
 
@@ -187,7 +169,7 @@ def _tested(run: Run, town: str, arm: str, stage: str) -> Reached:
 
 def _placed(run: Run, town: str) -> Placement:
     placed = next(each for each in run.arms[MAIN].placed if each.region == town)
-    return Placement(placed.chosen[0], placed.densest, placed.poles, placed.errors, placed.covered, placed.range_m)
+    return Placement(placed.first, placed.densest, placed.poles, placed.errors, placed.covered, placed.range_m)
 
 
 def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from flcav.experiments.fig1b.columns import Layer
 from flcav.perception.ops.sparse import SparseTensor
+from flcav.report.charts.task_columns import Layer
 
 Named = Mapping[str, nn.Module]
 

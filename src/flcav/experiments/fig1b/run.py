@@ -19,7 +19,6 @@ from flcav.dataset.layout import payload_path
 from flcav.dataset.payloads import POINTS
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.experiments.fig1b import columns as page
 from flcav.experiments.fig1b.layers import LAYERS, capture_inputs, capture_outputs
 from flcav.geometry import inverse, transform_points
 from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
@@ -35,6 +34,7 @@ from flcav.perception.weather.samples import reduce_picture
 from flcav.perception.weather.task import WEATHER
 from flcav.progress import Report, ignore_progress
 from flcav.report import style
+from flcav.report.charts import task_columns as page
 from flcav.report.pictures.clouds import draw_boxes, draw_points
 from flcav.report.pictures.inference import boxes_in_picture
 from flcav.report.pictures.predicted_paths import MAP_COLOURS, paths_on_map

@@ -8,7 +8,6 @@ score after training.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -29,8 +28,6 @@ from flcav.pipeline.planning import load_history
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Run
-from flcav.pipeline.running import run_seeds
-from flcav.pipeline.steps import Notify, Stale
 from flcav.report import style
 from flcav.report.charts import plans
 
@@ -40,18 +37,11 @@ ARM_OF = {EQUAL: "equal", JOINT: MAIN}
 STAGES = (PRETRAIN, EDGE, CLOUD)
 
 
-def run_allocation(
-    recipe: RunRecipe,
-    out: Path,
-    *,
-    seeds: int,
-    jobs: int,
-    notify: Notify,
-    stale: Stale = "refuse",
-    engine: str = "processes",
-) -> AllocationResult:
-    """Run or finish both plans of each seed, in folders below `out`, and return the results."""
-    runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
+def compare_plans(recipe: RunRecipe, runs: Sequence[Run]) -> AllocationResult:
+    """Return the results of both plans of `recipe`, from a run of each seed.
+
+    Raises `InputError` where no sensor was placed in a region.
+    """
     rows = tuple(one_seed(run) for run in runs)
     asked = recipe.model_dump(mode="json", exclude={"seed"})
     results = AllocationResult(_history_ranges(), rows, summarise(rows), recipe=asked, provenance=provenance())
@@ -90,7 +80,7 @@ def one_seed(run: Run) -> AllocationSeed:
             for town in towns
         },
         differences={town: {stage: _difference(found.get((town, stage))) for stage in STAGES} for town in towns},
-        poles={name: {placed.region: placed.chosen[0] for placed in arm.placed} for name, arm in arms.items()},
+        poles={name: {placed.region: placed.first for placed in arm.placed} for name, arm in arms.items()},
         ledger={name: arm.links for name, arm in arms.items()},
     )
 

@@ -4,14 +4,14 @@ Only points inside the view of a forward camera count, since KITTI's labels cove
 """
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects.augment import in_view
-from flcav.report.pictures.clouds import CloudNumbers, SeenCar, Street
 
 RANGES_M = (0, 5, 10, 15, 20, 25, 30, 40, 50, 60, 80)
 GROUND_M = (5, 8, 12, 16, 20, 25)  # limits of the sections of street ahead
@@ -21,6 +21,41 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 NO_INTENSITY = 0.005  # below this a return counts as without intensity
 
 Labelled = tuple[NDArray[np.float32], Boxes]  # points (N, 4) and cars of a frame, LiDAR frame
+
+
+@dataclass(frozen=True)
+class Street:
+    """Medians of the points of the street at some distance ahead."""
+
+    ahead_m: str  # "near-far"
+    height_m: float  # sensor frame
+    spread_m: float  # interquartile range of height
+    intensity: float
+
+
+@dataclass(frozen=True)
+class SeenCar:
+    """A car with returns."""
+
+    distance_m: float
+    returns: int
+    length_m: float
+    width_m: float
+    height_m: float
+    without_intensity: float  # share of its returns
+
+
+@dataclass(frozen=True)
+class CloudNumbers:
+    """Statistics of the clouds of several frames; numbers of returns are means per frame."""
+
+    frames: int
+    returns: float
+    returns_per_range: Mapping[str, float]  # "near-far m" -> returns
+    intensity_quantiles: tuple[float, ...]  # 5, 25, 50, 75 and 95 %
+    without_intensity: float  # share of returns
+    ground: tuple[Street, ...]
+    cars: tuple[SeenCar, ...]
 
 
 def summarise_clouds(frames: Iterable[Labelled]) -> CloudNumbers:

@@ -13,8 +13,8 @@ import numpy as np
 
 from flcav.dataset.formats.kitti.read import KittiFolder, KittiFrame
 from flcav.dataset.store import Dataset
-from flcav.experiments.sim_to_real.clouds import Labelled, summarise_clouds
-from flcav.experiments.studies.run import DATA, record_split
+from flcav.experiments.sim_to_real.clouds import CloudNumbers, Labelled, summarise_clouds
+from flcav.experiments.splits import open_split, record_split
 from flcav.geometry import Boxes, inverse
 from flcav.perception.images import kitti_view
 from flcav.perception.metrics import average_precision, match, round_or_none
@@ -28,7 +28,8 @@ from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps import Notify, Step, run_steps
 from flcav.records import LEFT_OUT, Class, Record
 from flcav.report import style
-from flcav.report.pictures.clouds import CloudNumbers, real_frame
+from flcav.report.charts.clouds import CloudSeries, cloud_statistics
+from flcav.report.pictures.clouds import real_frame
 
 RECIPE: dict[str, Any] = {  # of the simulated scenes
     "town": "suburb",
@@ -112,7 +113,7 @@ def run_sim_to_real(
     run_steps(steps, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     clouds = {REAL: summarise_clouds((frame.points, select_class(frame.objects.boxes, "Car")) for frame in real)}
     for name, step in zip(RIGS, steps, strict=True):
-        data = Dataset.open(out / step.name / DATA)
+        data = open_split(out / step.name)
         clouds[name] = summarise_clouds(labelled(data, number) for number in range(len(data)))
     return SimToReal(clouds, *detections(network, real), provenance(RECIPE["seed"]))
 
@@ -149,6 +150,11 @@ def shown(boxes: Boxes, frame: KittiFrame) -> Boxes:
     return boxes[kitti_view(frame.image, frame.calibration).shows(boxes.center)]
 
 
+def draw_clouds(results: SimToReal) -> bytes:
+    """Return a PNG of the statistics of all clouds."""
+    return style.png(cloud_statistics({name: _series(numbers) for name, numbers in results.clouds.items()}))
+
+
 def draw_frame(kitti: Path, story: FrameResult) -> bytes:
     """Return a PNG of one frame of the results: cloud from above and image, with labelled cars and detections."""
     folder = KittiFolder.open(kitti)
@@ -159,6 +165,12 @@ def draw_frame(kitti: Path, story: FrameResult) -> bytes:
         np.array([0.5 in car.found_at for car in story.cars], dtype=bool),
     )
     return style.png(real_frame(story.frame, frame.points, view, cars, hit, rows_to_boxes(story.boxes)))
+
+
+def _series(numbers: CloudNumbers) -> CloudSeries:
+    street = [(float(np.mean([float(m) for m in row.ahead_m.split("-")])), row.intensity) for row in numbers.ground]
+    cars = [(car.distance_m, car.returns) for car in numbers.cars]
+    return CloudSeries(numbers.returns_per_range, numbers.intensity_quantiles, street, cars)
 
 
 def _neutral(frame: KittiFrame, name: str) -> Boxes:

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from flcav.experiments.sim_to_real.clouds import CloudNumbers, SeenCar
 from flcav.experiments.sim_to_real.run import LabelledCar, RealScore, SimToReal
 from flcav.markdown import format_table
-from flcav.report.pictures.clouds import CloudNumbers, SeenCar
 
 
 def tables(results: SimToReal) -> dict[str, str]:
@@ -14,7 +14,7 @@ def tables(results: SimToReal) -> dict[str, str]:
     clouds = results.clouds
     return {
         "detections": format_table(
-            ("class", "overlap", "labelled", "found", "false", "AP R40"),
+            ("class", "overlap (IoU)", "labelled", "true positives", "false positives", "AP R40"),
             [
                 (row.label, f"{row.kind} at {row.iou}", row.targets, *_found(row))
                 for row in results.scores
@@ -22,7 +22,7 @@ def tables(results: SimToReal) -> dict[str, str]:
             ],
         ),
         "cars": format_table(
-            ("frame", "car at [m]", "found at IoU"),
+            ("frame", "distance of the car [m]", "detected at IoU"),
             [(story.frame, *_car(car)) for story in results.frames for car in story.cars],
         ),
         "clouds": format_table(("", *clouds), _clouds(clouds)),
@@ -43,13 +43,13 @@ def _clouds(clouds: Mapping[str, CloudNumbers]) -> list[list[str]]:
     for name in sorted(columns[0].returns_per_range, key=lambda limits: float(limits.split("-")[0])):
         rows.append([f"of them at {name}", *(f"{c.returns_per_range[name]:.0f}" for c in columns)])
     for place, share in enumerate((5, 25, 50, 75, 95)):
-        rows.append([f"intensity, {share} % are below", *(f"{c.intensity_quantiles[place]:.2f}" for c in columns)])
+        rows.append([f"intensity, {share}th percentile", *(f"{c.intensity_quantiles[place]:.2f}" for c in columns)])
     rows.append(["returns without intensity", *(f"{c.without_intensity:.0%}" for c in columns)])
     for ahead_m in (street.ahead_m for street in columns[0].ground):
         own = [next((street for street in c.ground if street.ahead_m == ahead_m), None) for c in columns]
         for what, values in (
             ("height", [street and street.height_m for street in own]),
-            ("spread of height", [street and street.spread_m for street in own]),
+            ("interquartile range of height", [street and street.spread_m for street in own]),
             ("intensity", [street and street.intensity for street in own]),
         ):
             cells = ["" if value is None else f"{value:.2f}" for value in values]

@@ -31,14 +31,14 @@ def tables(results: StudyResult[ObjectsEvaluation]) -> dict[str, str]:
     return {
         "findings": format_bullets(_findings(results)),
         "classes": format_table(
-            ("test", "class", "to find", *heads, *HEADINGS, "calibration error"), _classes(results)
+            ("test", "class", "targets", *heads, *HEADINGS, "calibration error"), _classes(results)
         ),
-        "slices": format_table(("test", "cars", "to find", *heads), _slices(results)),
+        "slices": format_table(("test", "subset of cars", "targets", *heads), _slices(results)),
         "training": format_table(
             ("seed", "sweeps", "steps", "validation, mean AP3D@0.5 of the classes, after each epoch; the best is kept"),
             training_rows(results),
         ),
-        "tracks": format_table(("class", "MOTA", "AMOTA", "id switches", "velocity off by [m/s]"), _tracks(results)),
+        "tracks": format_table(("class", "MOTA", "AMOTA", "id switches", "velocity error [m/s]"), _tracks(results)),
     }
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar, cast, get_type_hints
 
-from flcav.config import InputError, parse_config
-from flcav.dataset.recording.recorder import record
+from flcav.config import InputError
 from flcav.dataset.store import Dataset
+from flcav.experiments.splits import open_split, record_split
 from flcav.files import Json
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
 from flcav.perception.card import Card
@@ -22,8 +22,6 @@ from flcav.perception.weights import load_network
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps import Notify, Step, Work, run_steps
 from flcav.records import LEFT_OUT, from_json, to_json
-from flcav.sources.embedded import EmbeddedSource
-from flcav.sources.recipe import Recipe
 
 EvaluationT = TypeVar("EvaluationT", bound=Evaluated)
 VALIDATION = "validation"
@@ -89,15 +87,16 @@ class Study(Generic[EvaluationT]):
 
     def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> Json:
         """Train the network of one seed, resuming an interrupted training; return its card as JSON."""
-        data = [open_split(work, step) for step in _training_steps(self)]
-        request = Request(data, open_split(work, VALIDATION), network, epochs, patience, seed)
+        data = [open_split(work.inputs[step]) for step in _training_steps(self)]
+        request = Request(data, open_split(work.inputs[VALIDATION]), network, epochs, patience, seed)
         return train_network(self.task, request, work.folder, work.report).model_dump(mode="json")
 
     def test(self, work: Work, *, seed: int) -> Json:
         """Return the evaluation of one seed's network on each test, as JSON by test."""
         network = load_network(self.task, work.inputs[_seed_step(seed)] / WEIGHTS)
         return {
-            name: self._tested(name, network, open_split(work, _test_step(name)), work) for name in self.recipe.tests
+            name: self._tested(name, network, open_split(work.inputs[_test_step(name)]), work)
+            for name in self.recipe.tests
         }
 
     def _tested(self, name: str, network: Any, data: Dataset, work: Work) -> Mapping[str, Json]:
@@ -202,18 +201,3 @@ def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, MeanOverSeeds]:
 
 def _kind(study: Study[EvaluationT]) -> type[StudyResult[EvaluationT]]:
     return StudyResult[study.evaluation]  # pyright: ignore[reportInvalidTypeArguments]
-
-
-DATA = "data"
-
-
-def record_split(work: Work, recipe: dict[str, Any]) -> dict[str, int]:
-    """Record one split by its recipe; return its number of frames."""
-    source = EmbeddedSource(parse_config(Recipe, recipe, work.folder.name))
-    record(source, work.folder / DATA, progress=work.report)
-    return {"frames": len(Dataset.open(work.folder / DATA))}
-
-
-def open_split(work: Work, step: str) -> Dataset:
-    """Open the dataset that `record_split` recorded in the step `step`."""
-    return Dataset.open(work.inputs[step] / DATA)

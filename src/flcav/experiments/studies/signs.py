@@ -43,7 +43,7 @@ def _findings(results: StudyResult[SignsEvaluation]) -> list[str]:
 
 
 def _heads(results: StudyResult[SignsEvaluation]) -> list[str]:
-    return [head for test in results.summary for head in (f"{test}: to find", "AP50")]
+    return [head for test in results.summary for head in (f"{test}: targets", "AP50")]
 
 
 def _rows(tests: Sequence[Sequence[Sequence[ClassPrecision | SizePrecision]]]) -> list[list[str]]:

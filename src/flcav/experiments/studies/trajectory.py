@@ -35,12 +35,12 @@ def tables(results: StudyResult[TrajectoryEvaluation]) -> dict[str, str]:
         "errors": format_table(
             (
                 "test",
-                "slice",
-                "who predicts",
-                "average error m",
-                "final error m",
-                "missed by 2 m",
-                "of constant velocity",
+                "subset (samples)",
+                "predictor",
+                "average displacement error m",
+                "final displacement error m",
+                "miss rate (2 m)",
+                "final error / that of constant velocity",
             ),
             [row for test, means in results.summary.items() for row in _errors(test, means)],
         ),

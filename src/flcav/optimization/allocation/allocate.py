@@ -1,8 +1,8 @@
 """MLGRA (multi-layer graph resource allocation): samples, edge rounds and cloud rounds per task under uplink budgets.
 
 Plans are in whole numbers and within both budgets. The objective is the weighted error (`solvers.weighted`), the
-largest error (`solvers.fairness`), or the area of the accuracy polygon (`area`), which is maximised. Plans for the
-first two have a proven lower bound. Source: Wang et al., IEEE Network 37(3), 2023, solved exactly.
+largest error (`solvers.fairness`), or the area of the accuracy polygon (`solvers.area`), which is maximised. Plans for
+the first two have a proven lower bound. Source: Wang et al., IEEE Network 37(3), 2023, solved exactly.
 """
 
 from collections.abc import Sequence
@@ -12,13 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.network.plan import Price
-from flcav.optimization.allocation.area import area, maximise_area
-from flcav.optimization.allocation.problem import AllocationTask, Problem
 from flcav.optimization.curves.curves import Curve, Shared
+from flcav.optimization.problem import AllocationTask, Problem
+from flcav.optimization.solvers.area import area, maximise_area
 from flcav.optimization.solvers.fairness import minimise_largest_error
-from flcav.optimization.solvers.instance import Infeasible as Infeasible
 from flcav.optimization.solvers.instance import Instance, build_instance, price_counts
-from flcav.optimization.solvers.instance import stage_plan as stage_plan
 from flcav.optimization.solvers.weighted import minimise_weighted_error
 
 Array = NDArray[np.float64]

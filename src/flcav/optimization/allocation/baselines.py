@@ -10,22 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 
+from flcav.config import InputError, shorten
 from flcav.network.plan import Price
 from flcav.optimization.allocation.allocate import (
-    Infeasible,
     TaskPlan,
     build_task_plans,
     evaluate_objective,
     resolve_problem,
     sum_prices,
 )
-from flcav.optimization.allocation.problem import Problem
+from flcav.optimization.allocation.vehicles import split_plan
+from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
-from flcav.optimization.solvers.instance import Instance, build_instance
+from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance
 from flcav.optimization.solvers.rounding import trim
 from flcav.optimization.solvers.separable import relax
 from flcav.optimization.solvers.weighted import list_terms, minimise_weighted_error
-from flcav.optimization.vehicles import split_plan
 
 Array = NDArray[np.float64]
 
@@ -49,8 +49,10 @@ def baseline(problem: Problem, name: str) -> Baseline:
     """Return the plan of `BASELINES[name]` with its predicted objective.
 
     Baselines respect the fleet's budgets alone: `note` says where the vehicles' samples or links do not suffice. Raises
-    `Infeasible` as `allocate` does, KeyError for an unknown name.
+    `Infeasible` as `allocate` does, `InputError` for an unknown name.
     """
+    if name not in BASELINES:
+        raise InputError(f"baseline {shorten(name)}: unknown; known baselines: {', '.join(BASELINES)}")
     asked = resolve_problem(problem)
     plans = build_task_plans(problem, BASELINES[name](asked, build_instance(asked)))
     try:

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from flcav.network.plan import Price
-from flcav.optimization.allocation.allocate import Allocation, Infeasible, relative_gap
-from flcav.optimization.allocation.problem import Problem
-from flcav.optimization.fleet import allocate_fleet
+from flcav.optimization.allocation.allocate import Allocation, relative_gap
+from flcav.optimization.allocation.fleet import allocate_fleet
+from flcav.optimization.problem import Problem
+from flcav.optimization.solvers.instance import Infeasible
 
 FACTORS = (0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.25, 1.6, 2.0)  # of the problem's budgets
 LINKS = ("wireless", "wireline")

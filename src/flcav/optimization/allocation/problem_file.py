@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.optimization.allocation.allocate import resolve_problem
-from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.curves import Additive, Effective
 from flcav.optimization.curves.fitting import QUANTITIES, CurveFit
+from flcav.optimization.problem import Problem
 
 MEASURES = {"weighted": "weighted error", "max-min": "largest error", "area": "area"}  # by objective; keys of `TERMS`
 STEPS = {  # the quantities that cost uplink megabytes
@@ -43,6 +43,10 @@ TERMS = {
     "proven": "the solver also finds a bound that no plan can be below, so how far this one could still be improved is "
     "known.",
 }
+Array = NDArray[np.float64]
+Edit = tuple[int, int, str]  # start, end, replacement
+DIGITS = 6  # significant digits of a number
+ENDLESS = 10**9  # width of a line that is never wrapped
 
 
 def explain_objective(problem: Problem, objective: float) -> str:
@@ -55,12 +59,6 @@ def explain_objective(problem: Problem, objective: float) -> str:
     if problem.objective != "weighted" or abs(weights - 1) < 1e-9:
         return sentence
     return f"{sentence} Here they sum to {weights:.3g}, and the mean is {objective / weights:.4g}."
-
-
-Array = NDArray[np.float64]
-Edit = tuple[int, int, str]  # start, end, replacement
-DIGITS = 6  # significant digits of a number
-ENDLESS = 10**9  # width of a line that is never wrapped
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from pydantic import Field
 
 from flcav.config import Config, InputError
 from flcav.optimization.allocation.allocate import Allocation, allocate
-from flcav.optimization.allocation.problem import AllocationTask, Budgets, Count, Fraction, Problem
 from flcav.optimization.curves.curves import Additive, Curve, Decay, Effective, NonNegative
+from flcav.optimization.problem import AllocationTask, Budgets, Count, Fraction, Problem
 from flcav.optimization.solvers.instance import price_counts
 
 LEAST_ERROR = 1e-6  # error assumed for an accuracy of 1: test sets are finite
@@ -20,10 +20,12 @@ LEAST_ERROR = 1e-6  # error assumed for an accuracy of 1: test sets are finite
 class TaskState(Config):
     """The resources that one task has spent so far, and the accuracy of its network now."""
 
-    samples: Count
-    edge_rounds: Count = 0
-    cloud_rounds: Count = 0
-    accuracy: Fraction | None = None  # None: not measured; of a cluster: the weighted mean of its members'
+    samples: Count  # samples uploaded so far
+    edge_rounds: Count = 0  # edge rounds done
+    cloud_rounds: Count = 0  # cloud rounds done
+    accuracy: Fraction | None = (
+        None  # accuracy now; None: not measured; of a cluster: the weighted mean of its members'
+    )
 
     @property
     def counts(self) -> tuple[int, int, int]:
@@ -34,15 +36,15 @@ class TaskState(Config):
 class Sent(Config):
     """Uplink messages in the ledger, in total per link [MB]."""
 
-    wireless: NonNegative
-    wireline: NonNegative
+    wireless: NonNegative  # from vehicles to edge servers
+    wireline: NonNegative  # from edge servers to the cloud
 
 
 class PlanState(Config):
     """The state of a plan's execution: resources spent by task, and megabytes sent."""
 
-    tasks: Annotated[Mapping[str, TaskState], Field(min_length=1)]  # by name
-    used_mb: Sent | None = None  # None: the cost of the counts by the problem's sizes
+    tasks: Annotated[Mapping[str, TaskState], Field(min_length=1)]  # resources spent, by task
+    used_mb: Sent | None = None  # megabytes sent; None: the counts times the problem's message sizes
 
 
 def replan(problem: Problem, progress: PlanState, *, gap: float = 1e-4) -> Allocation:

@@ -122,9 +122,9 @@ class Effective(CurveConfig):
 class Member(Config):
     """A member of a cluster: one of the tasks that share a network and its data."""
 
-    name: Annotated[str, Field(min_length=1)]
-    weight: Positive = 1.0
-    curve: Annotated[Additive | Effective, Field(discriminator="model")]
+    name: Annotated[str, Field(min_length=1)]  # name of the task
+    weight: Positive = 1.0  # weight of the task's error in the cluster's mean
+    curve: Annotated[Additive | Effective, Field(discriminator="model")]  # the task's learning curve
 
 
 class Shared(Config):
@@ -133,8 +133,8 @@ class Shared(Config):
     Construction raises pydantic's ValidationError where one of several members has an `Effective` curve.
     """
 
-    model: Literal["shared"]
-    members: Annotated[tuple[Member, ...], Field(min_length=1)]
+    model: Literal["shared"]  # discriminator
+    members: Annotated[tuple[Member, ...], Field(min_length=1)]  # tasks of the cluster
 
     @model_validator(mode="after")
     def _additive(self) -> Self:

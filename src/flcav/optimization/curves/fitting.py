@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from flcav.config import InputError
-from flcav.optimization.curves.curves import STAGES, Additive, Decay, Effective
-from flcav.optimization.curves.forms import STEEPEST, AdditiveForm, CurveT, Form, additive_forms, effective_forms
+from flcav.optimization.curves.curves import STAGES, Additive, Effective
+from flcav.optimization.curves.forms import STEEPEST, CurveT, Form, additive_forms, effective_forms
 from flcav.optimization.curves.history import History
 
 Array = NDArray[np.float64]
@@ -100,19 +100,6 @@ class FitState(Generic[CurveT]):
     error: Array  # (n,)
     weight: Array  # (n,)
     scale: float | None  # residual at which the soft L1 loss turns from squares to absolute values; None: squares
-
-
-def fit_power(resource: ArrayLike, accuracy: ArrayLike) -> Decay:
-    """Return the article's curve, accuracy = 1 - a x^(-b), by plain least squares on accuracies (n,) at resources (n,).
-
-    Resources must be more than 0. Source: Wang et al., IEEE Network 37(3), 2023.
-    """
-    amounts = np.asarray(resource, dtype=np.float64)
-    spent = np.stack((amounts, np.zeros_like(amounts), np.zeros_like(amounts)), axis=1)
-    middle = float(np.exp(np.log(amounts).mean()))
-    form = AdditiveForm((0,), False, (), (middle,), (0.0, 0.0, 0.0))
-    error = 1 - np.asarray(accuracy, dtype=np.float64)
-    return form.curve(_solved(form, spent, error, np.ones(len(error)), False).parameters).pretrain
 
 
 def fit(

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Instance
 from flcav.optimization.solvers.rounding import fill
 from flcav.optimization.solvers.separable import BUDGET_SLACK

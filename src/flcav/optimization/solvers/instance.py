@@ -9,8 +9,8 @@ from scipy.optimize import OptimizeResult
 
 from flcav.config import InputError, shorten
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
-from flcav.optimization.allocation.problem import AllocationTask, Problem
 from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.effective import EffectiveTasks, build_effective_tasks
 from flcav.optimization.solvers.rounding import outermost
 from flcav.optimization.solvers.separable import BUDGET_SLACK, Separable, room

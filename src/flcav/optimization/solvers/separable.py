@@ -8,13 +8,11 @@ it, starting from the largest of the single powers' points. The dual function is
 gradient is the overspend. All steps are vectorised over the quantities.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from flcav.config import InputError
+from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
@@ -120,39 +118,6 @@ class ContinuousOptimum:
     x: Array  # (n,)
     multipliers: Array  # (2,) error saved per unit of each budget
     bound: float  # the dual value: no plan within the budgets has less error
-
-
-def check_separable(
-    a: ArrayLike, b: ArrayLike, x0: ArrayLike, low: ArrayLike, high: ArrayLike, cost: ArrayLike, budget: ArrayLike
-) -> Separable:
-    """Return a checked separable program of n quantities with one inverse power each.
-
-    Shapes are (n,), of `cost` (n, 2) and of `budget` (2,). `high` is lowered to what the budgets leave room for. Raises
-    `InputError` where a shape is wrong, a value is not a number or out of range, `low` is more than `high` or not
-    within the budgets, or the error at `low` is infinite.
-    """
-    named = {"a": a, "b": b, "x0": x0, "low": low, "high": high, "cost": cost, "budget": budget}
-    arrays = {name: np.asarray(values, dtype=np.float64) for name, values in named.items()}
-    n = len(arrays["a"])
-    for name, values in arrays.items():
-        shape = {"cost": (n, 2), "budget": (2,)}.get(name, (n,))
-        if values.shape != shape:
-            raise InputError(f"{name} has shape {values.shape}, and must have {shape}")
-        wrong = ~(values >= 0) if name not in ("b", "budget") else ~(values > 0)
-        wrong |= np.isinf(values) & (name != "high")
-        if wrong.any():
-            at = np.argwhere(wrong)[0]
-            allowed = "more than 0" if name in ("b", "budget") else "0 or more"
-            raise InputError(f"{name}{at.tolist()} = {values[tuple(at)]} must be a finite number of {allowed}")
-    problem = Separable(**arrays, of=None)
-    if not np.all(problem.low <= problem.high):
-        first = int(np.argmax(problem.low > problem.high))
-        raise InputError(f"low[{first}] = {problem.low[first]:g} is more than high[{first}] = {problem.high[first]:g}")
-    if not np.all(np.isfinite(problem.error(problem.low)[problem.a > 0])):
-        raise InputError("low + x0 must be more than 0 wherever a is: the error would be infinite")
-    if not problem.fits(problem.low):
-        raise InputError(f"low costs {problem.spent(problem.low)}, more than budget = {problem.budget}")
-    return replace(problem, high=np.minimum(problem.high, problem.low + room(problem)))
 
 
 def room(problem: Separable) -> Array:

@@ -18,9 +18,11 @@ from flcav.optimization.curves.curves import effective_samples
 from flcav.optimization.solvers.cutting_planes import Line, Program, Term, outer_approximation
 from flcav.optimization.solvers.instance import Instance, require_optimum
 from flcav.optimization.solvers.rounding import fill, trim
-from flcav.optimization.solvers.separable import Separable, newton_step, relax
+from flcav.optimization.solvers.separable import newton_step, relax
 
 Array = NDArray[np.float64]
+CORRECTIONS = 6  # Newton steps of the multipliers over whole quantities; dual points tried
+PLANES = 60  # most cutting planes of the dual
 
 
 @dataclass(frozen=True)
@@ -96,10 +98,6 @@ def list_terms(instance: Instance) -> list[Term]:
     return terms
 
 
-CORRECTIONS = 6  # Newton steps of the multipliers over whole quantities; dual points tried
-PLANES = 60  # most cutting planes of the dual
-
-
 @dataclass(frozen=True)
 class Solution:
     """A whole plan with its weighted error and a proven lower bound."""
@@ -116,11 +114,6 @@ class Solution:
         if bound > 0:
             return (self.error + floor - bound) / bound
         return float(self.error > self.bound)
-
-
-def solve_separable(problem: Separable, gap: float = 1e-4) -> Solution:
-    """Return whole quantities of a separable program within a relative `gap` of the least error."""
-    return minimise_weighted_error(Instance(problem, None, 0.0), gap)
 
 
 def minimise_weighted_error(instance: Instance, gap: float) -> Solution:

@@ -214,11 +214,6 @@ def small_config(
     )
 
 
-def second_small(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), ground_z_m: float = -1.73) -> Second:
-    """Return a new network of `small_config`."""
-    return second(small_config(classes, ground_z_m))
-
-
 def paper_config(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), ground_z_m: float = -1.8) -> SecondConfig:
     """Return the configuration with the published widths: 5.3 M parameters, 0-70.4 m ahead, 40 m to either side.
 

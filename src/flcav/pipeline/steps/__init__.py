@@ -1,10 +1,9 @@
 """Resumable workflows of named steps: finished steps are kept, independent ones run in parallel."""
 
-from flcav.pipeline.steps.run import ENGINES, run_side_by_side, run_steps, stopwatch
+from flcav.pipeline.steps.run import run_side_by_side, run_steps, stopwatch
 from flcav.pipeline.steps.step import FINISHED, STALE, Notify, Stale, Step, Work
 
 __all__ = [
-    "ENGINES",
     "FINISHED",
     "STALE",
     "Notify",

@@ -18,13 +18,14 @@ from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue, SimpleQueue
+from types import ModuleType
 from typing import IO, Any
 
-from flcav.dataset.recording.ray_engine import ray_session
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.steps.engines import KILLED, Engine, Workers, perform
 from flcav.pipeline.steps.source_hash import package_hash
 from flcav.pipeline.steps.step import Record, Step, read_value, remove, reserve_sibling
+from flcav.processes import ray_session
 from flcav.threads import use_threads
 
 PIECE_BYTES = 8_000_000
@@ -47,7 +48,7 @@ def ray_cluster(jobs: int) -> Iterator[Engine]:
 class _Cluster:
     """An engine of Ray actors, each driven by a thread of this process."""
 
-    def __init__(self, ray: Any) -> None:
+    def __init__(self, ray: ModuleType) -> None:
         self._ray = ray
         self._actors: list[Any] = []
 

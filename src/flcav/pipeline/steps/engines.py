@@ -9,13 +9,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from flcav.dataset.recording.workers import exit_with_parent
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps.step import Record, Step, Work, read_value, write_done, write_started
+from flcav.processes import exit_with_parent
 from flcav.progress import Report
 from flcav.threads import use_threads
 
 KILLED = "a step's process was killed from outside, most often for want of memory"
+_queue: Any = None  # in a worker process: `Workers.reports`
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,6 @@ def find_seed(arguments: Mapping[str, Any]) -> int | None:
         if isinstance(seed, int):
             return seed
     return None
-
-
-_queue: Any = None
 
 
 def _start(queue: Any) -> None:

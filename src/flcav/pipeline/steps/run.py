@@ -51,7 +51,7 @@ def _ray(jobs: int) -> Iterator[Engine]:
         yield engine
 
 
-ENGINES: Mapping[str, Callable[[int], contextlib.AbstractContextManager[Engine]]] = {
+_ENGINES: Mapping[str, Callable[[int], contextlib.AbstractContextManager[Engine]]] = {
     "processes": _processes,
     "ray": _ray,
 }
@@ -127,9 +127,9 @@ class _Plan:
 
 def _open_engine(engine: str, jobs: int) -> contextlib.AbstractContextManager[Engine]:
     """Return a context of an engine; raises `InputError` for an unknown one."""
-    if engine not in ENGINES:
-        raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
-    return ENGINES[engine](jobs)
+    if engine not in _ENGINES:
+        raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(_ENGINES)}")
+    return _ENGINES[engine](jobs)
 
 
 def _plan_steps(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Plan:

@@ -18,6 +18,10 @@ from flcav.progress import Report
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
 DONE_NOW, DONE_BEFORE, KEPT = FINISHED = ("done", "done before", "kept, of other code")  # notes of finished steps
+DONE, STARTED = "done.json", "started.json"
+Stale = str  # one of STALE
+STALE = ("refuse", "redo", "keep")  # what to do with steps begun or done by other code
+NAMED = 3  # most steps, or modules, that a message lists
 
 
 @dataclass(frozen=True)
@@ -56,12 +60,6 @@ def _named(value: Any) -> list[Any]:
     if not is_dataclass(value):
         raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a dataclass of them")
     return [type(value).__module__, type(value).__qualname__, {f.name: getattr(value, f.name) for f in fields(value)}]
-
-
-DONE, STARTED = "done.json", "started.json"
-Stale = str  # one of STALE
-STALE = ("refuse", "redo", "keep")  # what to do with steps begun or done by other code
-NAMED = 3  # most steps, or modules, that a message lists
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,14 @@ COLUMNS = {"task": "tasks", "network": "networks", "modality": "modalities", "ve
 COLOURS = {"task": style.ORANGE, "network": style.BLUE, "modality": style.GREEN, "vehicle": style.MUTED}
 GAP = 3.0  # between columns, where a node's row is 1 high
 Node = tuple[str, str]  # kind, name
+NAME_HEIGHT = 0.11  # of the axes: two lines of text
+SERIES_COLOURS = (style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.VERMILLION)
+Route = Sequence[tuple[int, int]]  # edge rounds, cloud rounds, at each x
 
 
 @style.styled
 def three_layers(graph: nx.Graph) -> Figure:
-    """Return the figure of a graph made by `flcav.optimization.graph.build`."""
+    """Return the figure of a graph made by `flcav.optimization.graph.build_graph`."""
     tallest = max(sum(kind == column for _, kind in graph.nodes(data="kind")) for column in COLUMNS)
     figure = style.canvas(6.6, 1.0 + 0.42 * max(tallest, 4))
     draw_layers(figure.add_subplot(), graph)
@@ -82,12 +85,6 @@ def layout(graph: nx.Graph) -> dict[Node, tuple[float, float]]:
         for row, node in enumerate(sorted(column, key=wish)):
             heights[node] = -(row - (len(column) - 1) / 2) * (spread + 1 / max(len(column), 1))
     return {node: (number * GAP, heights[node]) for number, column in enumerate(columns) for node in column}
-
-
-NAME_HEIGHT = 0.11  # of the axes: two lines of text
-SERIES_COLOURS = (style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.VERMILLION)
-
-Route = Sequence[tuple[int, int]]  # edge rounds, cloud rounds, at each x
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from flcav.intervals import MeanOverSeeds
+from flcav.optimization.allocation.budget_sweep import BudgetPoint
 from flcav.report import style
 from flcav.report.charts.figures import WIDTH
 
 TASKS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION, style.RULE)
 SHADES = {"samples": 1.0, "edge rounds": 0.62, "cloud rounds": 0.32}  # opacity by stage
 LINKS = {"both links": style.RULE, "wireless alone": style.BLUE, "wireline alone": style.VERMILLION}
+PLAN_COLOURS = {"equal-stages": style.ORANGE, "joint": style.BLUE}
+PLAN_NAMES = {"equal-stages": "equal stages", "joint": "joint plan"}
+STAGES = {"pretrain": "pretrained", "edge": "edge FL", "cloud": "edge +\ncloud FL"}
+ASIDE = 0.07  # offset that keeps intervals of two plans apart
 
 
 class Part(TypedDict):
@@ -59,7 +64,7 @@ def megabytes(parts: Sequence[Part], links: Mapping[str, Mapping[str, float]]) -
 
 
 @style.styled
-def best_by_budget(sweep: Mapping[str, Sequence[Mapping[str, float]]], measure: str) -> Figure:
+def best_by_budget(sweep: Mapping[str, Sequence[BudgetPoint]], measure: str) -> Figure:
     """Return the optimal objective, called `measure`, against the budgets, scaled together and one at a time."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
     axes = figure.add_subplot()
@@ -67,8 +72,8 @@ def best_by_budget(sweep: Mapping[str, Sequence[Mapping[str, float]]], measure: 
     for name, colour in LINKS.items():
         points = sweep[name]
         line = {"color": colour, "linewidth": widths[name], "marker": "o", "markersize": widths[name] + 1.5}
-        axes.plot([p["factor"] for p in points], [p["objective"] for p in points], **line)
-    now = [p["objective"] for p in sweep["both links"] if p["factor"] == 1]
+        axes.plot([p.factor for p in points], [p.objective for p in points], **line)
+    now = [p.objective for p in sweep["both links"] if p.factor == 1]
     axes.plot([1] * len(now), now, "o", color=style.INK, markersize=8, markeredgecolor="white")
     axes.annotate("this plan", (1, now[0]), (8, 8), textcoords="offset points", fontweight="bold")
     style.key(
@@ -79,12 +84,6 @@ def best_by_budget(sweep: Mapping[str, Sequence[Mapping[str, float]]], measure: 
     axes.set(xlabel="budget, as a multiple of this one", ylabel=measure)
     axes.grid(axis="y")
     return figure
-
-
-COLOURS = {"equal-stages": style.ORANGE, "joint": style.BLUE}
-NAMES = {"equal-stages": "equal stages", "joint": "joint plan"}
-STAGES = {"pretrain": "pretrained", "edge": "edge FL", "cloud": "edge +\ncloud FL"}
-ASIDE = 0.07  # offset that keeps intervals of two plans apart
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,9 @@ def predicted_and_realised(ap: Mapping[str, ByStage], differences: ByStage, town
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     _draw_ap(left, ap, town)
     _draw_differences(right, differences)
-    handles = [Line2D([], [], color=colour, marker="o", label=NAMES[name]) for name, colour in COLOURS.items()]
+    handles = [
+        Line2D([], [], color=colour, marker="o", label=PLAN_NAMES[name]) for name, colour in PLAN_COLOURS.items()
+    ]
     handles += [
         Line2D([], [], color=style.MUTED, linestyle=(0, (3, 2)), marker="D", mfc="white", label="predicted"),
         Line2D([], [], color=style.MUTED, marker="o", label="trained: mean, 95 % over seeds"),
@@ -117,7 +118,7 @@ def predicted_and_realised(ap: Mapping[str, ByStage], differences: ByStage, town
 
 
 def _draw_ap(axes: Axes, ap: Mapping[str, ByStage], town: str) -> None:
-    for side, (name, colour) in zip((-ASIDE, ASIDE), COLOURS.items(), strict=True):
+    for side, (name, colour) in zip((-ASIDE, ASIDE), PLAN_COLOURS.items(), strict=True):
         places = [number + side for number in range(len(STAGES))]
         reached = [ap[name][stage] for stage in STAGES]
         predicted = [each.predicted for each in reached]

@@ -13,6 +13,10 @@ from flcav.report import style
 
 SHADES = LinearSegmentedColormap.from_list("shares", ["white", style.BLUE])
 SIDE_IN, LABELS_IN = 3.6, 1.1
+PANEL_IN, ROW_IN, HEAD_IN = 4.2, 0.27, 0.9
+ABREAST = 3  # panels side by side, at most
+PREDICTOR_COLOURS = (style.RULE, style.BLUE, style.SKY)
+THICK = 0.26
 
 
 @style.styled
@@ -38,10 +42,6 @@ def confusions(counts: Mapping[str, NDArray[np.int64]], classes: Sequence[str]) 
         axes.set_title(f"{title}: {np.trace(matrix) / matrix.sum():.1%} of {matrix.sum()}")
     panels[0].set_ylabel("recorded; % of the row")
     return figure
-
-
-PANEL_IN, ROW_IN, HEAD_IN = 4.2, 0.27, 0.9
-ABREAST = 3  # panels side by side, at most
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,6 @@ def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precis
 
 Panels = Mapping[str, Mapping[str, Sequence[Bar]]]  # test -> slice, with its number of samples -> bars
 
-COLOURS = (style.RULE, style.BLUE, style.SKY)
-THICK = 0.26
-
 
 @style.styled
 def path_errors(panels: Panels) -> Figure:
@@ -96,14 +93,16 @@ def path_errors(panels: Panels) -> Figure:
         axes.set_xlabel("final error after 3 s [m]")
         if number == 0:
             bars = next(iter(slices.values()))
-            handles = [axes.barh([0], [0], color=colour, label=bar.name) for bar, colour in zip(bars, COLOURS)]
+            handles = [
+                axes.barh([0], [0], color=colour, label=bar.name) for bar, colour in zip(bars, PREDICTOR_COLOURS)
+            ]
             style.key(figure, handles)  # pyright: ignore[reportArgumentType]
     return figure
 
 
 def _draw(axes: Axes, slices: Mapping[str, Sequence[Bar]]) -> None:
     for place, bars in enumerate(slices.values()):
-        for number, (bar, colour) in enumerate(zip(bars, COLOURS, strict=True)):
+        for number, (bar, colour) in enumerate(zip(bars, PREDICTOR_COLOURS, strict=True)):
             y = place + (number - 1) * (THICK + 0.02)
             axes.barh(y, bar.mean, THICK, color=colour)
             axes.plot(bar.seeds, [y] * len(bar.seeds), "o", markersize=3, color=style.INK, markeredgewidth=0)

@@ -8,60 +8,51 @@ import networkx as nx
 
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import Allocation, TaskPlan, resolve_problem
-from flcav.optimization.allocation.baselines import baseline
-from flcav.optimization.allocation.budget_sweep import FACTORS, LINKS, BudgetPoint, Saving, sweep_budgets
-from flcav.optimization.allocation.problem import AllocationTask, Problem
+from flcav.optimization.allocation.budget_sweep import LINKS, BudgetPoint
+from flcav.optimization.allocation.comparison import PlanComparison
 from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, explain_objective
-from flcav.optimization.vehicles import VehicleShare
+from flcav.optimization.allocation.vehicles import Shares
+from flcav.optimization.problem import AllocationTask, Problem
 from flcav.report import style
 from flcav.report.charts import curves, plans
 from flcav.report.pages import html
 
 STAGES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
 SHOWN = 6  # tasks with a colour of their own; the others are drawn together
-COARSE = (0.5, 1.0, 2.0)  # budget factors where a plan takes seconds: without a certificate, or by links
 BETTER = {  # effect of more megabytes on the objective
     "weighted": {"verb": "lower the weighted error", "gain": "weighted error saved"},
     "max-min": {"verb": "lower the largest error", "gain": "largest error saved"},
     "area": {"verb": "raise the area", "gain": "area gained"},
 }
-OTHERS = {
+BASELINE_NAMES = {
     "equal-stages": "equal shares for every stage",
     "equal-tasks": "equal shares for every task",
     "max-throughput": "most messages, whatever they teach",
     "article": "the continuous optimum, rounded down",
 }
-Shares = Mapping[str, Sequence[VehicleShare]]
 
 
-def plan_page(
-    problem: Problem, plan: Allocation, shares: Shares, more: Sequence[Saving], graph: nx.Graph | None = None
-) -> str:
+def plan_page(compared: PlanComparison, graph: nx.Graph | None = None) -> str:
     """Return the page as self-contained HTML; `graph`: the three-layer graph that the problem was made from, if any."""
-    results = plan_results(problem, plan, shares, more)
+    results = plan_results(compared)
     pictures = {
         "megabytes": plans.megabytes(results["parts"], results["links"]),
-        "budgets": plans.best_by_budget(results["sweep"], results["measure"]["name"]),
+        "budgets": plans.best_by_budget(compared.sweeps, results["measure"]["name"]),
     }
     if graph is not None:
         pictures["layers"] = curves.three_layers(graph)
     return html.render(results, {name: style.png(figure) for name, figure in pictures.items()}, "plan.html.j2")
 
 
-def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Sequence[Saving]) -> dict[str, Any]:
-    """Return the numbers and sentences of the page, for its template.
-
-    Solves the problem again at multiples of the budgets, and by each of the simpler methods.
-    """
-    scaled = {"both links": LINKS, "wireless alone": ("wireless",), "wireline alone": ("wireline",)}
-    factors = FACTORS if plan.note is None else COARSE
-    sweep = {name: sweep_budgets(problem, plan, links, factors) for name, links in scaled.items()}
+def plan_results(compared: PlanComparison) -> dict[str, Any]:
+    """Return the numbers and sentences of the page, for its template."""
+    problem, plan = compared.problem, compared.plan
     links = {
         link: {
             "budget_mb": getattr(problem.budgets_mb, link),
             "used_mb": getattr(plan.used_mb, f"{link}_mb"),
             "share": getattr(plan.used_mb, f"{link}_mb") / getattr(problem.budgets_mb, link),
-            "more": [asdict(each) for each in more if each.link == link],
+            "more": [asdict(each) for each in compared.savings if each.link == link],
         }
         for link in LINKS
     }
@@ -79,21 +70,18 @@ def plan_results(problem: Problem, plan: Allocation, shares: Shares, more: Seque
         "tasks": tasks,
         "links": links,
         "parts": _parts(problem, plan),
-        "sweep": {name: [asdict(point) for point in points] for name, points in sweep.items()},
-        "vehicles": _vehicles(problem, shares),
+        "vehicles": _vehicles(problem, compared.shares),
         "horizon_s": problem.horizon_s,
         "robust": problem.robust,
         "note": plan.note,
         "warnings": plan.warnings,
         "words": {"steps": STEPS, "curve": CURVE, "terms": _terms(problem, plan)},
         "others": [
-            {"name": name, "objective": other.objective, "note": other.note}
-            for key, name in OTHERS.items()
-            if len(tasks) > 1 or key != "equal-tasks"
-            for other in [baseline(problem, key)]
+            {"name": BASELINE_NAMES[other.name], "objective": other.objective, "note": other.note}
+            for other in compared.baselines
         ],
     }
-    return values | {"sentences": _sentences(values, sweep["both links"])}
+    return values | {"sentences": _sentences(values, compared.sweeps["both links"])}
 
 
 def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:

@@ -24,6 +24,16 @@ TICK = 1.3  # length of the heading's tick, as a multiple of the distance from a
 ALONG = np.linspace(0, 1, 33)  # points of an edge: distortion bends it, and it may end behind the camera
 DISTANCES_M = Normalize(0, 60, clip=True)
 DISTANCE_COLOURS = ListedColormap(colormaps["turbo"](np.linspace(0.08, 0.92, 64))[::-1])
+ONE_IN, SHEET_IN = 8.0, 12.0  # width of a figure of one picture, and of several
+TITLE_IN = 0.32
+ONE_ROW = 3
+KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {  # name in the legend -> colour, categories
+    "cars and vans": (style.BLUE, ("car", "van")),
+    "trucks and buses": (style.PURPLE, ("truck", "bus")),
+    "two-wheelers": (style.GREEN, ("motorcycle", "bicycle")),
+    "pedestrians": (style.VERMILLION, ("pedestrian",)),
+}
+SIGNS = ("signs and lights", style.ORANGE)
 
 
 def show_view(axes: Axes, view: CameraView) -> None:
@@ -63,18 +73,6 @@ def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *,
         zorder=3,
     )
     axes.add_collection(lines, autolim=False)
-
-
-ONE_IN, SHEET_IN = 8.0, 12.0  # width of a figure of one picture, and of several
-TITLE_IN = 0.32
-ONE_ROW = 3
-KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {  # name in the legend -> colour, categories
-    "cars and vans": (style.BLUE, ("car", "van")),
-    "trucks and buses": (style.PURPLE, ("truck", "bus")),
-    "two-wheelers": (style.GREEN, ("motorcycle", "bicycle")),
-    "pedestrians": (style.VERMILLION, ("pedestrian",)),
-}
-SIGNS = ("signs and lights", style.ORANGE)
 
 
 @dataclass(frozen=True)

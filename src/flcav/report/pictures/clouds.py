@@ -1,6 +1,5 @@
-"""Point clouds seen from above, with boxes and matched detections; statistics of real and simulated clouds."""
+"""Point clouds seen from above, with boxes and matched detections; a real frame beside its image."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +17,7 @@ from flcav.report.pictures.camera import boxes_on_picture, show_view
 
 GROUND_M = 0.25  # returns less than this above the ground are drawn as ground
 Extent = tuple[float, float, float]  # shown behind (negative), ahead, aside [m]
+EXTENT = (0.0, 60.0, 22.0)  # of a real frame
 
 
 @dataclass(frozen=True)
@@ -90,75 +90,6 @@ def key(found: Detections | None = None) -> list[Patch]:
     ]
 
 
-COLOURS = (style.INK, style.BLUE, style.ORANGE)
-EXTENT = (0.0, 60.0, 22.0)
-
-
-@dataclass(frozen=True)
-class Street:
-    """Medians of the points of the street at some distance ahead."""
-
-    ahead_m: str  # "near-far"
-    height_m: float  # sensor frame
-    spread_m: float  # interquartile range of height
-    intensity: float
-
-
-@dataclass(frozen=True)
-class SeenCar:
-    """A car with returns."""
-
-    distance_m: float
-    returns: int
-    length_m: float
-    width_m: float
-    height_m: float
-    without_intensity: float  # share of its returns
-
-
-@dataclass(frozen=True)
-class CloudNumbers:
-    """Statistics of the clouds of several frames; numbers of returns are means per frame."""
-
-    frames: int
-    returns: float
-    returns_per_range: Mapping[str, float]  # "near-far m" -> returns
-    intensity_quantiles: tuple[float, ...]  # 5, 25, 50, 75 and 95 %
-    without_intensity: float  # share of returns
-    ground: tuple[Street, ...]
-    cars: tuple[SeenCar, ...]
-
-
-@style.styled
-def compare(clouds: Mapping[str, CloudNumbers]) -> Figure:
-    """Return four panels: returns by range, distribution of intensity, intensity of the street, returns by car."""
-    figure = style.canvas(9.0, 6.4)
-    ranges, intensity, ground, cars = figure.subplots(2, 2).ravel()
-    for numbers, colour in zip(clouds.values(), COLOURS, strict=False):
-        width = 1.8 if colour == style.INK else 1.4
-        per_range = numbers.returns_per_range
-        ranges.plot(range(len(per_range)), list(per_range.values()), "o-", color=colour, linewidth=width, markersize=3)
-        ranges.set_xticks(range(len(per_range)), [key.removesuffix(" m") for key in per_range], rotation=45)
-        intensity.plot(numbers.intensity_quantiles, (5, 25, 50, 75, 95), "o-", color=colour, linewidth=width)
-        street = numbers.ground
-        middle = [np.mean([float(limit) for limit in row.ahead_m.split("-")]) for row in street]
-        ground.plot(middle, [row.intensity for row in street], "o-", color=colour, linewidth=width)
-        dots = np.array([(car.distance_m, car.returns) for car in numbers.cars]).reshape(-1, 2)
-        size = 34 if colour == style.INK else 9
-        cars.scatter(*dots.T, s=size, color=colour, linewidths=0, zorder=3 if colour == style.INK else 2)
-    _name(ranges, "returns of a frame", "distance [m]")
-    _name(intensity, "share of returns below [%]", "intensity")
-    _name(ground, "median intensity of the street", "distance ahead [m]")
-    _name(cars, "returns of a car", "distance [m]")
-    cars.set_yscale("log")
-    ground.set_ylim(bottom=0)
-    handles = [
-        Line2D([], [], color=colour, marker="o", label=name) for name, colour in zip(clouds, COLOURS, strict=False)
-    ]
-    style.key(figure, handles)
-    return figure
-
-
 @style.styled
 def real_frame(
     name: str, points: NDArray[np.float32], view: CameraView, cars: Boxes, hit: NDArray[np.bool_], found: Boxes
@@ -182,9 +113,3 @@ def real_frame(
     colours = {"labelled, found": style.GREEN, "labelled, missed": style.MISSED, "detection": style.BLUE}
     style.key(figure, [Line2D([], [], color=colour, label=name) for name, colour in colours.items()])
     return figure
-
-
-def _name(axes: Axes, y: str, x: str) -> None:
-    axes.set_ylabel(y)
-    axes.set_xlabel(x)
-    axes.grid(axis="y")

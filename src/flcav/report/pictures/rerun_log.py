@@ -8,7 +8,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from io import BytesIO
 from itertools import groupby
-from typing import Any
 
 import numpy as np
 import rerun as rr  # pyright: ignore[reportMissingImports] # of the extra `view`
@@ -35,7 +34,7 @@ AGENTS = "world/agents"
 
 
 def log_scene(
-    recording: Any,
+    recording: rr.RecordingStream,
     dataset: Dataset,
     selected: Sequence[int],
     layers: MapLayers | None,
@@ -60,7 +59,7 @@ def log_scene(
         progress(done, len(selected), "")
 
 
-def blueprint(spin: Sequence[Frame]) -> Any:
+def blueprint(spin: Sequence[Frame]) -> rrb.Blueprint:
     """Return the initial layout of the viewer: the world from above and behind an agent, with its cameras beside.
 
     The agent is the first of the frames `spin` that has cameras, or the first of all.
@@ -77,7 +76,7 @@ def blueprint(spin: Sequence[Frame]) -> Any:
     return rrb.Blueprint(views, rrb.TimePanel(state="collapsed", timeline="spin"), collapse_panels=True)
 
 
-def _log_map(recording: Any, layers: MapLayers) -> None:
+def _log_map(recording: rr.RecordingStream, layers: MapLayers) -> None:
     outlines = {
         "roads": (layers.roads, (110, 110, 115)),
         "sidewalks": (layers.sidewalks, (150, 140, 120)),
@@ -90,12 +89,12 @@ def _log_map(recording: Any, layers: MapLayers) -> None:
     _log_lines(recording, "world/map/markings", [marking.line for marking in layers.markings], (235, 235, 235))
 
 
-def _log_lines(recording: Any, path: str, lines: Sequence[Array], colour: tuple[int, int, int]) -> None:
+def _log_lines(recording: rr.RecordingStream, path: str, lines: Sequence[Array], colour: tuple[int, int, int]) -> None:
     strips = [np.column_stack((line, np.zeros(len(line)))) for line in lines]
     recording.log(path, rr.LineStrips3D(strips, colors=colour, radii=0.05), static=True)
 
 
-def _log_agent(recording: Any, frame: Frame) -> None:
+def _log_agent(recording: rr.RecordingStream, frame: Frame) -> None:
     path = f"{AGENTS}/{frame.agent}"
     _log_pose(recording, path, frame.world_from_agent)
     agent_from_world = inverse(frame.world_from_agent)
@@ -121,16 +120,16 @@ def _log_agent(recording: Any, frame: Frame) -> None:
         recording.log(f"imu/{frame.agent}/{name}", rr.Scalars(reading))
 
 
-def _log_pose(recording: Any, path: str, parent_from_child: Array) -> None:
+def _log_pose(recording: rr.RecordingStream, path: str, parent_from_child: Array) -> None:
     recording.log(path, rr.Transform3D(translation=parent_from_child[:3, 3], mat3x3=parent_from_child[:3, :3]))
 
 
-def _log_radar(recording: Any, path: str, echoes: NDArray[np.float32]) -> None:
+def _log_radar(recording: rr.RecordingStream, path: str, echoes: NDArray[np.float32]) -> None:
     colours = RADAR_COLOURS(0.5 + echoes[:, 3] / (2 * RADAR_M_S), bytes=True)
     recording.log(path, rr.Points3D(echoes[:, :1] * compute_echo_directions(echoes), colors=colours, radii=0.12))
 
 
-def _log_pinhole(recording: Any, path: str, intrinsics: Array, picture: NDArray) -> None:
+def _log_pinhole(recording: rr.RecordingStream, path: str, intrinsics: Array, picture: NDArray) -> None:
     height, width = picture.shape[:2]
     pinhole = rr.Pinhole(
         image_from_camera=intrinsics,
@@ -141,13 +140,13 @@ def _log_pinhole(recording: Any, path: str, intrinsics: Array, picture: NDArray)
     recording.log(path, pinhole)
 
 
-def _log_picture(recording: Any, path: str, pixels: NDArray[np.uint8]) -> None:
+def _log_picture(recording: rr.RecordingStream, path: str, pixels: NDArray[np.uint8]) -> None:
     data = BytesIO()
     Image.fromarray(pixels).save(data, "jpeg", quality=90)
     recording.log(f"{path}/image", rr.EncodedImage(contents=data.getvalue(), media_type="image/jpeg"))
 
 
-def _log_rectangles(recording: Any, path: str, frame: Frame, camera: str) -> None:
+def _log_rectangles(recording: rr.RecordingStream, path: str, frame: Frame, camera: str) -> None:
     truth = frame.annotations
     views, signs = truth.views.get(camera), truth.signs.get(camera)
     if views is not None:
@@ -159,7 +158,7 @@ def _log_rectangles(recording: Any, path: str, frame: Frame, camera: str) -> Non
         _log_boxes(recording, f"{path}/image/signs", signs.box, names, [SIGN] * len(signs))
 
 
-def _log_boxes(recording: Any, path: str, boxes: Array, labels: list[str], colours: list) -> None:
+def _log_boxes(recording: rr.RecordingStream, path: str, boxes: Array, labels: list[str], colours: list) -> None:
     from_corner = boxes.reshape(-1, 4) + 0.5  # Rerun's first pixel begins, ours has its centre at 0
     rectangles = rr.Boxes2D(
         array=from_corner, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=colours, show_labels=False
@@ -167,7 +166,7 @@ def _log_boxes(recording: Any, path: str, boxes: Array, labels: list[str], colou
     recording.log(path, rectangles)
 
 
-def _log_actors(recording: Any, spin: list[Frame], tracks: dict[str, list[Array]]) -> None:
+def _log_actors(recording: rr.RecordingStream, spin: list[Frame], tracks: dict[str, list[Array]]) -> None:
     """Log the actors that any agent's annotations hold, and the track of each up to this spin."""
     actors = {}
     for frame in spin:

@@ -19,8 +19,8 @@ from flcav.world.weather import Weather
 class Camera(Lens):
     """Settings of a colour camera; its mount is in the rig."""
 
-    noise: float = Field(default=0.8, ge=0, le=20)  # standard deviation of a colour value from 0 to 255
-    drops: bool = True  # whether rain leaves drops on the lens
+    noise: float = Field(default=0.8, ge=0, le=20)  # standard deviation of a colour value, 0 to 255
+    drops: bool = True  # rain leaves drops on the lens
 
 
 class Exposure(NamedTuple):

@@ -88,7 +88,7 @@ _BODY = np.array([np.nan if WARMTH[material].body_c is None else WARMTH[material
 class Infrared(Lens):
     """Settings of a thermal camera; its mount is in the rig."""
 
-    noise_k: float = Field(default=0.06, ge=0, le=5)  # standard deviation of a pixel
+    noise_k: float = Field(default=0.06, ge=0, le=5)  # standard deviation of a pixel's temperature
 
 
 def render_thermal(

@@ -24,20 +24,20 @@ NEWTON_STEPS = 12  # by which the distortion is inverted
 class Lens(Config):
     """Image size, intrinsics and distortion of a camera."""
 
-    width: int = Field(default=640, ge=16, le=8192)  # columns [px]
-    height: int = Field(default=384, ge=16, le=8192)  # rows [px]
-    fov_deg: float = Field(default=90.0, gt=1, lt=170)  # horizontal field of view; without effect where fx is given
-    fx: float | None = Field(default=None, ge=1, le=1e6)  # horizontal focal length [px]
-    fy: float | None = Field(default=None, ge=1, le=1e6)  # vertical focal length [px]; fx where it is not given
+    width: int = Field(default=640, ge=16, le=8192)  # image width [px]
+    height: int = Field(default=384, ge=16, le=8192)  # image height [px]
+    fov_deg: float = Field(default=90.0, gt=1, lt=170)  # horizontal field of view; ignored if `fx` is given
+    fx: float | None = Field(default=None, ge=1, le=1e6)  # horizontal focal length [px]; default: from `fov_deg`
+    fy: float | None = Field(default=None, ge=1, le=1e6)  # vertical focal length [px]; default: `fx`
     cx: float | None = Field(
         default=None, ge=-1e6, le=1e6
-    )  # column of the principal point [px]; the image's centre where it is not given
-    cy: float | None = Field(default=None, ge=-1e6, le=1e6)  # row of the principal point [px], likewise
-    k1: float = 0.0  # radial distortion (Brown-Conrady, coefficients as OpenCV's), of r^2
-    k2: float = 0.0  # radial distortion, of r^4
-    p1: float = 0.0  # tangential distortion
-    p2: float = 0.0  # tangential distortion
-    k3: float = 0.0  # radial distortion, of r^6
+    )  # column of the principal point [px]; default: the image's centre
+    cy: float | None = Field(default=None, ge=-1e6, le=1e6)  # row of the principal point [px]; default: image's centre
+    k1: float = 0.0  # radial distortion, coefficient of r^2 (Brown-Conrady model, as in OpenCV)
+    k2: float = 0.0  # radial distortion, coefficient of r^4
+    p1: float = 0.0  # tangential distortion, first coefficient
+    p2: float = 0.0  # tangential distortion, second coefficient
+    k3: float = 0.0  # radial distortion, coefficient of r^6
 
     @model_validator(mode="after")
     def _check_distortion(self) -> "Lens":

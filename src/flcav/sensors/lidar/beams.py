@@ -50,10 +50,10 @@ BEAMS: dict[str, Beams] = {
 class CarlaReturns(Config):
     """The attributes of CARLA's LiDAR, with CARLA's names and defaults."""
 
-    atmosphere_attenuation_rate: float = Field(default=0.004, ge=0, le=10)  # a of exp(-a distance) [1/m]
-    dropoff_general_rate: float = Field(default=0.45, ge=0, le=1)  # share of all rays that is lost
-    dropoff_intensity_limit: float = Field(default=0.8, ge=1e-6, le=1)  # weaker returns may be lost besides
-    dropoff_zero_intensity: float = Field(default=0.4, ge=0, le=1)  # share lost of returns of intensity 0
+    atmosphere_attenuation_rate: float = Field(default=0.004, ge=0, le=10)  # a of intensity = exp(-a distance) [1/m]
+    dropoff_general_rate: float = Field(default=0.45, ge=0, le=1)  # probability that any return is lost
+    dropoff_intensity_limit: float = Field(default=0.8, ge=1e-6, le=1)  # weaker returns may be lost too
+    dropoff_zero_intensity: float = Field(default=0.4, ge=0, le=1)  # probability of loss at intensity 0
 
 
 def carla_returns(

@@ -27,26 +27,26 @@ CLEAR = Weather()
 class Lidar(Config):
     """Settings of a spinning LiDAR; its mount is in the rig."""
 
-    beams: str | None = None  # name of a model: its elevations, and its azimuth steps and range if not given
-    channels: int = Field(default=32, ge=1, le=256)  # beams above each other
-    azimuth_steps: int = Field(default=900, ge=4, le=8192)  # firings of each channel in a spin
-    range_m: float = Field(default=80.0, ge=0.1, le=1000)  # nothing further off is reported
+    beams: str | None = None  # name of a model: its elevations, and its azimuth steps and range by default
+    channels: int = Field(default=32, ge=1, le=256)  # number of beams, one above the other
+    azimuth_steps: int = Field(default=900, ge=4, le=8192)  # firings of each channel in one spin
+    range_m: float = Field(default=80.0, ge=0.1, le=1000)  # maximum range; farther returns are not reported
     up_deg: float = Field(default=3.0, ge=-90, le=90)  # elevation of the highest channel
-    down_deg: float = Field(default=-25.0, ge=-90, le=90)  # elevation of the lowest
-    elevations_deg: tuple[float, ...] | None = None  # of each channel, where they are not evenly spaced
-    rate_hz: float = Field(default=10.0, ge=0.1, le=100)  # spins a second
+    down_deg: float = Field(default=-25.0, ge=-90, le=90)  # elevation of the lowest channel
+    elevations_deg: tuple[float, ...] | None = None  # elevation of each channel, if they are not evenly spaced
+    rate_hz: float = Field(default=10.0, ge=0.1, le=100)  # spins per second
     sensitivity_m: float = Field(
         default=300.0, ge=0.1, le=1e5
-    )  # R_max: a white surface, face on, is detected up to here
+    )  # R_max: detection range of a white surface at normal incidence in clear air
     noise_m: float = Field(default=0.02, ge=0, le=1)  # standard deviation of the measured range
-    dropout: float = Field(default=0.005, ge=0, lt=1)  # share of echoes lost whatever their power
-    glass_pass: float = Field(default=0.9, ge=0, le=1)  # share of rays that pass panes of glass
-    divergence_rad: float = Field(default=0.003, ge=1e-6, le=0.05)  # width of a beam over its range
-    roughness_rad: float = Field(default=0.0, ge=0, le=1.5)  # of ground, masonry, plants and cloth (Oren-Nayar)
-    intensity_gamma: float = Field(default=1.0, ge=0.01, le=2)  # brightness to this power is the intensity reported
-    intensity_floor: float = Field(default=0.0, ge=0, lt=1)  # intensities below are reported as 0
-    rolling: bool = False  # the world and the sensor move on while it spins
-    carla: CarlaReturns | None = None  # report as CARLA's LiDAR does, in place of the power equation
+    dropout: float = Field(default=0.005, ge=0, lt=1)  # probability that a return is lost, whatever its power
+    glass_pass: float = Field(default=0.9, ge=0, le=1)  # fraction of rays that pass panes of glass
+    divergence_rad: float = Field(default=0.003, ge=1e-6, le=0.05)  # beam divergence, full angle
+    roughness_rad: float = Field(default=0.0, ge=0, le=1.5)  # Oren-Nayar roughness of ground, masonry, plants and cloth
+    intensity_gamma: float = Field(default=1.0, ge=0.01, le=2)  # intensity = brightness^gamma
+    intensity_floor: float = Field(default=0.0, ge=0, lt=1)  # intensities below this value are reported as 0
+    rolling: bool = False  # rolling shutter: traffic and sensor move during the spin
+    carla: CarlaReturns | None = None  # CARLA's detection model, in place of the power equation
 
     @model_validator(mode="before")
     @classmethod

@@ -96,18 +96,18 @@ RAIN_DB = (1.13, 0.718)  # k, a of k R^a [dB/km] at 77 GHz: ITU-R P.838-3
 class Radar(Config):
     """Settings of a radar; the defaults are those of a car's front radar."""
 
-    range_m: float = Field(default=120.0, ge=0.1, le=500)  # nothing further off is reported
-    azimuth_deg: float = Field(default=120.0, ge=0.1, le=170)  # field of view from side to side
-    elevation_deg: float = Field(default=20.0, ge=0.1, le=90)  # field of view from bottom to top
-    speed_m_s: float = Field(default=70.0, ge=0.1, le=1000)  # Doppler measured up to here, either way
-    range_cell_m: float = Field(default=0.4, ge=0.01, le=100)  # what is nearer together is one detection
-    azimuth_cell_deg: float = Field(default=2.0, ge=0.01, le=90)  # likewise
-    elevation_cell_deg: float = Field(default=5.0, ge=0.01, le=90)  # likewise
-    doppler_cell_m_s: float = Field(default=0.2, ge=0.001, le=100)  # likewise
+    range_m: float = Field(default=120.0, ge=0.1, le=500)  # maximum range; farther detections are not reported
+    azimuth_deg: float = Field(default=120.0, ge=0.1, le=170)  # horizontal field of view
+    elevation_deg: float = Field(default=20.0, ge=0.1, le=90)  # vertical field of view
+    speed_m_s: float = Field(default=70.0, ge=0.1, le=1000)  # largest radial speed measured, either way
+    range_cell_m: float = Field(default=0.4, ge=0.01, le=100)  # resolution of range
+    azimuth_cell_deg: float = Field(default=2.0, ge=0.01, le=90)  # resolution of azimuth
+    elevation_cell_deg: float = Field(default=5.0, ge=0.01, le=90)  # resolution of elevation
+    doppler_cell_m_s: float = Field(default=0.2, ge=0.001, le=100)  # resolution of radial speed
     detects_car_m: float = Field(
         default=150.0, ge=0.1, le=1e4
-    )  # 10 dBsm ahead are detected half the time at this range
-    false_alarm_rate: float = Field(default=3e-7, ge=1e-15, lt=0.1)  # chance of one in one cell of a sweep
+    )  # range at which 10 dBsm straight ahead in clear air is detected with probability 1/2
+    false_alarm_rate: float = Field(default=3e-7, ge=1e-15, lt=0.1)  # false alarms per resolution cell and sweep
 
     def resolution(self) -> Array:
         """Return a cell's size (4,): range [m], azimuth [rad], elevation [rad] and Doppler [m/s]."""

@@ -63,60 +63,62 @@ ClutterMix = Annotated[dict[str, float], AfterValidator(_clutter_mix)]
 class StreetParameters(Config):
     """Parameters of one street type: buildings, street furniture, parked vehicles and weight as a destination."""
 
-    frontage_m: NotNegative = 0.0  # paving behind the sidewalk
-    setback_m: Interval = (2.0, 4.0)  # from the paving to the facades; intervals are drawn from uniformly
-    building_length_m: Extent = (9.0, 14.0)
-    building_depth_m: Extent = (8.0, 11.0)
-    building_height_m: Extent = (5.0, 8.0)
-    building_gap_m: Interval = (3.0, 7.0)
-    tree_spacing_m: Spacing = 18.0
-    lamp_spacing_m: Spacing = 32.0
-    clutter_spacing_m: Spacing = 25.0
-    clutter: ClutterMix = Field(default={"hedge": 1.0})
-    parked: Share = 0.0  # share of the parking lane's places that are taken
-    parked_mix: VehicleMix = Field(default={"car": 1.0})
-    traffic: NotNegative = 1.0  # relative weight of its edges as a destination of vehicles
-    footfall: NotNegative = 1.0  # relative weight of its edges as a destination of pedestrians
+    frontage_m: NotNegative = 0.0  # width of the paving behind the sidewalk
+    setback_m: Interval = (2.0, 4.0)  # distance from the paving to the facades; intervals are drawn from uniformly
+    building_length_m: Extent = (9.0, 14.0)  # length of a building along the street
+    building_depth_m: Extent = (8.0, 11.0)  # depth of a building
+    building_height_m: Extent = (5.0, 8.0)  # height of a building
+    building_gap_m: Interval = (3.0, 7.0)  # gap between two buildings
+    tree_spacing_m: Spacing = 18.0  # distance between street trees
+    lamp_spacing_m: Spacing = 32.0  # distance between street lamps
+    clutter_spacing_m: Spacing = 25.0  # distance between pieces of street furniture
+    clutter: ClutterMix = Field(default={"hedge": 1.0})  # kinds of street furniture with their weights
+    parked: Share = 0.0  # fraction of the parking lane's places that are taken
+    parked_mix: VehicleMix = Field(default={"car": 1.0})  # categories of parked vehicles with their weights
+    traffic: NotNegative = 1.0  # weight of its edges as destinations of vehicles
+    footfall: NotNegative = 1.0  # weight of its edges as destinations of pedestrians
 
 
 class PoleParameters(Config):
     """A candidate site of a roadside sensor, at the kerb of an edge."""
 
-    id: Annotated[int, Field(ge=1, le=10**6)]
-    kind: Literal["straight", "cross", "tee", "roundabout"]
-    edge: str  # stands on the right of this edge
-    before_end_m: NotNegative  # distance to the edge's end; unless straight, the site faces the junction there
-    height_m: Height = 6.0
+    id: Annotated[int, Field(ge=1, le=10**6)]  # number of the pole in its town
+    kind: Literal["straight", "cross", "tee", "roundabout"]  # kind of street or junction it stands at
+    edge: str  # edge of the net; the pole stands on its right
+    before_end_m: (
+        NotNegative  # distance to the edge's end; unless `kind` is straight, the site faces the junction there
+    )
+    height_m: Height = 6.0  # height of the mount above the ground
 
 
 class GeoReference(Config):
     """Geodetic position of a town's local origin on the WGS 84 ellipsoid; x points east there and y north."""
 
-    latitude_deg: Annotated[float, Field(ge=-90, le=90)] = 49.0
-    longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 8.4
-    altitude_m: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] = 49.0  # geodetic latitude, positive north
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 8.4  # geodetic longitude, positive east
+    altitude_m: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0  # height above the ellipsoid
 
 
 class MapSource(Config):
     """The map a town was imported from."""
 
-    file: str
-    offset_m: tuple[float, float] = (0.0, 0.0)  # town = map + offset
+    file: str  # name of the OpenDRIVE file
+    offset_m: tuple[float, float] = (0.0, 0.0)  # shift from map to town coordinates: town = map + offset
 
 
 class TownParameters(Config):
     """The parameters of a town, as in its file `town.yaml`."""
 
-    description: str
-    geo: GeoReference = GeoReference()
-    source: MapSource | None = None  # None: not imported
-    seed: Annotated[int, Field(ge=0, lt=2**63)]  # of buildings, trees, lamps and clutter
-    vehicles: Many  # moving at once, without the CAVs
-    pedestrians: Many
-    mix: VehicleMix  # category -> weight among moving vehicles
-    shapes: dict[str, dict[str, float]] = Field(default={})  # category -> shape -> weight; equal weights where left out
-    streets: dict[str, StreetParameters]  # by the net's edge type
-    poles: tuple[PoleParameters, ...] = ()
+    description: str  # one line about the town
+    geo: GeoReference = GeoReference()  # geodetic position of the origin
+    source: MapSource | None = None  # map that the town was imported from; None: not imported
+    seed: Annotated[int, Field(ge=0, lt=2**63)]  # seed of buildings, trees, lamps and clutter
+    vehicles: Many  # vehicles moving at once, without the CAVs
+    pedestrians: Many  # pedestrians walking at once
+    mix: VehicleMix  # categories of moving vehicles with their weights
+    shapes: dict[str, dict[str, float]] = Field(default={})  # weights of shapes, by category; equal where left out
+    streets: dict[str, StreetParameters]  # parameters of the streets, by the net's edge type
+    poles: tuple[PoleParameters, ...] = ()  # candidate sites of roadside sensors
 
     @model_validator(mode="after")
     def _known_shapes(self) -> "TownParameters":

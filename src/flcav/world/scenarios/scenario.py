@@ -27,14 +27,18 @@ NEAR_M = 50.0  # from `Scenario.position` to the vehicle under test, at most
 class Scenario(Config):
     """One corner case of a recipe: it begins as soon after `at_s` as the traffic around `near` allows."""
 
-    kind: Kind  # what happens
-    at_s: Annotated[float, Field(gt=0, le=LONGEST_S)]  # of the traffic's clock, as `warmup_s`; not before
-    near: Annotated[str, Field(pattern=r"^cav[0-9]{1,4}$")] | None = None  # that vehicle (cav0); without it, the first
-    position: tuple[float, float] | None = None  # only while that vehicle is within 50 m of x, y [m]
-    lasts_s: Annotated[float, Field(ge=0.1, le=LONGEST_S)] | None = (
-        None  # a stalled vehicle drives on then; without it, never
+    kind: Kind  # kind of corner case
+    at_s: Annotated[float, Field(gt=0, le=LONGEST_S)]  # earliest start, since the start of the traffic run
+    near: Annotated[str, Field(pattern=r"^cav[0-9]{1,4}$")] | None = (
+        None  # vehicle that it happens to; default: the first possible
     )
-    actors: dict[str, str] = Field(default={})  # who takes part, by role: "category.shape", e.g. van: van.high_van
+    position: tuple[float, float] | None = (
+        None  # x, y of the world [m]; it starts only while the vehicle is within 50 m
+    )
+    lasts_s: Annotated[float, Field(ge=0.1, le=LONGEST_S)] | None = (
+        None  # standstill of a `stalled_vehicle`; default: for ever
+    )
+    actors: dict[str, str] = Field(default={})  # shapes by role, e.g. van: van.high_van
 
     @model_validator(mode="after")
     def _known_actors(self) -> "Scenario":

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array, csr_array
 
-from flcav.optimization.allocation.allocate import Infeasible, TaskPlan
-from flcav.optimization.allocation.problem import AllocationTask, Problem, Uplink
+from flcav.optimization.allocation.allocate import TaskPlan
+from flcav.optimization.problem import AllocationTask, Problem, Uplink
+from flcav.optimization.solvers.instance import Infeasible
 
 Array = NDArray[np.float64]
 

@@ -29,9 +29,9 @@ class Quantities(Config):
 class Limits(Config):
     """Least and most of each quantity of a task, both allowed."""
 
-    samples: Range
-    edge_rounds: Range
-    cloud_rounds: Range
+    samples: Range  # (least, most) samples
+    edge_rounds: Range  # (least, most) edge rounds
+    cloud_rounds: Range  # (least, most) cloud rounds
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -60,9 +60,9 @@ class Learner(NamedTuple):
 class Measured(Config):
     """The largest of each quantity in the curve's history; a plan beyond it extrapolates and has a warning."""
 
-    samples: NonNegative | None = None
-    edge_rounds: NonNegative | None = None
-    cloud_rounds: NonNegative | None = None
+    samples: NonNegative | None = None  # most samples in the history
+    edge_rounds: NonNegative | None = None  # most edge rounds in the history
+    cloud_rounds: NonNegative | None = None  # most cloud rounds in the history
 
 
 class AllocationTask(Quantities):

@@ -9,10 +9,11 @@ import pytest
 from flcav.experiments.fig3a.run import article_graph
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.budget_sweep import compute_savings
-from flcav.optimization.allocation.problem import Budgets, Limits, Problem, Uplink
+from flcav.optimization.allocation.comparison import PlanComparison, compare_plan
+from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.allocation.problem_file import STEPS, TERMS
-from flcav.optimization.fleet import allocate_fleet
 from flcav.optimization.graph import load_problem
+from flcav.optimization.problem import Budgets, Limits, Problem, Uplink
 from flcav.report.pages.plan_page import SHOWN, plan_page, plan_results
 
 RECIPES = Path(__file__).parents[3] / "recipes"
@@ -21,14 +22,17 @@ LINKS = {f"car {i}": Uplink(wireless=mbps) for i, mbps in enumerate((12, 9, 15, 
 FLEET = ONE.model_copy(update={"tasks": (ONE.tasks[0].model_copy(update={"uplink_mbps": LINKS}),), "horizon_s": 1800.0})
 
 
-def results_of(problem: Problem) -> dict[str, Any]:
+def compared(problem: Problem) -> PlanComparison:
     plan, shares = allocate_fleet(problem)
-    return plan_results(problem, plan, shares, compute_savings(problem, plan))
+    return compare_plan(problem, plan, shares, compute_savings(problem, plan))
+
+
+def results_of(problem: Problem) -> dict[str, Any]:
+    return plan_results(compared(problem))
 
 
 def page_of(problem: Problem, graph: nx.Graph | None = None) -> str:
-    plan, shares = allocate_fleet(problem)
-    return plan_page(problem, plan, shares, compute_savings(problem, plan), graph)
+    return plan_page(compared(problem), graph)
 
 
 @pytest.fixture(scope="module")

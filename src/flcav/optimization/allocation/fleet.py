@@ -20,7 +20,6 @@ import numpy as np
 from flcav.network.plan import Price
 from flcav.optimization.allocation.allocate import (
     Allocation,
-    Infeasible,
     allocate,
     build_task_plans,
     evaluate_objective,
@@ -28,8 +27,9 @@ from flcav.optimization.allocation.allocate import (
     resolve_problem,
     sum_prices,
 )
-from flcav.optimization.allocation.problem import AllocationTask, Problem
-from flcav.optimization.vehicles import BITS_PER_BYTE, Shares, TooSlow, split_plan
+from flcav.optimization.allocation.vehicles import BITS_PER_BYTE, Shares, TooSlow, split_plan
+from flcav.optimization.problem import AllocationTask, Problem
+from flcav.optimization.solvers.instance import Infeasible
 
 HALVINGS = 9  # steps of the bisection over the share of a budget
 ROUNDING = 1e-9  # relative tolerance of budgets and objectives

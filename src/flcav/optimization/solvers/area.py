@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.allocation.problem import Problem
 from flcav.optimization.curves.curves import Shared
+from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import build_instance
 from flcav.optimization.solvers.weighted import minimise_weighted_error
 

@@ -1,0 +1,60 @@
+"""Worker processes that end with the process that started them, and a session on a Ray cluster."""
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+from flcav.config import InputError
+from flcav.extras import format_install_command
+from flcav.threads import VARIABLES
+
+STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
+
+
+def exit_with_parent() -> None:
+    """Make this worker process ignore Ctrl-C, which the parent handles, and exit when the parent has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_exit_after_parent, daemon=True).start()
+
+
+def _exit_after_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+@contextlib.contextmanager
+def ray_session(jobs: int) -> Iterator[ModuleType]:
+    """Yield the module `ray`, connected to the cluster of RAY_ADDRESS or, without it, to a local one of `jobs` CPUs.
+
+    Its workers compute on one thread each. Raises `InputError` where Ray is not installed.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without it, Ray prints a warning
+    try:
+        import ray  # pyright: ignore[reportMissingImports]: an extra
+    except ImportError:
+        raise InputError(f"--engine ray needs Ray, which is not installed: {format_install_command('ray')}") from None
+    variables: dict[str, str] = dict.fromkeys(VARIABLES, "1")
+    local: dict[str, Any] = {}
+    if "RAY_ADDRESS" not in os.environ:
+        local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
+        variables["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # workers find modules as this process does
+    ray.init(
+        **local,
+        runtime_env={"env_vars": variables},
+        log_to_driver=False,
+        logging_level=logging.ERROR,
+    )
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
