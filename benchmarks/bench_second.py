@@ -22,7 +22,7 @@ import torch
 
 from flcav.perception.device import select_device
 from flcav.perception.objects import Sample, Second, detect, sample_from_frame
-from flcav.perception.objects.loss import predict
+from flcav.perception.objects.predict import predict
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import fresh
 from flcav.perception.training import adamw, step

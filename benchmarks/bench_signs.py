@@ -12,9 +12,9 @@ from cpu_time import cpu_ms
 
 from flcav.config import read_config
 from flcav.perception.signs.config import CONFIGURATIONS
-from flcav.perception.signs.detect import detect
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.outcomes import LOWEST_SCORE
+from flcav.perception.signs.predict import detect
 from flcav.perception.signs.samples import Sample, sample_from_frame
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import fresh

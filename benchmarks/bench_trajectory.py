@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from cpu_time import cpu_ms
 
+from flcav.dataset.layout import FrameKey
 from flcav.perception.task import fresh
 from flcav.perception.training import adamw, step
 from flcav.perception.trajectory.config import CONFIGURATIONS, FUTURE, PAST, TrajectoryConfig
@@ -48,8 +49,9 @@ def extraction_ms() -> float:
     trace = simulate(town, seed=1, cavs=1, times_s=np.arange(60.0, 70.1, 0.5))
     roads, patch = road_map(town), CONFIGURATIONS["tiny"].patch
     wanted = np.ones(len(trace.actor), np.bool_)
-    count = len(extract_columns(trace, 65.0, roads, patch, wanted)["past"])
-    return cpu_ms((lambda: extract_columns(trace, 65.0, roads, patch, wanted),), REPEATS)[0] / count
+    key = FrameKey("scene", 0, "cav0", 65.0)
+    count = len(extract_columns(trace, key, 0, roads, patch, wanted).past)
+    return cpu_ms((lambda: extract_columns(trace, key, 0, roads, patch, wanted),), REPEATS)[0] / count
 
 
 def made_sample(config: TrajectoryConfig) -> Sample:

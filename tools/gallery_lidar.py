@@ -51,7 +51,7 @@ def truth(scene: Scene, own: int) -> Boxes:
 def sweep(scene: Scene, own: int, lidar: Lidar, weather: Weather | None = None) -> np.ndarray:
     """Return (N, 3) points in the carrier's frame."""
     at = scene.world_from_actor(own) @ ROOF
-    points, _ = scan(scene, at, lidar, np.random.default_rng(0), own, weather)
+    points = scan(scene, at, lidar, np.random.default_rng(0), own, weather).points
     return transform_points(ROOF, points[:, :3])
 
 

@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from flcav.files import Json
 
+Place = tuple[int | str, ...]  # path to a nested field: names of fields, indices and keys, as pydantic's `loc`
+
 SHOWN = 80  # most characters of a wrong value that an error message quotes
 
 
@@ -36,7 +38,6 @@ class Config(BaseModel):
 
 
 ConfigT = TypeVar("ConfigT", bound=Config)
-Place = tuple[int | str, ...]  # path to a nested field: names of fields, indices and keys, as pydantic's `loc`
 
 
 def parse_config(model: type[ConfigT], values: object, origin: str) -> ConfigT:

@@ -35,14 +35,18 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def find_existing(path: Path) -> Path:
+    """Return `path`, or the nearest of its parents that exists."""
+    return next(each for each in (path, *path.absolute().parents) if each.exists())
+
+
 def check_writable(folder: Path) -> None:
     """Raise `PermissionError` if no file can be created in `folder`, or in its nearest existing parent.
 
     Leaves no file behind.
     """
-    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
-        tempfile.TemporaryFile(dir=nearest).close()
+        tempfile.TemporaryFile(dir=find_existing(folder)).close()
     except OSError as error:
         # PermissionError whatever the cause: a FileNotFoundError would be reported as a wrong input of the user
         raise PermissionError(error.errno, error.strerror, str(folder)) from None

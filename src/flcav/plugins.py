@@ -3,34 +3,29 @@
 import importlib
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 from flcav.config import InputError
+
+Wanted = TypeVar("Wanted")
 
 PLACE = re.compile(r"\w+(\.\w+)*:\w+")
 
 
-def load_own(kind: str, name: str, known: Iterable[str], wanted: type) -> Any:
-    """Return the object named `name`, written `module:NAME`; `kind` (a task, a strategy) names it in messages.
+def load_named(kind: str, name: str, known: Mapping[str, str | type], wanted: type[Wanted]) -> Wanted:
+    """Return the object named `name`: one of the package's `known` ones, or a user's own, written `module:NAME`.
 
-    The module is imported with the working directory on the path, as by `python -m`. A class is instantiated without
-    arguments. Raises `InputError` for a name without a colon, listing the `known` ones, for a module that is missing or
-    cannot be imported, a name that the module lacks, a class that cannot be instantiated so, and an object without all
-    public members of the protocol `wanted`.
+    kind: a task, a strategy; names it in messages. known: by name the class, or the place as `module:NAME`. A user's
+    module is imported with the working directory on the path, as by `python -m`. A class is instantiated without
+    arguments. Raises `InputError` for a name that is neither known nor has a colon, listing the `known` ones, for a
+    module that is missing or cannot be imported, a name that the module lacks, a class that cannot be instantiated so,
+    and an object without all public members of the protocol `wanted`.
     """
-    place, colon, attribute = name.partition(":")
     told = f"{kind} '{name}'"
-    if not colon:
-        raise InputError(f"{told}: choose one of {', '.join(known)}, or name your own as module:NAME")
-    if not PLACE.fullmatch(name):
-        raise InputError(f"{told}: a module, a colon and a name in it are wanted, as in my_package.my_module:NAME")
-    module = _imported(place, told)
-    if not hasattr(module, attribute):
-        raise InputError(f"{told}: {module.__file__} has no '{attribute}'")
-    found = getattr(module, attribute)
+    found = _load_known(known[name]) if name in known else _load_own(name, told, known)
     if isinstance(found, type):
         try:
             found = found()
@@ -41,6 +36,25 @@ def load_own(kind: str, name: str, known: Iterable[str], wanted: type) -> Any:
     if lacking := [name for name in vars(wanted) if not name.startswith("_") and not hasattr(found, name)]:
         raise InputError(f"{told}: is no {kind}, it has no {', '.join(lacking)}")
     return found
+
+
+def _load_known(known: str | type) -> Any:
+    if isinstance(known, type):
+        return known
+    module, _, attribute = known.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _load_own(name: str, told: str, known: Iterable[str]) -> Any:
+    place, colon, attribute = name.partition(":")
+    if not colon:
+        raise InputError(f"{told}: choose one of {', '.join(known)}, or name your own as module:NAME")
+    if not PLACE.fullmatch(name):
+        raise InputError(f"{told}: a module, a colon and a name in it are wanted, as in my_package.my_module:NAME")
+    module = _imported(place, told)
+    if not hasattr(module, attribute):
+        raise InputError(f"{told}: {module.__file__} has no '{attribute}'")
+    return getattr(module, attribute)
 
 
 def _imported(place: str, told: str) -> ModuleType:

@@ -31,7 +31,8 @@ from flcav.perception.task import Task, find_configuration, fresh
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.training import Checkpointing, Validation, train
 from flcav.perception.training.run import Request, train_network
-from flcav.perception.weather.task import WEATHER, evaluate_whole_space
+from flcav.perception.weather.evaluate import evaluate_whole_space
+from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import load_network, save_network, to_arrays
 from flcav.report import style
 from flcav.report.charts.task_columns import show_layers

@@ -13,6 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from test_record_sensors import resign
 
 from flcav.cli.main import run
+from flcav.config import InputError
 from flcav.dataset.checks.frames import check_points
 from flcav.dataset.checks.validate import validate
 from flcav.dataset.store import Dataset
@@ -96,6 +97,8 @@ def test_missing_times(folder: Path):
     path = folder / "roof" / "grid-3-000_0000_cav0.times.bin"
     path.unlink()
     assert f"{path}: missing" in validate(folder)
+    with pytest.raises(InputError, match=r"grid-3-000_0000_cav0\.times\.bin: missing from the dataset"):
+        first(folder)
 
 
 def test_times_without_their_points(folder: Path):

@@ -194,6 +194,14 @@ def test_an_unfinished_folder_is_no_dataset(folder: Path):
         validate(folder)
 
 
+def test_a_calibration_error_that_is_none(folder: Path):
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["recipe"]["calibration_error"] = {"position_m": "much"}
+    write_json(folder / "manifest.json", manifest)
+    with pytest.raises(InputError, match="calibration_error of the recipe: field 'position_m' = 'much'"):
+        validate(folder)
+
+
 @pytest.mark.parametrize(
     ("edit", "message"),
     [

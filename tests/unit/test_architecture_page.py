@@ -1,9 +1,10 @@
-"""What `docs/architecture.md` says of files: they are there, and a frame's way through them is short."""
+"""What `docs/architecture.md` says of files: they are there, a frame's way is short, and the tasks' names are alike."""
 
 import re
 from pathlib import Path
 
 import flcav
+from flcav.perception.tasks import TASKS
 
 PACKAGE = Path(flcav.__file__).parent
 PAGE = (PACKAGE.parents[1] / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -25,5 +26,17 @@ def test_files_to_start_reading_at_are_there():
 
 def test_no_folder_is_crowded():
     counts = {folder: len(list(folder.glob("[!_]*.py"))) for folder in PACKAGE.rglob("*") if folder.is_dir()}
-    crowded = {folder.relative_to(PACKAGE).as_posix(): count for folder, count in counts.items() if count > 16}
-    assert crowded.keys() <= {"perception/objects"}
+    assert {folder.relative_to(PACKAGE).as_posix(): count for folder, count in counts.items() if count > 16} == {}
+
+
+def test_the_tasks_call_the_same_role_by_the_same_file_name():
+    _, _, section = PAGE.partition("## The files of a task")
+    section, _, _ = section.partition("\n## ")
+    roles = dict(re.findall(r"^\| [\w ]+ \| `(\w+\.py)` \| (.*) \|$", section, re.MULTILINE))
+    always = {file for file, held in roles.items() if not held.startswith("where there")}
+    assert len(always) > 8
+    for task in TASKS:
+        others = set(re.findall(rf"`{task}/(\w+\.py)`", section))
+        files = {path.name for path in (PACKAGE / "perception" / task).glob("[!_]*.py")}
+        assert always <= files <= roles.keys() | others, task
+        assert others <= files, task

@@ -3,7 +3,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flcav.geometry import Boxes, inverse, is_rigid, points_in_boxes, pose, transform_points, wrap_angle
+from flcav.geometry import (
+    Boxes,
+    inverse,
+    is_rigid,
+    points_in_boxes,
+    pose,
+    transform_points,
+    unit_vectors,
+    wrap_angle,
+)
 
 coordinate = st.floats(-100, 100)
 angle = st.floats(-10, 10)
@@ -17,6 +26,13 @@ def test_a_pose_times_its_inverse_is_the_identity(x, y, z, yaw, pitch, roll):
 
 def test_yaw_turns_forward_to_the_left():
     np.testing.assert_allclose(transform_points(pose(1, 2, yaw=np.pi / 2), [[1.0, 0.0, 0.0]]), [[1, 3, 0]], atol=1e-12)
+
+
+@given(angle, st.floats(-1.5, 1.5))
+def test_unit_vectors_are_the_heading_turned_up(azimuth, elevation):
+    expected = pose(0, 0, yaw=azimuth, pitch=-elevation)[:3, 0]
+    np.testing.assert_allclose(unit_vectors(azimuth, elevation), expected, atol=1e-12)
+    assert unit_vectors(np.zeros(5), np.zeros((3, 1))).shape == (3, 5, 3)
 
 
 @given(angle)

@@ -26,7 +26,6 @@ ALLOWED: Mapping[str, str] = {
     "flcav.pipeline.steps.step:Step.arguments": STEPS,
     "flcav.pipeline.steps.step:Step.run": STEPS,
     "flcav.pipeline.steps.step:Work.result": STEPS,
-    "flcav.plugins:load_own": OWN,
 }
 
 

@@ -13,6 +13,20 @@ from rich.markup import escape
 from flcav.config import InputError
 from flcav.perception.tasks import TASKS
 
+THREADS = typer.Option(
+    1,
+    "--threads",
+    min=1,
+    help="Threads to compute on; part of what a seed names: another number, other weights.",
+)
+AGENTS = typer.Option(
+    None,
+    "--agents",
+    help="Whose frames of a dataset: vehicles, poles, all, or names with commas between them. By default those whose "
+    "sensors stand as the network expects: docs/tasks.md.",
+)
+JOBS = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each.")
+
 
 class Device(StrEnum):
     """Device that networks run on."""
@@ -62,21 +76,6 @@ def join_choices(choices: Iterable[str]) -> str:
 
 
 ANY_TASK = f"{join_choices(TASKS)}, or one of your own as module:NAME"
-
-
-THREADS = typer.Option(
-    1,
-    "--threads",
-    min=1,
-    help="Threads to compute on; part of what a seed names: another number, other weights.",
-)
-AGENTS = typer.Option(
-    None,
-    "--agents",
-    help="Whose frames of a dataset: vehicles, poles, all, or names with commas between them. By default those whose "
-    "sensors stand as the network expects: docs/tasks.md.",
-)
-JOBS = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each.")
 ENGINE = typer.Option(Engine.processes, "--engine", help="Who works: processes here, or a cluster by Ray.")
 STALE = typer.Option(
     Stale.refuse,

@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     from flcav.pipeline.recipe import RunRecipe
     from flcav.pipeline.results import Run
 
+RUN = ("jobs", "engine", "stale")  # options of targets that run as steps
+STUDY = ("seeds", "scale", *RUN)  # options of targets that run over seeds
+TASK = "task-"  # before the name of a task's study
+OWN = "a task of your own that says how it is studied, as module:NAME"
+COMMON_SEEDS = 3
+
 
 class Target(StrEnum):
     """Targets other than the tasks' studies."""
@@ -36,18 +42,13 @@ class Scale(StrEnum):
     full = "full"
 
 
-RUN = ("jobs", "engine", "stale")  # options of targets that run as steps
-STUDY = ("seeds", "scale", *RUN)  # options of targets that run over seeds
-TASK = "task-"  # before the name of a task's study
 TARGETS: tuple[str, ...] = (*(target.value for target in Target), *(f"{TASK}{name}" for name in STUDIES))
 TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig1b: (),
     Target.fig3a: (),
     Target.sim_to_real: (*RUN, "kitti", "weights"),
 }
-OWN = "a task of your own that says how it is studied, as module:NAME"
 SEEDS: Mapping[str, int] = {Target.demo_arms: 5}
-COMMON_SEEDS = 3
 
 
 class Reproducible(click.Choice):

@@ -48,7 +48,7 @@ def show(
     As a map: roads, lanes, markings, buildings, trees, signs, lights, and the numbered candidate poles. As a table: the
     poles' id, x, y, z [m, world], yaw_deg and kind, which `flcav place` reads; recipes take the same ids.
     """
-    from flcav.dataset.exchange import write_table
+    from flcav.exchange import write_table
     from flcav.files import write_bytes
     from flcav.report.pictures.town_map import town_map
     from flcav.world.map.census import summarise_town

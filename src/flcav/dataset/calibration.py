@@ -1,12 +1,11 @@
 """The calibration file of a dataset: true and assumed extrinsics, intrinsics and trigger times of each agent's sensors.
 
-JSON: agent -> "true" | "assumed" -> sensor -> {"agent_from_sensor": 16 numbers, row-major, "offset_ms": number [ms],
-and for a camera "intrinsics": 9 numbers, row-major [px], "distortion": 5 numbers}. See `flcav.sensors.frame`.
+JSON: agent -> `AgentEntry`. See `flcav.sensors.frame`.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
 
@@ -23,8 +22,24 @@ class Calibrations(NamedTuple):
     assumed: Calibration
 
 
-def encode_calibration(frame: Frame) -> dict[str, Any]:
-    """Return the entry of the frame's agent in the calibration file: {"true": ..., "assumed": ...}."""
+class SensorEntry(TypedDict):
+    """One sensor in the calibration file."""
+
+    agent_from_sensor: list[float]  # 16 numbers, row-major
+    offset_ms: float  # [ms]
+    intrinsics: NotRequired[list[float]]  # of a camera: 9 numbers, row-major [px]
+    distortion: NotRequired[list[float]]  # of a camera: 5 numbers
+
+
+class AgentEntry(TypedDict):
+    """One agent in the calibration file: sensor -> its true calibration, and the one that the agent assumes."""
+
+    true: dict[str, SensorEntry]
+    assumed: dict[str, SensorEntry]
+
+
+def encode_calibration(frame: Frame) -> AgentEntry:
+    """Return the entry of the frame's agent in the calibration file."""
     return {"true": _sensors(frame.calibration), "assumed": _sensors(frame.assumed)}
 
 
@@ -48,18 +63,18 @@ def read_calibrations(path: Path, sensors: Mapping[str, set[str]]) -> dict[str, 
     return found
 
 
-def _sensors(calibration: Calibration) -> dict[str, Any]:
-    return {
-        sensor: {
+def _sensors(calibration: Calibration) -> dict[str, SensorEntry]:
+    entries: dict[str, SensorEntry] = {}
+    for sensor, mount in calibration.agent_from_sensor.items():
+        entry = entries[sensor] = {
             "offset_ms": float(calibration.offset_ms.get(sensor, 0.0)),
-            **{
-                field: np.asarray(getattr(calibration, field)[sensor]).ravel().tolist()
-                for field in SHAPES
-                if sensor in getattr(calibration, field)
-            },
+            "agent_from_sensor": np.asarray(mount).ravel().tolist(),
         }
-        for sensor in calibration.agent_from_sensor
-    }
+        if sensor in calibration.intrinsics:
+            entry["intrinsics"] = np.asarray(calibration.intrinsics[sensor]).ravel().tolist()
+        if sensor in calibration.distortion:
+            entry["distortion"] = np.asarray(calibration.distortion[sensor]).ravel().tolist()
+    return entries
 
 
 def _calibration(sensors: dict[str, Any]) -> Calibration:

@@ -1,10 +1,10 @@
 """Encoding of frames as table rows; `flcav.dataset.frames` is the inverse."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from flcav.dataset.tables import (
     ACCELERATION_COLUMNS,
@@ -18,9 +18,11 @@ from flcav.dataset.tables import (
     VISIBLE_COLUMNS,
     WEATHER_COLUMNS,
 )
+from flcav.files import Json
 from flcav.sensors.frame import Frame, SignViews, Views
 
-Columns = Mapping[str, Any]
+Column = Sequence[Json] | NDArray
+Columns = Mapping[str, Column]
 
 
 def encode_frame(frame: Frame) -> dict[str, Columns]:
@@ -39,9 +41,10 @@ def build_table(name: str, parts: Sequence[Columns]) -> pa.Table:
     return pa.table({column: _stack([part[column] for part in parts]) for column in schema.names}, schema=schema)
 
 
-def _stack(parts: Sequence[Any]) -> Any:
-    if parts and all(isinstance(part, np.ndarray) for part in parts):
-        return np.concatenate(parts)
+def _stack(parts: Sequence[Column]) -> Column:
+    arrays = [part for part in parts if isinstance(part, np.ndarray)]
+    if parts and len(arrays) == len(parts):
+        return np.concatenate(arrays)
     return [value for part in parts for value in part]
 
 

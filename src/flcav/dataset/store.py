@@ -3,6 +3,7 @@
 import re
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -19,6 +20,7 @@ from flcav.dataset.checks.images import check_planes, check_signs, check_views
 from flcav.dataset.frames import decode_annotations, decode_vectors, decode_weather
 from flcav.dataset.layout import (
     CALIBRATION,
+    FILES,
     FrameKey,
     Manifest,
     payload_path,
@@ -29,13 +31,13 @@ from flcav.dataset.layout import (
 )
 from flcav.dataset.payloads import INFRARED, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, read_table
-from flcav.sensors.frame import CameraImage, Frame
+from flcav.sensors.frame import LONGEST_NAME, CameraImage, Frame, format_key
 from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
 
 POINT_BYTES = 16  # four float32
 KINDS = ("lidar", "radar", "cameras", "infrared")  # columns of `frames` that list sensors
-NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")  # of a frame, scene, agent or sensor: part of file names
+NAME = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")  # of a frame, scene, agent or sensor
 NOT_IN_SAMPLE = ("ax", "ay", "az")  # columns of `annotations` that are no part of a training sample
 
 Value = TypeVar("Value")
@@ -117,8 +119,8 @@ class Dataset:
     def frame(self, i: int) -> Frame:
         """Return frame `i`; its images are read on first access.
 
-        Raises `InputError` where a point cloud is missing or not of the length in the table, and on access to an image
-        that is missing or damaged.
+        Raises `InputError` where a point cloud or its recorded times are missing or not of the length in the table, and
+        on access to an image that is missing or damaged.
         """
         key, calibration = self.keys[i], self.calibrations[self.keys[i].agent]
         poses = self._tables["poses"].slice(i, 1).to_pylist()[0]
@@ -235,13 +237,19 @@ class Dataset:
         }
 
     def _point_times(self, i: int) -> dict[str, NDArray[np.float32]]:
-        """Return LiDAR -> (N,) the times of its points [s], for LiDARs with such a file.
-
-        A missing file is not an error here, since only rolling LiDARs have one; `validate` reports it.
-        """
-        paths = {sensor: self.folder / payload_path(sensor, self._name[i], TIMES) for sensor in self._lidar[i]}
-        timed = {sensor: count for sensor, count in self._lidar[i].items() if paths[sensor].is_file()}
+        """Return LiDAR -> (N,) the times of its points [s], for LiDARs with such a file, the rolling ones."""
+        timed = {
+            sensor: count
+            for sensor, count in self._lidar[i].items()
+            if payload_path(sensor, self._name[i], TIMES) in self._files_of_times
+        }
         return {sensor: times[:, 0] for sensor, times in self._rows_of(i, timed, TIMES).items()}
+
+    @cached_property
+    def _files_of_times(self) -> frozenset[str]:
+        """Return the relative paths of the recorded files of points' times."""
+        paths: list[str] = read_table(self.folder / table_path(FILES), FILES)["path"].to_pylist()
+        return frozenset(path for path in paths if path.endswith(f".{TIMES}"))
 
     def _image(self, i: int, camera: str) -> CameraImage:
         image = CameraImage(**{plane: self.plane(i, camera, plane) for plane in PLANES})
@@ -295,7 +303,7 @@ def _check_frames(frames: pa.Table, path: Path) -> None:
 def _find_wrong_names(frames: pa.Table) -> Iterator[str]:
     """Yield a sentence for each frame whose key does not match its row, or whose time is not finite."""
     for row in frames.to_pylist():
-        if row["key"] != f"{row['scene']}_{row['index']:04d}_{row['agent']}":
+        if row["key"] != format_key(row["scene"], row["index"], row["agent"]):
             yield f"'{row['key']}' is not spin {row['index']} of {row['agent']} in '{row['scene']}'"
         if not np.isfinite(row["time_s"]):
             yield f"'{row['key']}' is at no time"

@@ -24,6 +24,7 @@ RECTANGLE_COLUMNS = ("x1", "y1", "x2", "y2")
 GNSS_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m")
 IMU_COLUMNS = ("force_x", "force_y", "force_z", "rate_x", "rate_y", "rate_z")
 WEATHER_COLUMNS = tuple(Weather.model_fields)
+FILES_SCHEMA = pa.schema([("path", pa.string()), ("bytes", pa.int64()), ("sha256", pa.string())])
 
 
 def _numbers(names: Iterable[str]) -> list[tuple[str, pa.DataType]]:
@@ -103,7 +104,6 @@ SCHEMAS: dict[str, pa.Schema] = {
     "imu": pa.schema([("frame", pa.string()), ("sensor", pa.string()), *_numbers(IMU_COLUMNS)]),
     "weather": pa.schema([("frame", pa.string()), *_numbers(WEATHER_COLUMNS)]),
 }
-FILES_SCHEMA = pa.schema([("path", pa.string()), ("bytes", pa.int64()), ("sha256", pa.string())])
 
 
 def write_table(table: pa.Table, path: Path) -> None:

@@ -10,6 +10,7 @@ from flcav.geometry.poses import (
     rotate,
     rotations_about_z,
     transform_points,
+    unit_vectors,
     wrap_angle,
     yaw_of,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "rotate",
     "rotations_about_z",
     "transform_points",
+    "unit_vectors",
     "wrap_angle",
     "yaw_of",
 ]

@@ -68,6 +68,16 @@ def left_vectors(yaw: ArrayLike) -> Array:
     return np.stack((-np.sin(yaw), np.cos(yaw)), axis=-1)
 
 
+def unit_vectors(azimuth: ArrayLike, elevation: ArrayLike) -> Array:
+    """Return (..., 3) unit vectors x, y, z of spherical coordinates, which broadcast together.
+
+    `azimuth` [rad] is counter-clockwise from x in the x-y plane, `elevation` [rad] the angle above it.
+    """
+    level = np.cos(elevation)
+    parts = np.broadcast_arrays(level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation))
+    return np.stack(parts, axis=-1)
+
+
 def rotations_about_z(yaw: ArrayLike) -> Array:
     """Return (..., 3, 3) rotation matrices by `yaw` (...) [rad] about z."""
     cos, sin = np.cos(yaw), np.sin(yaw)

@@ -18,6 +18,17 @@ Direction = Literal["up", "down"]
 
 LINKS: tuple[Link, ...] = get_args(Link)
 BYTES_PER_MB = 1_000_000
+_SCHEMA = pa.schema(
+    [
+        ("stage", pa.string()),
+        ("task", pa.string()),
+        ("link", pa.string()),
+        ("direction", pa.string()),
+        ("round", pa.int64()),
+        ("client", pa.string()),
+        ("bytes", pa.int64()),
+    ]
+)
 
 
 class BudgetExceeded(InputError):
@@ -150,19 +161,6 @@ class Ledger:
             return cls(budget, (LedgerEntry(**row) for row in table.to_pylist()))
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}: not a ledger ({error})") from None
-
-
-_SCHEMA = pa.schema(
-    [
-        ("stage", pa.string()),
-        ("task", pa.string()),
-        ("link", pa.string()),
-        ("direction", pa.string()),
-        ("round", pa.int64()),
-        ("client", pa.string()),
-        ("bytes", pa.int64()),
-    ]
-)
 
 
 def _mb(count: int) -> str:

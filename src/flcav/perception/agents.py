@@ -7,6 +7,7 @@ from typing import Any
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.perception.task import RigBound, Task
 
 POLE = "pole"  # prefix of the names of roadside agents; all other agents are vehicles
@@ -27,7 +28,7 @@ class FrameSelection:
         left = f" ({_frames(self.left_out)} left out)" if self.left_out else ""
         return _frames(self.used) + left
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Json]:
         """Return the agents and the counts of selected frames as JSON values."""
         return {"agents": list(self.agents), "used": dict(self.used), "left_out": dict(self.left_out)}
 

@@ -124,7 +124,7 @@ def _entry(entry: DataEntry) -> str:
     return f"{entry.name}: {frames}; {_text(recipe)}; SHA-256 of its manifest {entry.manifest}"
 
 
-def _blocks(values: Mapping[str, Any]) -> list[str]:
+def _blocks(values: Mapping[str, Json]) -> list[str]:
     """Return Markdown blocks: one list of the values that fit on a line, then a titled table of each other value."""
     tables = {name: _table(value, values.get("classes")) for name, value in values.items()}
     plain = [f"{name}: {_text(value)}" for name, value in values.items() if tables[name] is None]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 from flcav.perception.training import train_steps
 from flcav.perception.weights import from_arrays, to_arrays
@@ -21,7 +22,7 @@ class Shared(Protocol):
     """A task with its own settings for federated training: recording, kinds of labels, bytes of a sample."""
 
     @property
-    def recording(self) -> Mapping[str, Any]:
+    def recording(self) -> Mapping[str, Json]:
         """Return the fields of the recording's recipe that differ from the recipe's defaults."""
         ...
 
@@ -38,7 +39,7 @@ class Shared(Protocol):
 class WholeFrames:
     """Default settings of a task without its own: whole frames are uploaded, labelled with their ground truth."""
 
-    recording: Mapping[str, Any] = {}
+    recording: Mapping[str, Json] = {}
     labels = (ANNOTATED,)
 
     def sample_bytes(self, data: Dataset, config: Any, frames: Sequence[int]) -> list[int]:
@@ -56,7 +57,7 @@ def picture_bytes(data: Dataset, i: int) -> int:
     return sum(data.plane_path(i, camera, "rgb").stat().st_size for camera in data.cameras(i))
 
 
-def camera_ahead(width: int, height: int, fov_deg: float) -> Mapping[str, Any]:
+def camera_ahead(width: int, height: int, fov_deg: float) -> Mapping[str, Json]:
     """Return a rig of one forward-looking camera behind the windscreen, as the fields of a recipe.
 
     `width` and `height` are in pixels, `fov_deg` is the horizontal field of view.

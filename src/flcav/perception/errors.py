@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from flcav.dataset.exchange import write_table
 from flcav.dataset.store import Dataset
+from flcav.exchange import write_table
 from flcav.progress import Report, ignore_progress
 
 if TYPE_CHECKING:

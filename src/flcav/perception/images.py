@@ -21,9 +21,13 @@ from flcav.sensors.camera.lens import project_points
 from flcav.sensors.frame import Frame
 
 Picture = NDArray[np.uint8]  # (H, W, 3) sRGB
+Array = NDArray[np.float64]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 SMALLEST_PX, LARGEST_PX = 32, 8192  # bounds of an image's width and height
+LEAST_AHEAD = 0.5  # least cosine of the angle between the camera's optical axis and the LiDAR's x axis
+NEAREST_M = 0.1  # near plane: least depth in front of the camera
+BESIDE = 0.5  # margin around the image, in its widths and heights, in which the distortion polynomial is used
 
 
 def read_pictures(path: Path, frames: Sequence[int] | None = None) -> Iterator[tuple[Path, Picture]]:
@@ -95,13 +99,6 @@ def recoloured(picture: Picture, gain: float, saturation: float) -> Picture:
     """Return the image with its brightness scaled by `gain` and its saturation by `saturation`."""
     coloured = ImageEnhance.Color(Image.fromarray(picture)).enhance(saturation)
     return np.asarray(ImageEnhance.Brightness(coloured).enhance(gain))
-
-
-Array = NDArray[np.float64]
-
-LEAST_AHEAD = 0.5  # least cosine of the angle between the camera's optical axis and the LiDAR's x axis
-NEAREST_M = 0.1  # near plane: least depth in front of the camera
-BESIDE = 0.5  # margin around the image, in its widths and heights, in which the distortion polynomial is used
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
-from flcav.perception.objects.area import narrow_range
-from flcav.perception.objects.results import ObjectsEvaluation
+from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.task import ObjectsTask
+from flcav.perception.objects.truth import narrow_range
 from flcav.perception.task import ConfigT, Finding, NetworkT, SampleT, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.tracking.evaluate import evaluate_tracks, group_sequences

@@ -6,10 +6,9 @@
 """
 
 from collections.abc import Mapping
-from importlib import import_module
 from typing import TYPE_CHECKING
 
-from flcav.plugins import load_own
+from flcav.plugins import load_named
 
 if TYPE_CHECKING:
     from flcav.perception.task import Task
@@ -31,9 +30,6 @@ def task_named(name: str) -> "Task":
     >>> list(task_named("objects").configurations)  # networks, the default first
     ['tiny', 'small', 'paper']
     """
-    if name in TASKS:
-        module, _, attribute = TASKS[name].partition(":")
-        return getattr(import_module(module), attribute)
     from flcav.perception.task import Task
 
-    return load_own("task", name, TASKS, Task)
+    return load_named("task", name, TASKS, Task)

@@ -6,10 +6,9 @@ import numpy as np
 
 from flcav.geometry import Boxes
 from flcav.perception.metrics.matching import assign_targets, on_neutral
-from flcav.perception.objects.detect import detect
-from flcav.perception.objects.evaluate import FrameTruth, asked_of
+from flcav.perception.objects.predict import detect
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.truth import choose_lidar
+from flcav.perception.objects.truth import FrameTruth, asked_of, choose_lidar
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.results import SweepComparison, SweepDetections
 from flcav.pipeline.stages import load_stage_network

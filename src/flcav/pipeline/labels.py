@@ -12,12 +12,11 @@ from flcav.fusion.road import RoadView, build_road_view
 from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.perception.client import as_shared
 from flcav.perception.metrics import match
-from flcav.perception.objects.detect import detect_all
-from flcav.perception.objects.evaluate import asked_of
 from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect_all
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.truth import choose_lidar
+from flcav.perception.objects.truth import asked_of, choose_lidar
 from flcav.perception.task import Task
 from flcav.perception.tasks import task_named
 from flcav.pipeline.frames import Frames

@@ -14,6 +14,36 @@ from flcav.world.weather import Weather
 
 Array = NDArray[np.float64]
 
+LONGEST_NAME = 100  # characters of a frame's key, and of the names in it: parts of file names
+
+# Numbers and names of CARLA's semantic tags (0.9.15)
+SEMANTICS: dict[str, int] = {
+    "unlabeled": 0,
+    "road": 1,
+    "sidewalk": 2,
+    "building": 3,
+    "pole": 6,
+    "traffic_light": 7,
+    "traffic_sign": 8,
+    "vegetation": 9,
+    "terrain": 10,
+    "sky": 11,
+    "pedestrian": 12,
+    "rider": 13,
+    "car": 14,
+    "truck": 15,
+    "bus": 16,
+    "motorcycle": 18,
+    "bicycle": 19,
+    "static": 20,
+    "road_line": 24,
+}
+
+
+def format_key(scene: str, index: int, agent: str) -> str:
+    """Return the key of the frame of a scene, spin and agent: see `Frame.key`."""
+    return f"{scene}_{index:04d}_{agent}"
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -35,7 +65,7 @@ class CameraImage:
 
     rgb: NDArray[np.uint8]  # (H, W, 3) sRGB
     depth_m: NDArray[np.float32]  # (H, W) z in the optical frame; inf for the sky
-    semantic: NDArray[np.uint8]  # (H, W) class: see `flcav.sensors.rendering.appearance.SEMANTICS`
+    semantic: NDArray[np.uint8]  # (H, W) class: one of SEMANTICS
     instance: NDArray[np.uint16]  # (H, W) 1 + row of the frame's annotations, 0 where there is no annotated actor
 
 
@@ -123,7 +153,7 @@ class Frame:
     @property
     def key(self) -> str:
         """Return `scene_index_agent`: unique in a dataset, safe as a file name."""
-        return f"{self.scene}_{self.index:04d}_{self.agent}"
+        return format_key(self.scene, self.index, self.agent)
 
     @property
     def agent_from_sensor(self) -> Mapping[str, Array]:

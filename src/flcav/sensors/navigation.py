@@ -1,12 +1,7 @@
-"""GNSS and IMU simulation: white noise and drifting biases (Gauss-Markov process, random walk), and WGS 84 geodesy.
+"""GNSS and IMU simulation: white noise and drifting biases (Gauss-Markov process, random walk).
 
 Biases are simulated on a grid of STEP_S from time 0 and interpolated linearly, so that the value at a time depends on
 the random stream and that time alone, in whatever order times are asked.
-
-Points of a town (east, north, up around its origin) become latitude, longitude and altitude by way of Earth-centred,
-Earth-fixed (ECEF) coordinates on the WGS 84 ellipsoid, without approximation; from ECEF back to latitude by Bowring's
-iteration ("The accuracy of geodetic latitude and height equations", Survey Review 28:202, 1985), exact to nanometres
-near the ground.
 
 A GNSS receiver has white noise and a first-order Gauss-Markov bias. An IMU measures the specific force f = a - g (at
 rest 9.8 m/s^2 upwards) and the angular rate; its white noise is given as a spectral density and its bias as a random
@@ -18,12 +13,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.config import Config
-from flcav.world.map.parameters import GeoReference
+from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.scene import Scene
 
 Array = NDArray[np.float64]
 
 STEP_S = 0.1  # of the grid on which biases are simulated
+GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
 
 
 def draw_gauss_markov(rng: np.random.Generator, time_s: float, deviation: Array, correlation_s: float) -> Array:
@@ -59,50 +55,6 @@ def _read(values: Array, time_s: float) -> Array:
     return (1 - share) * values[int(step)] + share * values[int(step) + 1]
 
 
-EQUATOR_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
-FLATTENING = 1 / 298.257223563
-POLE_M = EQUATOR_M * (1 - FLATTENING)  # semi-minor axis
-ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)  # first eccentricity, squared
-ITERATIONS = 4  # of Bowring's method
-
-
-def convert_to_geodetic(origin: GeoReference, enu: Array) -> Array:
-    """Return (..., 3) latitude [deg], longitude [deg], altitude [m], WGS 84, of points (..., 3) east, north, up [m]."""
-    return _from_earth(_to_earth(origin) + enu @ _earth_from_enu(origin).T)
-
-
-def _to_earth(at: GeoReference) -> Array:
-    lat, lon = np.radians((at.latitude_deg, at.longitude_deg))
-    normal = EQUATOR_M / np.sqrt(1 - ECCENTRICITY2 * np.sin(lat) ** 2)
-    level = (normal + at.altitude_m) * np.cos(lat)
-    return np.array(
-        [level * np.cos(lon), level * np.sin(lon), (normal * (1 - ECCENTRICITY2) + at.altitude_m) * np.sin(lat)]
-    )
-
-
-def _earth_from_enu(at: GeoReference) -> Array:
-    lat, lon = np.radians((at.latitude_deg, at.longitude_deg))
-    east = (-np.sin(lon), np.cos(lon), 0.0)
-    north = (-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat))
-    up = (np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat))
-    return np.array((east, north, up)).T
-
-
-def _from_earth(earth: Array) -> Array:
-    x, y, z = np.moveaxis(earth, -1, 0)
-    level = np.hypot(x, y)
-    beyond = ECCENTRICITY2 / (1 - ECCENTRICITY2)
-    reduced = np.arctan2(z * EQUATOR_M, level * POLE_M)
-    lat = reduced
-    for _ in range(ITERATIONS):
-        lat = np.arctan2(
-            z + beyond * POLE_M * np.sin(reduced) ** 3, level - ECCENTRICITY2 * EQUATOR_M * np.cos(reduced) ** 3
-        )
-        reduced = np.arctan2((1 - FLATTENING) * np.sin(lat), np.cos(lat))
-    altitude = level * np.cos(lat) + z * np.sin(lat) - EQUATOR_M * np.sqrt(1 - ECCENTRICITY2 * np.sin(lat) ** 2)
-    return np.stack((np.degrees(lat), np.degrees(np.arctan2(y, x)), altitude), axis=-1)
-
-
 class Gnss(Config):
     """Error model of a GNSS receiver; the defaults are those of a single-frequency receiver under open sky."""
 
@@ -128,9 +80,6 @@ def measure_position(
     noise = rng.standard_normal(3) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
     bias = draw_gauss_markov(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
     return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + noise + bias)
-
-
-GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
 
 
 class Imu(Config):

@@ -15,7 +15,7 @@ from flcav.sensors.camera.infrared import render_thermal
 from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
 from flcav.sensors.labels.annotate import Sight, Sweep, annotate
-from flcav.sensors.lidar.lidar import Lidar, cast, draw_passes, measure, point_times_s
+from flcav.sensors.lidar.lidar import Lidar, point_times_s, scan
 from flcav.sensors.navigation import measure_inertia, measure_position
 from flcav.sensors.radar.radar import sweep_radar
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
@@ -183,13 +183,11 @@ def _sweep(
 ) -> tuple[NDArray[np.float32], Sweep]:
     """Return the points (N, 4) of a LiDAR, and its rays and counts for the ground truth."""
     scene, world_from_sensor = carrier.scene, carrier.go_to(name)
-    passes = draw_passes(lidar, rng)
-    echoes = cast(scene, world_from_sensor, lidar, passes, carrier.own)
-    points, actor = measure(scene, world_from_sensor, lidar, echoes, rng, weather)
+    points, actor, passes, hits = scan(scene, world_from_sensor, lidar, rng, carrier.own, weather)
     count = len(scene.trace.actor)
     returns = np.bincount(actor + 1, minlength=count + 1)[1:]
-    visible = np.bincount(echoes.instance + 1, minlength=count + 2)[2:]  # without misses (-1) and the town (0)
-    return points, Sweep(lidar, world_from_sensor, passes, echoes.distance, echoes.instance, returns, visible)
+    visible = np.bincount(hits.instance + 1, minlength=count + 2)[2:]  # without misses (-1) and the town (0)
+    return points, Sweep(lidar, world_from_sensor, passes, hits.distance, hits.instance, returns, visible)
 
 
 def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> NDArray[np.int32]:

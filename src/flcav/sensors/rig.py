@@ -13,6 +13,7 @@ from flcav.config import Config
 from flcav.geometry import heading_vectors, pose
 from flcav.sensors.camera.camera import Camera
 from flcav.sensors.camera.infrared import Infrared
+from flcav.sensors.frame import LONGEST_NAME
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.navigation import Gnss, Imu
 from flcav.sensors.radar.radar import Radar
@@ -20,11 +21,13 @@ from flcav.sensors.radar.radar import Radar
 CAMERA_RANGE_M = 100.0  # of ground truth for rigs without LiDAR; what shows in an image is labelled at any distance
 TRIGGER_MS = 100.0  # largest offset of a trigger from the spin
 RESERVED = ("traces", "town")  # folders of a dataset, so no names of sensors
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-
+_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
 
 Reach = Annotated[float, Field(ge=-100, le=100)]  # [m]
 Turn = Annotated[float, Field(ge=-360, le=360)]  # [deg]
+# Velodyne's data sheet: range 50 m for pavement (reflectivity 0.1), 120 m for cars and foliage (0.8): 134 m for white.
+# Its intensities are compressed, and many returns from dark or glossy bodies have intensity 0.
+HDL64E = Lidar(beams="hdl64e", sensitivity_m=134.0, roughness_rad=0.6, intensity_gamma=0.5, intensity_floor=0.15)
 
 
 class Mount(Config):
@@ -116,7 +119,8 @@ class Rig(Config):
                 raise ValueError(f"two sensors are called '{name}'; names must differ over all kinds")
             if not _NAME.fullmatch(name) or name in RESERVED:
                 raise ValueError(
-                    f"sensor name '{name}': must be letters, digits, - and _, and none of {', '.join(RESERVED)}"
+                    f"sensor name '{name}': must be letters, digits, - and _, {LONGEST_NAME} at most, and none of "
+                    f"{', '.join(RESERVED)}"
                 )
         return self
 
@@ -166,11 +170,6 @@ def roadside() -> Rig:
         for name, yaw_deg in (("camera_left", 42.0), ("camera_right", -42.0))
     }
     return Rig(lidars=lidar_pole().lidars, cameras=cameras)
-
-
-# Velodyne's data sheet: range 50 m for pavement (reflectivity 0.1), 120 m for cars and foliage (0.8): 134 m for white.
-# Its intensities are compressed, and many returns from dark or glossy bodies have intensity 0.
-HDL64E = Lidar(beams="hdl64e", sensitivity_m=134.0, roughness_rad=0.6, intensity_gamma=0.5, intensity_floor=0.15)
 
 
 def kitti_lidar() -> Rig:

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.files import Json, sha256
 from flcav.seeds import derive_seed, stream
-from flcav.sensors.frame import Frame
+from flcav.sensors.frame import LONGEST_NAME, Frame, format_key
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.recipe import Recipe
@@ -31,7 +31,7 @@ class EmbeddedSource:
         """Load the town of `recipe`; a town's folder may also be relative to `beside`, the folder of the recipe.
 
         Raises `InputError` where the town or a pole does not exist, there is neither a vehicle nor a pole to observe,
-        or a sensor is not mounted above the ground.
+        a sensor is not mounted above the ground, or the town's name is too long for the names of frames.
         """
         self.recipe = recipe
         self.town = load_town(recipe.town, beside)
@@ -50,6 +50,12 @@ class EmbeddedSource:
             _check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
         self._per_scene = recipe.spins_per_scene * len(self.agents)
         self._frames = recipe.frames or recipe.scenes * self._per_scene
+        longest = max((format_key(self.scenes()[-1], recipe.spins_per_scene - 1, one) for one in self.agents), key=len)
+        if len(longest) > LONGEST_NAME:
+            raise InputError(
+                f"field 'town' = {shorten(recipe.town)}: a frame would be called {shorten(longest)}, {len(longest)} "
+                f"characters where {LONGEST_NAME} are allowed; give the town's folder a shorter name"
+            )
         self._last_trace: tuple[str, Trace] | None = None
         self._last_scene: tuple[str, Scene] | None = None
 

@@ -5,6 +5,38 @@ from typing import NamedTuple
 
 import numpy as np
 
+PAINT_REFLECTIVITY = np.array([0.08, 0.14, 0.22, 0.30, 0.45, 0.60, 0.70], np.float32)  # (P,) car paints, black to white
+# Albedos, linear red, green, blue, that go with each of PAINT_REFLECTIVITY: dark at 905 nm is roughly dark to the eye.
+PAINT_COLOURS: tuple[tuple[tuple[float, float, float], ...], ...] = (
+    ((0.010, 0.010, 0.012), (0.012, 0.014, 0.022), (0.020, 0.012, 0.012)),
+    ((0.045, 0.047, 0.052), (0.012, 0.030, 0.110), (0.015, 0.055, 0.040)),
+    ((0.100, 0.104, 0.110), (0.020, 0.075, 0.240), (0.160, 0.012, 0.016)),
+    ((0.180, 0.185, 0.190), (0.420, 0.022, 0.020), (0.060, 0.160, 0.300)),
+    ((0.330, 0.335, 0.340), (0.560, 0.060, 0.025), (0.310, 0.270, 0.200)),
+    ((0.520, 0.525, 0.530), (0.700, 0.420, 0.030), (0.450, 0.520, 0.560)),
+    ((0.780, 0.780, 0.770), (0.700, 0.690, 0.640)),
+)
+CLOTH_COLOURS = (  # albedos, linear red, green, blue
+    (0.030, 0.032, 0.040),
+    (0.18, 0.18, 0.19),
+    (0.55, 0.54, 0.50),
+    (0.020, 0.045, 0.150),
+    (0.30, 0.030, 0.028),
+    (0.045, 0.12, 0.060),
+    (0.42, 0.30, 0.090),
+    (0.12, 0.070, 0.040),
+    (0.10, 0.20, 0.30),
+    (0.62, 0.35, 0.02),
+)
+TROUSER_COLOURS = (  # albedos, linear red, green, blue
+    (0.016, 0.017, 0.022),
+    (0.030, 0.048, 0.105),
+    (0.055, 0.085, 0.16),
+    (0.16, 0.13, 0.09),
+    (0.09, 0.09, 0.09),
+)
+SKIN_TONES = (1.0, 1.15, 0.75, 0.45, 0.25)  # factors of the albedo of SKIN
+
 
 class Material(IntEnum):
     """The material of a face."""
@@ -74,7 +106,6 @@ OPTICS: dict[Material, Optics] = {
 # Columns of OPTICS, by material.
 REFLECTIVITY = np.array([OPTICS[material].reflectivity for material in Material], np.float32)
 RETRO = np.array([OPTICS[material].retro for material in Material], np.bool_)
-PAINT_REFLECTIVITY = np.array([0.08, 0.14, 0.22, 0.30, 0.45, 0.60, 0.70], np.float32)  # (P,) car paints, black to white
 
 
 class Look(NamedTuple):
@@ -117,34 +148,3 @@ LOOKS: dict[Material, Look] = {
 COLOUR = np.array([LOOKS[material].colour for material in Material], np.float32)
 MIRROR = np.array([LOOKS[material].mirror for material in Material], np.float32)
 GLOSS = np.array([LOOKS[material].gloss for material in Material], np.float32)
-
-# Albedos, linear red, green, blue, that go with each of PAINT_REFLECTIVITY: dark at 905 nm is roughly dark to the eye.
-PAINT_COLOURS: tuple[tuple[tuple[float, float, float], ...], ...] = (
-    ((0.010, 0.010, 0.012), (0.012, 0.014, 0.022), (0.020, 0.012, 0.012)),
-    ((0.045, 0.047, 0.052), (0.012, 0.030, 0.110), (0.015, 0.055, 0.040)),
-    ((0.100, 0.104, 0.110), (0.020, 0.075, 0.240), (0.160, 0.012, 0.016)),
-    ((0.180, 0.185, 0.190), (0.420, 0.022, 0.020), (0.060, 0.160, 0.300)),
-    ((0.330, 0.335, 0.340), (0.560, 0.060, 0.025), (0.310, 0.270, 0.200)),
-    ((0.520, 0.525, 0.530), (0.700, 0.420, 0.030), (0.450, 0.520, 0.560)),
-    ((0.780, 0.780, 0.770), (0.700, 0.690, 0.640)),
-)
-CLOTH_COLOURS = (  # albedos, linear red, green, blue
-    (0.030, 0.032, 0.040),
-    (0.18, 0.18, 0.19),
-    (0.55, 0.54, 0.50),
-    (0.020, 0.045, 0.150),
-    (0.30, 0.030, 0.028),
-    (0.045, 0.12, 0.060),
-    (0.42, 0.30, 0.090),
-    (0.12, 0.070, 0.040),
-    (0.10, 0.20, 0.30),
-    (0.62, 0.35, 0.02),
-)
-TROUSER_COLOURS = (  # albedos, linear red, green, blue
-    (0.016, 0.017, 0.022),
-    (0.030, 0.048, 0.105),
-    (0.055, 0.085, 0.16),
-    (0.16, 0.13, 0.09),
-    (0.09, 0.09, 0.09),
-)
-SKIN_TONES = (1.0, 1.15, 0.75, 0.45, 0.25)  # factors of the albedo of SKIN

@@ -14,11 +14,12 @@ from flcav.world.map.town import Town
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
 from flcav.world.rays.embree import Embree, Solid
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.static import SignsAndSignals, build_town_mesh, list_signs_and_signals
 from flcav.world.trace import Trace
 
 OFFSET_S = 0.1  # largest extrapolation from an instant of the trace: one step of the traffic
+TOWNS_KEPT = 4
 
 
 class Surfaces(NamedTuple):
@@ -101,7 +102,7 @@ class Scene:
         hidden: int | None = None,
         threads: int = 1,
     ) -> Hits:
-        """Return the first hit of each ray (N, 3), without the actor `hidden`: see `raycaster.Target.trace`."""
+        """Return the first hit of each ray (N, 3), without the actor `hidden`: see `embree.Assembly.trace`."""
         self._hide(hidden)
         return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m, threads=threads)
 
@@ -195,7 +196,6 @@ def _actor_model(category: str, shape: int) -> _Model:
 
 
 _TOWNS: dict[str, _Model] = {}  # by hash of the town: the last TOWNS_KEPT
-TOWNS_KEPT = 4
 
 
 def _town_model(town: Town) -> _Model:

@@ -14,6 +14,32 @@ from flcav.config import Config
 
 NO_FOG_M = 20_000.0  # from this visibility on, the air is clear
 NIGHT_DEG = -6.0  # sun elevation at the end of civil twilight: below it, street lamps and headlamps are on
+ANY = "any"  # instead of a class: the whole parameter space
+Region = Mapping[str, tuple[float, float]]  # parameter -> lowest and highest value; others are free
+_DAY = {"sun_elevation_deg": (20.0, 75.0)}
+_DRY = {"rain_mm_h": (0.0, 0.0), "wetness": (0.0, 0.2)}
+_FAR = {"visibility_m": (10_000.0, NO_FOG_M)}
+_WET_FAR = {"visibility_m": (3000.0, NO_FOG_M)}
+WEATHER_CLASSES: dict[str, Region] = {
+    "clear": {**_DAY, **_DRY, **_FAR, "cloud_cover": (0.0, 0.2)},
+    "cloudy": {**_DAY, **_DRY, **_FAR, "cloud_cover": (0.4, 0.65)},
+    "overcast": {**_DAY, **_DRY, **_FAR, "cloud_cover": (0.85, 1.0)},
+    "light_rain": {**_DAY, **_WET_FAR, "cloud_cover": (0.75, 1.0), "rain_mm_h": (1.0, 5.0), "wetness": (0.3, 0.7)},
+    "heavy_rain": {**_DAY, **_WET_FAR, "cloud_cover": (0.9, 1.0), "rain_mm_h": (20.0, 60.0), "wetness": (0.85, 1.0)},
+    "fog": {**_DAY, **_DRY, "cloud_cover": (0.5, 1.0), "visibility_m": (50.0, 400.0)},
+    "sunset": {**_DRY, **_FAR, "sun_elevation_deg": (1.0, 7.0), "cloud_cover": (0.0, 0.5)},
+    "night": {**_DRY, **_FAR, "sun_elevation_deg": (-60.0, -10.0), "cloud_cover": (0.0, 1.0)},
+}
+# Least gap between the regions of any two classes, in at least one of these parameters.
+MARGINS: dict[str, float] = {
+    "sun_elevation_deg": 10.0,
+    "cloud_cover": 0.2,
+    "rain_mm_h": 1.0,
+    "visibility_m": 5000.0,
+}
+# The same gaps in units of `find_nearest_class`: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H), of sight.
+SEPARATION: dict[str, float] = {"sun_elevation_deg": 10.0, "cloud_cover": 0.2, "rain_mm_h": 0.59, "visibility_m": 0.85}
+DRIZZLE_MM_H = 0.1  # added to the rain rate before its logarithm
 
 
 class Weather(Config):
@@ -51,36 +77,6 @@ WEATHERS: dict[str, Weather] = {
     "hard_sun": Weather(sun_elevation_deg=14.0, sun_azimuth_deg=90.0, cloud_cover=0.0),
     "wet_sun": Weather(cloud_cover=0.3, wetness=0.8),
 }
-
-ANY = "any"  # instead of a class: the whole parameter space
-
-Region = Mapping[str, tuple[float, float]]  # parameter -> lowest and highest value; others are free
-
-_DAY = {"sun_elevation_deg": (20.0, 75.0)}
-_DRY = {"rain_mm_h": (0.0, 0.0), "wetness": (0.0, 0.2)}
-_FAR = {"visibility_m": (10_000.0, NO_FOG_M)}
-_WET_FAR = {"visibility_m": (3000.0, NO_FOG_M)}
-
-WEATHER_CLASSES: dict[str, Region] = {
-    "clear": {**_DAY, **_DRY, **_FAR, "cloud_cover": (0.0, 0.2)},
-    "cloudy": {**_DAY, **_DRY, **_FAR, "cloud_cover": (0.4, 0.65)},
-    "overcast": {**_DAY, **_DRY, **_FAR, "cloud_cover": (0.85, 1.0)},
-    "light_rain": {**_DAY, **_WET_FAR, "cloud_cover": (0.75, 1.0), "rain_mm_h": (1.0, 5.0), "wetness": (0.3, 0.7)},
-    "heavy_rain": {**_DAY, **_WET_FAR, "cloud_cover": (0.9, 1.0), "rain_mm_h": (20.0, 60.0), "wetness": (0.85, 1.0)},
-    "fog": {**_DAY, **_DRY, "cloud_cover": (0.5, 1.0), "visibility_m": (50.0, 400.0)},
-    "sunset": {**_DRY, **_FAR, "sun_elevation_deg": (1.0, 7.0), "cloud_cover": (0.0, 0.5)},
-    "night": {**_DRY, **_FAR, "sun_elevation_deg": (-60.0, -10.0), "cloud_cover": (0.0, 1.0)},
-}
-# Least gap between the regions of any two classes, in at least one of these parameters.
-MARGINS: dict[str, float] = {
-    "sun_elevation_deg": 10.0,
-    "cloud_cover": 0.2,
-    "rain_mm_h": 1.0,
-    "visibility_m": 5000.0,
-}
-# The same gaps in units of `find_nearest_class`: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H), of sight.
-SEPARATION: dict[str, float] = {"sun_elevation_deg": 10.0, "cloud_cover": 0.2, "rain_mm_h": 0.59, "visibility_m": 0.85}
-DRIZZLE_MM_H = 0.1  # added to the rain rate before its logarithm
 
 
 def classify_weather(weather: Weather) -> str | None:

@@ -14,7 +14,6 @@ from flcav.dataset.formats.kitti import (
     Calibration,
     KittiFolder,
     read_calibration,
-    read_labels,
     read_objects,
     read_points,
 )
@@ -97,7 +96,7 @@ def test_boxes_match_the_devkit_corners(
     lidar = np.linalg.solve(camera_from_lidar, np.column_stack((camera, np.ones(8))).T).T[:, :3]
     path = tmp_path_factory.getbasetemp() / "label.txt"
     path.write_text(line)
-    box = read_labels(path, Calibration(camera_from_lidar, np.zeros((3, 4))))
+    box = read_objects(path, Calibration(camera_from_lidar, np.zeros((3, 4)))).boxes
     distance = np.linalg.norm(box.corners()[0][:, None] - lidar[None], axis=2)
     assert distance.min(axis=1).max() < 1e-9
     front = lidar[:4].mean(axis=0) - lidar.mean(axis=0)
@@ -109,21 +108,21 @@ def test_dont_care_is_left_out_and_scores_kept(tmp_path: Path, calibration: Cali
     path = tmp_path / "label.txt"
     row = "0 0 0 0 0 0 0 1.5 1.7 4 1 2 20 0.5"
     path.write_text(f"Van {row} 0.75\nDontCare -1 -1 -10 0 0 0 0 -1 -1 -1 -1000 -1000 -1000 -10\n")
-    boxes = read_labels(path, calibration)
+    boxes = read_objects(path, calibration).boxes
     assert boxes.label.tolist() == ["Van"]
     assert boxes.score is not None
     assert boxes.score.tolist() == [0.75]
     path.write_text(f"Van {row}\n")
-    assert read_labels(path, calibration).score is None
+    assert read_objects(path, calibration).boxes.score is None
     path.write_text("")
-    assert len(read_labels(path, calibration)) == 0
+    assert len(read_objects(path, calibration).boxes) == 0
 
 
 @pytest.mark.parametrize("text", ["Car 1 2 3", "Car " + "x " * 14, "Car " + "nan " * 14, "1 " * 30])
 def test_what_is_no_label(tmp_path: Path, calibration: Calibration, text: str):
     (tmp_path / "label.txt").write_text(text)
     with pytest.raises(InputError, match=r"label\.txt: line 1 is no KITTI label"):
-        read_labels(tmp_path / "label.txt", calibration)
+        read_objects(tmp_path / "label.txt", calibration)
 
 
 LABEL = "Car 0.10 1 -0.5 10 20 50 60 1.5 1.7 4 1 2 20 0.5\n"
@@ -199,7 +198,8 @@ def test_regions_nobody_cares_about_are_in_no_column(tmp_path: Path, calibration
 def test_the_boxes_of_the_real_frame_hold_its_points():
     frame = REAL / "training"
     points = read_points(frame / "velodyne" / "000008.bin")
-    boxes = read_labels(frame / "label_2" / "000008.txt", read_calibration(frame / "calib" / "000008.txt"))
+    calibration = read_calibration(frame / "calib" / "000008.txt")
+    boxes = read_objects(frame / "label_2" / "000008.txt", calibration).boxes
     assert points.shape == (17238, 4)
     assert boxes.label.tolist() == ["Car"] * 6
     inside = points_in_boxes(points, boxes).sum(axis=1)

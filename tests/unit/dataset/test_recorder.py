@@ -182,8 +182,11 @@ def test_a_folder_that_cannot_be_made(tmp_path: Path):
         record(ToySource(), tmp_path / "file" / "data")
 
 
-def test_names_that_would_leave_the_folder_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("name", ["../x", 95 * "x"])
+def test_names_that_would_leave_the_folder_or_are_too_long_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+):
     source = ToySource()
-    monkeypatch.setattr(ToySource, "scenes", lambda self: ["../x"])
+    monkeypatch.setattr(ToySource, "scenes", lambda self: [name])
     with pytest.raises(ValueError, match="cannot hold"):
         record(source, tmp_path / "data")

@@ -12,7 +12,7 @@ from flcav.geometry import Boxes
 from flcav.intervals import mean_over_seeds
 from flcav.perception.card import Card
 from flcav.perception.images import CameraView
-from flcav.perception.objects.results import ObjectsEvaluation
+from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.report.pictures.clouds import real_frame
 
 

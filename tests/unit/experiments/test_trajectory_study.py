@@ -28,8 +28,8 @@ def evaluated(off_m: float) -> TrajectoryEvaluation:
     past[..., 3] = 4.0  # constant velocity ends 8 m off
     paths = np.stack((future, future), axis=1)
     paths[:, 0, :, 1] = off_m
-    columns = {"future": future, "past": past, "at_junction": np.ones(2, np.bool_), "scene": np.array(["a", "b"])}
-    return evaluate_paths(paths, np.tile((0.9, 0.1), (2, 1)), columns)
+    shares = np.tile((0.9, 0.1), (2, 1))
+    return evaluate_paths(paths, shares, past, future, np.ones(2, np.bool_), np.array(["a", "b"]))
 
 
 def results(*off_m: float) -> StudyResult[TrajectoryEvaluation]:

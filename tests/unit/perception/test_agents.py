@@ -14,10 +14,10 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames
-from flcav.perception.objects import evaluate as evaluation
-from flcav.perception.objects.area import narrow_range
+from flcav.perception.objects import predict as prediction
 from flcav.perception.objects.model import second, second_tiny, small_config, tiny_config
 from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import narrow_range
 from flcav.perception.trajectory.config import CONFIGURATIONS as TRAJECTORIES
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.weather.task import WEATHER
@@ -197,7 +197,7 @@ def test_networks_of_different_ranges_are_asked_for_the_same_objects(street):
 
 def test_beyond_the_range_nothing_is_wrong(street, monkeypatch):
     hit, beyond = detections((10, 3, 0.8)), detections((44, 10, 0.9), (30, -26, 0.9))
-    monkeypatch.setattr(evaluation, "detect_all", lambda *_, **__: [concatenate([beyond, hit])])
+    monkeypatch.setattr(prediction, "detect_all", lambda *_, **__: [concatenate([beyond, hit])])
     network = second(small_config(("Car",)))
     ap = [
         OBJECTS.evaluate(network, street, street.select(agents=["cav0"]), asked=asked).scores[0].ap
@@ -228,7 +228,7 @@ def test_only_objects_lie_in_a_range(street, capsys):
 
 def test_one_scene_has_no_interval(recorded, tmp_path, said, monkeypatch):
     hits = detections((10, 3, 0.8))
-    monkeypatch.setattr(evaluation, "detect_all", lambda *_, **__: [hits])
+    monkeypatch.setattr(prediction, "detect_all", lambda *_, **__: [hits])
     weights = tmp_path / "weights.safetensors"
     save_network(OBJECTS, second_tiny(), weights)
     for scenes, words in ((("a",), "AP 1.000 (no interval: one scene)"), (("a", "b"), "AP 1.000 [1.000, 1.000]")):

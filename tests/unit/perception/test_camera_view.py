@@ -14,7 +14,7 @@ from flcav.dataset.formats.kitti.write import format_calibration
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.images import CameraView, kitti_view, recorded_view, view_beside
 from flcav.perception.marks import CloudBoxes
-from flcav.perception.objects.infer import ObjectsFound, boxes_to_rows, rows_to_boxes
+from flcav.perception.objects.predict import ObjectsFound, boxes_to_rows, rows_to_boxes
 from flcav.perception.task import Finding
 from flcav.report import style
 from flcav.report.pictures.camera import ALONG

@@ -14,8 +14,8 @@ from flcav.dataset.store import Dataset
 from flcav.perception.errors import FALSE_POSITIVE, FINAL_ERROR, MISS, PerceptionError, keep_first, save_errors
 from flcav.perception.signs import errors as sign_errors
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
-from flcav.perception.signs.detect import Detections
 from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.predict import Detections
 from flcav.perception.signs.samples import sample_from_frame
 from flcav.perception.trajectory import errors as path_errors
 from flcav.perception.trajectory.config import CONFIGURATIONS as PATHS
@@ -101,7 +101,7 @@ def test_an_invented_sign_is_where_its_ray_meets_the_town_or_is_dropped(drive, n
 def test_a_path_that_ends_elsewhere_is_registered_at_the_present(drive, monkeypatch):
     config = PATHS["tiny"]
     samples = samples_of(drive, config)
-    future = samples.columns["future"].astype(float)
+    future = samples.columns.future.astype(float)
     paths = np.repeat(future[:, None], config.modes, axis=1)
     paths[0, :, -1] += (2.5, 0.0)
     paths[1, :, -1] += (0.0, 1.5)
@@ -110,10 +110,10 @@ def test_a_path_that_ends_elsewhere_is_registered_at_the_present(drive, monkeypa
     result = path_errors.register_errors(TrajectoryNetwork(config), drive, samples)
     (error,) = result.errors
     assert error.kind == FINAL_ERROR
-    assert (error.x, error.y) == pytest.approx(tuple(samples.columns["pose"][0, :2]))
+    assert (error.x, error.y) == pytest.approx(tuple(samples.columns.pose[0, :2]))
     trace = drive.trace(error.scene)
     assert trace is not None
-    assert error.track == trace.actor[samples.columns["actor"][0]]
+    assert error.track == trace.actor[samples.columns.actor[0]]
 
 
 def made(kind: str, track: str, x: float = 0.0, scene: str = "a") -> PerceptionError:

@@ -7,8 +7,8 @@ from safetensors.torch import save_file
 
 from flcav.config import InputError
 from flcav.perception.objects import detect, detect_all, second, second_paper, second_tiny
-from flcav.perception.objects.loss import predict
 from flcav.perception.objects.model import head_shape
+from flcav.perception.objects.predict import predict
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import from_arrays, load_network, load_weights, save_network, to_arrays
 

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from flcav.perception.device import multiplies_bfloat16
-from flcav.perception.objects.loss import batch_loss, predict
+from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import second, tiny_config
+from flcav.perception.objects.predict import predict
 
 CPU = torch.device("cpu")
 

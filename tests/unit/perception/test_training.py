@@ -8,9 +8,10 @@ from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.perception.client import TaskClient
 from flcav.perception.objects import detect_all
-from flcav.perception.objects.evaluate import FrameTruth, score_detections
+from flcav.perception.objects.evaluate import score_detections
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.task import find_configuration, fresh
 from flcav.perception.training import Checkpointing, Validation, batches, train, train_steps
 from flcav.perception.training.loop import one_cycle

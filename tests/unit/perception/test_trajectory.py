@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from shapely.geometry import LineString, Polygon
 
 from flcav.config import InputError
+from flcav.dataset.layout import FrameKey
 from flcav.geometry import inverse, pose
 from flcav.perception.task import find_configuration, fresh
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S, CrossView, Patch, TrajectoryConfig
@@ -47,6 +48,7 @@ from flcav.world.trace import Trace
 
 RADIUS_M, SPEED = 20.0, 8.0
 PATCH = Patch()
+KEY = FrameKey("scene", 0, "cav0", 5.0)
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +119,10 @@ def test_the_past_does_not_know_the_future(roads):
     assert np.array_equal(plain.position[: PAST + 1], other.position[: PAST + 1])
     assert not np.allclose(plain.position[PAST + 1 :], other.position[PAST + 1 :])
     wanted = np.ones(1, np.bool_)
-    one, two = (extract_columns(t, 5.0, roads, PATCH, wanted) for t in (trace, replace(trace, position=changed)))
-    assert all(np.array_equal(one[name], two[name]) for name in one if name != "future")
-    assert not np.array_equal(one["future"], two["future"])
+    one, two = (extract_columns(t, KEY, 0, roads, PATCH, wanted) for t in (trace, replace(trace, position=changed)))
+    same = (np.array_equal(a, b) for name, a, b in zip(one._fields, one, two) if name != "future")
+    assert all(same)
+    assert not np.array_equal(one.future, two.future)
 
 
 def test_spins_far_apart_are_refused():
@@ -138,15 +141,15 @@ def test_frames_are_those_of_the_matrices(at, point):
 
 
 def test_a_sample_of_the_circle(roads):
-    rows = extract_columns(circle(), 5.0, roads, PATCH, np.ones(1, np.bool_))
+    rows = extract_columns(circle(), KEY, 0, roads, PATCH, np.ones(1, np.bool_))
     turn = SPEED / RADIUS_M * STEP_S * np.arange(-PAST, FUTURE + 1)
     path = RADIUS_M * np.stack((np.sin(turn), 1 - np.cos(turn)), axis=1)
-    assert np.allclose(rows["past"][0, :, :2], path[: PAST + 1], atol=0.06)  # one-sided tangents at the present
-    assert np.allclose(rows["future"][0], path[PAST + 1 :], atol=0.01)
-    assert np.allclose(rows["past"][0, :, 2], turn[: PAST + 1], atol=1e-6)
-    plain = constant_velocity(rows["past"])
+    assert np.allclose(rows.past[0, :, :2], path[: PAST + 1], atol=0.06)  # one-sided tangents at the present
+    assert np.allclose(rows.future[0], path[PAST + 1 :], atol=0.01)
+    assert np.allclose(rows.past[0, :, 2], turn[: PAST + 1], atol=1e-6)
+    plain = constant_velocity(rows.past)
     assert np.allclose(plain[0, -1], (3 * SPEED, 0), atol=1e-5)
-    bits = np.unpackbits(rows["raster"], axis=-1)[0]
+    bits = np.unpackbits(rows.raster, axis=-1)[0]
     own = bits[LAYERS.index("self")]
     assert 6 <= own.sum() <= 15  # 4.4 m x 1.8 m
     at, _ = cell_of(np.zeros(2), PATCH)
@@ -161,8 +164,8 @@ def test_others_are_marked_where_they_are(roads):
         np.repeat(trace.yaw, 2, axis=1),
         np.repeat(trace.velocity[..., :2], 2, axis=1),
     )
-    rows = extract_columns(both, 5.0, roads, PATCH, np.array([True, False]))
-    bits = np.unpackbits(rows["raster"], axis=-1)[0].astype(bool)
+    rows = extract_columns(both, KEY, 0, roads, PATCH, np.array([True, False]))
+    bits = np.unpackbits(rows.raster, axis=-1)[0].astype(bool)
     middle = centres(PATCH)[bits[LAYERS.index("others 0 s ago")].reshape(-1)].mean(axis=0)
     assert np.allclose(middle, (0, -RADIUS_M / 2), atol=0.7)  # outside on the same ray: to the right
     assert not bits[LAYERS.index("pedestrian")].any()
@@ -231,13 +234,8 @@ def test_slices_and_misses():
     assert is_turning(turned).tolist() == [False, False, True]
     past = np.zeros((3, PAST + 1, 4))
     past[..., 3] = 8.0
-    columns = {
-        "future": turned,
-        "past": past,
-        "at_junction": np.array([False, True, True]),
-        "scene": np.array(["a"] * 3),
-    }
-    result = evaluate_paths(ahead[:, None], np.ones((3, 1)), columns)
+    at_junction, scene = np.array([False, True, True]), np.array(["a"] * 3)
+    result = evaluate_paths(ahead[:, None], np.ones((3, 1)), past, turned, at_junction, scene)
     every, junctions, turned_there = result.slices.values()
     assert every is not None
     assert junctions is not None
@@ -245,7 +243,7 @@ def test_slices_and_misses():
     assert (every.samples, junctions.samples, turned_there.samples) == (3, 2, 1)
     assert every.miss_rate_1 == pytest.approx(1 / 3)
     assert turned_there.ratio_1 == pytest.approx(1.0)
-    nobody = evaluate_paths(ahead[:1, None], np.ones((1, 1)), {name: column[:1] for name, column in columns.items()})
+    nobody = evaluate_paths(ahead[:1, None], np.ones((1, 1)), past[:1], turned[:1], at_junction[:1], scene[:1])
     assert nobody.slices["at junctions"] is None
 
 

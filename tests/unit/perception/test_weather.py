@@ -6,11 +6,13 @@ import torch
 
 from flcav.perception.task import find_configuration, fresh
 from flcav.perception.training import train
+from flcav.perception.weather.augment import augment
 from flcav.perception.weather.config import LeNetConfig
 from flcav.perception.weather.evaluate import evaluate_classes
 from flcav.perception.weather.model import SEEN_MAPS, LeNet, PartlyConnected, Subsampling
-from flcav.perception.weather.samples import Sample, augment, reduce_picture
-from flcav.perception.weather.task import WEATHER, predict_probabilities
+from flcav.perception.weather.predict import predict_probabilities
+from flcav.perception.weather.samples import Sample, reduce_picture
+from flcav.perception.weather.task import WEATHER
 from flcav.world.weather import WEATHER_CLASSES
 
 

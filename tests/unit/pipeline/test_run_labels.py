@@ -8,7 +8,7 @@ import pytest
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
-from flcav.perception.objects.evaluate import FrameTruth
+from flcav.perception.objects.truth import FrameTruth
 from flcav.pipeline import labels
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels, fit_label_threshold, select_frames_near

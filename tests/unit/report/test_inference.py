@@ -8,7 +8,7 @@ import pytest
 from flcav.geometry import Boxes
 from flcav.perception.images import CameraView
 from flcav.perception.marks import Bars, CloudBoxes, Light, Mark, Mode, Paths, PictureBoxes, RoadUser
-from flcav.perception.objects.infer import ObjectsFound
+from flcav.perception.objects.predict import ObjectsFound
 from flcav.perception.task import Finding
 from flcav.report import style
 from flcav.report.pictures.inference import DRAWERS, draw

@@ -25,7 +25,7 @@ def walled(small_town: Callable[..., Town], standing: Callable[..., Trace]) -> S
 
 
 def sweep(scene: Scene, at: np.ndarray = AT, seed: int = 0, **settings: Any) -> np.ndarray:
-    return scan(scene, at, Lidar(**{**PERFECT, **settings}), np.random.default_rng(seed))[0]
+    return scan(scene, at, Lidar(**{**PERFECT, **settings}), np.random.default_rng(seed)).points
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def facing_car(small_town: Callable[..., Town], standing: Callable[..., Trace]) 
 
 def car_points(scene: Scene, **settings: Any) -> np.ndarray:
     lidar = Lidar(**{**PERFECT, "channels": 64, "azimuth_steps": 2048, **settings})
-    points, actor = scan(scene, AT, lidar, np.random.default_rng(0))
+    points, actor, *_ = scan(scene, AT, lidar, np.random.default_rng(0))
     return points[actor == 0]
 
 
@@ -141,7 +141,7 @@ def test_returns_of_a_car_fall_with_distance_as_on_real_sensors(
     for distance in (8.0, 15.0, 25.0, 40.0):
         scene = Scene(small_town(), standing([("veh0", "car", 3, distance, 0.0, np.pi / 4)]))
         lidar = Lidar(channels=64, azimuth_steps=2048, up_deg=2.0, down_deg=-24.8, range_m=120.0)
-        _, actor = scan(scene, pose(0.0, 0.0, 1.8), lidar, np.random.default_rng(0))
+        _, actor, *_ = scan(scene, pose(0.0, 0.0, 1.8), lidar, np.random.default_rng(0))
         counts.append(np.count_nonzero(actor == 0))
     lowest, highest = (2000, 550, 180, 60), (5500, 1500, 550, 240)
     assert all(low < count < high for low, count, high in zip(lowest, counts, highest)), counts
@@ -161,10 +161,10 @@ def test_a_car_is_a_shell_with_something_inside(facing_car: Scene):
 
 def test_the_hidden_carrier_returns_nothing(facing_car: Scene):
     lidar = Lidar(**PERFECT)
-    _, actor = scan(facing_car, AT, lidar, np.random.default_rng(0), hidden=0)
+    _, actor, *_ = scan(facing_car, AT, lidar, np.random.default_rng(0), hidden=0)
     assert len(actor) > 10_000
     assert (actor == -1).all()
-    _, actor = scan(facing_car, AT, lidar, np.random.default_rng(0))
+    _, actor, *_ = scan(facing_car, AT, lidar, np.random.default_rng(0))
     assert (actor == 0).any()
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flcav.geometry import pose
 from flcav.sensors.lidar.lidar import Lidar, scan
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, Material
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene, Surfaces
 
 FLOOR, WALL, PANE, DOOR, SIGN = range(5)  # planes: the floor z = 0, and x = their distance
@@ -57,7 +57,7 @@ class Planes:
 
 def digest(settings: Lidar, seed: int, **options: Any) -> str:
     scene = cast(Scene, Planes())
-    points, actor = scan(scene, pose(0.0, 0.0, EYE_M), settings, np.random.default_rng(seed), **options)
+    points, actor, *_ = scan(scene, pose(0.0, 0.0, EYE_M), settings, np.random.default_rng(seed), **options)
     assert (actor == 0).sum() > 100
     return sha256(points.tobytes() + actor.tobytes()).hexdigest()[:16]
 

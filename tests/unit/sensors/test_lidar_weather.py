@@ -30,7 +30,7 @@ def walled(small_town: Callable[..., Town], standing: Callable[..., Trace]) -> S
 
 
 def sweep(scene: Scene, weather: Weather | None = None, seed: int = 0, **settings: Any) -> np.ndarray:
-    return scan(scene, AT, Lidar(**settings), np.random.default_rng(seed), weather=weather)[0]
+    return scan(scene, AT, Lidar(**settings), np.random.default_rng(seed), weather=weather).points
 
 
 def test_weather_that_is_no_matter_to_a_lidar_changes_no_byte(walled: Scene):
@@ -59,7 +59,7 @@ def test_fog_takes_far_points_and_adds_near_ones(walled: Scene):
 
 def test_rain_points_belong_to_nobody(walled: Scene):
     lidar = Lidar(up_deg=40.0, down_deg=20.0)
-    points, actor = scan(walled, AT, lidar, np.random.default_rng(0), weather=WEATHERS["heavy_rain"])
+    points, actor, *_ = scan(walled, AT, lidar, np.random.default_rng(0), weather=WEATHERS["heavy_rain"])
     near = np.linalg.norm(points[:, :3], axis=1) < 10
     assert near.sum() > 500
     assert (actor[near] == -1).all()
@@ -163,7 +163,7 @@ def driving(small_town: Callable[..., Town], standing: Callable[..., Trace]) -> 
 
 def test_a_moving_sensor_bends_walls(driving: Scene):
     lidar = Lidar(**PERFECT, rolling=True, azimuth_steps=1800)
-    points, actor = scan(driving, AT, lidar, np.random.default_rng(0), hidden=0)
+    points, actor, *_ = scan(driving, AT, lidar, np.random.default_rng(0), hidden=0)
     assert (driving.index, driving.offset_s) == (0, 0.0)
     times = point_times_s(lidar, points)
     on_wall = (actor == -1) & (points[:, 2] > 0.0) & (np.abs(points[:, 0] + 15.0 * times - 25.0) < 0.03)
@@ -178,7 +178,7 @@ def test_a_moving_actor_is_where_it_is_when_the_beams_pass(driving: Scene):
     lidar = Lidar(**PERFECT, rolling=True, azimuth_steps=1800, channels=64)
     for facing in (0.0, np.pi):  # ahead: mid spin; behind: at the beginning or the end of it
         at = pose(0.0, 4.0, 2.0, yaw=facing)
-        points, actor = scan(driving, at, lidar, np.random.default_rng(0))
+        points, actor, *_ = scan(driving, at, lidar, np.random.default_rng(0))
         truck = points[actor == 1]
         back = truck[:, 0] * np.cos(facing) - 30.0 * point_times_s(lidar, truck)
         assert back.min() == pytest.approx(10 - 3.9, abs=0.25)

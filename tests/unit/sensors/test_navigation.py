@@ -13,12 +13,12 @@ from flcav.sensors.navigation import (
     STEP_S,
     Gnss,
     Imu,
-    convert_to_geodetic,
     draw_gauss_markov,
     draw_random_walk,
     measure_inertia,
     measure_position,
 )
+from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.map.parameters import GeoReference
 from flcav.world.map.town import Town
 from flcav.world.scene import Scene

@@ -16,7 +16,7 @@ from flcav.sensors.radar.detector import (
 )
 from flcav.sensors.radar.radar import Radar, cross_sections, draw_rays, sweep_radar
 from flcav.world.map.town import Town
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
 from flcav.world.trace import CATEGORIES, Trace
 from flcav.world.weather import WEATHERS

@@ -19,6 +19,7 @@ def rig(**kinds: object) -> Rig:
         ({"lidars": {"top": {}}, "cameras": {"top": {}}}, "two sensors are called 'top'"),
         ({"lidars": {"../top": {}}}, "sensor name '../top': must be letters"),
         ({"lidars": {"traces": {}}}, "sensor name 'traces'"),
+        ({"lidars": {101 * "t": {}}}, "digits, - and _, 100 at most"),
         ({"cameras": {"front": {"trigger_ms": 300}}}, "trigger_ms' = 300"),
         ({"lidars": {"top": {"trigger_ms": 3}}}, "unknown field 'lidars.top.trigger_ms'"),
     ],

@@ -8,11 +8,12 @@ import shapely
 from scipy.ndimage import label
 from shapely.geometry import MultiPolygon, Point, Polygon
 
+from flcav import memory
 from flcav.geometry import pose
 from flcav.sensors.camera.camera import Camera, photograph
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays
 from flcav.sensors.camera.tone import develop, grain
-from flcav.sensors.rendering import render, supersampling
+from flcav.sensors.rendering import supersampling
 from flcav.sensors.rendering.ambient_occlusion import DARKEST, compute_ambient_occlusion
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sensors.rendering.gbuffer import fill_gbuffer
@@ -137,8 +138,8 @@ def test_brightness_rises_and_walls_in_the_sun_are_not_burnt_out():
 @pytest.mark.parametrize(("library", "calls"), [("glibc", 2), ("", 0)])
 def test_memory_is_kept_only_where_the_library_can(monkeypatch: pytest.MonkeyPatch, library: str, calls: int):
     set_to: list[tuple[int, int]] = []
-    monkeypatch.setattr(render.platform, "libc_ver", lambda: (library, ""))
-    monkeypatch.setattr(render.ctypes, "CDLL", lambda name: SimpleNamespace(mallopt=lambda *pair: set_to.append(pair)))
-    render.keep_freed_memory.__wrapped__()
+    monkeypatch.setattr(memory.platform, "libc_ver", lambda: (library, ""))
+    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: SimpleNamespace(mallopt=lambda *pair: set_to.append(pair)))
+    memory.keep_freed_memory.__wrapped__()
     assert len(set_to) == calls
-    assert all(size in (render.KEPT_BYTES, render.LARGEST_BYTES) for _, size in set_to)
+    assert all(size in (memory.KEPT_BYTES, memory.LARGEST_BYTES) for _, size in set_to)

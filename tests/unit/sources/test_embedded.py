@@ -1,4 +1,6 @@
 import pickle
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,6 +8,7 @@ import pytest
 from flcav.config import InputError
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.world.map.town import load_town
 
 BURIED, TOO_LOW = ({"lidars": {"low": {"mount": {"z": z}}}} for z in (-0.3, -9.0))
 
@@ -17,6 +20,15 @@ def small(**fields: object) -> EmbeddedSource:
 
 def test_scenes_are_named_by_town_seed_and_number():
     assert small().scenes() == ["suburb-3-000", "suburb-3-001"]
+
+
+def test_a_town_whose_name_is_too_long_for_names_of_frames(tmp_path: Path):
+    longest = 100 - len("-3-000_0001_cav0")
+    for count in (longest, longest + 1):
+        shutil.copytree(load_town("suburb").net.parent, tmp_path / (count * "t"))
+    assert small(town=str(tmp_path / (longest * "t"))).scenes()[0].startswith("ttt")
+    with pytest.raises(InputError, match="101 characters where 100 are allowed"):
+        small(town=str(tmp_path / ((longest + 1) * "t")))
 
 
 def test_a_number_of_frames_takes_as_many_scenes_as_it_needs():

@@ -174,7 +174,7 @@ def test_bad_maps_get_one_sentence_and_leave_nothing(text: str, message: str, tm
     path = tmp_path / "map.xodr"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        import_town(path, tmp_path / "town")
+        import_town(path, tmp_path / "new" / "folders" / "town")
     assert "\n" not in str(caught.value)
     assert [found.name for found in tmp_path.iterdir()] == ["map.xodr"]
 
@@ -182,5 +182,7 @@ def test_bad_maps_get_one_sentence_and_leave_nothing(text: str, message: str, tm
 def test_nothing_is_overwritten(cross: ImportedTown, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is there already"):
         import_town(CROSS, cross.town.net.parent)
+    with pytest.raises(InputError, match="is a file; a town needs a folder"):
+        import_town(CROSS, cross.town.net / "folder" / "town")
     with pytest.raises(InputError, match="no such file"):
         read_document(tmp_path / "none.xodr")

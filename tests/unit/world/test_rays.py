@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from flcav.compiled import compiled
 from flcav.geometry import inverse, pose, transform_points
 from flcav.world.rays.embree import Assembly, Embree, Solid
+from flcav.world.rays.hits import MISS
 from flcav.world.rays.loader import embree_library
 from flcav.world.rays.packets import trace_packets
-from flcav.world.rays.raycaster import MISS, Raycaster
 
 FORWARD = np.array([[1.0, 0.0, 0.0]], np.float32)
 
@@ -74,7 +74,7 @@ def test_matches_brute_force(seed: int):
 
 def test_solid_alone_matches_the_placed_one():
     rng = np.random.default_rng(0)
-    engine: Raycaster[Solid] = Embree()
+    engine = Embree()
     solid = engine.solid(*soup(rng, 60))
     place, eye, rays = pose(20.0, -3.0, 1.0, yaw=0.7), pose(15.0, -3.0, 0.0, yaw=-0.4), directions(rng, 501)
     assembly = engine.assembly([solid])

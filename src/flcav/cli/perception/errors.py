@@ -51,8 +51,8 @@ def errors(
     use_threads(threads)
     from flcav import progress
     from flcav.config import InputError
-    from flcav.dataset.exchange import check_ending
     from flcav.dataset.store import Dataset
+    from flcav.exchange import check_ending
     from flcav.files import check_writable, write_bytes
     from flcav.perception import networks
     from flcav.perception.errors import save_errors

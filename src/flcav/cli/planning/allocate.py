@@ -12,6 +12,8 @@ from flcav.cli.options import join_choices
 from flcav.cli.terminal import print_json
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from flcav.optimization.allocation.allocate import Allocation
     from flcav.optimization.allocation.baselines import Baseline
     from flcav.optimization.allocation.budget_sweep import Saving
@@ -140,7 +142,7 @@ def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
     console.print(f"{beside.name}: {beside.objective:.6g}{note}; the plan above: {plan.objective:.6g}")
 
 
-def _table(plan: "Allocation | Baseline") -> Any:
+def _table(plan: "Allocation | Baseline") -> "Table":
     from rich.table import Table
 
     table = Table("task", *("samples", "edge rounds", "cloud rounds", "error", "wireless MB", "wireline MB"))

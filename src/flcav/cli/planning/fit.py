@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from flcav.optimization.allocation.problem_file import FittedFields
-    from flcav.optimization.curves.fitting import Fit
+    from flcav.optimization.curves.bands import Array, Bands
+    from flcav.optimization.curves.curves import Additive, Effective
+    from flcav.optimization.curves.fitting import CurveFit
 
 
 class Model(StrEnum):
@@ -147,8 +149,15 @@ def _counts(text: str) -> list[float]:
 
 
 def _answer(
-    task: str, fit: "Fit[Any]", found: Any, upper: Any, measured: Any, asked: list[list[float]], k: int
-) -> dict[str, Any]:  # fmt: skip
+    task: str,
+    fit: "CurveFit",
+    found: "Bands | None",
+    upper: "Additive | Effective | None",
+    measured: "Array",
+    asked: list[list[float]],
+    k: int,
+) -> dict[str, Any]:
+    """Return a curve, its bands and the predictions asked for as a JSON object."""
     import numpy as np
 
     from flcav.optimization.curves.bands import METHOD, tabulate_bands
@@ -173,7 +182,7 @@ def _answer(
     }
 
 
-def _show(answers: list[dict[str, Any]], fits: list["Fit[Any]"]) -> None:
+def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
     from rich.table import Table
 
     from flcav.cli.terminal import plain_console

@@ -4,7 +4,6 @@ Each check yields one sentence per problem.
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,9 +17,8 @@ SIGMAS = 6.0  # a larger error, in standard deviations, is reported
 EXACT = 1e-6  # tolerance of rounding, in the unit of each error: [m], [degrees], [px], [ms]
 
 
-def check_calibrations(calibrations: Mapping[str, Calibrations], recipe: Mapping[str, Any]) -> Iterator[str]:
-    """Check true and assumed calibrations by agent, and their difference against `calibration_error` of the recipe."""
-    error = CalibrationError.model_validate(recipe.get("calibration_error") or {})
+def check_calibrations(calibrations: Mapping[str, Calibrations], error: CalibrationError) -> Iterator[str]:
+    """Check true and assumed calibrations by agent, and their difference against `error` of the recipe."""
     for agent, (true, assumed) in calibrations.items():
         for which, calibration in (("true", true), ("assumed", assumed)):
             yield from check_calibration(f"the {which} calibration of {agent}", calibration)

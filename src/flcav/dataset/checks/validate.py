@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
-from flcav.config import InputError
+from flcav.config import InputError, parse_config
 from flcav.dataset.checks.calibration import check_calibrations
 from flcav.dataset.checks.frames import check_measurements, check_points, check_sweeps, check_traffic, check_values
 from flcav.dataset.checks.images import check_images
@@ -20,6 +20,7 @@ from flcav.dataset.store import Dataset
 from flcav.dataset.tables import read_table
 from flcav.files import sha256
 from flcav.progress import Report, ignore_progress
+from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
@@ -27,7 +28,7 @@ from flcav.world.trace import Trace
 def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[str]:
     """Return the problems of the dataset in the folder `path`, one sentence each; empty for a valid dataset.
 
-    Raises `InputError` where `path` holds no finished dataset.
+    Raises `InputError` where `path` holds no finished dataset, or one whose recipe has a wrong `calibration_error`.
 
     >>> from flcav import validate
     >>> validate("data")
@@ -45,7 +46,9 @@ def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[st
         return [*problems, str(error)]
     problems += check_order(dataset.keys)
     problems += _other_counts(dataset)
-    problems += check_calibrations(dataset.calibrations, manifest.recipe)
+    stated = manifest.recipe.get("calibration_error") or {}
+    error = parse_config(CalibrationError, stated, f"{folder / MANIFEST}: calibration_error of the recipe")
+    problems += check_calibrations(dataset.calibrations, error)
 
     traces: dict[str, Trace | None] = {}
     sight = BlockedViews()

@@ -7,7 +7,7 @@ Actors have instance masks in COCO's compressed run-length encoding (RLE); signs
 import json
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from faster_coco_eval.core import mask as coco_mask
@@ -17,6 +17,7 @@ from flcav.dataset.formats.exporter import Exported, ExportOptions, missing_data
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.progress import Report
 from flcav.sensors.frame import Frame
 
@@ -51,19 +52,30 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     return Exported(counts)
 
 
-def encode_run_lengths(mask: NDArray[np.bool_]) -> dict[str, Any]:
+class Table(TypedDict):
+    """One of COCO's annotation files."""
+
+    info: dict[str, str]
+    images: list[dict[str, Json]]
+    annotations: list[dict[str, Json]]
+    categories: list[dict[str, Json]]
+
+
+def encode_run_lengths(mask: NDArray[np.bool_]) -> dict[str, Json]:
     """Return COCO's compressed run-length encoding of an (H, W) mask: {"size": [H, W], "counts": text}."""
     encoded = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
     return {"size": list(mask.shape), "counts": encoded["counts"].decode("ascii")}
 
 
-def _empty(labels: str) -> dict[str, Any]:
+def _empty(labels: str) -> Table:
     kind = {"signs": "sign", "actors": "actor"}[labels]
-    categories = [{"id": i + 1, "name": name, "supercategory": kind} for i, name in enumerate(CLASSES[labels])]
+    categories: list[dict[str, Json]] = [
+        {"id": i + 1, "name": name, "supercategory": kind} for i, name in enumerate(CLASSES[labels])
+    ]
     return {"info": {"description": f"flcav {labels}"}, "images": [], "annotations": [], "categories": categories}
 
 
-def _image(frame: Frame, camera: str, file_name: str, number: int) -> dict[str, Any]:
+def _image(frame: Frame, camera: str, file_name: str, number: int) -> dict[str, Json]:
     height, width = frame.images[camera].rgb.shape[:2]
     return {
         "id": number,
@@ -77,13 +89,13 @@ def _image(frame: Frame, camera: str, file_name: str, number: int) -> dict[str, 
     }
 
 
-def _annotations(frame: Frame, camera: str, labels: str, min_pixels: int) -> list[dict[str, Any]]:
+def _annotations(frame: Frame, camera: str, labels: str, min_pixels: int) -> list[dict[str, Json]]:
     found = select_rectangles(frame, camera, labels, min_pixels)
     instance = frame.images[camera].instance
     out = []
     for label, box, pixels, row in zip(found.label, found.box, found.pixels, found.row):
         left, top, right, bottom = box.tolist()
-        about = {
+        about: dict[str, Json] = {
             "category_id": int(label) + 1,
             "bbox": [left, top, right - left, bottom - top],
             "area": int(pixels),

@@ -17,6 +17,8 @@ from flcav.dataset.formats.yolo import export_yolo
 from flcav.dataset.store import Dataset
 from flcav.progress import Report, ignore_progress
 
+DEFAULTS = ExportOptions()
+
 
 @dataclass(frozen=True)
 class Format:
@@ -34,7 +36,6 @@ FORMATS: Mapping[str, Format] = {
     "opv2v": Format(export_opv2v, ("validation", "min_points", "calibration")),
     "mcap": Format(export_mcap, ("calibration",)),
 }
-DEFAULTS = ExportOptions()
 
 
 def export(

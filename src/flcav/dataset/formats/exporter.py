@@ -17,6 +17,8 @@ from flcav.geometry import points_in_boxes, transform_points
 from flcav.progress import Report
 from flcav.sensors.frame import Frame
 
+SPLITS = ("train", "val", "test")
+
 
 class ExportOptions(Config):
     """Options of an export; `export.FORMATS` lists those that apply to each format."""
@@ -67,9 +69,6 @@ def check_rectified(frame: Frame, camera: str, name: str) -> None:
         raise InputError(
             f"{frame.key}: '{camera}' distorts; {name} wants rectified images, so record without distortion"
         )
-
-
-SPLITS = ("train", "val", "test")
 
 
 def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:

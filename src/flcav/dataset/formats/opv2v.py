@@ -6,7 +6,7 @@ vehicles are numbered in one list. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `tran
 
 from collections import Counter, defaultdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import yaml
@@ -24,7 +24,7 @@ from flcav.dataset.formats.exporter import (
 from flcav.dataset.formats.mounts import agent_velocities, assign_channels, optical_yaw
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import pose
+from flcav.geometry import pose, yaw_of
 from flcav.progress import Report
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Frame
@@ -43,6 +43,16 @@ FIRST_CAR, FIRST_POLE, FIRST_TRACK = 1001, 2001, 10001  # OpenCOOD takes the age
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 KMH = 3.6
 FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
+
+
+class Vehicle(TypedDict):
+    """A vehicle in OPV2V's file of a frame."""
+
+    angle: list[float]  # roll, yaw, pitch [degrees]
+    center: list[float]  # of the box, from `location` [m]
+    extent: list[float]  # half length, width, height [m]
+    location: list[float]  # x, y, z of the ground centre [m]
+    speed: float  # [km/h]
 
 
 def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
@@ -113,12 +123,11 @@ def carla_pose(world_from_body: Array) -> list[float]:
     """
     matrix = MIRROR @ world_from_body @ MIRROR
     roll = np.arctan2(-matrix[2, 1], matrix[2, 2])
-    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
     pitch = np.arcsin(np.clip(matrix[2, 0], -1, 1))
-    return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw, pitch)).tolist()]
+    return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw_of(matrix), pitch)).tolist()]
 
 
-def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, dict[str, Any]], speed_m_s: float) -> None:
+def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed_m_s: float) -> None:
     lidar, points = next(iter(frame.lidar.items()))
     folder.mkdir(parents=True, exist_ok=True)
     time = f"{frame.index:06d}"
@@ -148,11 +157,11 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, dict[str, Any]]
     (folder / f"{time}.yaml").write_text(yaml.dump(about, Dumper=FAST_DUMPER), encoding="utf-8")
 
 
-def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[int, dict[str, Any]]:
+def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[int, Vehicle]:
     """Return number -> OPV2V's box of each vehicle with at least `min_points` points of the first LiDAR in its box."""
     truth, boxes = frame.annotations, frame.annotations.boxes
     enough = count_points_in_boxes(frame, *next(iter(frame.lidar.items()))) >= min_points
-    vehicles = {}
+    vehicles: dict[int, Vehicle] = {}
     for i in np.flatnonzero(np.isin(boxes.label, VEHICLES) & enough):
         tall = boxes.size[i, 2]
         x, y, z, *rotation = carla_pose(pose(*boxes.center[i], yaw=boxes.yaw[i]))

@@ -22,14 +22,15 @@ from flcav.dataset.payloads import encode_payloads
 from flcav.dataset.rows import build_table, encode_frame
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
 from flcav.files import write_bytes, write_in_pieces
-from flcav.sensors.frame import Frame
+from flcav.sensors.frame import LONGEST_NAME, Frame
 from flcav.sources.source import Replayable, Source
 from flcav.world.trace import Trace
 
 PART_FRAMES = 16  # frames of a part: few are lost by an interruption, and starting a part is cheap beside them
 TRAFFIC = "traffic.parquet"
 PAYLOADS = "payloads"  # folder of a part with the files that are moved into the dataset unchanged
-_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+_SAFE_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")
+AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
 class Traffic(NamedTuple):
@@ -121,9 +122,6 @@ def _check_names(frame: Frame, scene: str) -> None:
     names = (frame.key, *frame.calibration.agent_from_sensor)
     if frame.scene != scene or TRACES in names or not all(_SAFE_NAME.fullmatch(name) for name in names):
         raise ValueError(f"{frame.key}: scene, agent or sensor names that a dataset cannot hold: {names}")
-
-
-AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
 class Engine(Protocol):

@@ -10,7 +10,6 @@ import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -32,11 +31,13 @@ from flcav.dataset.recording.jobs import PAYLOADS, TRAFFIC, find_pending, record
 from flcav.dataset.recording.ray_engine import start_ray_engine
 from flcav.dataset.recording.workers import start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, join_tables, write_table
-from flcav.files import sha256, write_bytes, write_json
+from flcav.files import Json, sha256, write_bytes, write_json
 from flcav.progress import Report, ignore_progress
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.sources.source import Source, TownSource
+
+Header = Mapping[str, Mapping[str, Json]]  # "recipe" -> description of the source, "versions" -> of packages
 
 ENGINES = {"processes": start_processes, "ray": start_ray_engine}
 HEADER = "recipe.json"
@@ -69,7 +70,7 @@ def record(
     if isinstance(source, Recipe):
         source = EmbeddedSource(source)
     out = Path(out)
-    header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))
+    header: Header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))
     try:
         if not _claim(out, header):
             return False
@@ -96,7 +97,7 @@ def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report)
         record_scenes(source, hands, work)
 
 
-def _claim(out: Path, header: dict[str, Any]) -> bool:
+def _claim(out: Path, header: Header) -> bool:
     """Prepare `out` for this recording; return False if it holds the finished dataset already.
 
     Raises `InputError` where `out` is a file, or holds another dataset, another recording or other files.
@@ -117,7 +118,7 @@ def _claim(out: Path, header: dict[str, Any]) -> bool:
     return True
 
 
-def _refuse_other(out: Path, what: str, held: dict[str, Any], wanted: dict[str, Any]) -> None:
+def _refuse_other(out: Path, what: str, held: Header, wanted: Header) -> None:
     different = [
         name
         for part in held
@@ -128,7 +129,7 @@ def _refuse_other(out: Path, what: str, held: dict[str, Any], wanted: dict[str, 
         raise InputError(f"{out}: {what} (different: {', '.join(different)}); record into another folder")
 
 
-def _assemble(source: Source, out: Path, header: dict[str, Any]) -> None:
+def _assemble(source: Source, out: Path, header: Header) -> None:
     """Assemble the dataset from the parts below `.recording`; can be repeated after an interruption."""
     work, scenes = out / WORK, list(source.scenes())
     joined = work / JOINED
@@ -197,9 +198,9 @@ def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
     return listing if listing.exists() else None
 
 
-def _calibrations(folders: list[Path]) -> dict[str, Any]:
+def _calibrations(folders: list[Path]) -> dict[str, Json]:
     """Return the calibration file's content: the union of those of all parts; raises ValueError if they differ."""
-    found: dict[str, Any] = {}
+    found: dict[str, Json] = {}
     for folder in folders:
         for agent, calibration in json.loads((folder / CALIBRATION).read_text()).items():
             if found.setdefault(agent, calibration) != calibration:

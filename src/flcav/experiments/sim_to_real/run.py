@@ -17,12 +17,12 @@ from flcav.experiments.sim_to_real.clouds import CloudNumbers, Labelled, summari
 from flcav.experiments.splits import open_split, record_split
 from flcav.geometry import Boxes, inverse
 from flcav.perception.images import kitti_view
-from flcav.perception.metrics import average_precision, match
+from flcav.perception.metrics import average_precision, match, round_or_none
 from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.detect import detect
-from flcav.perception.objects.evaluate import LOWEST_SCORE, OVERLAPS, round_or_none, select_class
-from flcav.perception.objects.infer import ObjectFound, boxes_to_rows, rows_to_boxes
+from flcav.perception.objects.evaluate import OVERLAPS
 from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import LOWEST_SCORE, ObjectFound, boxes_to_rows, detect, rows_to_boxes
+from flcav.perception.objects.truth import select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps import Notify, Step, run_steps

@@ -4,11 +4,10 @@ What is recorded, trained and tested is in `flcav.perception.study`; the modules
 """
 
 from collections.abc import Mapping
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 from flcav.config import InputError
-from flcav.plugins import load_own
+from flcav.plugins import load_named
 
 if TYPE_CHECKING:
     from flcav.experiments.studies.run import Study, StudyResult
@@ -27,19 +26,16 @@ def study_named(name: str) -> "Study":
 
     Raises `InputError` where there is none.
     """
-    if name in STUDIES:
-        module, _, attribute = STUDIES[name].partition(":")
-        return getattr(import_module(module), attribute)
     from flcav.experiments.studies.run import Study
     from flcav.perception.study import Studied
     from flcav.perception.task import Task
 
-    own = load_own("study", name, STUDIES, object)
+    own = load_named("study", name, STUDIES, object)
     if isinstance(own, Study):
         return own
     if not isinstance(own, Studied):
         raise InputError(f"study '{name}': is neither a study nor a task with a study()")
-    task = load_own("task", name, (), Task)
+    task = load_named("task", name, {}, Task)
     return Study(task, own.study(), draw=draw_numbers)
 
 

@@ -8,9 +8,8 @@ import numpy as np
 from flcav.dataset.store import Dataset
 from flcav.experiments.studies.run import Study, StudyResult, training_rows
 from flcav.markdown import format_bullets, format_table
-from flcav.perception.objects.evaluate import Score
+from flcav.perception.objects.evaluate import BreakdownRow, ObjectsEvaluation, Score
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.results import BreakdownRow, ObjectsEvaluation
 from flcav.perception.objects.study import TRACKS
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.tracking import evaluate_tracks

@@ -8,10 +8,10 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.studies.run import Study, StudyResult
 from flcav.intervals import Estimate
 from flcav.markdown import format_bullets, format_table
-from flcav.perception.weather.evaluate import Classification
+from flcav.perception.weather.evaluate import Classification, evaluate_whole_space
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.study import WHOLE_SPACE
-from flcav.perception.weather.task import WEATHER, evaluate_whole_space
+from flcav.perception.weather.task import WEATHER
 from flcav.report import style
 from flcav.report.charts.studies import confusions
 from flcav.verdicts import describe_aim

@@ -6,6 +6,7 @@ from flcav.perception.metrics.average_precision import (
     interval_words,
     orientation_similarity,
     right_headings,
+    round_or_none,
     weighted_precision,
 )
 from flcav.perception.metrics.calibration import calibration_error, fit_logistic
@@ -21,5 +22,6 @@ __all__ = [
     "match",
     "orientation_similarity",
     "right_headings",
+    "round_or_none",
     "weighted_precision",
 ]

@@ -56,6 +56,11 @@ def interval_words(low: float | None, high: float | None) -> str:
     return "(no interval: one scene)" if low is None or high is None else f"[{low:.3f}, {high:.3f}]"
 
 
+def round_or_none(value: float) -> float | None:
+    """Return the number rounded to six decimals, or None for NaN, which JSON cannot hold."""
+    return None if np.isnan(value) else round(value, 6)
+
+
 def _times(matches: Matches, frames: ArrayLike | None) -> NDArray[np.int64]:
     """Return (1, F) the multiplicity of each frame in `frames`."""
     if frames is None:

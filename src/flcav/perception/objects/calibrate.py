@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flcav.geometry import Boxes
-from flcav.perception.metrics import calibration_error, fit_logistic, match
+from flcav.perception.metrics import calibration_error, fit_logistic, match, round_or_none
 from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.evaluate import FrameTruth, detect_frames, round_or_none, select_class
 from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect_frames
+from flcav.perception.objects.truth import FrameTruth, select_class
 from flcav.records import Class
 from flcav.sensors.frame import Frame
 

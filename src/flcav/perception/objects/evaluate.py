@@ -1,45 +1,52 @@
-"""Evaluation of detections against ground truth: AP and AOS per class, 3D and bird's-eye view, at IoU 0.5 and 0.7."""
+"""Evaluation of an object detector: AP and AOS per class, broken down by distance, occlusion and weather; calibration.
 
-from collections.abc import Iterable, Sequence
+AP is that in 3D and in bird's-eye view, at IoU 0.5 and 0.7.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, concatenate
 from flcav.perception.metrics import (
     average_precision,
     bootstrap_interval,
+    interval_words,
     match,
     orientation_similarity,
     right_headings,
+    round_or_none,
 )
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.detect import detect_all
-from flcav.perception.objects.model import Second
-from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
+from flcav.perception.objects.calibrate import OVERLAP, Reliability
+from flcav.perception.objects.truth import FrameTruth, TargetCriteria, select_class
 from flcav.perception.ops.rotated import Kind
-from flcav.progress import Report, ignore_progress
-from flcav.records import Class
+from flcav.perception.task import Evaluated
+from flcav.perception.tracking.evaluate import TracksEvaluation
+from flcav.records import LEFT_OUT, Class
 from flcav.seeds import stream
-from flcav.sensors.frame import Frame
-from flcav.world.weather import classify_weather
+from flcav.world.weather import WEATHER_CLASSES
 
 OVERLAPS: tuple[tuple[Kind, float], ...] = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
-LOWEST_SCORE = 0.05  # of detections that are evaluated; lower ones change AP by less than its interval
+DISTANCES_M = ((0, 20), (20, 40), (40, 80))  # from, to: in the plane from the LiDAR to the centre of the box
+OCCLUSIONS = ((0.0, 0.2), (0.2, 0.6), (0.6, 1.01))  # from, to: occluded share
+BORDER_M = 2.0  # detections up to this far outside a range of distances are kept: they may be of objects in it
 
 
 @dataclass(frozen=True)
-class FrameTruth:
-    """Ground truth of one frame for evaluation: targets, neutral and hidden objects, LiDAR frame, detection classes."""
+class BreakdownRow:
+    """Average precision of one class in one part of a breakdown, for one kind of overlap and IoU threshold."""
 
-    scene: str
-    targets: Boxes  # see `flcav.perception.objects.truth`
-    neutral: Boxes  # a detection on them is neither true nor false; label = the class they are neutral for
-    hidden: Boxes  # in range without a return: counted, and neutral too
-    occlusion: NDArray[np.float64] | None = None  # (targets,) occluded share in [0, 1]; None: not known
-    weather: str | None = None  # weather class of the frame; None between the classes, and where it is not known
+    by: str  # distance | occlusion | weather
+    slice: str  # name of the part
+    label: Class
+    kind: Kind
+    iou: float  # from which a detection is a true positive
+    ap: float | None  # AP|R40, [0, 1]
+    targets: int  # in the part
 
 
 @dataclass(frozen=True)
@@ -58,42 +65,65 @@ class Score:
     hidden: int  # objects in range without a return
 
 
-def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
-    """Return the targets, neutral and hidden objects of `frame` for the evaluation of a network of `config`.
+@dataclass(frozen=True, kw_only=True)
+class ObjectsEvaluation(Evaluated):
+    """Evaluation of one network on one set of frames: AP and AOS, breakdown, calibration, tracking."""
 
-    Faint and hidden objects, objects out of range and lookalikes are neutral. Raises `InputError` where the frame has
-    no LiDAR.
-    """
-    truth = ground_truth(frame, config)
-    neutral = (truth.known & ~truth.target) | truth.lookalike
-    weather = None if frame.weather is None else classify_weather(frame.weather)
-    occlusion = frame.annotations.occlusion[truth.target].astype(float)
-    boxes = truth.boxes
-    return FrameTruth(frame.scene, boxes[truth.target], boxes[neutral], boxes[truth.hidden], occlusion, weather)
+    frames: int
+    scenes: int
+    scores: tuple[Score, ...]  # class by class
+    rules: Annotated[TargetCriteria | None, LEFT_OUT] = None  # target criteria; None in results of earlier versions
+    slices: tuple[BreakdownRow, ...]  # breakdown of AP
+    trust: tuple[Reliability, ...]  # calibration of scores and variances, one per class
+    tracks: Annotated[TracksEvaluation | None, LEFT_OUT] = None  # None unless asked for
 
+    @property
+    def score(self) -> float:
+        """Return the mean AP in 3D at IoU 0.5 over the classes with an AP above 0; 0 where there is none."""
+        known = [row.ap for row in self.scores if (row.kind, row.iou) == ("3d", 0.5) and row.ap]
+        return float(np.mean(known)) if known else 0.0
 
-def detect_frames(
-    network: Second,
-    frames: Iterable[Frame],
-    asked: SecondConfig | None = None,
-    *,
-    total: int = 0,
-    progress: Report = ignore_progress,
-) -> tuple[list[Boxes], list[FrameTruth]]:
-    """Return the detections of `network` in each frame, from `LOWEST_SCORE` on, and the ground truth of each frame.
+    def numbers(self) -> Mapping[str, float]:
+        """Return the metrics that are known, by name, for each class.
 
-    asked: a configuration of smaller range (None: the network's own); objects beyond it are neutral, and detections
-    beyond it are dropped. total: number of frames where it is known, for `progress`. Raises `InputError` where a frame
-    has no LiDAR.
-    """
-    truths: list[FrameTruth] = []
-    detections: list[Boxes] = []
-    for done, frame in enumerate(frames, start=1):
-        truths.append(asked_of(frame, asked or network.config))
-        (found,) = detect_all(network, [frame.lidar[choose_lidar(frame)]], score_threshold=LOWEST_SCORE)
-        detections.append(found if asked is None else found[in_range(found, asked)])
-        progress(done, max(total, done), "")
-    return detections, truths
+        AP for every kind of overlap and IoU; AOS and the share of right headings in 3D at IoU 0.5; expected calibration
+        error; MOTA and AMOTA where tracks were evaluated.
+        """
+        ap = {f"{row.label} AP {row.kind} at {row.iou}": row.ap for row in self.scores}
+        headings = {
+            f"{row.label} {name}": value
+            for row in self.scores
+            if (row.kind, row.iou) == ("3d", 0.5)
+            for name, value in (("AOS 3d at 0.5", row.aos), ("right headings", row.right_headings))
+        }
+        errors = {f"{row.label} calibration error": row.ece for row in self.trust}
+        tracks = {
+            f"{row.label} {name}": value
+            for row in (self.tracks.scores if self.tracks else ())
+            for name, value in (("MOTA", row.mota), ("AMOTA", row.amota))
+        }
+        return {name: value for name, value in (ap | headings | errors | tracks).items() if value is not None}
+
+    def lines(self) -> list[str]:
+        """Return the evaluation in words.
+
+        Frames and target criteria; a line per class, kind of overlap and IoU; a line per class and part of the
+        breakdown; calibration errors; tracking.
+        """
+        lines = [f"{self.frames} frames of {self.scenes} scenes", *(self.rules.lines() if self.rules else ())]
+        for row in self.scores:
+            found = "nothing to find"
+            if row.ap is not None:
+                found = f"AP {row.ap:.3f} {interval_words(row.low, row.high)}  AOS {row.aos:.3f}"
+            if row.right_headings is not None:
+                found += f", {row.right_headings:.0%} of those found head the right way"
+            counts = f"objects: {row.targets}, and {row.hidden} without a return"
+            lines.append(f"{row.label:<12}{row.kind:>4} IoU {row.iou:.1f}  {found}  ({counts})")
+        lines += [f"at IoU {OVERLAP:g} by distance, occlusion and weather:", *format_breakdown(self.slices, OVERLAP)]
+        for row in self.trust:
+            if row.ece is not None:
+                lines.append(f"{row.label:<12}expected calibration error {row.ece:.3f}")
+        return [*lines, *(self.tracks.lines() if self.tracks else ())]
 
 
 def score_detections(
@@ -122,11 +152,80 @@ def score_detections(
     return tuple(scores)
 
 
-def select_class(boxes: Boxes, name: str) -> Boxes:
-    """Return the boxes with the label `name`."""
-    return boxes[boxes.label == name]
+class BreakdownPart(NamedTuple):
+    """One part of a breakdown: the objects of a range of distance or occlusion, or the frames of a weather."""
+
+    by: str  # distance | occlusion | weather
+    name: str  # of the part: "0-20 m", "20%-60%", "fog"
+    detections: list[Boxes]  # of each frame
+    wanted: list[NDArray[np.bool_]]  # of each frame (targets,): whether the target is in the part; others are neutral
+    frames: NDArray[np.int64]  # indices of the frames in the part
 
 
-def round_or_none(value: float) -> float | None:
-    """Return the number rounded to six decimals, or None for NaN, which JSON cannot hold."""
-    return None if np.isnan(value) else round(value, 6)
+def break_down(
+    detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: Sequence[str]
+) -> tuple[BreakdownRow, ...]:
+    """Return the breakdown of AP: a row for each part, class with targets in it, kind of overlap and IoU threshold.
+
+    detections (LiDAR frame) and truths run over the same frames.
+    """
+    rows = []
+    for part in split_parts(detections, truths):
+        for label in classes:
+            found = [select_class(boxes, label) for boxes in part.detections]
+            own = [truth.targets.label == label for truth in truths]
+            targets = [t.targets[o & w] for t, o, w in zip(truths, own, part.wanted, strict=True)]
+            count = sum(len(targets[frame]) for frame in part.frames)
+            if not count:
+                continue
+            others = [t.targets[o & ~w] for t, o, w in zip(truths, own, part.wanted, strict=True)]
+            neutral = [concatenate([select_class(t.neutral, label), o]) for t, o in zip(truths, others, strict=True)]
+            for kind, overlap in OVERLAPS:
+                ap = average_precision(match(found, targets, neutral, overlap, kind), part.frames)
+                rows.append(BreakdownRow(part.by, part.name, label, kind, overlap, round_or_none(ap), count))
+    return tuple(rows)
+
+
+def format_breakdown(rows: Sequence[BreakdownRow], overlap: float) -> list[str]:
+    """Return a breakdown at IoU `overlap` in words: a line per class and part, class by class."""
+    own = [row for row in rows if row.iou == overlap]
+    ap = {(row.label, row.by, row.slice, row.kind): row.ap for row in own}
+    known = {(row.label, row.by, row.slice): row.targets for row in own}
+    labels = list(dict.fromkeys(row.label for row in own))
+    return [
+        f"{label:<12}{by:<11}{name.replace('_', ' '):<12}AP 3d {ap[label, by, name, '3d']:.3f}"
+        f"  bev {ap[label, by, name, 'bev']:.3f}  (objects: {targets})"
+        for (label, by, name), targets in sorted(known.items(), key=lambda each: labels.index(each[0][0]))
+    ]
+
+
+def split_parts(detections: Sequence[Boxes], truths: Sequence[FrameTruth]) -> Iterator[BreakdownPart]:
+    """Yield the parts of the breakdown, by distance, occlusion and weather.
+
+    Occlusion is left out unless every frame has it, weather unless the frames have several.
+    """
+    everything = np.arange(len(truths))
+    for low, high in DISTANCES_M:
+        near = [_between(_distance(boxes), low - BORDER_M, high + BORDER_M) for boxes in detections]
+        found = [boxes[kept] for boxes, kept in zip(detections, near, strict=True)]
+        wanted = [_between(_distance(truth.targets), low, high) for truth in truths]
+        yield BreakdownPart("distance", f"{low}-{high} m", found, wanted, everything)
+    hidden = [truth.occlusion for truth in truths if truth.occlusion is not None]
+    if len(hidden) == len(truths):
+        for low, high in OCCLUSIONS:
+            wanted = [_between(share, low, high) for share in hidden]
+            yield BreakdownPart("occlusion", f"{low:.0%}-{min(high, 1):.0%}", list(detections), wanted, everything)
+    seen = {truth.weather for truth in truths}
+    weathers = [name for name in WEATHER_CLASSES if name in seen]
+    for name in weathers if len(weathers) > 1 else ():
+        wanted = [np.ones(len(truth.targets), dtype=bool) for truth in truths]
+        frames = np.flatnonzero([truth.weather == name for truth in truths])
+        yield BreakdownPart("weather", name, list(detections), wanted, frames)
+
+
+def _distance(boxes: Boxes) -> NDArray[np.float64]:
+    return np.hypot(boxes.center[:, 0], boxes.center[:, 1])
+
+
+def _between(value: NDArray[np.float64], low: float, high: float) -> NDArray[np.bool_]:
+    return (value >= low) & (value < high)

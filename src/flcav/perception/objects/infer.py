@@ -1,7 +1,6 @@
-"""Point clouds of files, folders and datasets for inference, and detected objects as JSON records."""
+"""Inference on point clouds of files, folders and datasets: findings with the detected objects."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -13,12 +12,13 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti import read_points
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.geometry import Boxes
 from flcav.perception.images import CameraView, recorded_view, view_beside
+from flcav.perception.marks import CloudBoxes
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import ObjectsFound, boxes_to_rows, detect
 from flcav.perception.objects.samples import validate_points
 from flcav.perception.objects.truth import choose_lidar
-from flcav.perception.task import Result
-from flcav.records import Class
+from flcav.perception.task import Finding
 
 
 class Cloud(NamedTuple):
@@ -27,6 +27,19 @@ class Cloud(NamedTuple):
     path: Path  # of the file; of a dataset, folder / key of the frame
     points: NDArray[np.float32]  # (N, 4) x, y, z [m], intensity [0, 1]
     view: Callable[[], CameraView | None]  # reads the view of a camera with the same direction, None without one
+
+
+def detect_objects(
+    network: Second, path: Path, threshold: float, frames: Sequence[int] | None = None
+) -> Iterator[Finding]:
+    """Yield the objects of score `threshold` or more in each point cloud of `path`.
+
+    path: a KITTI .bin file, a folder of them, or a dataset folder, of which `frames` (None: all). Raises `InputError`
+    as `read_point_clouds` does.
+    """
+    for cloud in read_point_clouds(path, frames):
+        found = detect(network, cloud.points, score_threshold=threshold)
+        yield Finding(cloud.path, cloud.points, ObjectsFound(boxes_to_rows(found)), (CloudBoxes(found),), cloud.view)
 
 
 def read_point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterator[Cloud]:
@@ -47,50 +60,6 @@ def read_point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterat
     else:
         raise InputError(f"{path}: no such file or folder")
     return (cloud._replace(points=validate_points(cloud.points, cloud.path)) for cloud in clouds)
-
-
-@dataclass(frozen=True)
-class ObjectFound:
-    """A detected object: class, score and 3D box, LiDAR frame (x forward, y left, z up)."""
-
-    label: Class
-    score: float  # [0, 1]
-    x: float  # of the box's centre [m]
-    y: float
-    z: float
-    length: float  # [m]
-    width: float
-    height: float
-    yaw: float  # counter-clockwise from the x axis [rad]
-
-
-@dataclass(frozen=True)
-class ObjectsFound(Result):
-    """The objects detected in a point cloud."""
-
-    boxes: tuple[ObjectFound, ...]
-
-    def lines(self) -> list[str]:
-        """Return the number of objects, then one line per box."""
-        lines = [f"{len(self.boxes)} objects"]
-        for box in self.boxes:
-            place = f"at ({box.x:.1f}, {box.y:.1f}, {box.z:.1f}) m, yaw {box.yaw:.2f} rad"
-            size = f"{box.length:.1f} x {box.width:.1f} x {box.height:.1f} m"
-            lines.append(f"{box.label:<11}{box.score:.2f}  {place}, {size}")
-        return lines
-
-
-def boxes_to_rows(boxes: Boxes) -> tuple[ObjectFound, ...]:
-    """Return the boxes as records, one per box; a score that is not known is 1."""
-    scores = boxes.score if boxes.score is not None else np.ones(len(boxes))
-    rows = zip(boxes.label.tolist(), scores.tolist(), boxes.array().tolist(), strict=True)
-    return tuple(ObjectFound(label, score, *row) for label, score, row in rows)
-
-
-def rows_to_boxes(rows: Sequence[ObjectFound]) -> Boxes:
-    """Return the records as boxes: the inverse of `boxes_to_rows`."""
-    array = np.array([(b.x, b.y, b.z, b.length, b.width, b.height, b.yaw) for b in rows]).reshape(-1, 7)
-    return Boxes.from_array(array, [row.label for row in rows], [row.score for row in rows])
 
 
 def _of_file(path: Path) -> Cloud:

@@ -11,20 +11,18 @@ does not change the boxes.
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.model import HeadOutput, Second
+from flcav.perception.objects.model import LOG_VARIANCES, HeadOutput, Second
+from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.targets import Targets, anchor_classes, assign_anchors
 
 ALPHA, GAMMA = 0.25, 2.0  # of the focal loss
 BOX_WEIGHT, DIRECTION_WEIGHT, VARIANCE_WEIGHT = 2.0, 1.0, 0.2
-LOG_VARIANCES = -10.0, 4.0  # a predicted log variance is clamped to this interval
 SMOOTH_L1_BETA = 1 / 9  # error at which the smooth L1 loss turns from quadratic to linear
 
 
@@ -81,12 +79,3 @@ def batch_loss(network: Second, samples: Sequence[Sample]) -> Tensor:
     """Return the scalar loss of `network` on a batch of samples, differentiable in the network's parameters."""
     targets = [assign_anchors(sample, network.config) for sample in samples]
     return second_loss(predict(network, [sample.points for sample in samples]), targets, network.config)
-
-
-def predict(network: Second, clouds: Sequence[NDArray[np.float32]]) -> HeadOutput:
-    """Return the raw predictions of `network` for a batch of point clouds (N_i, 4), LiDAR frame, on its device."""
-    device = network.head.weight.device
-    points = torch.from_numpy(np.concatenate(clouds)).to(device)
-    sizes = torch.tensor([len(cloud) for cloud in clouds], device=device)
-    sample = torch.repeat_interleave(torch.arange(len(clouds), device=device), sizes)
-    return network(network.voxels(points, sample, len(clouds)))

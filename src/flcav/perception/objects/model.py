@@ -17,6 +17,7 @@ from flcav.perception.ops.norm import NormReLU
 from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d
 from flcav.perception.ops.voxels import grid_shape, voxelize
 
+LOG_VARIANCES = -10.0, 4.0  # a predicted log variance is clamped to this interval
 HEADINGS = 2  # anchors per class and cell: along x, along y
 
 

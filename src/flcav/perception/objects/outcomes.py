@@ -2,16 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.intervals import REDRAWS
 from flcav.perception.metrics import Matches, match, orientation_similarity, right_headings, weighted_precision
-from flcav.perception.objects.evaluate import detect_frames, select_class
 from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect_frames
+from flcav.perception.objects.truth import select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.perception.outcomes import Outcomes, Times, Values
 from flcav.progress import Report, ignore_progress
@@ -39,7 +40,7 @@ class ObjectsOutcomes:
         if not truths:
             raise InputError("evaluation on 0 frames: at least one is wanted")
         hidden = [sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes]
-        arrays: dict[str, Any] = {CLASSES: np.array(classes), HIDDEN: np.array(hidden)}
+        arrays: dict[str, NDArray] = {CLASSES: np.array(classes), HIDDEN: np.array(hidden)}
         for name in classes:
             own = [select_class(boxes, name) for boxes in found]
             targets = [select_class(truth.targets, name) for truth in truths]

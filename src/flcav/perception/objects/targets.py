@@ -14,12 +14,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from flcav.geometry import heading_vectors
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import HEADINGS, head_shape
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import in_range
 
 Array = NDArray[np.float64]
+
+IGNORE_IOU = 0.1  # an anchor is ignored where its IoU with an ignored box exceeds this
+IGNORE_MARGIN_M = 0.5  # and where its centre lies in an ignored box enlarged by this on each side
 
 
 def cell_size(config: SecondConfig) -> tuple[float, float]:
@@ -56,10 +60,6 @@ def anchor_classes(config: SecondConfig) -> NDArray[np.int64]:
     classes = np.tile(np.repeat(np.arange(len(config.anchors)), HEADINGS), rows * columns)
     classes.flags.writeable = False
     return classes
-
-
-IGNORE_IOU = 0.1  # an anchor is ignored where its IoU with an ignored box exceeds this
-IGNORE_MARGIN_M = 0.5  # and where its centre lies in an ignored box enlarged by this on each side
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def _find_ignored(boxes: Array, config: SecondConfig) -> NDArray[np.int64]:
         return near
     anchors = anchor_boxes(config)[near]
     delta = anchors[:, None, :2] - boxes[None, :, :2]
-    cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
+    cos, sin = heading_vectors(boxes[:, 6]).T
     along = np.abs(delta[..., 0] * cos + delta[..., 1] * sin) <= boxes[:, 3] / 2 + IGNORE_MARGIN_M
     across = np.abs(delta[..., 1] * cos - delta[..., 0] * sin) <= boxes[:, 4] / 2 + IGNORE_MARGIN_M
     overlaps = _axis_aligned_iou(anchors, boxes) > IGNORE_IOU

@@ -2,29 +2,26 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.geometry import Boxes
 from flcav.perception.errors import THRESHOLD, Registry
-from flcav.perception.marks import CloudBoxes
-from flcav.perception.objects.area import target_criteria
 from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
 from flcav.perception.objects.calibrate import calibrate, measure_reliability
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.detect import detect
 from flcav.perception.objects.errors import register_errors
-from flcav.perception.objects.evaluate import detect_frames, score_detections
-from flcav.perception.objects.infer import ObjectsFound, boxes_to_rows, read_point_clouds
+from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, score_detections
+from flcav.perception.objects.infer import detect_objects
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.outcomes import ObjectsOutcomes
-from flcav.perception.objects.results import ObjectsEvaluation, break_down
+from flcav.perception.objects.predict import detect, detect_frames
 from flcav.perception.objects.samples import RecordedSweeps, Sample, select_fitting_frames
-from flcav.perception.objects.truth import choose_lidar
+from flcav.perception.objects.truth import choose_lidar, target_criteria
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.progress import Report, ignore_progress
@@ -37,7 +34,7 @@ class ObjectsTask(ObjectsOutcomes):
     family = "second"
     configurations = CONFIGURATIONS
     practice = Practice(batch=2, learning_rate=2e-3)
-    recording: Mapping[str, Any] = {}
+    recording: Mapping[str, Json] = {}
     labels = ("ideal-road", "own-detections")
     threshold = THRESHOLD
 
@@ -99,8 +96,8 @@ class ObjectsTask(ObjectsOutcomes):
     ) -> ObjectsEvaluation:
         """Return AP and AOS per class, kind of overlap and IoU, with intervals over scenes; breakdown; calibration.
 
-        frames: their numbers (None: all). asked: the network's configuration with a smaller range, see
-        `flcav.perception.objects.area`. Raises `InputError` where there are no frames, or one has no LiDAR.
+        frames: their numbers (None: all). asked: the network's configuration with a smaller range, see `narrow_range`
+        in `flcav.perception.objects.truth`. Raises `InputError` where there are no frames, or one has no LiDAR.
         """
         numbers, classes = data.numbers(frames), network.config.classes
         found, truths = detect_frames(network, map(data.frame, numbers), asked, total=len(numbers), progress=progress)
@@ -124,16 +121,8 @@ class ObjectsTask(ObjectsOutcomes):
     def infer(
         self, network: Second, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the objects of score `threshold` or more in each point cloud of `path`.
-
-        path: a KITTI .bin file, a folder of them, or a dataset folder, of which `frames` (None: all). Raises
-        `InputError` for anything else, see `flcav.perception.objects.infer`.
-        """
-        for cloud in read_point_clouds(path, frames):
-            found = detect(network, cloud.points, score_threshold=threshold)
-            yield Finding(
-                cloud.path, cloud.points, ObjectsFound(boxes_to_rows(found)), (CloudBoxes(found),), cloud.view
-            )
+        """Yield the objects detected in each point cloud of `path`, see `flcav.perception.objects.infer`."""
+        yield from detect_objects(network, path, threshold, frames)
 
     def register_errors(
         self,

@@ -1,11 +1,12 @@
-"""Ground truth of object detection: targets, faint, hidden and lookalike objects of a frame.
+"""Ground truth of object detection: targets, faint, hidden and lookalike objects of a frame, and target criteria.
 
 An object of a class the network knows, with its centre in the network's range, is a *target* with five LiDAR returns or
 more, *faint* with one to four, *hidden* with none. Training, evaluation, error registry and tracking share this
 definition; how each treats the kinds is in docs/tasks.md.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,8 +14,10 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.geometry import Boxes, inverse
+from flcav.intervals import CONFIDENCE
 from flcav.perception.objects.config import SecondConfig
 from flcav.sensors.frame import Frame
+from flcav.world.weather import classify_weather
 
 DETECTION_CLASS = {
     "car": "Car",
@@ -110,3 +113,80 @@ def choose_lidar(frame: Frame, name: str | None = None) -> str:
         wanted = "no LiDAR in it" if name is None else f"no LiDAR '{name}' in it; it has {sorted(frame.lidar)}"
         raise InputError(f"frame {frame.key}: {wanted}")
     return name
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """Ground truth of one frame for evaluation: targets, neutral and hidden objects, LiDAR frame, detection classes."""
+
+    scene: str
+    targets: Boxes  # (T,) objects to be found
+    neutral: Boxes  # a detection on them is neither true nor false; label = the class they are neutral for
+    hidden: Boxes  # in range without a return: counted, and neutral too
+    occlusion: NDArray[np.float64] | None = None  # (targets,) occluded share in [0, 1]; None: not known
+    weather: str | None = None  # weather class of the frame; None between the classes, and where it is not known
+
+
+def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
+    """Return the targets, neutral and hidden objects of `frame` for the evaluation of a network of `config`.
+
+    Faint and hidden objects, objects out of range and lookalikes are neutral. Raises `InputError` where the frame has
+    no LiDAR.
+    """
+    truth = ground_truth(frame, config)
+    neutral = (truth.known & ~truth.target) | truth.lookalike
+    weather = None if frame.weather is None else classify_weather(frame.weather)
+    occlusion = frame.annotations.occlusion[truth.target].astype(float)
+    boxes = truth.boxes
+    return FrameTruth(frame.scene, boxes[truth.target], boxes[neutral], boxes[truth.hidden], occlusion, weather)
+
+
+def select_class(boxes: Boxes, name: str) -> Boxes:
+    """Return the boxes with the label `name`."""
+    return boxes[boxes.label == name]
+
+
+def narrow_range(config: SecondConfig, text: str) -> SecondConfig:
+    """Return `config` with the smaller range `text`: metres ahead, a comma, metres to either side, as in "48,24".
+
+    Networks of different ranges are thus evaluated on the same objects. Raises `InputError` for any other text, and
+    where the range exceeds that of the network.
+    """
+    try:
+        ahead, side = map(float, text.split(","))
+    except ValueError:
+        ahead = side = math.nan
+    if not (0 < ahead < math.inf and 0 < side < math.inf):
+        raise InputError(f"range '{text}': metres ahead and metres to either side are wanted, as in 48,24")
+    x0, y0, z0, x1, y1, z1 = config.range_m
+    if x0 > 0 or x1 < ahead or y0 > -side or y1 < side:
+        raise InputError(f"range '{text}': the network sees no further than {_extent(config.range_m)}")
+    return replace(config, range_m=(0.0, -side, z0, ahead, side, z1))
+
+
+@dataclass(frozen=True)
+class TargetCriteria:
+    """Criteria that make an object a target, and the confidence level of intervals."""
+
+    range_m: tuple[float, ...]  # of its centre, LiDAR frame: minima x, y, z, then maxima [m]
+    min_returns: int  # LiDAR returns from it
+    confidence: float  # in (0, 1)
+
+    def lines(self) -> list[str]:
+        """Return the criteria in words: a line on targets, a line on intervals."""
+        return [
+            f"targets: centre {_extent(self.range_m)}, {self.min_returns} LiDAR returns or more; "
+            "others are neutral, and so are trucks and buses beside cars",
+            f"intervals: {100 * self.confidence:g} %, over scenes",
+        ]
+
+
+def target_criteria(config: SecondConfig) -> TargetCriteria:
+    """Return the target criteria of an evaluation of a network of `config`."""
+    return TargetCriteria(tuple(config.range_m), MIN_RETURNS, CONFIDENCE)
+
+
+def _extent(range_m: tuple[float, ...]) -> str:
+    x0, y0, _, x1, y1, _ = range_m
+    sides = f"{y1:g} m to either side" if y0 == -y1 else f"{-y0:g} m to the right and {y1:g} m to the left"
+    return f"{x0:g} to {x1:g} m ahead and {sides}"

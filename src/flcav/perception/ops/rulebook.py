@@ -22,6 +22,7 @@ from flcav.compiled import compiled
 
 Int32s = NDArray[np.int32]
 Int64s = NDArray[np.int64]
+Triple = tuple[int, int, int]
 
 
 @compiled
@@ -119,9 +120,6 @@ def find_strided_pairs(
                 source[pair], target[pair] = row, number[key]
                 pair += 1
     return source, target, per_offset, out_keys
-
-
-Triple = tuple[int, int, int]
 
 
 @dataclass(frozen=True)

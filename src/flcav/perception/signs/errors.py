@@ -13,8 +13,8 @@ from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Regis
 from flcav.perception.images import check_picture
 from flcav.perception.ops.rectangles import iou
 from flcav.perception.signs.config import SignsConfig
-from flcav.perception.signs.detect import Detections, detect
 from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.predict import Detections, detect
 from flcav.perception.signs.samples import find_targets, size_px
 from flcav.progress import Report, ignore_progress
 from flcav.sensors.camera.lens import unproject_pixels

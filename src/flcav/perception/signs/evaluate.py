@@ -10,7 +10,7 @@ import numpy as np
 from faster_coco_eval import COCO, COCOeval_faster
 from numpy.typing import NDArray
 
-from flcav.perception.signs.detect import Detections
+from flcav.perception.signs.predict import Detections
 from flcav.perception.signs.samples import size_px
 from flcav.perception.task import Evaluated
 from flcav.records import Class

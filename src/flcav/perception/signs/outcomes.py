@@ -8,9 +8,9 @@ import numpy as np
 from flcav.dataset.store import Dataset
 from flcav.perception.outcomes import Outcomes, Times, Values
 from flcav.perception.signs.config import SignsConfig
-from flcav.perception.signs.detect import Detections, detect
 from flcav.perception.signs.evaluate import GroundTruth, mean_average_precision
 from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.predict import Detections, detect
 from flcav.perception.signs.samples import RecordedPictures
 from flcav.progress import Report, ignore_progress
 

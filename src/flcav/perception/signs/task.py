@@ -3,22 +3,20 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.perception.client import ANNOTATED, camera_ahead, picture_bytes
 from flcav.perception.errors import THRESHOLD, Registry
-from flcav.perception.images import read_pictures
-from flcav.perception.marks import PictureBoxes
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
-from flcav.perception.signs.detect import boxes_found, detect, predict
 from flcav.perception.signs.errors import register_errors
 from flcav.perception.signs.evaluate import SignsEvaluation, mean_average_precision
-from flcav.perception.signs.loss import assign_anchors, detection_loss
+from flcav.perception.signs.infer import detect_signs
+from flcav.perception.signs.loss import batch_loss
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.outcomes import SignsOutcomes, by_picture
 from flcav.perception.signs.samples import RecordedPictures, Sample
@@ -36,7 +34,7 @@ class SignsTask(SignsOutcomes):
     family = "yolo"
     configurations = CONFIGURATIONS
     practice = Practice(batch=8, learning_rate=2e-3)
-    recording: Mapping[str, Any] = {
+    recording: Mapping[str, Json] = {
         "vehicle_rig": camera_ahead(640, 384, 45.0),
         "weather": {"classes": ["clear", "cloudy", "overcast", "light_rain"]},
     }
@@ -62,9 +60,8 @@ class SignsTask(SignsOutcomes):
         return draw(samples, index, config, rng)
 
     def loss(self, network: SignDetector, samples: Sequence[Sample]) -> Tensor:
-        """Return the loss of a batch of images of one size, whose sides are multiples of 32; see `detection_loss`."""
-        raw = predict(network, [sample.picture for sample in samples])
-        return detection_loss(raw, assign_anchors(samples, network.config), network.config)
+        """Return the loss of a batch of images of one size, whose sides are multiples of 32."""
+        return batch_loss(network, samples)
 
     def evaluate(
         self,
@@ -90,11 +87,7 @@ class SignsTask(SignsOutcomes):
         self, network: SignDetector, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
         """Yield the detections of each image at `path`, by falling score."""
-        for origin, rgb in read_pictures(path, frames):
-            found = detect(network, rgb, threshold=threshold)
-            names = np.array(network.config.classes)[found.label]
-            marks = (PictureBoxes(found.box, names, found.score),)
-            yield Finding(origin, rgb, boxes_found(found, network.config.classes), marks)
+        yield from detect_signs(network, path, threshold, frames)
 
     def register_errors(
         self,

@@ -28,6 +28,10 @@ ACCELERATION = 3.0  # standard deviation of the white acceleration [m/s^2]
 DRIFT = np.array((0, 0, 0.2, 0.05, 0.05, 0.05, 0.3))  # of the random walks of z, size [m/sqrt(s)] and yaw [rad/sqrt(s)]
 FIRST_SPEED = 8.0  # standard deviation of the velocity of a new track [m/s]
 LEAST_VARIANCE = np.array((0.1, 0.1, 0.1, 0.2, 0.1, 0.1, 0.15)) ** 2  # of a detection: x, y, z, size [m^2], yaw [rad^2]
+GATE = 9.21  # largest squared Mahalanobis distance in x, y of a pair: 99 % quantile of chi-squared with 2 dof
+FASTEST = 40.0  # [m/s] a pair is at most this speed times the elapsed time, plus `SLACK_M`, apart
+SLACK_M = 2.0
+UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of detections without a predicted one
 
 
 class State(NamedTuple):
@@ -80,12 +84,6 @@ def update_state(state: State, box: Array, variance: Array) -> State:
     rest[:, :MEASURED] -= gain
     noise = np.diag(np.maximum(variance, LEAST_VARIANCE))
     return State(mean, rest @ state.covariance @ rest.T + gain @ noise @ gain.T)  # Joseph form: stays symmetric
-
-
-GATE = 9.21  # largest squared Mahalanobis distance in x, y of a pair: 99 % quantile of chi-squared with 2 dof
-FASTEST = 40.0  # [m/s] a pair is at most this speed times the elapsed time, plus `SLACK_M`, apart
-SLACK_M = 2.0
-UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of detections without a predicted one
 
 
 @dataclass(frozen=True)

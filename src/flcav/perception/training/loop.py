@@ -21,6 +21,9 @@ from flcav.perception.training.checkpoint import RunState, load_checkpoint, save
 from flcav.progress import Report, ignore_progress
 from flcav.seeds import stream
 
+CLIP_NORM = 10.0  # largest norm of the gradient
+Watch = Callable[[int, Mapping[str, float]], None]  # called with the number of steps taken and scalars by name
+
 
 def constant(done: float) -> float:
     """Return 1, the constant schedule."""
@@ -40,11 +43,6 @@ def one_cycle(done: float) -> float:
 
 
 SCHEDULES: dict[str, Callable[[float], float]] = {"constant": constant, "one_cycle": one_cycle}
-
-
-CLIP_NORM = 10.0  # largest norm of the gradient
-
-Watch = Callable[[int, Mapping[str, float]], None]  # called with the number of steps taken and scalars by name
 
 
 def _unwatched(step: int, values: Mapping[str, float]) -> None:

@@ -23,6 +23,8 @@ from flcav.perception.training.loop import Checkpointing, Validation, Watch, tra
 from flcav.perception.weights import save_network
 from flcav.progress import Report, ignore_progress
 
+WEIGHTS, CARD, CHECKPOINT, EVENTS = "weights.safetensors", "card.md", "checkpoint.pt", "events"
+
 
 @contextlib.contextmanager
 def event_files(folder: Path) -> Iterator[Watch]:
@@ -46,9 +48,6 @@ def event_files(folder: Path) -> Iterator[Watch]:
     finally:
         if writer is not None:
             writer.close()
-
-
-WEIGHTS, CARD, CHECKPOINT, EVENTS = "weights.safetensors", "card.md", "checkpoint.pt", "events"
 
 
 @dataclass(frozen=True)

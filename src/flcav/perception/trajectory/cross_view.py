@@ -20,6 +20,13 @@ from flcav.perception.trajectory.config import CrossView, Patch, TrajectoryConfi
 from flcav.perception.trajectory.rasters import LAYERS, OTHERS
 
 COARSE = 8  # cells along each side of the pooled map
+LEARNED = {"road": 1.0, "lane": 1.0, "crossing": 5.0, "way": 3.0, "red": 10.0, "green": 10.0, OTHERS[0]: 8.0}
+"""Layers of the raster that cameras are taught to see, and how much more a cell in one weighs: some are rare."""
+SCALE_M = 10.0  # unit of positions on the ground
+STRIDES = (4, 8)  # [px] of the image features, down and to the right; finer down, since the ground is foreshortened
+FAR_M = 100.0  # largest distance of a ray's intersection with the ground, also of rays without one
+SHARPNESS = 3.0  # initial inverse temperature of the cosine similarities; it is learned
+NEAR = 3  # channels of query and key that hold the distance on the ground
 
 
 class Inputs(NamedTuple):
@@ -74,15 +81,6 @@ class RasterEncoder(nn.Module):
 def conv(maps: int, out: int, stride: int | tuple[int, int] = 1) -> nn.Sequential:
     """Return a 3 x 3 convolution with group normalisation and ReLU."""
     return nn.Sequential(nn.Conv2d(maps, out, 3, stride, 1, bias=False), nn.GroupNorm(out // 8, out), nn.ReLU())
-
-
-LEARNED = {"road": 1.0, "lane": 1.0, "crossing": 5.0, "way": 3.0, "red": 10.0, "green": 10.0, OTHERS[0]: 8.0}
-"""Layers of the raster that cameras are taught to see, and how much more a cell in one weighs: some are rare."""
-SCALE_M = 10.0  # unit of positions on the ground
-STRIDES = (4, 8)  # [px] of the image features, down and to the right; finer down, since the ground is foreshortened
-FAR_M = 100.0  # largest distance of a ray's intersection with the ground, also of rays without one
-SHARPNESS = 3.0  # initial inverse temperature of the cosine similarities; it is learned
-NEAR = 3  # channels of query and key that hold the distance on the ground
 
 
 class CrossViewEncoder(nn.Module):

@@ -1,7 +1,5 @@
 """Error registry of the trajectory task: forecasts whose single path has a final error above `MISS_M`."""
 
-from typing import Any
-
 import numpy as np
 
 from flcav.dataset.store import Dataset
@@ -21,17 +19,17 @@ def register_errors(
 
     Its position is that of the road user at the present, on the ground (z = 0).
     """
-    columns: dict[str, Any] = samples.columns
+    columns = samples.columns
     paths, probabilities = predict(network, samples, progress)
     said = paths[np.arange(len(paths)), find_medoid(paths, probabilities), -1]
-    wrong = np.linalg.norm(said - columns["future"][:, -1], axis=1) > MISS_M
-    traces: dict[str, Trace | None] = {scene: data.trace(scene) for scene in np.unique(columns["scene"]).tolist()}
+    wrong = np.linalg.norm(said - columns.future[:, -1], axis=1) > MISS_M
+    traces: dict[str, Trace | None] = {scene: data.trace(scene) for scene in np.unique(columns.scene).tolist()}
     errors = []
     for row in np.flatnonzero(wrong):
-        scene, actor = str(columns["scene"][row]), int(columns["actor"][row])
+        scene, actor = str(columns.scene[row]), int(columns.actor[row])
         trace = traces[scene]
         assert trace is not None  # the samples come from it
-        x, y, _ = columns["pose"][row]
+        x, y, _ = columns.pose[row]
         errors.append(
             PerceptionError(
                 x=float(x),

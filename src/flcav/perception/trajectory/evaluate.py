@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,14 +98,20 @@ class TrajectoryEvaluation(Evaluated):
         return lines
 
 
-def evaluate_paths(paths: Array, probabilities: Array, columns: Mapping[str, NDArray[Any]]) -> TrajectoryEvaluation:
+def evaluate_paths(
+    paths: Array,
+    probabilities: Array,
+    past: NDArray[np.floating],
+    future: NDArray[np.floating],
+    at_junction: NDArray[np.bool_],
+    scene: NDArray[np.str_],
+) -> TrajectoryEvaluation:
     """Return the displacement errors of all samples, of those at junctions, and of those turning at junctions.
 
-    `paths` (N, K, FUTURE, 2) [m] and `probabilities` (N, K) are the forecasts of N samples, `columns` the arrays of
-    `Samples.columns`.
+    `paths` (N, K, FUTURE, 2) [m] and `probabilities` (N, K) are the forecasts of N samples, whose columns the
+    others are.
     """
-    future, past = columns["future"].astype(np.float64), columns["past"]
-    at_junction = columns["at_junction"].astype(np.bool_)
+    future = future.astype(np.float64)
     slices = {
         ALL: np.ones(len(future), np.bool_),
         "at junctions": at_junction,
@@ -115,7 +121,7 @@ def evaluate_paths(paths: Array, probabilities: Array, columns: Mapping[str, NDA
     return TrajectoryEvaluation(
         modes=paths.shape[1],
         miss_m=MISS_M,
-        scenes=len(np.unique(columns["scene"])),
+        scenes=len(np.unique(scene)),
         slices={name: _means({key: e[rows] for key, e in errors.items()}) for name, rows in slices.items()},
     )
 

@@ -1,7 +1,6 @@
-"""Forecasts for the frames of a dataset, as records and as marks on the map around the observing agent."""
+"""Inference on the frames of a dataset: findings with the forecasts, drawn on the map around the observing agent."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,77 +10,22 @@ from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose, yaw_of
 from flcav.perception.marks import Light, Mode, Paths, RoadUser
-from flcav.perception.task import Finding, Result
+from flcav.perception.task import Finding
 from flcav.perception.trajectory.config import FUTURE, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.predict import find_medoid, predict
+from flcav.perception.trajectory.predict import find_medoid, forecasts, predict
 from flcav.perception.trajectory.rasters import OPEN
 from flcav.perception.trajectory.roads import STATIC_ROWS, RoadMap, load_roads
 from flcav.perception.trajectory.samples import Samples, extract_columns, find_near, load_traffic
 from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame
-from flcav.records import Class
 from flcav.world.map.lanes import rasterise
 from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
-Point = tuple[float, float]  # x, y in the world [m]
 
 AROUND_M = 50.0  # half side of the map around the observer, and of the square whose vehicles are predicted with rasters
 PIXEL_M = 0.2  # resolution of the map
 TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())  # of the path points, after the present
-
-
-@dataclass(frozen=True)
-class Pose2D:
-    """A 2D pose in the world."""
-
-    x: float  # world [m]
-    y: float
-    yaw: float  # [rad]
-
-
-@dataclass(frozen=True)
-class ForecastMode:
-    """One mode of a forecast."""
-
-    probability: float
-    path: tuple[Point, ...]  # positions at `Forecasts.time_s`
-
-
-@dataclass(frozen=True, kw_only=True)
-class Forecast:
-    """The forecast of one road user: the JSON record of a `RoadUser`."""
-
-    track: str
-    label: Class
-    x: float  # world [m]
-    y: float
-    yaw: float  # [rad]
-    speed: float  # [m/s]
-    length: float  # [m]
-    width: float
-    modes: tuple[ForecastMode, ...]  # the first is the single path (the medoid), the others follow by probability
-    constant_velocity: tuple[Point, ...] | None  # path at constant heading and speed
-    truth: tuple[Point, ...] | None  # path that was driven; None if not recorded
-
-
-@dataclass(frozen=True)
-class Forecasts(Result):
-    """The forecasts of a frame."""
-
-    time_s: tuple[float, ...]  # times of the points of every path, after the present
-    observer: Pose2D
-    lights: tuple[Light, ...]
-    agents: tuple[Forecast, ...]
-
-    def lines(self) -> list[str]:
-        """Return one line per road user: its position now and at the end of its single path."""
-        lines = []
-        for agent in self.agents:
-            x, y = agent.modes[0].path[-1]
-            said = f"at ({agent.x:.1f}, {agent.y:.1f}), in {self.time_s[-1]:g} s at ({x:.1f}, {y:.1f})"
-            lines.append(f"{agent.track} {said}")
-        return lines or ["nobody to predict"]
 
 
 def forecast_frames(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | None = None) -> Iterator[Finding]:
@@ -105,32 +49,6 @@ def forecast_frames(network: TrajectoryNetwork, path: Path, frames: Sequence[int
         yield Finding(path / data.name(number), map_around(load_roads(data), observer), forecasts(found), (found,))
 
 
-def forecasts(paths: Paths) -> Forecasts:
-    """Return the JSON record of the forecasts of a frame."""
-    x, y, yaw = paths.observer
-    return Forecasts(paths.times_s, Pose2D(x, y, yaw), paths.lights, tuple(map(_forecast, paths.users)))
-
-
-def _forecast(user: RoadUser) -> Forecast:
-    return Forecast(
-        track=user.track,
-        label=user.label,
-        x=user.x,
-        y=user.y,
-        yaw=user.yaw,
-        speed=user.speed,
-        length=user.length,
-        width=user.width,
-        modes=tuple(ForecastMode(mode.probability, _points(mode.path)) for mode in user.modes),
-        constant_velocity=None if user.constant_velocity is None else _points(user.constant_velocity),
-        truth=None if user.truth is None else _points(user.truth),
-    )
-
-
-def _points(path: Array) -> tuple[Point, ...]:
-    return tuple((x, y) for x, y in path.tolist())
-
-
 def map_around(roads: RoadMap, observer: Array) -> NDArray[np.bool_]:
     """Return the raster (len(STATIC), H, W) of the map in the square of half side `AROUND_M` around x, y, yaw."""
     middle = pose(float(observer[0]), float(observer[1]), yaw=float(observer[2]))
@@ -145,23 +63,21 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
     else:
         apart = into_frame(trace.position[None, instant, :, :2], observer[None])[0]
         wanted = (np.abs(apart) <= AROUND_M).all(axis=1)
-    columns = extract_columns(trace, key.time_s, load_roads(data), config.patch, wanted, complete=False)
-    count = len(columns["past"])
-    columns |= {"scene": np.full(count, key.scene), "frame": np.full(count, number)}
+    columns = extract_columns(trace, key, number, load_roads(data), config.patch, wanted, complete=False)
     users: list[RoadUser] = []
-    if count:
+    if len(columns.past):
         paths, probabilities = predict(network, Samples(data, columns, config.cameras))
         first = find_medoid(paths, probabilities)
-        present, plain = columns["pose"], constant_velocity(columns["past"])
-        for i, actor in enumerate(columns["actor"]):
+        present, plain = columns.pose, constant_velocity(columns.past)
+        for i, actor in enumerate(columns.actor):
             modes = [Mode(float(share), _in_world(way, present[i])) for share, way in zip(probabilities[i], paths[i])]
-            truth = columns["future"][i].astype(np.float64)
+            truth = columns.future[i].astype(np.float64)
             users.append(
                 RoadUser(
                     str(trace.actor[actor]),
                     str(trace.category[actor]),
                     *present[i].tolist(),
-                    speed=float(columns["past"][i, -1, 3]),
+                    speed=float(columns.past[i, -1, 3]),
                     length=float(trace.size[actor, 0]),
                     width=float(trace.size[actor, 1]),
                     modes=(modes.pop(first[i]), *sorted(modes, key=lambda mode: -mode.probability)),

@@ -1,15 +1,30 @@
 """Loss of the trajectory network: winner-takes-all regression, mode classification, and map segmentation."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from flcav.perception.trajectory.cross_view import LEARNED
-from flcav.perception.trajectory.model import ForecastTensors
+from flcav.perception.trajectory.model import ForecastTensors, TrajectoryNetwork
+from flcav.perception.trajectory.predict import futures_of, inputs_of, rasters_of
 from flcav.perception.trajectory.rasters import LAYERS
+from flcav.perception.trajectory.samples import Sample
 
 SHARED = 0.05  # share of the regression over all modes, against unused modes: Rupprecht et al., ICCV 2017, eq. 5
 MODE_WEIGHT = 1.0  # weight of the mode classification
+
+
+def batch_loss(network: TrajectoryNetwork, samples: Sequence[Sample]) -> Tensor:
+    """Return the loss of the forecast, with cameras plus the weighted loss of the map's segmentation."""
+    inputs = inputs_of(samples, network)
+    forecast = network(inputs)
+    loss = forecast_loss(forecast, futures_of(samples, inputs.past.device))
+    if forecast.map_logits is None or network.config.cameras is None:
+        return loss
+    taught = map_loss(forecast.map_logits, rasters_of(samples, inputs.past.device))
+    return loss + network.config.cameras.map_weight * taught
 
 
 def forecast_loss(forecast: ForecastTensors, future: Tensor) -> Tensor:

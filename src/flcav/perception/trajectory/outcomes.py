@@ -34,9 +34,9 @@ class TrajectoryOutcomes:
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
         columns = samples.columns
-        future, past = columns["future"].astype(np.float64), columns["past"]
-        errors = compute_errors(paths, probabilities, future, constant_velocity(past))
-        return Outcomes(np.asarray(columns["scene"], dtype=np.str_), dict(errors))
+        future = columns.future.astype(np.float64)
+        errors = compute_errors(paths, probabilities, future, constant_velocity(columns.past))
+        return Outcomes(np.asarray(columns.scene, dtype=np.str_), errors)
 
     def measure(self, outcomes: Outcomes, times: Times) -> Values:
         """Return the score of each bootstrap sample."""

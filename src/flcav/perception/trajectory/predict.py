@@ -1,16 +1,78 @@
-"""Inference of the trajectory network on samples: input and target tensors, batches, and the single path."""
+"""Inference of the trajectory network: input and target tensors, batches, single path; forecasts as JSON records."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from flcav.perception.marks import Light, Paths, RoadUser
+from flcav.perception.task import Result
 from flcav.perception.trajectory.cross_view import Inputs
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.samples import Sample
 from flcav.progress import Report, ignore_progress
+from flcav.records import Class
+
+Array = NDArray[np.float64]
+Point = tuple[float, float]  # x, y in the world [m]
+
+RASTERS, VIEWS = 256, 16  # batch sizes of inference with rasters and with cameras
+
+
+@dataclass(frozen=True)
+class Pose2D:
+    """A 2D pose in the world."""
+
+    x: float  # world [m]
+    y: float
+    yaw: float  # [rad]
+
+
+@dataclass(frozen=True)
+class ForecastMode:
+    """One mode of a forecast."""
+
+    probability: float
+    path: tuple[Point, ...]  # positions at `Forecasts.time_s`
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forecast:
+    """The forecast of one road user: the JSON record of a `RoadUser`."""
+
+    track: str
+    label: Class
+    x: float  # world [m]
+    y: float
+    yaw: float  # [rad]
+    speed: float  # [m/s]
+    length: float  # [m]
+    width: float
+    modes: tuple[ForecastMode, ...]  # the first is the single path (the medoid), the others follow by probability
+    constant_velocity: tuple[Point, ...] | None  # path at constant heading and speed
+    truth: tuple[Point, ...] | None  # path that was driven; None if not recorded
+
+
+@dataclass(frozen=True)
+class Forecasts(Result):
+    """The forecasts of a frame."""
+
+    time_s: tuple[float, ...]  # times of the points of every path, after the present
+    observer: Pose2D
+    lights: tuple[Light, ...]
+    agents: tuple[Forecast, ...]
+
+    def lines(self) -> list[str]:
+        """Return one line per road user: its position now and at the end of its single path."""
+        lines = []
+        for agent in self.agents:
+            x, y = agent.modes[0].path[-1]
+            said = f"at ({agent.x:.1f}, {agent.y:.1f}), in {self.time_s[-1]:g} s at ({x:.1f}, {y:.1f})"
+            lines.append(f"{agent.track} {said}")
+        return lines or ["nobody to predict"]
 
 
 def inputs_of(samples: Sequence[Sample], network: nn.Module) -> Inputs:
@@ -44,11 +106,6 @@ def _floats(arrays: list[NDArray[np.float64]], device: torch.device) -> Tensor:
     return torch.from_numpy(np.stack(arrays).astype(np.float32)).to(device)
 
 
-Array = NDArray[np.float64]
-
-RASTERS, VIEWS = 256, 16  # batch sizes of inference with rasters and with cameras
-
-
 def predict(
     network: TrajectoryNetwork, samples: Sequence[Sample], progress: Report = ignore_progress
 ) -> tuple[Array, Array]:
@@ -80,3 +137,29 @@ def find_medoid(paths: Array, probabilities: Array) -> NDArray[np.int64]:
     """
     apart = np.linalg.norm(paths[:, :, None] - paths[:, None], axis=4).mean(axis=3)  # (N, K, K)
     return (apart * probabilities[:, None]).sum(axis=2).argmin(axis=1)
+
+
+def forecasts(paths: Paths) -> Forecasts:
+    """Return the JSON record of the forecasts of a frame."""
+    x, y, yaw = paths.observer
+    return Forecasts(paths.times_s, Pose2D(x, y, yaw), paths.lights, tuple(map(_forecast, paths.users)))
+
+
+def _forecast(user: RoadUser) -> Forecast:
+    return Forecast(
+        track=user.track,
+        label=user.label,
+        x=user.x,
+        y=user.y,
+        yaw=user.yaw,
+        speed=user.speed,
+        length=user.length,
+        width=user.width,
+        modes=tuple(ForecastMode(mode.probability, _points(mode.path)) for mode in user.modes),
+        constant_velocity=None if user.constant_velocity is None else _points(user.constant_velocity),
+        truth=None if user.truth is None else _points(user.truth),
+    )
+
+
+def _points(path: Array) -> tuple[Point, ...]:
+    return tuple((x, y) for x, y in path.tolist())

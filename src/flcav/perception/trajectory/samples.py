@@ -5,7 +5,7 @@ that projects the vehicle's frame into them.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import NamedTuple, overload
 
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 CAMERAS = 6  # typical number of cameras of a vehicle
 KEPT_BYTES = 2**30  # [B] of images cached in memory
+SEEN_M = 25.0  # largest distance from the observing vehicle to a road user that is predicted with cameras
+LOOKED_AT_AGAIN = 4  # number of cached sets of samples, so that validation does not extract its samples again
 
 Pictured = tuple[NDArray[np.uint8], Array, Array]  # images, intrinsics and camera_from_world of a frame's cameras
 
@@ -77,16 +79,22 @@ def rescaled(intrinsics: Array, rgb: Picture, settings: CrossView) -> Array:
     return out
 
 
-SEEN_M = 25.0  # largest distance from the observing vehicle to a road user that is predicted with cameras
-LOOKED_AT_AGAIN = 4  # number of cached sets of samples, so that validation does not extract its samples again
+class Columns(NamedTuple):
+    """The fields of N samples as arrays with a row for each, see `Sample`; without `surround`."""
+
+    past: NDArray[np.float32]  # (N, PAST + 1, 4)
+    future: NDArray[np.float32]  # (N, FUTURE, 2)
+    raster: NDArray[np.uint8]  # (N, LAYERS, cells, cells / 8)
+    pose: NDArray[np.float64]  # (N, 3)
+    actor: NDArray[np.int64]  # (N,)
+    at_junction: NDArray[np.bool_]  # (N,)
+    scene: NDArray[np.str_]  # (N,)
+    frame: NDArray[np.int64]  # (N,)
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One road user at one instant, in the frame of its present pose: x along its heading; metres, radians, seconds.
-
-    The fields before `surround` are also the keys of `Samples.columns`, there with a row for each of N samples.
-    """
+    """One road user at one instant, in the frame of its present pose: x along its heading; metres, radians, seconds."""
 
     past: NDArray[np.float32]  # (PAST + 1, 4) x, y, yaw, speed; the last is the present
     future: NDArray[np.float32]  # (FUTURE, 2) x, y; NaN if unknown
@@ -99,18 +107,15 @@ class Sample:
     surround: Surround | None = None  # images and calibration of the cameras; None with rasters
 
 
-COLUMNS = tuple(field.name for field in fields(Sample) if field.name != "surround")
-
-
 class Samples(Sequence[Sample]):
     """Samples as arrays with a row per sample, `columns`; images are read when a sample is accessed."""
 
-    def __init__(self, data: Dataset, columns: dict[str, NDArray], cameras: CrossView | None) -> None:
+    def __init__(self, data: Dataset, columns: Columns, cameras: CrossView | None) -> None:
         self.columns = columns
         self._data, self._cameras = data, cameras
 
     def __len__(self) -> int:
-        return len(self.columns["past"])
+        return len(self.columns.past)
 
     @overload
     def __getitem__(self, index: int) -> Sample: ...
@@ -119,9 +124,9 @@ class Samples(Sequence[Sample]):
     def __getitem__(self, index: int | slice) -> Sample | list[Sample]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        row = {name: column[index] for name, column in self.columns.items()}
-        seen = surround(self._data, int(row["frame"]), row["pose"], self._cameras) if self._cameras else None
-        return Sample(**row, surround=seen)
+        row = Columns(*(column[index] for column in self.columns))
+        seen = surround(self._data, int(row.frame), row.pose, self._cameras) if self._cameras else None
+        return Sample(*row, surround=seen)
 
 
 def samples_of(data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | None = None) -> Samples:
@@ -137,15 +142,12 @@ def samples_of(data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | 
 @lru_cache(maxsize=LOOKED_AT_AGAIN)
 def _samples(data: Dataset, patch: Patch, cameras: CrossView | None, frames: tuple[int, ...]) -> Samples:
     parts = list(_parts(data, patch, cameras, frames))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in COLUMNS}
-    if not len(columns["past"]):
+    if not any(len(part.past) for part in parts):
         raise InputError(f"{data.folder}: no vehicle is there from 2 s before to 3 s after any of the frames")
-    return Samples(data, columns, cameras)
+    return Samples(data, Columns(*map(np.concatenate, zip(*parts))), cameras)
 
 
-def _parts(
-    data: Dataset, patch: Patch, cameras: CrossView | None, frames: Sequence[int]
-) -> Iterator[dict[str, NDArray]]:
+def _parts(data: Dataset, patch: Patch, cameras: CrossView | None, frames: Sequence[int]) -> Iterator[Columns]:
     seen = set()
     traces: dict[str, Trace] = {}
     for number in frames:
@@ -162,9 +164,7 @@ def _parts(
         else:
             wanted = np.ones(len(trace.actor), np.bool_)
         seen.add((key.scene, key.index))
-        rows = extract_columns(trace, key.time_s, load_roads(data), patch, wanted)
-        count = len(rows["past"])
-        yield rows | {"scene": np.full(count, key.scene), "frame": np.full(count, number)}
+        yield extract_columns(trace, key, number, load_roads(data), patch, wanted)
 
 
 def select_fitting_frames(data: Dataset, cameras: bool) -> Sequence[int]:
@@ -196,13 +196,19 @@ def find_near(trace: Trace, key: FrameKey) -> NDArray[np.bool_]:
 
 
 def extract_columns(
-    trace: Trace, time_s: float, roads: RoadMap, patch: Patch, wanted: NDArray[np.bool_], complete: bool = True
-) -> dict[str, NDArray]:
-    """Return the columns of `Sample` except scene and frame, of the `wanted` (A,) vehicles on the road at `time_s`.
+    trace: Trace,
+    key: FrameKey,
+    number: int,
+    roads: RoadMap,
+    patch: Patch,
+    wanted: NDArray[np.bool_],
+    complete: bool = True,
+) -> Columns:
+    """Return the samples of the `wanted` (A,) vehicles on the road at the time of the frame of this key and number.
 
     Only vehicles with a complete past are included, and only with a complete future if `complete`.
     """
-    tracks = tracks_around(trace, time_s)
+    tracks = tracks_around(trace, key.time_s)
     known = np.isfinite(tracks.yaw)
     on_road = (trace.category != "pedestrian") & ~np.char.startswith(trace.actor, "parked") & wanted
     on_road &= known.all(axis=0) if complete else known[: PAST + 1].all(axis=0)
@@ -213,14 +219,16 @@ def extract_columns(
     turn -= np.round(turn[:, -1:] / (2 * np.pi)) * 2 * np.pi
     speed = tracks.speed[: PAST + 1, actor].T
     past = np.concatenate((path[:, : PAST + 1], turn[..., None], speed[..., None]), axis=2)
-    lit = trace.light_state[max(0, int(np.searchsorted(trace.time_s, time_s + 1e-6, side="right")) - 1)]
+    lit = trace.light_state[max(0, int(np.searchsorted(trace.time_s, key.time_s + 1e-6, side="right")) - 1)]
     seen = draw_rasters(trace, tracks, lit, actor, roads, patch)
     _, to_junction_m = roads.lanes_at(pose[:, :2], pose[:, 2])
-    return {
-        "past": past.astype(np.float32),
-        "future": path[:, PAST + 1 :].astype(np.float32),
-        "raster": np.packbits(seen, axis=-1),
-        "pose": pose,
-        "actor": actor,
-        "at_junction": to_junction_m <= BEFORE_M,
-    }
+    return Columns(
+        past=past.astype(np.float32),
+        future=path[:, PAST + 1 :].astype(np.float32),
+        raster=np.packbits(seen, axis=-1),
+        pose=pose,
+        actor=actor,
+        at_junction=to_junction_m <= BEFORE_M,
+        scene=np.full(len(actor), key.scene),
+        frame=np.full(len(actor), number),
+    )

@@ -3,13 +3,12 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.perception.errors import Registry
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
@@ -17,14 +16,12 @@ from flcav.perception.trajectory.config import CONFIGURATIONS, TrajectoryConfig
 from flcav.perception.trajectory.errors import register_errors
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
 from flcav.perception.trajectory.infer import forecast_frames
-from flcav.perception.trajectory.loss import forecast_loss, map_loss
+from flcav.perception.trajectory.loss import batch_loss
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.outcomes import TrajectoryOutcomes
-from flcav.perception.trajectory.predict import futures_of, inputs_of, predict, rasters_of
+from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.samples import Sample, samples_of, select_fitting_frames
 from flcav.progress import Report, ignore_progress
-
-Array = NDArray[np.float64]
 
 
 class TrajectoryTask(TrajectoryOutcomes):
@@ -34,7 +31,7 @@ class TrajectoryTask(TrajectoryOutcomes):
     family = "trajectory-lstm"
     configurations = CONFIGURATIONS
     practice = Practice(batch=64, learning_rate=2e-3)
-    recording: Mapping[str, Any] = {
+    recording: Mapping[str, Json] = {
         "vehicle_rig": {"lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 4, "azimuth_steps": 90}}}},
         "every_s": 0.5,
     }
@@ -64,13 +61,7 @@ class TrajectoryTask(TrajectoryOutcomes):
 
     def loss(self, network: TrajectoryNetwork, samples: Sequence[Sample]) -> Tensor:
         """Return the loss of the forecast, with cameras plus the weighted loss of the map's segmentation."""
-        inputs = inputs_of(samples, network)
-        forecast = network(inputs)
-        loss = forecast_loss(forecast, futures_of(samples, inputs.past.device))
-        if forecast.map_logits is None or network.config.cameras is None:
-            return loss
-        taught = map_loss(forecast.map_logits, rasters_of(samples, inputs.past.device))
-        return loss + network.config.cameras.map_weight * taught
+        return batch_loss(network, samples)
 
     def evaluate(
         self,
@@ -80,10 +71,11 @@ class TrajectoryTask(TrajectoryOutcomes):
         *,
         progress: Report = ignore_progress,
     ) -> TrajectoryEvaluation:
-        """Return displacement errors of single path, K modes and constant velocity by slice, see `metrics`."""
+        """Return displacement errors of single path, K modes and constant velocity by slice, see `evaluate_paths`."""
         samples = samples_of(data, network.config, frames)
         paths, probabilities = predict(network, samples, progress)
-        return evaluate_paths(paths, probabilities, samples.columns)
+        seen = samples.columns
+        return evaluate_paths(paths, probabilities, seen.past, seen.future, seen.at_junction, seen.scene)
 
     def sample_bytes(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> list[int]:
         """Return the size [B] of each frame's samples: past and future in float32; the map is not sent.
@@ -91,15 +83,15 @@ class TrajectoryTask(TrajectoryOutcomes):
         With rasters, each agent that observes an instant sends all samples of the instant.
         """
         columns = samples_of(data, config, frames).columns
-        each = 4 * int(np.prod(columns["past"].shape[1:]) + np.prod(columns["future"].shape[1:]))
+        each = 4 * int(np.prod(columns.past.shape[1:]) + np.prod(columns.future.shape[1:]))
         keys = [i if config.cameras else (data.keys[i].scene, data.keys[i].index) for i in range(len(data))]
-        counts = Counter(keys[i] for i in columns["frame"].tolist())
+        counts = Counter(keys[i] for i in columns.frame.tolist())
         return [each * counts[keys[i]] for i in frames]
 
     def infer(
         self, network: TrajectoryNetwork, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the forecasts of each frame of a dataset, see `findings`; all modes, whatever the threshold."""
+        """Yield the forecasts of each frame of a dataset, see `forecast_frames`; all modes, whatever the threshold."""
         yield from forecast_frames(network, path, frames)
 
     def register_errors(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.geometry import wrap_angle
+from flcav.geometry import heading_vectors, wrap_angle
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
 from flcav.world.trace import Trace
 
@@ -89,7 +89,7 @@ def _tangents(knots: Array, position: Array) -> Array:
 def into_frame(points: Array, pose: Array) -> Array:
     """Transform world points (N, ..., 2) into the frames of poses (N, 3) x, y, yaw: x ahead, y to the left [m]."""
     spread = (slice(None), *(None,) * (points.ndim - 2))
-    cos, sin = np.cos(pose[:, 2])[spread], np.sin(pose[:, 2])[spread]
+    cos, sin = (part[spread] for part in heading_vectors(pose[:, 2]).T)
     x, y = points[..., 0] - pose[:, 0][spread], points[..., 1] - pose[:, 1][spread]
     return np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)
 
@@ -97,7 +97,7 @@ def into_frame(points: Array, pose: Array) -> Array:
 def out_of_frame(points: Array, pose: Array) -> Array:
     """Transform points (N, ..., 2) from the frames of poses (N, 3) x, y, yaw to the world: `into_frame` inverted."""
     spread = (slice(None), *(None,) * (points.ndim - 2))
-    cos, sin = np.cos(pose[:, 2])[spread], np.sin(pose[:, 2])[spread]
+    cos, sin = (part[spread] for part in heading_vectors(pose[:, 2]).T)
     x, y = points[..., 0], points[..., 1]
     return np.stack((cos * x - sin * y + pose[:, 0][spread], sin * x + cos * y + pose[:, 1][spread]), axis=-1)
 

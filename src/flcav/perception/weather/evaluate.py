@@ -7,11 +7,17 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.dataset.store import Dataset
 from flcav.intervals import CONFIDENCE, bootstrap_over_scenes
 from flcav.perception.metrics import interval_words
 from flcav.perception.task import Evaluated
+from flcav.perception.weather.model import Classifier
+from flcav.perception.weather.predict import predict_probabilities
+from flcav.perception.weather.samples import Sample, label_pictures
+from flcav.progress import Report, ignore_progress
 from flcav.records import LEFT_OUT
 from flcav.seeds import stream
+from flcav.world.weather import find_nearest_class
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +84,24 @@ def evaluate_classes(
         pictures=len(truth),
         scenes=len(set(scenes)),
     )
+
+
+def evaluate_samples(
+    network: Classifier, samples: Sequence[Sample], progress: Report = ignore_progress
+) -> Classification:
+    """Return the classification metrics of a network on labelled images, see `evaluate_classes`."""
+    found = predict_probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
+    truth = np.array([sample.label for sample in samples])
+    return evaluate_classes(truth, found, [sample.scene for sample in samples], network.config.classes)
+
+
+def evaluate_whole_space(network: Classifier, data: Dataset) -> Classification:
+    """Return the classification metrics on all images: weathers outside the regions get the nearest class.
+
+    Raises `InputError` as `label_pictures` does.
+    """
+    samples = label_pictures(data, network.config.classes, named=find_nearest_class)
+    return evaluate_samples(network, samples)
 
 
 def _interval(right: NDArray[np.bool_], scenes: Sequence[str], seed: int) -> tuple[float, float] | tuple[None, None]:

@@ -1,17 +1,32 @@
-"""Inference of the weather classifier: class probabilities of images, in batches."""
+"""Inference of the weather classifier: class probabilities of images, in batches, and the JSON record of one."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from flcav.perception.images import Picture
+from flcav.perception.task import Result
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.samples import stack_pictures
 from flcav.progress import Report, ignore_progress
+from flcav.records import Class
 
 BATCH = 256  # images of a batch of inference
+
+
+@dataclass(frozen=True)
+class Named(Result):
+    """Classification of one image: the likeliest class, and the probability of each class."""
+
+    label: Class
+    probabilities: Mapping[str, float]  # by class
+
+    def lines(self) -> list[str]:
+        """Return one line with the class and its probability."""
+        return [f"{self.label} ({self.probabilities[self.label]:.2f})"]
 
 
 def predict_probabilities(

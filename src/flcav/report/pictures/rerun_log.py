@@ -15,6 +15,7 @@ import rerun.blueprint as rrb  # pyright: ignore[reportMissingImports]
 from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
 from flcav.dataset.store import Dataset
@@ -177,11 +178,10 @@ def _log_actors(recording: rr.RecordingStream, spin: list[Frame], tracks: dict[s
         tracks[track].append(center - (0, 0, size[2] / 2))
     colours = [COLOURS.get(label, OTHER) for *_, label in actors.values()]
     yaw = np.array([yaw for _, _, yaw, _ in actors.values()])
-    turned = np.stack((0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)), axis=1)
     boxes = rr.Boxes3D(
         centers=np.array([center for center, *_ in actors.values()]).reshape(-1, 3),
         sizes=np.array([size for _, size, *_ in actors.values()]).reshape(-1, 3),
-        quaternions=turned,
+        quaternions=Rotation.from_euler("z", yaw[:, None]).as_quat(),
         colors=colours,
         labels=[f"{label} {track}" for track, (*_, label) in actors.items()],
         show_labels=False,

@@ -41,6 +41,7 @@ LAMP_K = 14.0  # how much warmer a lit lamp is
 BLUR_PX = 0.6  # standard deviation of the lens' point spread function
 PATCHES_K = 1.6  # range of the noise of one surface's temperature
 PANE_EMISSIVITY = 0.85
+WALL, BUILDING = int(Material.WALL), int(Part.BUILDING)
 
 
 class Warmth(NamedTuple):
@@ -80,7 +81,6 @@ WARMTH: dict[Material, Warmth] = {
     Material.LENS_AMBER: Warmth(sun_k=8, sky_k=4),
     Material.LENS_GREEN: Warmth(sun_k=8, sky_k=4),
 }
-WALL, BUILDING = int(Material.WALL), int(Part.BUILDING)
 _SUN, _SKY, _EMISSIVITY, _MOVING = np.array([WARMTH[material][:4] for material in Material]).T
 _BODY = np.array([np.nan if WARMTH[material].body_c is None else WARMTH[material].body_c for material in Material])
 

@@ -13,6 +13,7 @@ from flcav.sensors.labels.outlines import clip_boxes, compute_amodal_boxes, comp
 from flcav.world.scene import Scene
 
 OUTER_EDGES = np.array((-0.5, -0.5, 0.5, 0.5))  # from the centres of the outermost pixels
+SAMPLES = 4096  # pixels sampled of an amodal box for its occlusion, about; of larger ones every n-th row and column
 
 
 class Regions(NamedTuple):
@@ -52,10 +53,6 @@ def _collect(instance, sign, pixels, box):
                 box[number, 1] = min(box[number, 1], v)
                 box[number, 2] = max(box[number, 2], u)
                 box[number, 3] = max(box[number, 3], v)
-
-
-SAMPLES = 4096  # pixels sampled of an amodal box for its occlusion, about; of larger ones every n-th row and column
-NO_PIXEL = np.zeros((0, 2), np.int64)
 
 
 def view_actors(

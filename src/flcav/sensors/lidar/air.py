@@ -41,6 +41,14 @@ QUANTILES = 256  # of the tabulated distribution below
 SPREAD_M = (10.0 * betaincinv(2.0, 20.0, (np.arange(QUANTILES) + 0.5) / QUANTILES)).astype(np.float32)
 """Quantiles of how far behind the peak a soft return is reported: 10 m * Beta(2, 20), as published with the paper."""
 
+N0 = 8000.0  # of Marshall and Palmer [1 / m^3 / mm]
+DROP_REFLECTANCE = ((1.328 - 1) / (1.328 + 1)) ** 2  # Fresnel reflectance of water at normal incidence, 905 nm
+NEAREST_M = 1.5  # nearer drops are outside the receiver's field of view
+FARTHEST_M = 40.0  # no drop farther away is ever bright enough
+POWERS = 64  # rows of the table of powers
+SHARES = 32  # quantiles of range for each power
+NO_FOG = np.zeros(1, np.float32), np.zeros(1, np.float32)
+
 
 @lru_cache(maxsize=64)
 def compute_fog_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Floats, Floats]:
@@ -60,14 +68,6 @@ def compute_fog_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Floa
     backscatter = 0.046 * fog_per_m / np.log(20.0)
     power = received.max(axis=0) * backscatter / SURFACE_PER_SR
     return power.astype(np.float32), r[received.argmax(axis=0)].astype(np.float32)
-
-
-N0 = 8000.0  # of Marshall and Palmer [1 / m^3 / mm]
-DROP_REFLECTANCE = ((1.328 - 1) / (1.328 + 1)) ** 2  # Fresnel reflectance of water at normal incidence, 905 nm
-NEAREST_M = 1.5  # nearer drops are outside the receiver's field of view
-FARTHEST_M = 40.0  # no drop farther away is ever bright enough
-POWERS = 64  # rows of the table of powers
-SHARES = 32  # quantiles of range for each power
 
 
 class Drops(NamedTuple):
@@ -110,7 +110,6 @@ def compute_drops(rain_mm_h: float, extinction_per_m: float, divergence_rad: flo
     return Drops(number.astype(np.float32), power.astype(np.float32), np.array(ranges, np.float32))
 
 
-NO_FOG = np.zeros(1, np.float32), np.zeros(1, np.float32)
 NO_DROPS = Drops(np.zeros(1, np.float32), np.zeros(1, np.float32), np.zeros((1, SHARES), np.float32))
 
 

@@ -6,18 +6,19 @@ Rain, fog and wet roads change P; in clear weather they cost nothing and draw no
 """
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flcav.config import Config
+from flcav.geometry import unit_vectors
 from flcav.sensors.lidar.air import add_air_returns, compute_air
 from flcav.sensors.lidar.beams import BEAMS, CarlaReturns, carla_returns
 from flcav.sensors.lidar.returns import LEVELS, QUANTILES, Returns, cast_through_glass, compute_brightness, detect
 from flcav.sensors.lidar.rolling import step_sectors, time_in_spin_s
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.scene import OFFSET_S, Scene
 from flcav.world.weather import Weather
 
@@ -84,6 +85,15 @@ class Lidar(Config):
         return self
 
 
+class Scan(NamedTuple):
+    """The point cloud of one spin, and the rays behind it."""
+
+    points: NDArray[np.float32]  # (M, 4) x, y, z [m] in the sensor's frame, intensity in [0, 1]
+    actor: NDArray[np.int32]  # (M,) the trace's actor that each point comes from; -1 for the town, rain and fog
+    passes: NDArray[np.bool_]  # (N,) whether each ray of the pattern passes the panes of glass that it meets
+    returns: Returns  # the surface that each ray returns from
+
+
 def build_ray_pattern(lidar: Lidar) -> NDArray[np.float32]:
     """Return the ray directions of one spin: (channels * azimuth_steps, 3) unit vectors, sensor frame; read-only.
 
@@ -99,9 +109,7 @@ def _build_ray_pattern(
     even = np.linspace(up_deg, down_deg, channels)
     elevation = np.radians(even if elevations_deg is None else np.sort(elevations_deg)[::-1])[:, None]
     azimuth = np.arange(steps)[None] * (2 * np.pi / steps)
-    level = np.cos(elevation)
-    x, y, z = level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth
-    directions = np.stack((x, y, z), axis=-1).reshape(-1, 3).astype(np.float32)
+    directions = unit_vectors(azimuth, elevation).reshape(-1, 3).astype(np.float32)
     directions.flags.writeable = False
     return directions
 
@@ -161,7 +169,7 @@ def measure(
     rng: np.random.Generator,
     weather: Weather | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return the points that the detector reports, (M, 4), and the actor (M,) each comes from: see `scan`.
+    """Return the points that the detector reports, (M, 4), and the actor (M,) each comes from: see `Scan`.
 
     `echoes` are the surfaces from which the spin's rays return, `weather` is clear by default.
     """
@@ -219,14 +227,14 @@ def scan(
     rng: np.random.Generator,
     hidden: int | None = None,
     weather: Weather | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+) -> Scan:
     """Return the point cloud of one spin at the scene's instant, without the actor `hidden` (the carrier).
 
-    The first array is (N, 4): x, y, z [m] in the sensor's frame and intensity in [0, 1]. The second is (N,): the
-    trace's actor each return comes from, -1 for the town, rain and fog. `weather` is clear by default.
+    `weather` is clear by default.
     """
-    echoes = cast(scene, world_from_sensor, lidar, draw_passes(lidar, rng), hidden)
-    return measure(scene, world_from_sensor, lidar, echoes, rng, weather)
+    passes = draw_passes(lidar, rng)
+    returns = cast(scene, world_from_sensor, lidar, passes, hidden)
+    return Scan(*measure(scene, world_from_sensor, lidar, returns, rng, weather), passes, returns)
 
 
 def point_times_s(lidar: Lidar, points: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ from scipy.special import ndtri
 
 from flcav.compiled import compiled
 from flcav.world.materials import Material
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 
 PANES = 6  # more panes than these stop a ray
 PANE_TRANSMISSION = 0.8  # of the power, both ways together

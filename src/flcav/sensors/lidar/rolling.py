@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import inverse
+from flcav.geometry import heading_vectors, inverse
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
 
@@ -85,5 +85,5 @@ class Motion(NamedTuple):
 
 def _turn(points: Array, angles: NDArray[np.floating]) -> Array:
     x, y, z = points.T
-    cos, sin = np.cos(angles), np.sin(angles)
+    cos, sin = heading_vectors(angles).T
     return np.column_stack((cos * x - sin * y, sin * x + cos * y, z))

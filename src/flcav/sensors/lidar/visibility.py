@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.compiled import compiled
+from flcav.geometry import rotations_about_z
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.sensors.lidar.returns import cast_through_glass
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
 
 BOX_MARGIN_M = 0.01  # by which boxes are grown, so that no ray that grazes a mesh is missed
@@ -50,8 +51,7 @@ def count_occluded_rays(
 
 def _bodies_from(poses: NDArray[np.float64], world_from_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (K, 4, 4) transforms `body_from_sensor` of actors with the poses (K, 4) x, y, z, yaw."""
-    cos, sin, zero, one = np.cos(poses[:, 3]), np.sin(poses[:, 3]), 0 * poses[:, 3], 0 * poses[:, 3] + 1
-    turn = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
+    turn = rotations_about_z(-poses[:, 3])
     found = np.tile(np.eye(4), (len(poses), 1, 1))
     found[:, :3, :3] = turn @ world_from_sensor[:3, :3]
     found[:, :3, 3] = np.einsum("kij,kj->ki", turn, world_from_sensor[:3, 3] - poses[:, :3])

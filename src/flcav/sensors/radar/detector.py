@@ -23,6 +23,28 @@ from flcav.world.materials import Material
 from flcav.world.trace import CATEGORIES
 
 Array = NDArray[np.float64]
+FLASH = 24.0  # exponent of the cosine of a flash's angle: about 27 degrees wide at half its decibels
+LYING = (Material.GROUND, Material.ROAD, Material.SIDEWALK)  # horizontal surfaces: constant-gamma clutter
+TOWN_DB: dict[Material, float] = {
+    Material.GROUND: -20.0,  # of horizontal surfaces: gamma
+    Material.ROAD: -30.0,
+    Material.SIDEWALK: -28.0,
+    Material.WALL: -10.0,  # of others: cross-section per square metre of silhouette, at grazing incidence
+    Material.ROOF: -10.0,
+    Material.BARK: -8.0,
+    Material.LEAF: -14.0,
+    Material.METAL: 2.0,
+    Material.SIGN: 4.0,
+}
+ELSE_DB = -5.0  # of all other materials
+GLINT_DB = 20.0  # specular gain of a flat face at normal incidence
+GLINT = 40.0  # exponent of the cosine of incidence
+_TOWN = 10 ** (np.array([TOWN_DB.get(material, ELSE_DB) for material in Material]) / 10)
+_LIES = np.array([material in LYING for material in Material])
+REFERENCE_M2 = 10.0  # cross-section of the target in the definition of `detects_car_m`
+EDGE_DB = 6.0  # two-way gain at the edge of the field of view, below that ahead
+SPLIT = 1.6  # cell size over the standard deviation of a value, at a signal-to-noise ratio of 1/2 (Barton)
+RAIN_DB = (1.13, 0.718)  # k, a of k R^a [dB/km] at 77 GHz: ITU-R P.838-3
 
 
 class AspectRcs(NamedTuple):
@@ -42,26 +64,6 @@ ACTOR_RCS: dict[str, AspectRcs] = {
     "bicycle": AspectRcs(-3.0, 4.0, -4.0),
     "pedestrian": AspectRcs(-8.0, 1.0, 1.5),
 }
-FLASH = 24.0  # exponent of the cosine of a flash's angle: about 27 degrees wide at half its decibels
-
-LYING = (Material.GROUND, Material.ROAD, Material.SIDEWALK)  # horizontal surfaces: constant-gamma clutter
-TOWN_DB: dict[Material, float] = {
-    Material.GROUND: -20.0,  # of horizontal surfaces: gamma
-    Material.ROAD: -30.0,
-    Material.SIDEWALK: -28.0,
-    Material.WALL: -10.0,  # of others: cross-section per square metre of silhouette, at grazing incidence
-    Material.ROOF: -10.0,
-    Material.BARK: -8.0,
-    Material.LEAF: -14.0,
-    Material.METAL: 2.0,
-    Material.SIGN: 4.0,
-}
-ELSE_DB = -5.0  # of all other materials
-GLINT_DB = 20.0  # specular gain of a flat face at normal incidence
-GLINT = 40.0  # exponent of the cosine of incidence
-
-_TOWN = 10 ** (np.array([TOWN_DB.get(material, ELSE_DB) for material in Material]) / 10)
-_LIES = np.array([material in LYING for material in Material])
 _ACTOR = np.array([ACTOR_RCS[category] for category in CATEGORIES])
 
 
@@ -85,12 +87,6 @@ def compute_town_rcs(material: NDArray[np.uint8], cosine: Array) -> Array:
     """Return (K,) cross-sections per projected area of the town's surfaces, by material and `cosine` of incidence."""
     glint = 1 + (10 ** (GLINT_DB / 10) - 1) * cosine**GLINT
     return _TOWN[material] * np.where(_LIES[material], 1.0, glint)
-
-
-REFERENCE_M2 = 10.0  # cross-section of the target in the definition of `detects_car_m`
-EDGE_DB = 6.0  # two-way gain at the edge of the field of view, below that ahead
-SPLIT = 1.6  # cell size over the standard deviation of a value, at a signal-to-noise ratio of 1/2 (Barton)
-RAIN_DB = (1.13, 0.718)  # k, a of k R^a [dB/km] at 77 GHz: ITU-R P.838-3
 
 
 class Radar(Config):

@@ -6,6 +6,7 @@ Only direct echoes of the first surface are modelled: no multipath over the road
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.geometry import unit_vectors
 from flcav.sensors.radar.detector import (
     Array,
     Radar,
@@ -16,7 +17,7 @@ from flcav.sensors.radar.detector import (
     resolve,
     silhouette,
 )
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
@@ -62,8 +63,7 @@ def sweep_radar(
 def compute_echo_directions(echoes: NDArray[np.float32]) -> Array:
     """Return (N, 3) unit vectors from the radar to the detections (N, 5) of a sweep, radar frame."""
     azimuth, elevation = echoes[:, 1:3].T.astype(np.float64)
-    level = np.cos(elevation)
-    return np.column_stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)))
+    return unit_vectors(azimuth, elevation)
 
 
 def draw_rays(radar: Radar, rng: np.random.Generator) -> tuple[NDArray[np.float32], Array]:
@@ -75,9 +75,8 @@ def draw_rays(radar: Radar, rng: np.random.Generator) -> tuple[NDArray[np.float3
     row, column = np.divmod(np.arange(rows * columns), columns)
     azimuth = left + (column + rng.random(len(column))) * (right - left) / columns
     elevation = low + (row + rng.random(len(row))) * (high - low) / rows
-    level = np.cos(elevation)
-    directions = np.column_stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)))
-    return directions.astype(np.float32), level * ((right - left) / columns) * ((high - low) / rows)
+    solid_angle = np.cos(elevation) * ((right - left) / columns) * ((high - low) / rows)
+    return unit_vectors(azimuth, elevation).astype(np.float32), solid_angle
 
 
 def cross_sections(scene: Scene, world_from_radar: Array, ahead: Array, hits: Hits, solid_angle: Array) -> Array:

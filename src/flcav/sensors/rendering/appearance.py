@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import left_vectors
+from flcav.sensors.frame import SEMANTICS
 from flcav.sensors.rendering.facade import Facades, facades_of
 from flcav.sensors.rendering.ground import Markings, build_markings
 from flcav.sensors.rendering.noise import make_noise
@@ -31,28 +32,6 @@ from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
 from flcav.world.static import Part, build_static_world
 
-# Numbers and names of CARLA's semantic tags (0.9.15)
-SEMANTICS: dict[str, int] = {
-    "unlabeled": 0,
-    "road": 1,
-    "sidewalk": 2,
-    "building": 3,
-    "pole": 6,
-    "traffic_light": 7,
-    "traffic_sign": 8,
-    "vegetation": 9,
-    "terrain": 10,
-    "sky": 11,
-    "pedestrian": 12,
-    "rider": 13,
-    "car": 14,
-    "truck": 15,
-    "bus": 16,
-    "motorcycle": 18,
-    "bicycle": 19,
-    "static": 20,
-    "road_line": 24,
-}
 _OF_PART = {
     Part.GROUND: "terrain",
     Part.ROAD: "road",

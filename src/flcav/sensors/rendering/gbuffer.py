@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.compiled import compiled, inlined
+from flcav.geometry import heading_vectors
 from flcav.sensors.rendering.appearance import Appearance
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
 
 LIFT_M = 0.015  # offset along the normal of secondary rays' origins
@@ -37,7 +38,7 @@ def fill_gbuffer(
     """Return the G-buffer of N rays `directions` (N, 3), unit, optical frame, from their `hits`."""
     count, poses = len(directions), scene.poses()
     bodies = np.zeros((len(poses) + 1, 5), np.float32)  # by instance: x, y, z, cosine and sine of the yaw
-    bodies[1:] = np.c_[poses[:, :3], np.cos(poses[:, 3]), np.sin(poses[:, 3])]
+    bodies[1:] = np.c_[poses[:, :3], heading_vectors(poses[:, 3])]
     out = GBuffer(
         np.empty((count, 3), np.float32),
         hits.distance,

@@ -28,6 +28,8 @@ STRIP_M = 0.06  # arrows are cut into strips of this length
 COLOURS = {"white": (0.68, 0.68, 0.66), "yellow": (0.62, 0.42, 0.06)}
 
 Rectangle = tuple[float, float, float, float, float, float]  # centre x, y, direction x, y, half length, half width
+SLAB_M = 0.5  # side of a paving slab
+JOINT_M = 0.012  # width of the joints between slabs
 
 
 class Markings(NamedTuple):
@@ -144,10 +146,6 @@ def _grid(rectangle: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[
     first[:, :-1] = starts[:-1].reshape(cells[0], cells[1])
     first[:, -1] = starts[cells[1] :: cells[1]]
     return corner, first, pairs[:, 1].astype(np.int32)
-
-
-SLAB_M = 0.5  # side of a paving slab
-JOINT_M = 0.012  # width of the joints between slabs
 
 
 @inlined

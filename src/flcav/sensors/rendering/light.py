@@ -52,6 +52,10 @@ _HORIZON = (
     (0.600, 0.730, 0.860),
 )
 
+SUN_REACH_M = 300.0  # length of shadow rays
+DARK = 1e-3  # irradiance of the sun below which it casts no shadow
+SAME = 0.04  # relative difference of distance up to which two pixels lie on one surface
+
 
 class Light(NamedTuple):
     """The light of the sun and the sky, and the air, under one weather."""
@@ -125,11 +129,6 @@ def _at(elevation_deg: float, table: tuple[tuple[float, float, float], ...]) -> 
 def _exposure(ambient: float) -> float:
     """Return the exposure for an `ambient` brightness: a power law of exponent -0.55, so that nights stay dark."""
     return float(0.92 * max(ambient, 2e-3) ** -0.55 if ambient < 1.0 else 0.92)
-
-
-SUN_REACH_M = 300.0  # length of shadow rays
-DARK = 1e-3  # irradiance of the sun below which it casts no shadow
-SAME = 0.04  # relative difference of distance up to which two pixels lie on one surface
 
 
 def compute_lamplight(scene: Scene, seen: GBuffer, lamps: Lamps, hidden: int | None) -> NDArray[np.float32]:

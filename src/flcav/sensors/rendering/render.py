@@ -3,14 +3,12 @@
 The result is the radiance of every pixel; exposure and tone mapping follow in `flcav.sensors.camera.tone`.
 """
 
-import ctypes
-import platform
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.memory import keep_freed_memory
 from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.rendering import rain, supersampling
 from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
@@ -20,27 +18,9 @@ from flcav.sensors.rendering.glare import add_glare, add_sun_glare
 from flcav.sensors.rendering.light import Light, compute_lamplight, compute_light, compute_sun_visibility, soften
 from flcav.sensors.rendering.state import Lamps, LampState, collect_lamps, compute_lamp_state, no_lamps
 from flcav.sensors.rendering.surface import shade
-from flcav.world.rays.raycaster import Hits
+from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
-
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3)
-KEPT_BYTES = 64 << 20  # of freed memory that stays with the process
-LARGEST_BYTES = 32 << 20  # the largest M_MMAP_THRESHOLD that glibc accepts
-
-
-@lru_cache(maxsize=1)
-def keep_freed_memory() -> None:
-    """Make glibc keep up to `KEPT_BYTES` of freed memory in this process; does nothing with other C libraries.
-
-    By default glibc returns freed arrays of megabytes to the system, and the pages of the next image's arrays must be
-    mapped and cleared again: a seventh of the time of an image.
-    """
-    if platform.libc_ver()[0] == "glibc":
-        library = ctypes.CDLL(None)
-        library.mallopt(_MMAP_THRESHOLD, LARGEST_BYTES)
-        library.mallopt(_TRIM_THRESHOLD, KEPT_BYTES)
-
 
 FAR_M = 1000.0  # length of primary rays
 LOW_SIGHT = 0.002  # extinction [1/m] above which vehicles have their lamps on by day

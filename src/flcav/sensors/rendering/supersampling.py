@@ -26,6 +26,11 @@ THIN_PX = 4.0  # objects narrower than this are thin
 REACH_PX = 0.8  # margin beside thin objects
 FARTHEST_M = 220.0  # of thin objects
 POST_M, SIGN_M, SIGNAL_M = 0.1, 0.42, 0.6  # half widths of thin objects
+SIGN = int(Material.SIGN)
+ROOKS = np.float32(3)  # factor by which the footprint of a further ray is narrower than its pixel
+_THREE = np.array([(-1, 1), (1, -1)], np.float32) / 3
+_NINE = np.array([(-4, -1), (-3, 2), (-2, -3), (-1, 4), (1, -4), (2, 3), (3, -2), (4, 1)], np.float32) / 9
+BRIGHTEST = 3.0  # exposed light at which samples are clamped: else edges of lamps would stay jagged
 
 
 def find_edges(
@@ -119,13 +124,6 @@ def _draw_bars(start, end, half, near, distance, width, height, kind):
                 pixel = row * width + column
                 if distance[pixel] > near[bar] - 1.0:
                     kind[pixel] |= THIN
-
-
-SIGN = int(Material.SIGN)
-ROOKS = np.float32(3)  # factor by which the footprint of a further ray is narrower than its pixel
-_THREE = np.array([(-1, 1), (1, -1)], np.float32) / 3
-_NINE = np.array([(-4, -1), (-3, 2), (-2, -3), (-1, 4), (1, -4), (2, 3), (3, -2), (4, 1)], np.float32) / 9
-BRIGHTEST = 3.0  # exposed light at which samples are clamped: else edges of lamps would stay jagged
 
 
 def further_rays(

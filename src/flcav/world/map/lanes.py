@@ -28,6 +28,9 @@ RASTER_LAYERS: tuple[str, ...] = (
     "arrow",
 )
 
+WAYS: dict[str, ArrowKind] = {kind: kind for kind in get_args(ArrowKind)}
+ARROWS_BEFORE_M = (8.0, 28.0)  # from the end of the lane back to an arrow's middle
+
 
 def rasterise(
     layers: MapLayers, world_from_patch: Array, size_m: tuple[float, float], resolution_m: float
@@ -99,13 +102,6 @@ def _polygons(layers: MapLayers) -> dict[str, list[Array]]:
         "arrow": (outline_arrow(row) for row in layers.arrows),
     }
     return {name: list(parts[name]) for name in RASTER_LAYERS}
-
-
-__all__ = ["RASTER_LAYERS", "map_layers", "rasterise"]
-
-
-WAYS: dict[str, ArrowKind] = {kind: kind for kind in get_args(ArrowKind)}
-ARROWS_BEFORE_M = (8.0, 28.0)  # from the end of the lane back to an arrow's middle
 
 
 def map_layers(town: Town) -> MapLayers:

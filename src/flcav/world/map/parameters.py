@@ -8,6 +8,20 @@ from flcav.config import Config
 from flcav.world.shapes import SHAPES
 
 LARGEST_M = 1000.0
+CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, height [m]
+    "hedge": (5.0, 0.8, 1.2),
+    "bins": (3.2, 0.9, 1.3),
+    "planter": (3.4, 1.3, 1.0),
+    "kiosk": (3.6, 1.8, 2.2),
+    "shelter": (4.0, 1.5, 2.3),
+    "container": (4.2, 1.8, 1.6),
+    "cabinet": (1.4, 0.6, 1.3),
+}
+Height = Annotated[float, Field(ge=0.1, le=100)]
+Spacing = Annotated[float, Field(ge=0.5, le=10_000)]
+NotNegative = Annotated[float, Field(ge=0, le=10_000)]
+Many = Annotated[int, Field(ge=0, le=10_000)]
+Share = Annotated[float, Field(ge=0, le=1)]
 
 
 def _interval(value: tuple[float, float]) -> tuple[float, float]:
@@ -39,23 +53,8 @@ def _clutter_mix(value: dict[str, float]) -> dict[str, float]:
     return _mix(value, list(CLUTTER))
 
 
-CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, height [m]
-    "hedge": (5.0, 0.8, 1.2),
-    "bins": (3.2, 0.9, 1.3),
-    "planter": (3.4, 1.3, 1.0),
-    "kiosk": (3.6, 1.8, 2.2),
-    "shelter": (4.0, 1.5, 2.3),
-    "container": (4.2, 1.8, 1.6),
-    "cabinet": (1.4, 0.6, 1.3),
-}
-
 Interval = Annotated[tuple[float, float], AfterValidator(_interval)]
-Height = Annotated[float, Field(ge=0.1, le=100)]
-Spacing = Annotated[float, Field(ge=0.5, le=10_000)]
-NotNegative = Annotated[float, Field(ge=0, le=10_000)]
-Many = Annotated[int, Field(ge=0, le=10_000)]
 Extent = Annotated[tuple[float, float], AfterValidator(_extent)]
-Share = Annotated[float, Field(ge=0, le=1)]
 VehicleMix = Annotated[dict[str, float], AfterValidator(_vehicle_mix)]
 ClutterMix = Annotated[dict[str, float], AfterValidator(_clutter_mix)]
 

@@ -68,7 +68,6 @@ class Connection:
     end: str  # id of the lane it enters
     via: str  # first lane inside the junction; empty where there is none
     turn: str  # s straight, l left, r right, L and R half left and half right, t U-turn
-    state: str  # right of way in SUMO's letters: M has priority, m gives way, s stops, o at a traffic light, ...
     light: str  # "junction:link" as in `Trace.light`; empty without a light
 
 
@@ -79,7 +78,9 @@ class RoadNet:
     edges: dict[str, Edge]
     junctions: dict[str, Junction]
     roundabouts: frozenset[str]  # ids of the junctions on a roundabout
-    right_of_way: dict[str, str]  # edge -> `Connection.state` of all links of its driving lanes, e.g. "MMm"
+    # edge -> right of way of all links of its driving lanes in SUMO's letters, e.g. "MMm": M has priority, m gives way,
+    # s stops, o is at a traffic light, ...
+    right_of_way: dict[str, str]
     connections: tuple[Connection, ...]
 
     @property
@@ -145,7 +146,6 @@ def _connection(row: ElementTree.Element) -> Connection:
         f"{row.attrib['to']}_{row.attrib['toLane']}",
         row.get("via", ""),
         row.get("dir", ""),
-        row.get("state", ""),
         f"{row.attrib['tl']}:{row.attrib['linkIndex']}" if "tl" in row.attrib else "",
     )
 

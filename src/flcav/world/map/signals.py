@@ -13,6 +13,7 @@ from flcav.world.map.roads import Connection, Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 
 Array = NDArray[np.float64]
+Head = tuple[tuple[float, float, float], float, tuple[float, float], str]  # position, yaw, foot, link
 
 KERB_HEAD_M = 2.9  # height of the centre of a head beside the road
 ARM_HEAD_M = 5.6  # height of the centre of a head above the road
@@ -47,9 +48,6 @@ def place_signals(net: RoadNet, sensors: Array) -> Signals:
         return Signals.none()
     position, yaw, foot, link = zip(*heads)
     return Signals(np.array(position), np.array(yaw), np.array(foot), link)
-
-
-Head = tuple[tuple[float, float, float], float, tuple[float, float], str]
 
 
 def _approach(edge: Edge, connections: tuple[Connection, ...], sensors: Array) -> Iterator[Head]:

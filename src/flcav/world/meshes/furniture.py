@@ -13,6 +13,14 @@ from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join_meshes, sheet, tu
 
 LEAVES = 360  # triangles of a crown; each stands for a cluster of leaves
 LEAF = 0.38  # size of a cluster over the crown's radius: the crown stops about two rays in three
+HEAD_M = (0.20, 0.36, 1.04)  # depth, width, height of a signal head's housing
+LENS_RADIUS_M = 0.125
+LENS_PITCH_M = 0.32  # between the centres of neighbouring lenses
+VISOR_M = 0.20  # length of a visor
+LIGHT_MAST_BEHIND_M = 0.22  # from the head's centre back to its mast
+LENSES = (Material.LENS_RED, Material.LENS_AMBER, Material.LENS_GREEN)  # from top to bottom
+SIGN_RADIUS_M = 0.36  # circumscribed radius of a sign's plate
+MAST_BEHIND_M = 0.40  # from a roadside sensor back to its mast
 
 
 def make_tree(height: float, crown_radius: float, rng: np.random.Generator) -> Mesh:
@@ -37,14 +45,6 @@ def scatter_leaves(center: ArrayLike, radii: ArrayLike, count: int, size_m: floa
     corners *= size_m / 2 / np.linalg.norm(corners, axis=2, keepdims=True)
     vertices = (place[:, None] + corners).reshape(-1, 3).astype(np.float32)
     return Mesh(vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3), np.full(count, Material.LEAF, np.uint8))
-
-
-HEAD_M = (0.20, 0.36, 1.04)  # depth, width, height of a signal head's housing
-LENS_RADIUS_M = 0.125
-LENS_PITCH_M = 0.32  # between the centres of neighbouring lenses
-VISOR_M = 0.20  # length of a visor
-LIGHT_MAST_BEHIND_M = 0.22  # from the head's centre back to its mast
-LENSES = (Material.LENS_RED, Material.LENS_AMBER, Material.LENS_GREEN)  # from top to bottom
 
 
 def signal_head(height: float) -> Mesh:
@@ -86,10 +86,6 @@ def _visor(middle: np.ndarray) -> Mesh:
     angle = np.linspace(-0.15 * np.pi, 1.15 * np.pi, 9)
     rim = np.stack((0 * angle, np.cos(angle), np.sin(angle)), axis=1) * (LENS_RADIUS_M + 0.015) + middle
     return sheet(np.stack((rim, rim + np.array((VISOR_M, 0, 0)))), Material.TRIM)
-
-
-SIGN_RADIUS_M = 0.36  # circumscribed radius of a sign's plate
-MAST_BEHIND_M = 0.40  # from a roadside sensor back to its mast
 
 
 def make_clutter(kind: str, length: float, width: float, height: float) -> Mesh:

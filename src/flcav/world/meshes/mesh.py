@@ -11,6 +11,9 @@ from flcav.geometry import rotations_about_z
 from flcav.world.materials import Material
 
 Array = NDArray[np.float64]
+_BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_BOX_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], np.int32)
+_BOX_FACES = _BOX_QUADS[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -98,11 +101,6 @@ def sheet(points: ArrayLike, material: Material | NDArray[np.uint8]) -> Mesh:
     faces = np.stack((a, b, c, a, c, d), axis=1).reshape(-1, 3)
     cells = np.broadcast_to(np.asarray(material, np.uint8), (rows - 1, columns - 1))
     return Mesh(grid.reshape(-1, 3).astype(np.float32), faces.astype(np.int32), np.repeat(cells.ravel(), 2))
-
-
-_BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_BOX_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], np.int32)
-_BOX_FACES = _BOX_QUADS[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def box(center: ArrayLike, size: ArrayLike, material: Material) -> Mesh:

@@ -104,19 +104,8 @@ PROFILES: dict[str, Profile] = {
         rounding=0.10,
     ),
 }
-
-
-def car(shape: Shape) -> Mesh:
-    """Return the car or van `shape`, in its body frame; a taxi has a roof sign."""
-    if shape.name == "taxi":
-        top = shape.height - TAXI_SIGN_M
-        return join_meshes((vehicle_body(PROFILES["taxi"], shape.length, shape.width, top), roof_sign(-0.2, top)))
-    return vehicle_body(PROFILES[shape.name], shape.length, shape.width, shape.height)
-
-
 CAB_M = 2.2  # length of a truck's cab
 WHEEL_M = 0.48  # radius of the wheels of trucks and buses
-
 _CAB = Profile(
     belt=((-0.5, 0.44), (0.40, 0.44), (0.48, 0.40), (0.5, 0.30)),
     roof=((-0.49, 0.44), (-0.47, 0.98), (-0.30, 1.0), (0.20, 1.0), (0.32, 0.94), (0.46, 0.44)),
@@ -141,6 +130,14 @@ _BUS = Profile(
     rounding=0.05,
     stations=31,
 )
+
+
+def car(shape: Shape) -> Mesh:
+    """Return the car or van `shape`, in its body frame; a taxi has a roof sign."""
+    if shape.name == "taxi":
+        top = shape.height - TAXI_SIGN_M
+        return join_meshes((vehicle_body(PROFILES["taxi"], shape.length, shape.width, top), roof_sign(-0.2, top)))
+    return vehicle_body(PROFILES[shape.name], shape.length, shape.width, shape.height)
 
 
 def truck(shape: Shape) -> Mesh:

@@ -1,6 +1,6 @@
 """Parameters of an imported town: defaults by street type, traffic by lane length, and candidate sites of sensors."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import shapely
@@ -15,33 +15,33 @@ MOST = 150  # vehicles, and pedestrians, at most
 CORNER_M = 4.0  # from a pole at a junction to the end of its edge
 STRAIGHT_M = 60.0  # straight edges of at least this length get a pole midway
 BENT_M = 2.0  # largest deviation of a straight edge from its chord
-STREETS: dict[str, dict[str, Any]] = {
-    "arterial": {
-        "frontage_m": 1.0,
-        "setback_m": (0.5, 3.0),
-        "building_length_m": (12.0, 22.0),
-        "building_depth_m": (10.0, 13.0),
-        "building_height_m": (9.0, 18.0),
-        "building_gap_m": (0.5, 4.0),
-        "tree_spacing_m": 24.0,
-        "clutter_spacing_m": 16.0,
-        "clutter": {"kiosk": 0.6, "shelter": 1.0, "bins": 1.0, "planter": 1.0, "cabinet": 0.8},
-        "parked": 0.3,
-        "parked_mix": {"car": 0.8, "van": 0.2},
-        "traffic": 1.5,
-        "footfall": 2.0,
-    },
-    "street": {
-        "setback_m": (1.5, 4.5),
-        "building_height_m": (5.0, 10.0),
-        "building_gap_m": (1.5, 6.0),
-        "tree_spacing_m": 16.0,
-        "clutter_spacing_m": 15.0,
-        "clutter": {"hedge": 2.0, "bins": 1.0, "cabinet": 0.4},
-        "parked": 0.3,
-        "parked_mix": {"car": 0.9, "van": 0.1},
-    },
-    "open": {"footfall": 0.0},
+STREETS: dict[str, StreetParameters] = {
+    "arterial": StreetParameters(
+        frontage_m=1.0,
+        setback_m=(0.5, 3.0),
+        building_length_m=(12.0, 22.0),
+        building_depth_m=(10.0, 13.0),
+        building_height_m=(9.0, 18.0),
+        building_gap_m=(0.5, 4.0),
+        tree_spacing_m=24.0,
+        clutter_spacing_m=16.0,
+        clutter={"kiosk": 0.6, "shelter": 1.0, "bins": 1.0, "planter": 1.0, "cabinet": 0.8},
+        parked=0.3,
+        parked_mix={"car": 0.8, "van": 0.2},
+        traffic=1.5,
+        footfall=2.0,
+    ),
+    "street": StreetParameters(
+        setback_m=(1.5, 4.5),
+        building_height_m=(5.0, 10.0),
+        building_gap_m=(1.5, 6.0),
+        tree_spacing_m=16.0,
+        clutter_spacing_m=15.0,
+        clutter={"hedge": 2.0, "bins": 1.0, "cabinet": 0.4},
+        parked=0.3,
+        parked_mix={"car": 0.9, "van": 0.1},
+    ),
+    "open": StreetParameters(footfall=0.0),
 }
 MIX = {"car": 0.66, "van": 0.12, "truck": 0.05, "bus": 0.03, "motorcycle": 0.05, "bicycle": 0.09}
 
@@ -57,7 +57,7 @@ def furnish(net: RoadNet, *, description: str, seed: int, geo: GeoReference, sou
         vehicles=_count(net, "driving", VEHICLES_PER_KM),
         pedestrians=_count(net, "sidewalk", PEDESTRIANS_PER_KM),
         mix=MIX,
-        streets={kind: StreetParameters(**STREETS[kind]) for kind in kinds},
+        streets={kind: STREETS[kind] for kind in kinds},
         poles=tuple(find_candidate_poles(net)),
     )
 

@@ -6,9 +6,9 @@ nanometers", J. Geodesy 85, 2011, eqs. 11, 15, 36).
 
 import math
 
+from flcav.world.geodesy import ECCENTRICITY2, EQUATOR_M, FLATTENING
 from flcav.world.map.parameters import GeoReference
 
-EQUATOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
 UTM_SCALE, UTM_FALSE_EASTING_M, UTM_FALSE_NORTHING_M = 0.9996, 500_000.0, 10_000_000.0
 
 
@@ -74,14 +74,14 @@ def inverse_mercator(
 
 def _conformal_tangent(tangent: float) -> float:
     """Return the tangent of the conformal latitude, given that of the geodetic one (eqs. 7-9)."""
-    e = math.sqrt(FLATTENING * (2 - FLATTENING))
+    e = math.sqrt(ECCENTRICITY2)
     sigma = math.sinh(e * math.atanh(e * tangent / math.hypot(1, tangent)))
     return tangent * math.hypot(1, sigma) - sigma * math.hypot(1, tangent)
 
 
 def _geodetic_tangent(conformal: float) -> float:
     """Return the tangent of the geodetic latitude, given that of the conformal one, by Newton's method (eqs. 19-21)."""
-    e2 = FLATTENING * (2 - FLATTENING)
+    e2 = ECCENTRICITY2
     tangent = conformal / (1 - e2)
     for _ in range(6):
         guess = _conformal_tangent(tangent)

@@ -16,6 +16,7 @@ import yaml
 
 from flcav.config import InputError
 from flcav.extras import format_install_command
+from flcav.files import find_existing
 from flcav.world.map.parameters import GeoReference, MapSource
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town, load_town
@@ -94,15 +95,17 @@ class ImportedTown:
 def import_town(xodr: Path, out: Path) -> ImportedTown:
     """Write the town of an OpenDRIVE map as the folder `out` and return it; the same map gives the same town.
 
-    Raises `InputError`, and does not make `out`, where it exists already, where the file is no OpenDRIVE map that
+    Raises `InputError`, and makes no folder, where `out` exists already, where the file is no OpenDRIVE map that
     netconvert can read, and where the map has no driving lane.
     """
     if out.exists():
         raise InputError(f"{out}: is there already; give a new folder")
+    beside = find_existing(out.parent)
+    if not beside.is_dir():
+        raise InputError(f"{beside}: is a file; a town needs a folder")
     document = read_document(xodr)
     notes = ["Heights of the map are left out: towns are flat."]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as scratch:
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=beside) as scratch:
         prefix, folder = Path(scratch) / "map", Path(scratch) / out.name
         folder.mkdir()
         split_map(xodr, prefix)
@@ -132,5 +135,6 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
         (folder / "town.yaml").write_text(text, encoding="utf-8")
         load_town(folder)
+        out.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(folder, out)
     return ImportedTown(load_town(out), tuple(notes))

@@ -1,1 +1,1 @@
-"""Ray casting: the interface of an engine (`raycaster`), and Embree 4 behind it."""
+"""Ray casting with Embree 4."""

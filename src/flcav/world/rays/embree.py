@@ -1,4 +1,4 @@
-"""Embree 4 as a `Raycaster`, with a two-level hierarchy: moving an instance sets its transform and rebuilds no mesh.
+"""Ray casting with Embree 4, in a two-level hierarchy: moving an instance sets its transform and rebuilds no mesh.
 
 There is one Embree device per process. It builds the bounding volume hierarchies on one thread, so that they are the
 same from run to run.
@@ -9,15 +9,14 @@ import weakref
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import pose
 from flcav.world.rays import loader as c
+from flcav.world.rays.hits import Hits
 from flcav.world.rays.packets import LANES, occlude_packets, trace_groups, trace_packets
-from flcav.world.rays.raycaster import Hits
 
 _ARGUMENTS = c.IntersectArguments(flags=c.QUERY_COHERENT, feature_mask=0xFFFFFFFF)
 _BLOCK_ARGUMENTS = c.OccludedArguments(flags=c.QUERY_COHERENT, feature_mask=0xFFFFFFFF)
@@ -61,7 +60,7 @@ class Solid:
         far_m: float = np.inf,
         threads: int = 1,
     ) -> Hits:
-        """Return the first hit of each ray with the mesh alone: see `raycaster.Target.trace`."""
+        """Return the first hit of each ray with the mesh alone: see `Assembly.trace`."""
         return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
 
 
@@ -69,7 +68,7 @@ class Assembly:
     """Instances of solids, placed by rigid transforms: the upper level of the hierarchy."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
-        """Make one instance of each of `solids`, none placed yet."""
+        """Make one instance of each of `solids`, none placed yet; instance i is of solid i."""
         api, device = c.embree_library(), _device()
         self._solids = tuple(solids)  # kept alive as long as their instances
         self.handle: int = api.rtcNewScene(device)
@@ -98,7 +97,10 @@ class Assembly:
         api.rtcCommitGeometry(geometry)
 
     def commit(self) -> None:
-        """Rebuild the upper level from the placed instances; raises `OSError` where Embree fails."""
+        """Rebuild the upper level from the placed instances; raises `OSError` where Embree fails.
+
+        Not to be called while another thread traces.
+        """
         c.embree_library().rtcCommitScene(self.handle)
         _check("placing meshes")
 
@@ -111,13 +113,20 @@ class Assembly:
         far_m: float = np.inf,
         threads: int = 1,
     ) -> Hits:
-        """Return the first hit of each ray with the placed instances: see `raycaster.Target.trace`."""
+        """Return the first hit of each ray beyond `near_m` (N,) [m], by default 0, and before `far_m` [m].
+
+        All rays start at the origin of one frame: `target_from_rays` (4, 4) is its pose in the assembly's frame,
+        `directions` (N, 3) are unit vectors in it. Raises `ValueError` where `near_m` is not of the rays' number.
+        """
         return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
 
     def find_occluded(
         self, origins: NDArray[np.float32], directions: NDArray[np.float32], far_m: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
-        """Return whether each ray is occluded before its end: see `raycaster.Assembly.blocked`."""
+        """Return (N,) whether each ray is occluded before its end `far_m` (N,) [m]; never where that is not positive.
+
+        `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the assembly's frame.
+        """
         out = np.empty(len(far_m), np.bool_)
         occlude_packets(
             _address("rtcOccluded16"),
@@ -156,7 +165,11 @@ class Embree:
         near_m: NDArray[np.float32] | None = None,
         far_m: float = np.inf,
     ) -> Hits:
-        """Return the first hits of groups of rays, each with its own solid: see `raycaster.Raycaster.trace_each`."""
+        """Return the first hits of K groups of rays, group k with `solids[k]` alone; `instance` is the group's number.
+
+        Group k is `directions[ends[k - 1] : ends[k]]`: unit vectors in a frame whose pose in its solid's frame is
+        `solid_from_rays[k]` (4, 4). `near_m` and `far_m` are as in `Assembly.trace`.
+        """
         rays, near, hits = _buffers(directions, near_m)
         trace_groups(
             _address("rtcIntersect16"),
@@ -259,8 +272,8 @@ def _self_test() -> None:
     assembly = Assembly([solid, solid])
     assembly.place(1, pose(10.0, 5.0, 0.0, yaw=np.pi / 2))  # the face, 2 m ahead of the body, now at (10, 7)
     assembly.commit()
-    alone: Any = solid.trace(np.eye(4), forward)
-    placed: Any = assembly.trace(pose(10.0, 0.0, 0.0, yaw=np.pi / 2), forward)
+    alone = solid.trace(np.eye(4), forward)
+    placed = assembly.trace(pose(10.0, 0.0, 0.0, yaw=np.pi / 2), forward)
     missed = assembly.trace(np.eye(4), forward)
     found = [float(alone.distance[0]), float(placed.distance[0]), int(placed.instance[0]), int(missed.instance[0])]
     if not np.allclose(found, [2.0, 7.0, 1, -1], atol=1e-5):

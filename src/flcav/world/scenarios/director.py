@@ -8,6 +8,7 @@ from flcav.world.map.roads import read_net
 from flcav.world.scenarios import breakdowns, manoeuvres, overtaking, pedestrians
 from flcav.world.scenarios.scenario import Kind, Scenario
 from flcav.world.scenarios.stage import STEP_S, Stage, State
+from flcav.world.trace import Event
 
 Cast = Callable[[Stage, Scenario], Any]  # returns the roles, or None while nobody fits
 Act = Callable[[Stage, Scenario, Any], Generator[None, None, None]]  # the script: one step per `yield`
@@ -21,7 +22,6 @@ SCRIPTS: dict[Kind, tuple[Cast, Act]] = {
     "crash": (breakdowns.cast_crash, breakdowns.crash),
 }
 
-
 ALONE_S = 15.0  # for so long after a scenario begins, its vehicle under test is not free: see `Stage.free_egos`
 LOOKS_AGAIN = 3  # steps between two attempts to cast a scenario
 
@@ -32,7 +32,7 @@ class Director:
     def __init__(self, sumo: Any, net: Path, scenarios: list[Scenario]) -> None:
         """Start at the beginning of a run; `sumo` is the libsumo module, `net` the net file."""
         self.stage = Stage(sumo, read_net(net))
-        self.events: list[dict[str, Any]] = []  # of scenarios that have begun, in that order; fields of `Event`
+        self.events: list[Event] = []  # of scenarios that have begun, in that order
         self._busy: set[str] = set()  # actors of a scenario, which take part in no other
         self._scenarios = scenarios
         self._scripts: list[Generator[None, None, None] | None] = [
@@ -69,8 +69,7 @@ class Director:
         self._needed[number] = {name for name in actors if name in there and not name.startswith("cav")}
         until = self.stage.step + round(ALONE_S / STEP_S)
         self.stage.engaged |= dict.fromkeys((name for name in actors if name.startswith("cav")), until)
-        begins_s = round(self.stage.step * STEP_S, 1)
-        self.events.append({"kind": scenario.kind, "begins_s": begins_s, "actors": actors})
+        self.events.append(Event(scenario.kind, round(self.stage.step * STEP_S, 1), tuple(actors)))
         yield
         yield from playing
 

@@ -65,9 +65,8 @@ def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
 def _meets(one: State, other: State) -> bool:
     """Return whether two vehicles drive towards each other, with road enough to overtake `one` in between."""
     dx, dy = other[0] - one[0], other[1] - one[1]
-    (x, y), (other_x, other_y) = (
-        (math.sin(math.radians(state[2])), math.cos(math.radians(state[2]))) for state in (one, other)
-    )
+    # SUMO's angles are clockwise from north
+    (x, y), (other_x, other_y) = (rotate(0.0, 1.0, -math.radians(state[2])) for state in (one, other))
     facing = dx * x + dy * y > 0.0 > dx * other_x + dy * other_y
     beyond_m = math.hypot(dx, dy) - _takes_m(one[3]) - braking_m(other[3])
     return facing and 0.0 <= beyond_m <= WITHIN_M and one[3] > SLOW / 2

@@ -92,12 +92,9 @@ class Stage:
         a, b = (self.sumo.simulation.convert2D(edge, at, int(index)) for at in (low, high))
         heading = math.atan2(b[1] - a[1], b[0] - a[0])
         x, y = self.sumo.simulation.convert2D(edge, inside, int(index))
-        on = along - inside
-        return (
-            x + on * math.cos(heading) - left * math.sin(heading),
-            y + on * math.sin(heading) + left * math.cos(heading),
-            heading,
-        )
+        ahead_x, ahead_y = rotate(along - inside, 0.0, heading)
+        aside_x, aside_y = rotate(0.0, left, heading)
+        return x + ahead_x + aside_x, y + ahead_y + aside_y, heading
 
     def cast(self, kind: str) -> str:
         """Create a prop of a vehicle type, "category.shape", placed nowhere yet; return its name."""
@@ -189,8 +186,8 @@ class Stage:
             return state
         left, turn = self.shifted[name]
         x, y, angle, speed = state
-        heading = math.radians(90.0 - angle)
-        return x - left * math.sin(heading), y + left * math.cos(heading), angle - math.degrees(turn), speed
+        aside_x, aside_y = rotate(0.0, left, math.radians(90.0 - angle))
+        return x + aside_x, y + aside_y, angle - math.degrees(turn), speed
 
     def trail(self, name: str, behind_m: float) -> Iterator[tuple[int, State]]:
         """Yield steps and states of a follower on a vehicle's path, `behind_m` behind it from front to front.

@@ -18,12 +18,26 @@ from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 from flcav.world.shapes import SHAPES
 
+Array = NDArray[np.float64]
+
 FROM_JUNCTION_M = 6.0  # kept free at both ends of a parking lane
 KERB_GAP_M = (0.1, 0.3)  # limits of the gap between wheels and kerb
 BUMPER_GAP_M = (0.6, 1.8)  # limits of the gap between neighbours
 CROOKED = 0.12  # share of vehicles parked at a larger angle
 BACKWARDS = 0.06  # share of vehicles parked against the driving direction
 OVERHANG_M = 0.1  # by which a vehicle may stand out of its lane, at most
+DRIVER = {  # attributes of SUMO's vehicle types by category, where they differ from the defaults
+    "car": {"vClass": "passenger", "speedFactor": "normc(1,0.1,0.75,1.2)", "minGap": "2.0"},
+    "van": {"vClass": "delivery", "speedFactor": "normc(0.95,0.1,0.7,1.1)", "minGap": "2.0"},
+    "truck": {"vClass": "truck", "speedFactor": "normc(0.9,0.1,0.7,1.0)", "minGap": "2.5"},
+    "bus": {"vClass": "bus", "speedFactor": "normc(0.85,0.1,0.7,1.0)", "minGap": "2.5"},
+    "motorcycle": {"vClass": "motorcycle", "speedFactor": "normc(1.05,0.1,0.8,1.3)", "minGap": "1.5"},
+    "bicycle": {"vClass": "bicycle", "maxSpeed": "5.0", "minGap": "1.0"},
+    "pedestrian": {"vClass": "pedestrian", "maxSpeed": "1.6", "speedFactor": "normc(0.8,0.15,0.4,1.0)"},
+}
+CAV_TYPE = "car.sedan"
+FASTEST = 20.0  # speed for which tours are long enough, of vehicles [m/s]
+FASTEST_WALK = 1.7  # and of pedestrians [m/s]
 
 
 @dataclass(frozen=True)
@@ -69,22 +83,6 @@ def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) 
                     out.append(Parked(category, shape, x, y, yaw))
                 along += length + bumper_gap
     return out
-
-
-Array = NDArray[np.float64]
-
-DRIVER = {  # attributes of SUMO's vehicle types by category, where they differ from the defaults
-    "car": {"vClass": "passenger", "speedFactor": "normc(1,0.1,0.75,1.2)", "minGap": "2.0"},
-    "van": {"vClass": "delivery", "speedFactor": "normc(0.95,0.1,0.7,1.1)", "minGap": "2.0"},
-    "truck": {"vClass": "truck", "speedFactor": "normc(0.9,0.1,0.7,1.0)", "minGap": "2.5"},
-    "bus": {"vClass": "bus", "speedFactor": "normc(0.85,0.1,0.7,1.0)", "minGap": "2.5"},
-    "motorcycle": {"vClass": "motorcycle", "speedFactor": "normc(1.05,0.1,0.8,1.3)", "minGap": "1.5"},
-    "bicycle": {"vClass": "bicycle", "maxSpeed": "5.0", "minGap": "1.0"},
-    "pedestrian": {"vClass": "pedestrian", "maxSpeed": "1.6", "speedFactor": "normc(0.8,0.15,0.4,1.0)"},
-}
-CAV_TYPE = "car.sedan"
-FASTEST = 20.0  # speed for which tours are long enough, of vehicles [m/s]
-FASTEST_WALK = 1.7  # and of pedestrians [m/s]
 
 
 def write_demand(

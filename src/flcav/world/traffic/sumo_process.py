@@ -29,6 +29,7 @@ from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import State
 
 HURRY_MPS = 2.5  # jogging speed; the pedestrians of the demand walk at no more than 1.7 m/s
+STEP_S = 0.1
 
 
 class Walkers:
@@ -63,9 +64,6 @@ class Walkers:
             left -= distance
             x, y = path.popleft()
         return target
-
-
-STEP_S = 0.1
 
 
 def run_sumo(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenarios: list[Scenario]) -> None:
@@ -137,7 +135,7 @@ def run_sumo(net: Path, routes: Path, seed: int, steps: list[int], out: Path, sc
         state=np.array(states, dtype=np.float64).reshape(-1, 4),
         light=np.array(lights, dtype=np.str_),
         light_state=np.array(light_states, dtype=np.str_).reshape(len(steps), len(lights)),
-        events=np.array(json.dumps(director.events if director else [])),
+        events=np.array(json.dumps([event._asdict() for event in director.events] if director else [])),
     )
 
 

@@ -9,7 +9,6 @@ from flcav.dataset.formats.kitti.read import (
     KittiFrame,
     Objects,
     read_calibration,
-    read_labels,
     read_objects,
     read_points,
 )
@@ -20,7 +19,6 @@ __all__ = [
     "KittiFrame",
     "Objects",
     "read_calibration",
-    "read_labels",
     "read_objects",
     "read_points",
 ]

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.geometry import Boxes, inverse, transform_points, wrap_angle
+from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
 
 POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
 LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
 MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
+CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
+SUFFIXES = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}
+MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,8 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
     height, width, length, x, y, z, rotation = numbers[:, 7:].T
     lidar_from_camera = inverse(calibration.camera_from_lidar)
     center = transform_points(lidar_from_camera, np.stack((x, y - height / 2, z), axis=1))
-    ahead = np.stack((np.cos(rotation), np.zeros_like(rotation), -np.sin(rotation)), axis=1)  # camera frame
+    cos, sin = heading_vectors(rotation).T
+    ahead = np.stack((cos, np.zeros_like(rotation), -sin), axis=1)  # camera frame
     ahead = ahead @ lidar_from_camera[:3, :3].T
     yaw = wrap_angle(np.arctan2(ahead[:, 1], ahead[:, 0]))
     size = np.stack((length, width, height), axis=1)
@@ -118,11 +122,6 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
     )
 
 
-def read_labels(path: Path, calibration: Calibration) -> Boxes:
-    """Return the boxes of the labelled objects, LiDAR frame: see `read_objects`."""
-    return read_objects(path, calibration).boxes
-
-
 def _lines(path: Path) -> list[str]:
     try:
         return [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
@@ -130,11 +129,6 @@ def _lines(path: Path) -> list[str]:
         raise InputError(f"{path}: no such file") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
-
-
-CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
-SUFFIXES = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}
-MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
 
 
 @dataclass(frozen=True)

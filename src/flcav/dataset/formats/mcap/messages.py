@@ -5,8 +5,8 @@ and that one of `world` (ENU, z up). Transforms are given at the spin, and at th
 another.
 """
 
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -36,9 +36,15 @@ from numpy.typing import NDArray
 from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
 from flcav.dataset.formats.mounts import quaternion
 from flcav.dataset.payloads import encode_png
+from flcav.files import Json
 from flcav.geometry import pose
 from flcav.sensors.frame import Frame
 from flcav.sensors.radar.radar import compute_echo_directions
+
+LIDAR_FIELDS = ("x", "y", "z", "intensity")
+TIME_FIELD = "time"  # of a point [s] after the cloud's time stamp, as in ROS drivers of spinning LiDARs
+RADAR_FIELDS = ("x", "y", "z", "range_m", "azimuth_rad", "elevation_rad", "doppler_m_s", "rcs_dbsm")
+IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^2], [rad/s], body frame
 
 
 def scene_update(frame: Frame, stamp: Timestamp) -> SceneUpdate:
@@ -121,17 +127,18 @@ def _metadata(about: dict[str, str]) -> list[KeyValuePair]:
     return [KeyValuePair(key=key, value=value) for key, value in about.items()]
 
 
-LIDAR_FIELDS = ("x", "y", "z", "intensity")
-TIME_FIELD = "time"  # of a point [s] after the cloud's time stamp, as in ROS drivers of spinning LiDARs
-RADAR_FIELDS = ("x", "y", "z", "range_m", "azimuth_rad", "elevation_rad", "doppler_m_s", "rcs_dbsm")
-IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^2], [rad/s], body frame
-
-
 class JsonMessage(NamedTuple):
     """A JSON message, for data without a schema of Foxglove's."""
 
     kind: str
-    values: dict[str, Any]
+    values: Mapping[str, Json]
+
+
+class Place(TypedDict):
+    """When and in which coordinate frame a sensor measured: fields of most of Foxglove's messages."""
+
+    timestamp: Timestamp
+    frame_id: str
 
 
 class Logged(NamedTuple):
@@ -149,7 +156,7 @@ def make_messages(frame: Frame) -> Iterator[Logged]:
     def looks_s(sensor: str) -> float:
         return spin_s + true.offset_ms.get(sensor, 0.0) / 1000
 
-    def place(sensor: str) -> dict[str, Any]:
+    def place(sensor: str) -> Place:
         return {"timestamp": _stamp(looks_s(sensor)), "frame_id": f"{frame.agent}/{sensor}"}
 
     mounts = [(frame.agent, f"{frame.agent}/{name}", mount) for name, mount in true.agent_from_sensor.items()]
@@ -161,18 +168,18 @@ def make_messages(frame: Frame) -> Iterator[Logged]:
         cloud, fields = points, LIDAR_FIELDS
         if name in frame.point_times:
             cloud, fields = np.column_stack((points, frame.point_times[name])), (*LIDAR_FIELDS, TIME_FIELD)
-        yield Logged(f"{name}/points", _cloud(cloud, fields, **place(name)), looks_s(name))
+        yield Logged(f"{name}/points", _cloud(cloud, fields, place(name)), looks_s(name))
     for name, picture in frame.images.items():
         image = CompressedImage(**place(name), data=encode_png(picture.rgb), format="png")
-        yield Logged(f"{name}/calibration", _calibration(frame, name, picture.rgb, **place(name)), looks_s(name))
+        yield Logged(f"{name}/calibration", _calibration(frame, name, picture.rgb, place(name)), looks_s(name))
         yield Logged(f"{name}/image", image, looks_s(name))
         yield Logged(f"{name}/labels", image_annotations(frame, name, _stamp(looks_s(name))), looks_s(name))
     for name, picture in frame.infrared.items():
-        yield Logged(f"{name}/calibration", _calibration(frame, name, picture, **place(name)), looks_s(name))
-        yield Logged(f"{name}/image", _thermal(picture, **place(name)), looks_s(name))
+        yield Logged(f"{name}/calibration", _calibration(frame, name, picture, place(name)), looks_s(name))
+        yield Logged(f"{name}/image", _thermal(picture, place(name)), looks_s(name))
         yield Logged(f"{name}/labels", image_annotations(frame, name, _stamp(looks_s(name))), looks_s(name))
     for name, echoes in frame.radar.items():
-        yield Logged(f"{name}/points", _cloud(radar_points(echoes), RADAR_FIELDS, **place(name)), looks_s(name))
+        yield Logged(f"{name}/points", _cloud(radar_points(echoes), RADAR_FIELDS, place(name)), looks_s(name))
     for name, (latitude, longitude, altitude) in frame.gnss.items():
         fix = LocationFix(**place(name), latitude=latitude, longitude=longitude, altitude=altitude)
         yield Logged(f"{name}/fix", fix, looks_s(name))
@@ -190,14 +197,14 @@ def radar_points(echoes: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.concatenate((echoes[:, :1] * compute_echo_directions(echoes), echoes), axis=1).astype(np.float32)
 
 
-def _cloud(points: NDArray[np.float32], names: tuple[str, ...], **place: Any) -> PointCloud:
+def _cloud(points: NDArray[np.float32], names: tuple[str, ...], place: Place) -> PointCloud:
     number = PackedElementField.FLOAT32
     fields = [PackedElementField(name=name, offset=4 * i, type=number) for i, name in enumerate(names)]
     data = np.ascontiguousarray(points, dtype="<f4").tobytes()
     return PointCloud(**place, pose=pose_message(np.eye(4)), point_stride=4 * len(names), fields=fields, data=data)
 
 
-def _calibration(frame: Frame, camera: str, picture: NDArray, **place: Any) -> CameraCalibration:
+def _calibration(frame: Frame, camera: str, picture: NDArray, place: Place) -> CameraCalibration:
     intrinsics = frame.calibration.intrinsics[camera]
     return CameraCalibration(
         **place,
@@ -211,7 +218,7 @@ def _calibration(frame: Frame, camera: str, picture: NDArray, **place: Any) -> C
     )
 
 
-def _thermal(picture: NDArray[np.uint16], **place: Any) -> RawImage:
+def _thermal(picture: NDArray[np.uint16], place: Place) -> RawImage:
     height, width = picture.shape
     data = np.ascontiguousarray(picture, dtype="<u2").tobytes()
     return RawImage(**place, width=width, height=height, encoding="mono16", step=2 * width, data=data)

@@ -2,9 +2,9 @@
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from google.protobuf.message import Message
 from mcap.writer import Writer
@@ -13,6 +13,7 @@ from mcap_protobuf.schema import register_schema
 from flcav.dataset.formats.exporter import Exported, ExportOptions, read_frame
 from flcav.dataset.formats.mcap.messages import JsonMessage, make_messages
 from flcav.dataset.store import Dataset
+from flcav.files import Json
 from flcav.progress import Report
 
 
@@ -63,8 +64,8 @@ class _Log:
         return self.writer.register_channel(topic, "protobuf", self._schema(type(message)))
 
 
-def _schema_of(value: Any) -> dict[str, Any]:
+def _schema_of(value: Json) -> dict[str, Json]:
     """Return the JSON schema of a value made of objects, texts and numbers."""
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {"type": "object", "properties": {name: _schema_of(part) for name, part in value.items()}}
     return {"type": "string" if isinstance(value, str) else "number"}

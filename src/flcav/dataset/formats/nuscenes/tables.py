@@ -1,11 +1,12 @@
 """nuScenes' tables: constant rows, classes, attributes and channels, tokens, and links between rows."""
 
 from hashlib import sha256
-from typing import Any
 
 import numpy as np
 
-Row = dict[str, Any]
+from flcav.files import Json
+
+Row = dict[str, Json]
 
 TABLES = (
     "attribute",
@@ -58,7 +59,7 @@ RADARS = {
 }
 
 
-def token(*names: object) -> str:
+def token(*names: str | int) -> str:
     """Return the token of a row, 32 hexadecimal digits of the SHA-256 of its `names`."""
     return sha256("/".join(map(str, names)).encode()).hexdigest()[:32]
 

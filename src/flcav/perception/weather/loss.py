@@ -1,0 +1,17 @@
+"""Loss of the weather classifier: cross entropy."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from flcav.perception.weather.model import Classifier
+from flcav.perception.weather.predict import tensor_of
+from flcav.perception.weather.samples import Sample
+
+
+def batch_loss(network: Classifier, samples: Sequence[Sample]) -> Tensor:
+    """Return the mean cross entropy of `network` on a batch of samples, differentiable in the network's parameters."""
+    logits = network(tensor_of(network, [sample.picture for sample in samples]))
+    return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
