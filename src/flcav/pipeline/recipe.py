@@ -213,6 +213,7 @@ class RunRecipe(Config):
     seed: int = Field(default=1, ge=0, lt=2**31)  # of all random draws
     retrainings: int = Field(default=0, ge=0, le=100)  # of every arm, on the same frames with other random numbers
     spread: str | None = None  # spread of retraining of a run without: a name of the package's, or a CSV file
+    test_draw: int = Field(default=0, ge=0)  # draw of the test scenes; another one after results were looked at
     size: Literal["toy", "demo", "full"] = "demo"  # preset of `splits` and `training` where they are not given
     splits: Splits | None = None  # sizes of the data splits; default: by `size`
     training: Training | None = None  # training schedule; default: by `size`

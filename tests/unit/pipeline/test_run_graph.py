@@ -88,6 +88,15 @@ def test_an_arm_may_train_otherwise_on_the_same_frames() -> None:
         recipe_of(arms={"slow": {"training": {"cooldowns": [0.1]}}})
 
 
+def test_another_draw_changes_the_test_scenes_alone() -> None:
+    first, other = steps_of(recipe_of()), steps_of(recipe_of(test_draw=1))
+    changed = {name for name in first if first[name] != other[name]}
+    assert {name for name in changed if not name.startswith("test-")} == {
+        *(f"{region}-test-objects" for region in ("suburb", "grid", "arterial")),
+        "look",
+    }
+
+
 def test_what_decides_federations_alone_leaves_pretraining_shared() -> None:
     arms = {"mean": {"training": {"average_rounds": 3}}, "moving": {"training": {"average": 0.9}}}
     names = Graph(recipe_of(arms=arms, retrainings=1), Path()).names
