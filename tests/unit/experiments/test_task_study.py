@@ -44,7 +44,7 @@ RECORDED = {
     "weather": "e5217e3fd7183127",
     "signs": "ea2a27477d52ba62",
     "objects": "cc8eab7b4120267d",
-    "trajectory": "d8fe8ac9f0efaba5",
+    "trajectory": "3b5f95cc2d111a7a",
     "trajectory-cameras": "c719b82001559349",
 }
 
