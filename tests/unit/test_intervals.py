@@ -1,4 +1,4 @@
-"""Intervals against SciPy's own bootstrap and t test, and against redrawings one by one."""
+"""Intervals against SciPy's own bootstrap and against redrawings one by one."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,8 @@ from scipy import stats
 
 from flcav.intervals import (
     Estimate,
-    MeanOverSeeds,
     Spread,
     bootstrap_over_scenes,
-    mean_over_seeds,
     measure_spread,
     widen,
     widen_share,
@@ -45,14 +43,6 @@ def test_what_no_redrawing_knows_has_no_interval_and_unknown_ones_are_left_out()
     assert np.isnan(bootstrap_over_scenes(lambda times: np.full(len(times), np.nan), "ab", 50, rng=rng)).all()
     known = bootstrap_over_scenes(lambda times: np.where(times[:, 0] > 0, 1.0, np.nan), list("ab"), 50, rng=rng)
     assert known == (1.0, 1.0)
-
-
-def test_means_over_seeds_have_the_interval_of_a_t_test():
-    values = [0.71, 0.78, 0.69, 0.74]
-    wanted = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
-    found = mean_over_seeds(values)
-    assert (found.mean, found.low, found.high) == pytest.approx((0.73, wanted.low, wanted.high))
-    assert mean_over_seeds([0.7]) == MeanOverSeeds(0.7, 0.7, 0.7)
 
 
 def test_an_estimate_is_told_with_its_interval_where_it_has_one():

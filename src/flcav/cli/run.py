@@ -104,8 +104,8 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
             typer.echo(f"{finding.question}: {finding.verdict}. {finding.sentence}")
         return
     for row in (*summary.measures, *summary.differences):
-        low, high = row.estimate.low, row.estimate.high
-        typer.echo(f"{row.name}: {row.estimate.mean:.3f} ({low:.3f} to {high:.3f}) over {len(summary.seeds)} seeds")
+        judged = f": {row.judged.verdict}, {row.judged.describe()}" if row.judged else ""
+        typer.echo(f"{row.name}: {row.estimate.describe()} over {len(summary.seeds)} seeds{judged}")
 
 
 def compare(

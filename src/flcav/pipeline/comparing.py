@@ -1,18 +1,19 @@
 """Paired comparison of two runs, over all tests that both made on the same frames."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import Estimate, mean_over_seeds
+from flcav.intervals import Estimate
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.results import OUTCOMES, Run, Test
 from flcav.pipeline.running import RESULTS, WORK, seed_folders
-from flcav.verdicts import verdict
+from flcav.pipeline.summary import mean_of_tests
+from flcav.verdicts import Claim, judge, verdict
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task
 
@@ -28,14 +29,14 @@ class Compared:
     measure: str
     first: float
     second: float
-    difference: Estimate  # over scenes; over seeds where both runs have several
-    verdict: str  # of the claim that the second is better
+    difference: Estimate  # over scenes; over seeds and scenes where both runs have several seeds
+    verdict: str  # of the claim that the second is better; of several seeds corrected for the number of tests
 
 
 def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     """Return the paired difference of every test that both runs made, over the seeds that both have.
 
-    Its interval (95 %) is a bootstrap over scenes for one common seed, Student's t over seeds for several.
+    Its interval (95 %) is a bootstrap over scenes for one common seed, over seeds and scenes for several.
     Raises `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
     """
     folders = [seed_folders(folder) for folder in (first, second)]
@@ -44,21 +45,37 @@ def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     common = [key for key in (rows[0] if rows else {}) if all(key in row for row in rows)]
     if not common:
         raise InputError(f"{first} and {second}: no test was made by both on the same frames, with the same seed")
-    return tuple(_over_seeds(key, [row[key] for row in rows]) for key in common)
+    if len(rows) == 1:
+        return tuple(rows[0][key].compared for key in common)
+    means = [mean_of_tests(key[3], *_listed([row[key] for row in rows])) for key in common]
+    judged = judge([Claim(mean) for mean in means])
+    return tuple(
+        _compared(key, [row[key].compared for row in rows], mean, one.verdict)
+        for key, mean, one in zip(common, means, judged, strict=True)
+    )
 
 
-def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, Compared]:
+@dataclass(frozen=True)
+class _Pair:
+    compared: Compared  # of one seed
+    folders: tuple[Path, Path]  # of the second run's test and of the first's
+
+
+def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
     runs = [Run.load(folder, RESULTS) for folder in (first, second)]
     tests: list[Mapping[Key, Test]] = [{_key(test): test for test in run.tested} for run in runs]
     found = {}
     for key in tests[0].keys() & tests[1].keys():
-        places = [folder / WORK / own[key].step / OUTCOMES for folder, own in zip((first, second), tests, strict=True)]
+        places = [folder / WORK / own[key].step for folder, own in zip((first, second), tests, strict=True)]
         try:
-            both = [Outcomes.load(path) for path in places]
+            both = [Outcomes.load(path / OUTCOMES) for path in places]
             mean, low, high = difference(task_named(key[3]), both[0], both[1], seed)
         except InputError:
             continue
-        found[key] = _compared(key, tests[0][key], tests[1][key], Estimate(mean, low, high))
+        before, after = (own[key].result for own in tests)
+        values = before.estimate.mean, after.estimate.mean
+        one = Compared(*key, after.measure, *values, Estimate(mean, low, high), verdict(low, high))
+        found[key] = _Pair(one, (places[1], places[0]))
     order = list(tests[0])
     return {key: found[key] for key in sorted(found, key=order.index)}
 
@@ -67,14 +84,11 @@ def _key(test: Test) -> Key:
     return test.arm, test.stage, test.region, test.task
 
 
-def _compared(key: Key, first: Test, second: Test, change: Estimate) -> Compared:
-    values = first.result.estimate.mean, second.result.estimate.mean
-    return Compared(*key, second.result.measure, *values, change, verdict(change.low, change.high))
+def _listed(pairs: Sequence[_Pair]) -> tuple[list[float], list[tuple[Path, Path]]]:
+    """Return the difference and the folders of each seed."""
+    return [pair.compared.difference.mean for pair in pairs], [pair.folders for pair in pairs]
 
 
-def _over_seeds(key: Key, rows: list[Compared]) -> Compared:
-    if len(rows) == 1:
-        return rows[0]
-    change = mean_over_seeds([row.difference.mean for row in rows])
+def _compared(key: Key, rows: Sequence[Compared], change: Estimate, decided: str) -> Compared:
     first, second = float(np.mean([row.first for row in rows])), float(np.mean([row.second for row in rows]))
-    return Compared(*key, rows[0].measure, first, second, change, verdict(change.low, change.high))
+    return Compared(*key, rows[0].measure, first, second, change, decided)

@@ -8,6 +8,7 @@ same town, by recipes/trajectory_cameras.yaml.
 from flcav.perception.study import StudyRecipe, read_recipe
 
 GRID, SUBURB, RING = read_recipe("trajectory"), read_recipe("trajectory_suburb"), read_recipe("trajectory_ring")
+TESTED = {"split": "test", "scenes": 10, "spins_per_scene": 41}  # 20 s of a scene
 CAMERA_RECIPE = read_recipe("trajectory_cameras")
 
 STUDY = StudyRecipe(
@@ -15,8 +16,8 @@ STUDY = StudyRecipe(
     train=(GRID, SUBURB),
     validation={**GRID, "seed": 121, "split": "validation", "scenes": 1},
     tests={
-        "held-out scenes": {**GRID, "seed": 221, "split": "test", "scenes": 3},
-        "held-out town": {**RING, "split": "test"},
+        "held-out scenes": {**GRID, "seed": 221, **TESTED},
+        "held-out town": {**RING, **TESTED},
     },
     epochs=3,
     patience=3,
@@ -27,7 +28,7 @@ CAMERAS = StudyRecipe(
     network="tiny-cameras",
     train=(CAMERA_RECIPE,),
     validation={**CAMERA_RECIPE, "seed": 131, "split": "validation", "cavs": 3, "scenes": 4},
-    tests={"held-out scenes": {**CAMERA_RECIPE, "seed": 331, "split": "test", "cavs": 3, "scenes": 6}},
+    tests={"held-out scenes": {**CAMERA_RECIPE, **TESTED, "seed": 331, "cavs": 2}},
     epochs=5,
     patience=5,
     quick_scenes=1,
