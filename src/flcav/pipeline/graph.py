@@ -239,10 +239,11 @@ class Graph:
                     step = self.names.more_edge(arm.name, region, task)
                     self._add(_step(step, edge_step, common | more, _named_in(more["steps"])))
             if CLOUD in arm.stages:
-                for region, steps in rests.items():
-                    steps["edge"] = self.names.edge(arm.name, region, task)
-                needs = [step for steps in rests.values() for step in _named_in(steps)]
-                arguments = common | {"budget_mb": self._budget_mb, "regions": rests}
+                edges = {
+                    region: steps | {"edge": self.names.edge(arm.name, region, task)} for region, steps in rests.items()
+                }
+                needs = [step for steps in edges.values() for step in _named_in(steps)]
+                arguments = common | {"budget_mb": self._budget_mb, "regions": edges}
                 self._add(_step(self.names.cloud(arm.name, task), cloud_step, arguments, needs))
 
     def _central(self, arm: Setting, region: str, task: str) -> Step:
