@@ -207,7 +207,8 @@ def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: E
     write_bytes(out / f"{study.task.name}.png", study.draw(results))
     for test, numbers in results.summary.items():
         for name, value in numbers.items():
-            typer.echo(f"{test}, {name}: {value.describe()}")
+            spread = f", standard deviation over seeds {value.sd:.3f}" if value.seeds > 1 else ""
+            typer.echo(f"{test}, {name}: {value.describe()}{spread}")
 
 
 def register(app: typer.Typer) -> None:

@@ -114,7 +114,7 @@ def compare(
     as_json: bool = AS_JSON,
 ) -> None:
     """Compare two runs: differences, second minus first, of every test that both made on the same frames."""
-    from flcav.pipeline.comparing import compare as compare_runs
+    from flcav.pipeline.seeds.comparing import compare as compare_runs
 
     rows = compare_runs(first, second)
     if as_json:

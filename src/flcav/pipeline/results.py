@@ -299,12 +299,12 @@ class Mean:
 
     name: str
     estimate: MeanOverSeeds
-    judged: Annotated[Judged | None, LEFT_OUT] = None  # of a difference: the claim that it is positive
+    judged: Annotated[Judged | None, LEFT_OUT] = None  # of the run's own differences: the claim that they are positive
 
 
 @dataclass(frozen=True)
 class Summary(Saved):
-    """Means over several seeds of a recipe; the verdicts on all differences are corrected together."""
+    """Means over several seeds of a recipe; verdicts on differences are corrected together."""
 
     seeds: tuple[int, ...]
     measures: tuple[Mean, ...]

@@ -35,9 +35,9 @@ from flcav.pipeline.results import (
     Tested,
     Watched,
 )
+from flcav.pipeline.seeds.summary import summarise
 from flcav.pipeline.spread import difference_key, list_spreads, test_key
 from flcav.pipeline.steps import Notify, Stale, run_side_by_side, run_steps, stopwatch
-from flcav.pipeline.summary import summarise
 from flcav.pipeline.tables import append_records
 
 WORK, RESULTS, SUMMARY, HISTORY, SPREAD = "work", "results.json", "summary.json", "history.csv", "spread.csv"

@@ -12,7 +12,7 @@ from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.results import OUTCOMES, Run, Test
 from flcav.pipeline.running import RESULTS, WORK, seed_folders
-from flcav.pipeline.summary import mean_of_tests
+from flcav.pipeline.seeds.summary import mean_of_tests
 from flcav.verdicts import Claim, judge, verdict
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task

@@ -18,8 +18,9 @@ from flcav.verdicts import Claim, judge
 def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
     """Return means over the seeds of a recipe; `works`: the folder of each run's steps, with the outcomes of its tests.
 
-    Simulated towns have traffic of their own for each seed. Where seeds are tested on the same recorded scenes, the
-    intervals include what these scenes vary by; those of closed gaps do not.
+    The claims that the run itself is better, as in its findings, are judged together. Simulated towns have traffic of
+    their own for each seed. Where seeds are tested on the same recorded scenes, the intervals include what these scenes
+    vary by; those of closed gaps do not.
     """
     tests = [{_key(test): test for test in run.tested} for run in runs]
     measures = [
@@ -29,12 +30,14 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
         Mean(rows[0].name, _mean_difference(rows, tests, works))
         for rows in zip(*(run.differences for run in runs), strict=True)
     ]
-    judged = judge([Claim(each.estimate) for each in differences])
+    own = [number for number, each in enumerate(runs[0].differences) if each.arm == MAIN]
+    for number, one in zip(own, judge([Claim(differences[number].estimate) for number in own]), strict=True):
+        differences[number] = replace(differences[number], judged=one)
     closed = [Mean(name, mean_over_seeds([run.gap_closed[name] for run in runs])) for name in runs[0].gap_closed]
     return Summary(
         tuple(run.recipe.seed for run in runs),
         tuple(measures),
-        tuple(replace(each, judged=one) for each, one in zip(differences, judged, strict=True)),
+        tuple(differences),
         tuple(closed),
     )
 
