@@ -184,6 +184,17 @@ def test_planned_seeds_are_those_of_published_tables(effect: float, seeds: int) 
     assert plan_seeds(-0.02 * effect, 0.02) == seeds
 
 
+def test_seeds_for_a_share_are_planned_on_the_scale_of_its_test() -> None:
+    """Near 0.5 log-odds are linear; near 1 a lower value is nearer, in units of the spread."""
+    middle, high = [0.50, 0.52, 0.48], [0.96, 0.98, 0.94]
+    for values, hypothesis, same in ((middle, 0.51, True), (high, 0.94, False)):
+        share, plain = (mean_over_seeds(values, share=each).seeds_to_tell(hypothesis) for each in (True, False))
+        assert share is not None
+        assert plain is not None
+        assert (share == plain) == same
+        assert share >= plain
+
+
 def test_power_is_that_of_simulated_tests() -> None:
     rng = np.random.default_rng(4)
     for effect, seeds, level in ((0.9, 5, 0.05), (1.5, 8, 0.05 / 6), (6.0, 3, 0.05)):

@@ -13,7 +13,7 @@ import pytest
 from flcav.cli.main import run as command
 from flcav.config import InputError, parse_config
 from flcav.experiments.studies import STUDIES, study_named, weather
-from flcav.experiments.studies.run import results_as_json, results_of_json, run_study, steps_of
+from flcav.experiments.studies.run import list_counts, results_as_json, results_of_json, run_study, steps_of
 from flcav.perception.study import TEST_SEEDS
 from flcav.perception.training.run import CARD, EVENTS, WEIGHTS
 from flcav.sources.recipe import Recipe
@@ -70,6 +70,10 @@ def test_what_a_study_records_stays_what_its_committed_figures_are_of(name):
     recipe = study.recipe
     recipes = {"train": list(recipe.train), "validation": recipe.validation, "tests": dict(recipe.tests)}
     assert hashlib.sha256(json.dumps(recipes, sort_keys=True).encode()).hexdigest()[:16] == RECORDED[name]
+
+
+def test_counts_are_said_once_where_all_seeds_have_the_same():
+    assert (list_counts([288, 288, 288]), list_counts([33, 30, 33])) == ("288", "33, 30, 33")
 
 
 def test_a_training_waits_for_its_frames_and_a_test_for_its_training():
