@@ -125,6 +125,16 @@ def measure_spread(values: Sequence[float]) -> Spread | None:
     return Spread(float(np.std(values, ddof=1)), len(values)) if len(values) > 1 else None
 
 
+def combine_spreads(first: Spread | None, second: Spread | None) -> Spread | None:
+    """Return the spread of the difference of two numbers whose trainings vary independently; None where one is unknown.
+
+    Variances add; trainings are the fewer of both.
+    """
+    if first is None or second is None:
+        return None
+    return Spread(float(np.hypot(first.sd, second.sd)), min(first.trainings, second.trainings))
+
+
 def widen(estimate: Estimate, spread: Spread) -> Estimate:
     """Return an estimate of one training with the interval for the mean over trainings.
 

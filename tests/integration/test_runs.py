@@ -35,7 +35,7 @@ from flcav.pipeline.results import Placed, Pretrained, Run, StageResult, Watched
 from flcav.pipeline.running import RESULTS, SUMMARY, run, run_seeds
 from flcav.pipeline.seeds.comparing import compare
 from flcav.report.pages.run_page import write_report
-from flcav.verdicts import verdict
+from flcav.verdicts import UNDECIDED, verdict
 from flcav.world.map.town import load_town
 
 pytestmark = pytest.mark.slow
@@ -340,6 +340,7 @@ def test_runs_are_compared_on_the_same_frames(finished: Path, tmp_path: Path, mo
     edge = by_key[MAIN, EDGE, "grid"]
     assert edge.second == other.test(stage=EDGE, region="grid", task="objects").estimate.mean
     assert edge.difference.mean == pytest.approx(edge.second - edge.first)
+    assert {row.verdict for row in rows} == {UNDECIDED}  # the spread of retraining is not known
     weights = "grid-edge-fl-objects/weights.safetensors"
     assert (work / weights).read_bytes() != (finished / "work" / weights).read_bytes()
     with pytest.raises(InputError, match="no finished run"):

@@ -8,6 +8,7 @@ from flcav.intervals import (
     Estimate,
     Spread,
     bootstrap_over_scenes,
+    combine_spreads,
     measure_spread,
     widen,
     widen_share,
@@ -57,6 +58,15 @@ def test_the_spread_is_the_standard_deviation_of_several_trainings():
     assert found is not None
     assert (found.sd, found.trainings) == (pytest.approx(stats.tstd(values)), 3)
     assert measure_spread([0.6]) is None
+
+
+def test_a_difference_spreads_by_both_trainings():
+    rng = np.random.default_rng(7)
+    first, second = rng.normal(scale=0.03, size=50_000), rng.normal(scale=0.04, size=50_000)
+    found = combine_spreads(Spread(0.03, 9), Spread(0.04, 5))
+    assert found is not None
+    assert (found.sd, found.trainings) == (pytest.approx((first - second).std(), rel=0.02), 5)
+    assert combine_spreads(Spread(0.03, 9), None) is None
 
 
 def test_widened_intervals_contain_the_mean_over_trainings_and_scenes_as_often_as_they_say():

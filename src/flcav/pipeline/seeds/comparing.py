@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import Estimate
+from flcav.intervals import Estimate, combine_spreads, widen
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.results import OUTCOMES, Run, Test
 from flcav.pipeline.running import RESULTS, WORK, seed_folders
 from flcav.pipeline.seeds.summary import mean_of_tests
-from flcav.verdicts import Claim, judge, verdict
+from flcav.verdicts import UNDECIDED, Claim, judge, verdict
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task
 
@@ -29,15 +29,15 @@ class Compared:
     measure: str
     first: float
     second: float
-    difference: Estimate  # over scenes; over seeds and scenes where both runs have several seeds
+    difference: Estimate  # over scenes and retraining; over seeds and scenes where both runs have several seeds
     verdict: str  # of the claim that the second is better; of several seeds corrected for the number of tests
 
 
 def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     """Return the paired difference of every test that both runs made, over the seeds that both have.
 
-    Its interval (95 %) is a bootstrap over scenes for one common seed, over seeds and scenes for several.
-    Raises `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
+    Its interval (95 %) is a bootstrap over scenes for one common seed, widened by the spread of retraining in both
+    runs; where that is not known, one seed decides nothing. For several seeds it is over seeds and scenes. Raises `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
     """
     folders = [seed_folders(folder) for folder in (first, second)]
     seeds = [seed for seed in folders[0] if seed in folders[1]]
@@ -74,7 +74,10 @@ def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
             continue
         before, after = (own[key].result for own in tests)
         values = before.estimate.mean, after.estimate.mean
-        one = Compared(*key, after.measure, *values, Estimate(mean, low, high), verdict(low, high))
+        spread = combine_spreads(*(own[key].spread for own in tests))
+        change = Estimate(mean, low, high) if spread is None else widen(Estimate(mean, low, high), spread)
+        said = UNDECIDED if spread is None else verdict(change.low, change.high)
+        one = Compared(*key, after.measure, *values, change, said)
         found[key] = _Pair(one, (places[1], places[0]))
     order = list(tests[0])
     return {key: found[key] for key in sorted(found, key=order.index)}
