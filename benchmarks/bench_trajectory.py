@@ -16,8 +16,9 @@ from flcav.perception.trajectory.config import CONFIGURATIONS, FUTURE, PAST, Tra
 from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.rasters import LAYERS
 from flcav.perception.trajectory.roads import road_map
-from flcav.perception.trajectory.samples import Sample, Surround, extract_columns
+from flcav.perception.trajectory.samples import Columns, Sample, Surround, extract_columns
 from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.perception.trajectory.tracks import tracks_around
 from flcav.world.map.town import load_town
 from flcav.world.traffic.traffic import simulate
 
@@ -50,8 +51,11 @@ def extraction_ms() -> float:
     roads, patch = road_map(town), CONFIGURATIONS["tiny"].patch
     wanted = np.ones(len(trace.actor), np.bool_)
     key = FrameKey("scene", 0, "cav0", 65.0)
-    count = len(extract_columns(trace, key, 0, roads, patch, wanted).past)
-    return cpu_ms((lambda: extract_columns(trace, key, 0, roads, patch, wanted),), REPEATS)[0] / count
+
+    def extract() -> Columns:
+        return extract_columns(trace, tracks_around(trace, key.time_s), key, 0, roads, patch, wanted)
+
+    return cpu_ms((extract,), REPEATS)[0] / len(extract().past)
 
 
 def made_sample(config: TrajectoryConfig) -> Sample:

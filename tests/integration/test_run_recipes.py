@@ -4,14 +4,17 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
-from make_history import Chosen, main
 
+from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.pipeline import results
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
+from flcav.pipeline.learning_history import ORIGIN, HistoryOrigin
 from flcav.pipeline.planning import parse_history
 from flcav.pipeline.recipe import (
     CLOUD,
@@ -26,9 +29,10 @@ from flcav.pipeline.recipe import (
     Training,
     load_run_recipe,
 )
-from flcav.pipeline.results import Run
+from flcav.pipeline.results import WEIGHTS, Difference, Pretrained, Run
 from flcav.pipeline.running import RESULTS, run
 from flcav.report.pages.run_page import page, write_report
+from flcav.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town
 
 pytestmark = pytest.mark.slow
@@ -131,8 +135,8 @@ def test_a_town_from_a_map_federates(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "test-cloud-fl-objects-ring" in steps
 
 
-def test_a_history_is_made_of_recorded_datasets_by_plans_chosen_by_hand(
-    three_tasks: tuple[Path, Run], tmp_path: Path
+def test_a_history_is_made_of_recorded_datasets(
+    three_tasks: tuple[Path, Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = three_tasks[0] / "work"
 
@@ -146,20 +150,70 @@ def test_a_history_is_made_of_recorded_datasets_by_plans_chosen_by_hand(
     recipe["tasks"] = {"weather": recipe["tasks"]["weather"]}
     recipe["placement"] = {"rule": "none", "tasks": [], "group_range_m": 400.0}
     (tmp_path / "few.yaml").write_text(json.dumps(recipe))
-    out, runs = tmp_path / "weather.csv", tmp_path / "runs"
-    asked = ["--runs", str(runs), "--out", str(out), "--jobs", "1"]
-    main([str(tmp_path / "few.yaml"), "weather", "101:4,2,1", "102:2,0,0", *asked])
-    made = parse_history("weather", out.read_text(), "weather.csv")
-    assert made.resources.tolist() == [[4, 0, 0], [4, 1, 0], [4, 2, 0], [4, 2, 1], [2, 0, 0]]
+    out = tmp_path / "history"
+    asked = ["--out", str(out), "--jobs", "1", "--edge-rounds", "2", "--cloud-rounds", "1", "--seeds", "1"]
+    flcav("history", str(tmp_path / "few.yaml"), "--task", "weather", "--samples", "4,2", *asked, code=0)
+    made = parse_history("weather", (out / "history.csv").read_text(), "history.csv")
+    assert made.resources.tolist() == [[n, *rounds] for n in (2, 4) for rounds in ([0, 0], [1, 0], [2, 0], [2, 1])]
     assert (made.weight == 1).all()  # validation frames
-    result = Run.load(runs / "101-4-2-1", RESULTS)
+    origin = HistoryOrigin.load(out, ORIGIN)
+    assert (origin.samples, origin.edge_rounds, origin.cloud_rounds, origin.seeds) == ((2, 4), 2, 1, (101,))
+    assert origin.recipe.training == QUICK
+    result = Run.load(out / "seed101-4", RESULTS)
     assert {(test.region, test.stage) for test in result.tested} == {
         *((region, stage) for region in roles for stage in (PRETRAIN, CLOUD)),
         ("grid", EDGE),
     }
-    dealt = Frames.open(runs / "101-4-2-1/work/grid-edge-weather")
+    dealt = Frames.open(out / "seed101-4/work/grid-edge-weather")
     assert dealt.vehicles == Frames.open(before / "grid-edge-weather").vehicles
-    with pytest.raises(InputError, match="'101:4' is no plan"):
-        Chosen.read("101:4")
-    with pytest.raises(InputError, match="'signs' is none of the recipe's tasks"):
-        main([str(tmp_path / "few.yaml"), "signs", "101:4,2,1", *asked])
+    flcav("history", str(tmp_path / "few.yaml"), "--task", "weather", "--samples", "4;2", *asked, code=2)
+    assert "--samples '4;2': whole numbers from 1" in capsys.readouterr().err
+    flcav("history", str(tmp_path / "few.yaml"), "--task", "signs", "--samples", "4", *asked, code=2)
+    assert "'signs' is none of the recipe's tasks: weather" in capsys.readouterr().err
+
+
+def flcav(*arguments: str, code: int) -> None:
+    """Run the command line and check its exit code."""
+    with pytest.raises(SystemExit) as ended:
+        command(list(arguments))
+    assert ended.value.code == code
+
+
+def test_retrainings_measure_a_spread_that_another_run_of_the_recipe_takes(tmp_path: Path) -> None:
+    few = {"scenes": 2, "spins": 1, "cavs": 1}
+    asked = {
+        "splits": dict.fromkeys(("pool", "validation", "registry", "edge", "test"), few),
+        "training": {"block_steps": 2, "max_blocks": 1, "cooldown": (), "local_steps": 1},
+        "tasks": {"weather": {"plan": {"samples": 2, "edge_rounds": 1, "cloud_rounds": 1}}},
+        "regions": {"suburb": {"role": "pretrain"}, "ring": {"role": "federate"}},
+        "budgets_mb": {"wireless": 9, "wireline": 9},
+        "placement": {"rule": "none"},
+        "recording": {"warmup_s": 5.0, "weather": "clear"},
+    }
+    once = run(RunRecipe.model_validate(asked), tmp_path / "own")
+    assert {finding.verdict for finding in once.findings} == {UNDECIDED}
+    again = run(RunRecipe.model_validate(asked | {"retrainings": 2}), tmp_path / "own")
+    work = tmp_path / "own" / "work"
+    names = ["pretrain-weather", "pretrain-weather-main-again1", "pretrain-weather-main-again2"]
+    assert len({(work / name / WEIGHTS).read_bytes() for name in names}) == 3
+    assert len({str(Pretrained.load(work / name).uploaded) for name in names}) == 1
+    for test, before in zip(again.tested, once.tested, strict=True):
+        assert test.result == before.result
+        assert len(test.retrained) == 2
+        assert test.spread is not None
+        assert test.spread.sd == pytest.approx(np.std([test.result.estimate.mean, *test.retrained], ddof=1))
+    for each in again.differences:
+        pairs = [
+            [again_at(again, each, stage).retrained[n] for stage in (each.before_stage, each.stage)] for n in (0, 1)
+        ]
+        assert each.retrained == pytest.approx([after - before for before, after in pairs])
+    taken = run(RunRecipe.model_validate(asked | {"spread": "own/spread.csv"}), tmp_path / "own", beside=tmp_path)
+    told = {each.name: each.spread for each in again.differences}
+    for each in taken.differences:
+        assert each.spread is not None
+        assert each.spread.sd == pytest.approx(told[each.name].sd, abs=1e-5)  # type: ignore[union-attr]
+    assert "sd of retraining" in write_report(taken, tmp_path / "own").read_text()
+
+
+def again_at(result: Run, each: Difference, stage: str) -> results.Test:
+    return next(test for test in result.tested if (test.stage, test.region) == (stage, each.region))

@@ -13,7 +13,7 @@ from flcav.cli import (
 from flcav.cli.data import birdseye, camera, export, record, validate, view
 from flcav.cli.options import escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
-from flcav.cli.planning import allocate, fit, place
+from flcav.cli.planning import allocate, fit, history, place
 from flcav.cli.terminal import Interrupted
 from flcav.config import InputError
 
@@ -59,6 +59,7 @@ for command in (
     allocate,
     place,
     fit,
+    history,
     reproduce,
 ):
     command.register(app)

@@ -21,7 +21,8 @@ from flcav.pipeline.recipe import (
 PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
 PLANNED = ("plan",)  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
 PLACED = ("plan", "placement")  # those that decide where sensors stand
-PRETRAINED = ("plan", "training", "repeat")  # those that decide pretraining
+PRETRAINED = ("plan", "pretraining", "repeat")  # those that decide pretraining
+OF_ROUNDS = ("local_steps", "local_rate", "final_rate", "average_rounds")  # fields of `Training` of federations alone
 LEARNED = ("plan", "training", "repeat", "placement", "labels", "federation")  # those that decide a federation
 
 
@@ -39,6 +40,12 @@ class Setting:
     central: Literal["pretrain", "federate"] | None
     regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
+
+    @property
+    def pretraining(self) -> Mapping[str, Training]:
+        """Return the training by task without what decides federations alone."""
+        of_rounds = {name: field.default for name, field in Training.model_fields.items() if name in OF_ROUNDS}
+        return {task: training.model_copy(update=of_rounds) for task, training in self.training.items()}
 
 
 def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:

@@ -61,11 +61,12 @@ def recording_fields(recipe: RunRecipe, region: str, split: SplitName, task: str
     spins = frames.spins
     if how["every_s"] < frames.every_s:  # the same duration, sampled more often
         spins = round(max(frames.spins * frames.every_s, SHORTEST_S) / how["every_s"]) + 1
+    drawn = (recipe.test_draw,) if split == "test" and recipe.test_draw else ()
     return {
         **how,
         "town": place.town or region,
         "split": split,
-        "seed": derive_seed(recipe.seed, region, split),
+        "seed": derive_seed(recipe.seed, region, split, *drawn),
         "scenes": frames.scenes,
         "spins_per_scene": spins,
         "cavs": recipe.vehicles(region) if split == "edge" else frames.cavs,

@@ -165,7 +165,7 @@ class Graph:
         recipe, names = self.recipe, self.names
         starts = recipe.with_role("pretrain")
         pools = {task: [names.recording(region, "pool", task) for region in starts] for task in recipe.tasks}
-        others = {"retrainings", "spread", "arms", "splits", "training", "recording", "placement"}
+        others = {"retrainings", "spread", "test_draw", "arms", "splits", "training", "recording", "placement"}
         asked = recipe.model_dump(mode="json", exclude=others)
         asked["placement"] = {"tasks": []}  # not part of the plan; the default would depend on objects
         asked["federation"] = {"edge_rounds_per_cloud_round": recipe.federation.edge_rounds_per_cloud_round}

@@ -70,9 +70,11 @@ class Training(Config):
     )  # plateau: the best of these last blocks is less than `min_gain` above the best before
     min_gain: float = Field(default=0.01, ge=0)  # least gain of the validation measure over `patience` blocks
     cooldown: tuple[float, ...] = (0.3, 0.05)  # learning rates of the blocks after the plateau, one block each
+    average: float = Field(default=0.0, ge=0, lt=1)  # decay per step of a moving average of pretrained weights
     local_steps: int = Field(default=16, ge=1, le=10**6)  # optimiser steps of one vehicle in one round
     local_rate: float = Field(default=0.5, gt=0)  # learning rate of the first round
     final_rate: float = Field(default=0.1, gt=0)  # learning rate of the last round
+    average_rounds: int = Field(default=1, ge=1)  # last rounds of a federation whose models its result averages
 
 
 class FixedPlan(Config):
@@ -215,6 +217,7 @@ class RunRecipe(Config):
     seed: int = Field(default=1, ge=0, lt=2**31)  # of all random draws
     retrainings: int = Field(default=0, ge=0, le=100)  # of every arm, on the same frames with other random numbers
     spread: str | None = None  # spread of retraining of a run without: a name of the package's, or a CSV file
+    test_draw: int = Field(default=0, ge=0)  # draw of the test scenes; another one after results were looked at
     size: Literal["toy", "demo", "full"] = "demo"  # preset of `splits` and `training` where they are not given
     splits: Splits | None = None  # sizes of the data splits; default: by `size`
     training: Training | None = None  # training schedule; default: by `size`

@@ -1,6 +1,6 @@
 """Running a recipe, with one seed or several, and collecting the results of its steps."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,7 +90,7 @@ def run(
         notify(step, done, total, note)
 
     run_steps(graph.steps, out / WORK, jobs=jobs, notify=timed, stale=stale, engine=engine)
-    return _save_results(graph, out, out / HISTORY, clock())
+    return _save_results(graph, out, out / HISTORY, clock(), f"seed{recipe.seed}")
 
 
 def run_seeds(
@@ -108,24 +108,40 @@ def run_seeds(
 
     Each seed has a folder in `out`, beside summary.json and a common history.csv. Other arguments are those of `run`.
     """
-    out = Path(out)
-    graphs = {
-        out / f"seed{seed}": Graph(recipe.model_copy(update={"seed": seed}), Path(beside or "."))
-        for seed in range(recipe.seed, recipe.seed + seeds)
+    recipes = {
+        f"seed{seed}": recipe.model_copy(update={"seed": seed}) for seed in range(recipe.seed, recipe.seed + seeds)
     }
-    steps = {folder / WORK: graph.steps for folder, graph in graphs.items()}
-    names = {folder / WORK: folder.name for folder in graphs}
-    run_side_by_side(steps, jobs=jobs, notify=notify, stale=stale, engine=engine, names=names)
-    runs = tuple(_save_results(graph, folder, out / HISTORY, 0.0) for folder, graph in graphs.items())
-    summary = summarise(runs, [folder / WORK for folder in graphs])
-    summary.save(out, SUMMARY)
+    runs = run_several(recipes, out, beside=beside, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    summary = summarise(runs, [Path(out) / name / WORK for name in recipes])
+    summary.save(Path(out), SUMMARY)
     return runs, summary
 
 
-def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float) -> Run:
+def run_several(
+    recipes: Mapping[str, RunRecipe],
+    out: Path | str,
+    *,
+    beside: Path | str | None = None,
+    jobs: int = 1,
+    notify: Notify = _silent,
+    stale: Stale = "refuse",
+    engine: str = "processes",
+) -> tuple[Run, ...]:
+    """Run or finish several recipes side by side, each in the folder of its name in `out`; return their results.
+
+    They have a common history.csv in `out`. Other arguments are those of `run`.
+    """
+    out = Path(out)
+    graphs = {out / name: Graph(recipe, Path(beside or ".")) for name, recipe in recipes.items()}
+    steps = {folder / WORK: graph.steps for folder, graph in graphs.items()}
+    names = {folder / WORK: folder.name for folder in graphs}
+    run_side_by_side(steps, jobs=jobs, notify=notify, stale=stale, engine=engine, names=names)
+    return tuple(_save_results(graph, folder, out / HISTORY, 0.0, folder.name) for folder, graph in graphs.items())
+
+
+def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float, name: str) -> Run:
     """Collect the results of finished steps, write them to `out`, and add their points to the history."""
     result = replace(collect_results(graph, out / WORK), elapsed_s=round(elapsed_s, 1))
-    name = f"seed{graph.recipe.seed}"
     append_records(history, make_history_points(result, name))
     if graph.recipe.retrainings:
         append_records(history.with_name(SPREAD), list_spreads(result, name))

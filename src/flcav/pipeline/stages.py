@@ -13,11 +13,15 @@ from typing import Any
 
 import numpy as np
 from safetensors.numpy import load_file, save
+from safetensors.torch import load_file as load_tensors
+from safetensors.torch import save as save_tensors
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from flcav.federation.rounds import OnRound
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Trainable, Weights
 from flcav.files import write_bytes, write_json
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
@@ -90,15 +94,18 @@ def train_until_level(
 ) -> tuple[Block, ...]:
     """Pretrain in blocks until validation reaches a plateau, then at falling rates; return the record of each block.
 
-    Writes the weights of the last block, whose rate is the lowest. An interrupted training resumes after its last
-    complete block.
+    Writes the weights of the last block, whose rate is the lowest, or their moving average over all steps
+    (`Training.average`). An interrupted training resumes after its last complete block.
     """
     training, task = learning.training, learning.task
     blocks: list[Block] = []
     network = learning.build_network()
+    moving = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(training.average), use_buffers=True)
     if (folder / BLOCKS).exists():
         blocks = [Block(**row) for row in json.loads((folder / BLOCKS).read_text())]
         load_weights(task, network, folder / f"block{len(blocks)}.safetensors")
+        if training.average:
+            moving.load_state_dict(load_tensors(folder / f"average{len(blocks)}.safetensors"))
     while (rate := next_rate([block.score for block in blocks], training)) is not None:
         number = len(blocks) + 1
         loss = train_steps(
@@ -109,12 +116,17 @@ def train_until_level(
             batch=learning.batch,
             learning_rate=rate * task.practice.learning_rate,
             seed=derive_seed(learning.seed, PRETRAIN, number),
+            watch=lambda _step, _values: moving.update_parameters(network),
         )
         score = mean_score(task, network, validation)
         blocks.append(Block(rate, loss, score))
         save_network(task, network, folder / f"block{number}.safetensors")
+        if training.average:
+            write_bytes(folder / f"average{number}.safetensors", save_tensors(moving.state_dict()))
         write_json(folder / BLOCKS, [vars(block) for block in blocks])
         report(number, training.max_blocks + len(training.cooldown), f"validation {score:.3f}")
+    if training.average:
+        network.load_state_dict(moving.module.state_dict())
     save_network(task, network, folder / WEIGHTS)
     return tuple(blocks)
 
@@ -210,10 +222,16 @@ class FederationCheckpoints:
 
         return keep
 
-    def finish(self, network: Any, rounds: int) -> None:
-        """Write the final weights (without rounds, those of `network`) and the ledger."""
+    def finish(self, network: Any, rounds: int, averaged: int) -> None:
+        """Write the final weights and the ledger: the mean of the last `averaged` rounds' weights.
+
+        Without rounds, the weights are those of `network`.
+        """
         if rounds:
-            network = load_round_network(self._task, network.config, self._folder, rounds)
+            last = range(max(rounds - averaged, 0) + 1, rounds + 1)
+            weights = average([load_file(round_path(self._folder, number)) for number in last], [1.0] * len(last))
+            network = self._task.build(network.config)
+            from_arrays(network, weights)
         save_network(self._task, network, self._folder / WEIGHTS)
         self._book.save(self._folder / LEDGER)
 
@@ -234,7 +252,7 @@ def federate_edge(
     account = Account(book, EDGE, learning.task.name, "wireless")
     keep = federating.make_saver(schedule.rounds)
     federate(clients, start, schedule, account, strategy=strategy, done=done, on_round=keep)
-    federating.finish(network, schedule.rounds)
+    federating.finish(network, schedule.rounds, learning.training.average_rounds)
     return tuple(federating.losses)
 
 
@@ -263,7 +281,7 @@ def federate_cloud(
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
     keep = federating.make_saver(rounds)
     federate(servers, start, schedule, wireline, strategy=strategy, done=done, on_round=keep)
-    federating.finish(network, rounds)
+    federating.finish(network, rounds, learning.training.average_rounds)
     return tuple(federating.losses)
 
 

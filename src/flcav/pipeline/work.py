@@ -77,7 +77,6 @@ from flcav.pipeline.stages import (
 from flcav.pipeline.steps import Work
 
 PROBLEM = "problem.json"
-WATCHED_FRAMES = 30  # validation frames that a network is measured on after each round
 
 Fields = Mapping[str, Any]
 
@@ -336,22 +335,20 @@ def test_step(work: Work, task: str, region: str, trained: str, frames: str, see
 
 
 def rounds_step(work: Work, task: str, region: str, trained: str, start: str, frames: str) -> None:
-    """Validate a federation's network after each round on up to `WATCHED_FRAMES` frames of a region.
+    """Validate a federation's network after each round on a region's validation frames, used for nothing else.
 
     For stage II the pretrained network is validated too, as round 0.
     """
     learned, split = task_named(task), Frames.open(work.inputs[frames])
     stage = StageResult.load(work.inputs[trained])
-    count = min(WATCHED_FRAMES, len(split.vehicles))
-    some = [split.vehicles[i] for i in np.linspace(0, len(split.vehicles) - 1, count).astype(int)]
     first = load_stage_network(learned, work.inputs[start])
     config = first.config
-    rounds = [Round(0, score_network(learned, first, split.data, some))] if stage.stage == EDGE else []
+    rounds = [Round(0, score_network(learned, first, split.data, split.vehicles))] if stage.stage == EDGE else []
     for number in range(1, stage.rounds + 1):
         network = load_round_network(learned, config, work.inputs[trained], number)
-        rounds.append(Round(number, score_network(learned, network, split.data, some)))
+        rounds.append(Round(number, score_network(learned, network, split.data, split.vehicles)))
         work.report(number, stage.rounds, "")
-    Watched(stage.stage, task, region, count, tuple(rounds)).save(work.folder)
+    Watched(stage.stage, task, region, len(split.vehicles), tuple(rounds)).save(work.folder)
 
 
 def look_step(work: Work, before: str, after: str, frames: str) -> None:

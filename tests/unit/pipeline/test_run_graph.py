@@ -102,6 +102,24 @@ def test_an_arm_may_train_otherwise_on_the_same_frames() -> None:
         recipe_of(arms={"slow": {"training": {"cooldowns": [0.1]}}})
 
 
+def test_another_draw_changes_the_test_scenes_alone() -> None:
+    first, other = steps_of(recipe_of()), steps_of(recipe_of(test_draw=1))
+    changed = {name for name in first if first[name] != other[name]}
+    assert {name for name in changed if not name.startswith("test-")} == {
+        *(f"{region}-test-objects" for region in ("suburb", "grid", "arterial")),
+        "look",
+    }
+
+
+def test_what_decides_federations_alone_leaves_pretraining_shared() -> None:
+    arms = {"mean": {"training": {"average_rounds": 3}}, "moving": {"training": {"average": 0.9}}}
+    names = Graph(recipe_of(arms=arms, retrainings=1), Path()).names
+    assert names.pretrain("mean", "objects") == "pretrain-objects"
+    assert names.pretrain("mean-again1", "objects") == "pretrain-objects-main-again1"
+    assert names.edge("mean", "grid", "objects") == "grid-edge-fl-objects-mean"
+    assert names.pretrain("moving", "objects") == "pretrain-objects-moving"
+
+
 def test_another_plan_shares_recordings_that_no_plan_decides() -> None:
     armed = recipe_of(arms={"equal": {"plan": "equal-stages"}})
     names = Graph(armed, Path()).names

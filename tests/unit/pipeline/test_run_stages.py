@@ -1,21 +1,29 @@
 """Stages as functions: when training is over, what a kill leaves, who pays, how many steps a control takes."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from safetensors.numpy import load_file
+import torch
+from pydantic.dataclasses import dataclass
+from safetensors.numpy import load_file, save
 
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.files import write_bytes
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import Practice, Task
+from flcav.perception.weights import to_arrays
 from flcav.pipeline import stages
 from flcav.pipeline.recipe import Training
+from flcav.pipeline.results import WEIGHTS
 from flcav.pipeline.stages import (
+    BLOCKS,
     FederationCheckpoints,
     Learning,
     choose_uploads,
@@ -24,6 +32,7 @@ from flcav.pipeline.stages import (
     round_path,
     share_budget,
     train_centrally,
+    train_until_level,
 )
 
 TRAINING = Training(max_blocks=6, patience=2, min_gain=0.01, cooldown=(0.3, 0.05))
@@ -135,6 +144,74 @@ def test_a_federation_killed_at_any_write_ends_the_same(
             assert all(np.array_equal(found[name], weights[name]) for name in weights), last
             assert resumed.entries == book.entries, last
     assert total >= 3 * SCHEDULE.rounds
+
+
+@dataclass(frozen=True)
+class Slope:
+    bias: bool = True
+
+
+class Line(torch.nn.Linear):
+    def __init__(self, config: Slope) -> None:
+        super().__init__(1, 1)
+        self.config = config
+
+
+class LineTask:
+    """Fits y = 2 x to samples x."""
+
+    name, family, configurations, practice = "line", "line", {"tiny": Slope()}, Practice(2, learning_rate=0.1)
+    build = Line
+
+    def draw(self, samples, index, config, rng):
+        return samples[index]
+
+    def loss(self, network, samples):
+        x = torch.tensor(np.array(samples))[:, None]
+        return ((network(x) - 2 * x) ** 2).mean()
+
+
+LINEAR = cast(Task, LineTask())
+
+
+def test_the_mean_of_the_last_rounds_is_the_federation_s_result(tmp_path: Path) -> None:
+    network = LINEAR.build(Slope())
+    rounds = []
+    for number in range(1, 4):
+        rounds.append({name: array + np.float32(number**2) for name, array in to_arrays(network).items()})
+        write_bytes(round_path(tmp_path, number), save(rounds[-1]))
+    federating = FederationCheckpoints(LINEAR, tmp_path, Ledger(Budget(1.0, 1.0)), lambda done, total, note="": None)
+    for averaged, last in ((1, rounds[2:]), (2, rounds[1:]), (9, rounds)):
+        federating.finish(network, 3, averaged)
+        found = load_file(tmp_path / WEIGHTS)
+        for name in found:
+            np.testing.assert_allclose(found[name], np.mean([each[name] for each in last], axis=0), rtol=1e-6)
+
+
+def pretrain(folder: Path, average: float) -> Weights:
+    training = Training(block_steps=1, max_blocks=4, patience=3, cooldown=(0.5,), average=average)
+    folder.mkdir(exist_ok=True)
+    samples = [np.float32(number) for number in range(5)]
+    train_until_level(Learning(LINEAR, None, training, 3), samples, (), folder, lambda done, total, note="": None)
+    return load_file(folder / WEIGHTS)
+
+
+def test_pretrained_weights_are_a_moving_average_that_a_kill_does_not_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stages, "mean_score", lambda task, network, splits: 0.5)
+    last, found = pretrain(tmp_path / "last", 0.0), pretrain(tmp_path / "mean", 0.8)
+    blocks = [load_file(tmp_path / f"mean/block{number}.safetensors") for number in range(1, 6)]
+    for name, mean in blocks[0].items():
+        np.testing.assert_array_equal(last[name], blocks[-1][name])
+        for block in blocks[1:]:
+            mean = 0.8 * mean + 0.2 * block[name]
+        np.testing.assert_allclose(found[name], mean, rtol=1e-5)
+        assert not np.allclose(found[name], last[name], rtol=1e-5)
+    rows = json.loads((tmp_path / "mean" / BLOCKS).read_text())
+    (tmp_path / "mean" / BLOCKS).write_text(json.dumps(rows[:2]))
+    again = pretrain(tmp_path / "mean", 0.8)
+    assert all(np.array_equal(again[name], found[name]) for name in found)
 
 
 def test_regions_share_what_stage_one_left_by_their_vehicles() -> None:

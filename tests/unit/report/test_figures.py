@@ -84,24 +84,28 @@ def test_ahead_is_up_and_left_is_left() -> None:
         assert np.isclose(centres, (-y, x)).all(axis=1).any()
 
 
-def test_tested_values_stand_at_the_ends_of_their_stages() -> None:
-    axes = figures.by_round(ROUNDS, TESTED, "AP50").axes[0]
-    assert _tested(axes) == {0: {0.412, 0.381}, 1: {0.503, 0.447}, 2: {0.511, 0.468}}
+def test_validation_and_test_frames_stand_on_axes_of_their_own() -> None:
+    validated, tested = figures.by_round(ROUNDS, TESTED, "AP50").axes
+    assert _dots(validated) == {}
+    assert {len(np.asarray(line.get_xdata())) for line in validated.get_lines() if line.get_marker() == "o"} == {
+        sum(row["town"] == town for row in ROUNDS) for town in {row["town"] for row in ROUNDS}
+    }
+    assert _dots(tested) == {0: {0.412, 0.381}, 1: {0.503, 0.447}, 2: {0.511, 0.468}}
 
 
-def test_a_stage_without_rounds_takes_its_tested_values_with_it() -> None:
-    rounds = [row for row in ROUNDS if row["stage"] != "edge FL"]
-    axes = figures.by_round(rounds, TESTED, "AP50").axes[0]
-    assert _tested(axes) == {0: {0.412, 0.381}, 1: {0.511, 0.468}}
-    assert {"pretraining", "cloud FL"} <= {text.get_text() for text in axes.texts}
+def test_a_stage_that_was_not_tested_takes_no_place() -> None:
+    rest = [row for row in TESTED if row["stage"] != "edge FL"]
+    tested = figures.by_round(ROUNDS, rest, "AP50").axes[1]
+    assert _dots(tested) == {0: {0.412, 0.381}, 1: {0.511, 0.468}}
+    assert [label.get_text() for label in tested.get_xticklabels()] == ["pretraining", "cloud FL"]
 
 
-def _tested(axes) -> dict[int, set[float]]:
+def _dots(axes) -> dict[int, set[float]]:
     """Return the values drawn as single dots by the place of their stage on the x axis."""
     out: dict[int, set[float]] = {}
     for line in axes.get_lines():
         if len(line.get_xdata()) == 1:
-            out.setdefault(int(line.get_xdata()[0]), set()).add(round(float(line.get_ydata()[0]), 3))
+            out.setdefault(round(float(line.get_xdata()[0])), set()).add(round(float(line.get_ydata()[0]), 3))
     return out
 
 
@@ -133,7 +137,7 @@ def test_a_town_of_ones_own_has_a_colour_of_its_own() -> None:
 
 def test_a_measure_of_one_scene_is_drawn_without_a_bar() -> None:
     single = [{**row, "low": None, "high": None} for row in TESTED]
-    assert _tested(figures.by_round(ROUNDS, single, "AP50").axes[0]) == {
+    assert _dots(figures.by_round(ROUNDS, single, "AP50").axes[1]) == {
         0: {0.412, 0.381},
         1: {0.503, 0.447},
         2: {0.511, 0.468},

@@ -148,10 +148,11 @@ def train_steps(
     batch: int | None = None,
     learning_rate: float,
     seed: int,
+    watch: Watch = _unwatched,
 ) -> float:
     """Train `network` in place at a constant learning rate, as a federated client does.
 
-    Returns the mean loss, 0 for 0 steps; raises as `train` does.
+    Returns the mean loss, 0 for 0 steps; raises as `train` does. `watch` is that of `train`.
     """
     history = train(
         task,
@@ -162,6 +163,7 @@ def train_steps(
         learning_rate=learning_rate,
         schedule="constant",
         seed=seed,
+        watch=watch,
     )
     return float(history.losses.mean()) if steps else 0.0
 

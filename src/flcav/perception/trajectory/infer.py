@@ -11,13 +11,13 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import pose, yaw_of
 from flcav.perception.marks import Light, Mode, Paths, RoadUser
 from flcav.perception.task import Finding
-from flcav.perception.trajectory.config import FUTURE, STEP_S
+from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import find_medoid, forecasts, predict
 from flcav.perception.trajectory.rasters import OPEN
 from flcav.perception.trajectory.roads import STATIC_ROWS, RoadMap, load_roads
-from flcav.perception.trajectory.samples import Samples, extract_columns, find_near, load_traffic
-from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame
+from flcav.perception.trajectory.samples import Samples, extract_columns, find_near, find_pictured, load_traffic
+from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame, tracks_around
 from flcav.world.map.lanes import rasterise
 from flcav.world.trace import Trace
 
@@ -58,12 +58,15 @@ def map_around(roads: RoadMap, observer: Array) -> NDArray[np.bool_]:
 def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Trace, observer: Array) -> Paths:
     key, config = data.keys[number], network.config
     instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
-    if config.cameras:
-        wanted = find_near(trace, key)
-    else:
-        apart = into_frame(trace.position[None, instant, :, :2], observer[None])[0]
+    tracks = tracks_around(trace, key.time_s)
+    if not config.cameras:
+        apart = into_frame(tracks.position[None, PAST], observer[None])[0]
         wanted = (np.abs(apart) <= AROUND_M).all(axis=1)
-    columns = extract_columns(trace, key, number, load_roads(data), config.patch, wanted, complete=False)
+    elif find_pictured(data, number) is None:
+        wanted = np.zeros(len(trace.actor), np.bool_)
+    else:
+        wanted = find_near(trace, tracks, key)
+    columns = extract_columns(trace, tracks, key, number, load_roads(data), config.patch, wanted, complete=False)
     users: list[RoadUser] = []
     if len(columns.past):
         paths, probabilities = predict(network, Samples(data, columns, config.cameras))

@@ -1,10 +1,13 @@
 """Samples of the trajectory task: a vehicle's past and future in the frame of its present, and its surroundings.
 
 The surroundings are a raster of map and tracks, or resized images of the cameras near the vehicle with the calibration
-that projects the vehicle's frame into them.
+that projects the vehicle's frame into them. Nothing of them depends on what happens after the present: tracks are those
+of `tracks_around`, and images, which show the smoothed traffic, are `REACH_S` old.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from bisect import bisect_right
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import NamedTuple, overload
@@ -21,8 +24,9 @@ from flcav.perception.images import Picture, check_picture, resize_picture
 from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.rasters import draw_rasters
 from flcav.perception.trajectory.roads import BEFORE_M, RoadMap, load_roads
-from flcav.perception.trajectory.tracks import check_instants, into_frame, tracks_around
+from flcav.perception.trajectory.tracks import GAP_S, Tracks, check_instants, into_frame, tracks_around
 from flcav.world.trace import Trace
+from flcav.world.traffic.traffic import REACH_S
 
 Array = NDArray[np.float64]
 
@@ -35,7 +39,7 @@ Pictured = tuple[NDArray[np.uint8], Array, Array]  # images, intrinsics and came
 
 
 class Surround(NamedTuple):
-    """The images of n cameras at one instant, with their calibration relative to a road user."""
+    """The images of n cameras, `REACH_S` before the present, with their calibration relative to a road user there."""
 
     pictures: NDArray[np.uint8]  # (n, height, width, 3)
     intrinsics: Array  # (n, 3, 3) of the resized images [px]
@@ -43,13 +47,38 @@ class Surround(NamedTuple):
 
 
 def surround(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
-    """Return the resized images of frame `number` with their calibration relative to a road user at `present`.
+    """Return the resized images seen at frame `number` with their calibration relative to a road user at `present`.
 
-    `present` is x, y, yaw in the world; poses and intrinsics of the cameras are the agent's assumed calibration.
+    They are those of `find_pictured`. `present` is x, y, yaw in the world; poses and intrinsics of the cameras are the
+    agent's assumed calibration.
     """
-    pictures, intrinsics, camera_from_world = _kept(settings)(data, number)
+    pictured = find_pictured(data, number)
+    assert pictured is not None
+    pictures, intrinsics, camera_from_world = _kept(settings)(data, pictured)
     world_from_frame = pose(float(present[0]), float(present[1]), yaw=float(present[2]))
     return Surround(pictures, intrinsics, camera_from_world @ world_from_frame)
+
+
+def find_pictured(data: Dataset, number: int) -> int | None:
+    """Return the number of the frame whose images are seen at frame `number`: its agent's last one `REACH_S` before.
+
+    None where there is none, or only one more than `GAP_S` older than that.
+    """
+    key = data.keys[number]
+    numbers, time_s = _frames_of_agents(data)[key.scene, key.agent], key.time_s - REACH_S
+    count = bisect_right(numbers, time_s + 1e-6, key=lambda i: data.keys[i].time_s)
+    if not count or data.keys[numbers[count - 1]].time_s < time_s - GAP_S - 1e-6:
+        return None
+    return numbers[count - 1]
+
+
+@lru_cache(maxsize=2)
+def _frames_of_agents(data: Dataset) -> Mapping[tuple[str, str], Sequence[int]]:
+    """Return the numbers of each agent's frames by scene and agent, in order of time."""
+    numbers: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for number in sorted(range(len(data)), key=lambda i: data.keys[i].time_s):
+        numbers[data.keys[number].scene, data.keys[number].agent].append(number)
+    return numbers
 
 
 @lru_cache(maxsize=2)
@@ -94,7 +123,10 @@ class Columns(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """One road user at one instant, in the frame of its present pose: x along its heading; metres, radians, seconds."""
+    """One road user at one instant, in the frame of its present pose: x along its heading; metres, radians, seconds.
+
+    Past and present are those of `tracks_around`, which use nothing of later; the future is the recorded one.
+    """
 
     past: NDArray[np.float32]  # (PAST + 1, 4) x, y, yaw, speed; the last is the present
     future: NDArray[np.float32]  # (FUTURE, 2) x, y; NaN if unknown
@@ -156,15 +188,17 @@ def _parts(data: Dataset, patch: Patch, cameras: CrossView | None, frames: Seque
             traces = {key.scene: load_traffic(data, key.scene)}
         trace = traces[key.scene]
         if cameras:
-            if not data.cameras(number):
+            pictured = find_pictured(data, number)
+            if not data.cameras(number if pictured is None else pictured):
                 raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
-            wanted = find_near(trace, key)
+            if pictured is None:
+                continue
         elif (key.scene, key.index) in seen:
             continue
-        else:
-            wanted = np.ones(len(trace.actor), np.bool_)
         seen.add((key.scene, key.index))
-        yield extract_columns(trace, key, number, load_roads(data), patch, wanted)
+        tracks = tracks_around(trace, key.time_s)
+        wanted = find_near(trace, tracks, key) if cameras else np.ones(len(trace.actor), np.bool_)
+        yield extract_columns(trace, tracks, key, number, load_roads(data), patch, wanted)
 
 
 def select_fitting_frames(data: Dataset, cameras: bool) -> Sequence[int]:
@@ -185,18 +219,21 @@ def load_traffic(data: Dataset, scene: str) -> Trace:
     return trace
 
 
-def find_near(trace: Trace, key: FrameKey) -> NDArray[np.bool_]:
-    """Return (A,) which actors are within `SEEN_M` of the observing vehicle, itself included; none for a pole."""
-    instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
+def find_near(trace: Trace, tracks: Tracks, key: FrameKey) -> NDArray[np.bool_]:
+    """Return (A,) which actors are within `SEEN_M` of the observing vehicle, itself included; none for a pole.
+
+    `tracks` are those around the time of `key`.
+    """
     own = trace.actor == key.agent
     if not own.any():
         return own
-    apart = trace.position[instant, :, :2] - trace.position[instant, own, :2]
+    apart = tracks.position[PAST] - tracks.position[PAST, own]
     return np.linalg.norm(apart, axis=1) <= SEEN_M  # False for absent actors
 
 
 def extract_columns(
     trace: Trace,
+    tracks: Tracks,
     key: FrameKey,
     number: int,
     roads: RoadMap,
@@ -206,9 +243,9 @@ def extract_columns(
 ) -> Columns:
     """Return the samples of the `wanted` (A,) vehicles on the road at the time of the frame of this key and number.
 
-    Only vehicles with a complete past are included, and only with a complete future if `complete`.
+    `tracks` are those around that time. Only vehicles with a complete past are included, and only with a complete
+    future if `complete`.
     """
-    tracks = tracks_around(trace, key.time_s)
     known = np.isfinite(tracks.yaw)
     on_road = (trace.category != "pedestrian") & ~np.char.startswith(trace.actor, "parked") & wanted
     on_road &= known.all(axis=0) if complete else known[: PAST + 1].all(axis=0)

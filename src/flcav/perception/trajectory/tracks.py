@@ -1,6 +1,7 @@
 """Tracks of a traffic trace, interpolated at the task's instants and transformed into the frame of a pose.
 
-Interpolation is by cubic Hermite curves with Catmull-Rom tangents.
+Interpolation is by cubic Hermite curves with Catmull-Rom tangents. What a network may know of the present is
+extrapolated, since a trace smooths over later states.
 """
 
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from flcav.config import InputError
 from flcav.geometry import heading_vectors, wrap_angle
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
 from flcav.world.trace import Trace
+from flcav.world.traffic.traffic import REACH_S
 
 Array = NDArray[np.float64]
 
@@ -36,11 +38,55 @@ def check_instants(trace: Trace, origin: str) -> None:
 
 
 def tracks_around(trace: Trace, time_s: float) -> Tracks:
-    """Return the tracks at `time_s + OFFSETS_S`; points up to `time_s` depend on no later instant of the trace."""
-    times_s = time_s + OFFSETS_S
-    known = int(np.searchsorted(trace.time_s, time_s + 1e-6, side="right"))
-    past, future = tracks_at(trace, times_s[: PAST + 1], known), tracks_at(trace, times_s[PAST + 1 :])
-    return Tracks(*(np.concatenate(parts) for parts in zip(past, future)))
+    """Return the tracks at `time_s + OFFSETS_S`; points up to `time_s` depend on nothing that happens after it.
+
+    A trace's states are averages that include states up to `REACH_S` later. So points up to `time_s` are made of the
+    instants up to `REACH_S` before it: interpolated between these, and extrapolated from the last. An actor is present
+    at an extrapolated point if it is at the last instant up to that point. Points after `time_s` are the trace's.
+    """
+    times_s = np.round(time_s + OFFSETS_S, 6)
+    known = int(np.searchsorted(trace.time_s, time_s - REACH_S + 1e-6, side="right"))
+    last_s = trace.time_s[known - 1] if known else np.inf  # without one, all is NaN
+    between = int(np.searchsorted(times_s[: PAST + 1], last_s + 1e-6, side="right"))
+    parts = [
+        tracks_at(trace, times_s[:between], known),
+        _rebuilt(trace, times_s[between : PAST + 1], known - 1),
+        tracks_at(trace, times_s[PAST + 1 :]),
+    ]
+    return Tracks(*(np.concatenate(points) for points in zip(*parts)))
+
+
+def _rebuilt(trace: Trace, times_s: Array, instant: int) -> Tracks:
+    """Return the tracks extrapolated from an instant to `times_s` (S,), of the actors that are present then."""
+    there = trace.present[np.searchsorted(trace.time_s, times_s + 1e-6, side="right") - 1]
+    position, yaw, speed = extrapolate(trace, instant, times_s - trace.time_s[instant])
+    return Tracks(
+        np.where(there[..., None], position, np.nan), np.where(there, yaw, np.nan), np.where(there, speed, np.nan)
+    )
+
+
+def extrapolate(trace: Trace, instant: int, ahead_s: Array) -> Tracks:
+    """Return the tracks `ahead_s` (S,) [s] after an instant of the trace, from the states of that instant alone.
+
+    Vehicles keep their turn rate, and their acceleration until they stand (CTRA, constant turn rate and acceleration:
+    Schubert et al., "Comparison and evaluation of advanced motion models for vehicle tracking", FUSION 2008). The
+    distance driven is laid on an arc, which is exact at constant speed and on straight lines. Pedestrians, whom SUMO
+    moves without turning them, keep their velocity. NaN where an actor is absent at the instant.
+    """
+    velocity, yaw = trace.velocity[instant, :, :2], trace.yaw[instant]
+    walking = trace.category == "pedestrian"
+    speed = np.linalg.norm(velocity, axis=1)
+    gain = np.where(walking, 0.0, (trace.acceleration[instant, :, :2] * heading_vectors(yaw)).sum(axis=1))
+    turn = np.where(walking, 0.0, trace.yaw_rate[instant])
+    ahead = ahead_s[:, None]
+    driven_s = np.where(gain < 0, np.minimum(ahead, speed / np.maximum(-gain, 1e-9)), ahead)  # until it stands
+    distance = speed * driven_s + gain * driven_s**2 / 2
+    half = turn * ahead / 2
+    chord = distance * np.sinc(half / np.pi)
+    moved = np.where(walking[:, None], velocity * ahead[..., None], chord[..., None] * heading_vectors(yaw + half))
+    return Tracks(
+        trace.position[instant, :, :2] + moved, wrap_angle(yaw + 2 * half), np.maximum(speed + gain * ahead, 0)
+    )
 
 
 def tracks_at(trace: Trace, times_s: Array, known: int | None = None) -> Tracks:

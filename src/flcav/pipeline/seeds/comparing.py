@@ -37,7 +37,8 @@ def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     """Return the paired difference of every test that both runs made, over the seeds that both have.
 
     Its interval (95 %) is a bootstrap over scenes for one common seed, widened by the spread of retraining in both
-    runs; where that is not known, one seed decides nothing. For several seeds it is over seeds and scenes. Raises `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
+    runs; where that is not known, one seed decides nothing. For several seeds it is over seeds and scenes. Raises
+    `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
     """
     folders = [seed_folders(folder) for folder in (first, second)]
     seeds = [seed for seed in folders[0] if seed in folders[1]]

@@ -39,9 +39,14 @@ def before_after(sweep: clouds.Sweep, extent: clouds.Extent = EXTENT) -> Figure:
 
 @style.styled
 def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figure:
-    """Return a measure after every round, a line per town; for the rows see `runs.runs.draw_by_round`."""
-    figure = style.canvas(WIDTH, 0.8 * WIDTH)
-    runs.draw_by_round(figure.add_subplot(), rounds, tested, measure)
+    """Return a measure on validation frames after every round, and below it on test frames after every stage.
+
+    For the rows see `runs.draw_by_round` and `runs.draw_tested`.
+    """
+    figure = style.canvas(WIDTH, 1.35 * WIDTH)
+    above, below = figure.subplots(2, height_ratios=(3, 2))
+    runs.draw_by_round(above, rounds, measure)
+    runs.draw_tested(below, tested, measure)
     return figure
 
 
@@ -69,7 +74,7 @@ def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
 def overview(
     scene: maps.ErrorMap, sweep: clouds.Sweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
 ) -> Figure:
-    """Return the overview of a run: map of errors, a sweep before and after, and a measure after every round."""
+    """Return the overview of a run: map of errors, a sweep before and after, a measure by round and by stage."""
     figure = style.canvas(9.6, 4.4)
     grid = figure.add_gridspec(1, 3, width_ratios=(4.1, 2.1, 3.4))
     left, middle, right = (figure.add_subfigure(grid[column]) for column in range(3))
@@ -83,7 +88,8 @@ def overview(
         axes.set(xticks=[], yticks=[0, 20, 40])
     middle.supylabel("metres ahead", fontsize=style.TEXT, color=style.MUTED)
     style.key(middle, clouds.key(), columnspacing=0.8)
-    axes = right.add_subplot()
-    runs.draw_by_round(axes, rounds, tested, measure)
-    axes.set_title(f"{measure} through the stages", fontweight="bold", pad=22)
+    above, below = right.subplots(2, height_ratios=(3, 2))
+    runs.draw_by_round(above, rounds, measure)
+    above.set_title(f"{measure} through the stages", fontweight="bold", pad=22)
+    runs.draw_tested(below, tested, measure)
     return figure

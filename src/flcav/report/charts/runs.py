@@ -15,34 +15,45 @@ LINE = 0.07  # height of a name, as a fraction of the axis
 STAGES = ("pretraining", "edge FL", "cloud FL")  # as rows name them, in their order
 
 
-def draw_by_round(axes: Axes, rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> None:
-    """Draw a validation measure after every round, a line per town, and test scores with intervals at ends of stages.
+def draw_by_round(axes: Axes, rounds: Sequence[Row], measure: str) -> None:
+    """Draw the measure on validation frames after every round, a line per town.
 
-    `rounds` has rows stage, round, town, score; `tested` has rows stage, town, score, low, high. Stages are named as in
-    `STAGES`; all are equally wide, whatever their number of rounds.
+    `rounds` has rows stage, round, town, score; round 0 is before the stage. Stages are named as in `STAGES`; all are
+    equally wide, whatever their number of rounds.
     """
     places = _places(rounds)
     lines = {
         town: sorted((places[row["stage"]][row["round"]], row["score"]) for row in rounds if row["town"] == town)
         for town in dict.fromkeys(row["town"] for row in rounds)
     }
-    towns = list(dict.fromkeys(row["town"] for row in tested))
-    colours = {town: _colour(town, [*lines, *towns]) for town in (*lines, *towns)}
+    colours = {town: _colour(town, lines) for town in lines}
     for town, line in lines.items():
         axes.plot(*zip(*line, strict=True), color=colours[town], linewidth=1.6, marker="o", markersize=2.5)
-    ends = {town: line[-1] for town, line in lines.items()}
-    for number, town in enumerate(towns):
-        aside = 0.04 * (number - (len(towns) - 1) / 2)  # keeps intervals of towns apart
-        for row in tested:
-            if row["town"] == town and row["stage"] in places:
-                x = max(places[row["stage"]].values()) + aside
-                _draw_tested(axes, x, row, colours[town])
-                if town not in lines:
-                    ends[town] = x, row["score"]
     axes.set_ylim(0, None)
-    _name_ends(axes, ends, colours)
+    _name_ends(axes, {town: line[-1] for town, line in lines.items()}, colours)
     _mark_stages(axes, places)
-    axes.set(xlabel="round of the stage", ylabel=measure)
+    axes.set(xlabel="round of the stage, validation frames", ylabel=measure)
+    axes.grid(axis="y")
+
+
+def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
+    """Draw the measure on test frames with its interval after every stage, a colour per town.
+
+    `tested` has rows stage, town, score, low, high, stages named as in `STAGES`; low and high may be None.
+    """
+    stages = [stage for stage in STAGES if any(row["stage"] == stage for row in tested)]
+    towns = list(dict.fromkeys(row["town"] for row in tested))
+    for number, town in enumerate(towns):
+        aside = 0.12 * (number - (len(towns) - 1) / 2)  # keeps intervals of towns apart
+        own = sorted((stages.index(row["stage"]) + aside, row["score"]) for row in tested if row["town"] == town)
+        colour = _colour(town, towns)
+        axes.plot(*zip(*own, strict=True), color=colour, linewidth=0.8, linestyle=(0, (2, 2)))
+        for row in tested:
+            if row["town"] == town:
+                _draw_interval(axes, stages.index(row["stage"]) + aside, row, colour)
+    axes.set(xlim=(-0.5, len(stages) - 0.5), xlabel="test frames", ylabel=measure)
+    axes.set_ylim(0, None)
+    axes.set_xticks(range(len(stages)), stages)
     axes.grid(axis="y")
 
 
@@ -95,7 +106,7 @@ def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
     axes.set_xlim(0, len(places) + 0.12)
 
 
-def _draw_tested(axes: Axes, x: float, row: Row, colour: str) -> None:
+def _draw_interval(axes: Axes, x: float, row: Row, colour: str) -> None:
     if row["low"] is not None:
         axes.plot([x, x], [row["low"], row["high"]], color=colour, marker="_", markersize=7)
     axes.plot(x, row["score"], "o", color=colour, markersize=6, markeredgecolor="white")

@@ -134,7 +134,7 @@ def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
 
 
 def _chart(run: Run, task: str) -> tuple[list[Row], list[Row]]:
-    """Return the rows `rounds` and `tested` of a task for `charts.runs.draw_by_round`."""
+    """Return the rows of a task for `charts.runs.draw_by_round` and `charts.runs.draw_tested`."""
     starts = " + ".join(run.recipe.with_role("pretrain"))
     (pretrained,) = (each for each in run.pretrained if each.task == task)
     rounds: list[Row] = [
@@ -147,7 +147,6 @@ def _chart(run: Run, task: str) -> tuple[list[Row], list[Row]]:
             rounds += [
                 {"stage": stage, "round": each.round, "town": watched.region, "score": each.score}
                 for each in watched.rounds
-                if each.round
             ]
     tested: list[Row] = [
         {

@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 
 FILL_S = 30.0  # all actors have departed by then
 SMOOTHING_STEPS = 4  # half width of the moving average of poses, since SUMO turns and changes lanes abruptly
+REACH_S = (SMOOTHING_STEPS + 1) * STEP_S  # a trace's state depends on SUMO's up to this much later, by its rates
 
 
 def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: Sequence[Scenario] = ()) -> Trace:
