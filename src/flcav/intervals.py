@@ -1,21 +1,32 @@
-"""95 % confidence intervals: the percentile bootstrap over scenes and Student's t over seeds.
+"""95 % confidence intervals: the percentile bootstrap over scenes, Student's t over seeds, and the power of a t test.
 
 Frames of one scene share their traffic, so the bootstrap resamples whole scenes (Efron and Tibshirani, "An Introduction
-to the Bootstrap", 1993, ch. 13: percentile intervals). Results of different seeds are independent but few: Student's t.
-A single training adds the spread of retraining: its network is one draw of those that other random numbers would give.
+to the Bootstrap", 1993, ch. 13: percentile intervals). A single training adds the spread of retraining: its network is
+one draw of those that other random numbers would give.
+
+Seeds differ in training and, where each has test scenes of its own, in scenes. Of nested data only the top level is to
+be resampled, since the values of seeds vary by their scenes already (Davison and Hinkley, "Bootstrap Methods and their
+Application", 1997, section 3.8). For few seeds the bootstrap of the mean, with its standard error scaled by
+sqrt(n / (n - 1)), is Student's t. Scenes that seeds share do not average out over seeds: their variance is the
+covariance between seeds over draws of these scenes, and is added. Numbers in [0, 1] have their interval on the scale
+of log-odds.
+`tests/unit/test_seeds_and_scenes.py` simulates the coverage of this and of other methods.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logit, stdtrit
+from scipy.special import expit, logit, nctdtr, stdtr, stdtrit
 
 CONFIDENCE = 0.95
 REDRAWS = 1000
 TAILS = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
 EDGE = 1e-6  # log-odds are taken of shares this far from 0 and 1
+LEVEL = 1 - CONFIDENCE  # of a test, two-sided
+POWER = 0.8  # chance to tell an effect that a number of seeds is planned for
+MOST_SEEDS = 1000  # that a plan of seeds is sought up to
 
 
 @dataclass(frozen=True)
@@ -38,11 +49,62 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class MeanOverSeeds(Estimate):
-    """The mean over seeds with Student's 95 % confidence interval, of zero width for a single seed."""
+class SharedScenes:
+    """The part of the spread of a mean over seeds that more seeds do not reduce, since they share test scenes."""
 
-    low: float
-    high: float
+    sd: float = 0.0  # standard deviation of the mean over draws of these scenes
+    scenes: int = 0  # that several seeds share
+
+
+OWN_SCENES = SharedScenes()  # every seed has test scenes of its own
+
+
+@dataclass(frozen=True)
+class MeanOverSeeds(Estimate):
+    """The mean over seeds with its 95 % confidence interval, over seeds and scenes.
+
+    There is no interval (None) of a single seed, and none of a share that is 0, or 1, in all seeds. The standard error
+    is sqrt(sd^2 / n + shared.sd^2); its degrees of freedom are the harmonic mean of those of the seeds, n - 1, and of
+    the shared scenes, weighted by their parts of the variance.
+    """
+
+    seeds: int = 1
+    sd: float = 0.0  # standard deviation over seeds; 0 of a single seed
+    shared: SharedScenes = OWN_SCENES
+    share: bool = False  # a number in [0, 1]: its interval and tests are on the scale of log-odds
+
+    @property
+    def known(self) -> bool:
+        """Return whether the spread over seeds is known, so that there are intervals and tests."""
+        return self.seeds > 1 and (0 < self.mean < 1 or not self.share)
+
+    @property
+    def slope(self) -> float:
+        """Return the derivative of the tests' scale: that of the log-odds for a share, 1 for other numbers."""
+        return 1 / (self.mean * (1 - self.mean)) if self.share else 1.0
+
+    def distance(self, hypothesis: float) -> float:
+        """Return how far the mean is above `hypothesis`, on the tests' scale."""
+        if not self.share:
+            return self.mean - hypothesis
+        return float(logit(self.mean) - logit(np.clip(hypothesis, EDGE, 1 - EDGE)))
+
+    def p_value(self, hypothesis: float = 0.0) -> float | None:
+        """Return the two-sided p-value of Student's t test that the mean is `hypothesis`; None without an interval."""
+        if not self.known:
+            return None
+        error, freedom = _standard_error(self.sd, self.seeds, self.shared)
+        far = abs(self.distance(hypothesis))
+        if error == 0:
+            return 0.0 if far else 1.0
+        return float(2 * stdtr(freedom, -far / (self.slope * error)))
+
+    def seeds_to_tell(self, hypothesis: float = 0.0, level: float = LEVEL) -> int | None:
+        """Return `plan_seeds` for an effect as large as the distance from `hypothesis`, if the spread is known."""
+        if not self.known:
+            return None
+        shared = SharedScenes(self.slope * self.shared.sd, self.shared.scenes)
+        return plan_seeds(self.distance(hypothesis), self.slope * self.sd, level, shared)
 
 
 @dataclass(frozen=True)
@@ -61,6 +123,16 @@ class Spread:
 def measure_spread(values: Sequence[float]) -> Spread | None:
     """Return the spread of the trainings' `values`; None for fewer than two."""
     return Spread(float(np.std(values, ddof=1)), len(values)) if len(values) > 1 else None
+
+
+def combine_spreads(first: Spread | None, second: Spread | None) -> Spread | None:
+    """Return the spread of the difference of two numbers whose trainings vary independently; None where one is unknown.
+
+    Variances add; trainings are the fewer of both.
+    """
+    if first is None or second is None:
+        return None
+    return Spread(float(np.hypot(first.sd, second.sd)), min(first.trainings, second.trainings))
 
 
 def widen(estimate: Estimate, spread: Spread) -> Estimate:
@@ -112,10 +184,93 @@ def bootstrap_over_scenes(
     return float(low), float(high)
 
 
-def mean_over_seeds(values: Sequence[float]) -> MeanOverSeeds:
-    """Return the mean of `values`, one per seed, and its 95 % interval: mean ± t(n - 1, 97.5 %) · s / √n."""
+def share_scenes(
+    measures: Sequence[Callable[[NDArray[np.int64]], NDArray[np.float64]]],
+    scenes_of_frames: Sequence[ArrayLike],
+    n: int = REDRAWS,
+    *,
+    rng: np.random.Generator,
+) -> SharedScenes:
+    """Return the spread of the mean over seeds by the test scenes that several seeds share.
+
+    `measures` and `scenes_of_frames` are those of `bootstrap_over_scenes`, one per seed. A scene's weight is drawn from
+    a Poisson distribution of mean 1, the same in all seeds that have it (Poisson bootstrap; Hanley and MacGibbon,
+    Computer Methods and Programs in Biomedicine 83, 2006). The variance is the mean covariance between two seeds, at
+    least 0.
+    """
+    scenes = [np.asarray(each) for each in scenes_of_frames]
+    names, counts = np.unique(np.concatenate([np.unique(each) for each in scenes]), return_counts=True)
+    shared = int((counts > 1).sum())
+    if not shared:
+        return OWN_SCENES
+    times = rng.poisson(1.0, size=(n, len(names)))
+    draws = np.array([of(times[:, np.searchsorted(names, each)]) for of, each in zip(measures, scenes, strict=True)])
+    covariance = np.cov(draws[:, np.isfinite(draws).all(axis=0)])
+    between = covariance[~np.eye(len(draws), dtype=bool)].mean()
+    return SharedScenes(float(np.sqrt(max(between, 0.0))), shared)
+
+
+def mean_over_seeds(
+    values: Sequence[float], *, shared: SharedScenes = OWN_SCENES, share: bool = False
+) -> MeanOverSeeds:
+    """Return the mean of `values`, one per seed, and its 95 % interval: mean ± t · sqrt(sd^2 / n + shared.sd^2).
+
+    `share`: a number in [0, 1], whose interval is on the scale of log-odds by the delta method and stays inside [0, 1].
+    """
     array = np.asarray(values, dtype=np.float64)
-    half = 0.0
-    if len(array) > 1:
-        half = float(stdtrit(len(array) - 1, TAILS[1]) * array.std(ddof=1) / np.sqrt(len(array)))
-    return MeanOverSeeds(float(array.mean()), float(array.mean()) - half, float(array.mean()) + half)
+    sd = float(array.std(ddof=1)) if len(array) > 1 else 0.0
+    found = MeanOverSeeds(float(array.mean()), None, None, len(array), sd, shared, share)
+    if not found.known:
+        return found
+    error, freedom = _standard_error(sd, len(array), shared)
+    half = float(stdtrit(freedom, TAILS[1])) * error
+    ends = [found.mean - half, found.mean + half]
+    if share:
+        ends = expit(logit(found.mean) + found.slope * half * np.array([-1, 1])).tolist()
+    return replace(found, low=ends[0], high=ends[1])
+
+
+def _standard_error(sd: float, seeds: int, shared: SharedScenes) -> tuple[float, float]:
+    """Return the standard error of a mean over seeds, and its degrees of freedom."""
+    own, common = sd**2 / seeds, shared.sd**2
+    if own + common == 0:
+        return 0.0, seeds - 1
+    freedom = (own + common) / (own / (seeds - 1) + common / max(shared.scenes - 1, 1))
+    return float(np.sqrt(own + common)), freedom
+
+
+def power_of_seeds(
+    effect: float, sd: float, seeds: int, level: float = LEVEL, shared: SharedScenes = OWN_SCENES
+) -> float:
+    """Return the power of the two-sided t test of a mean of `effect` over seeds of standard deviation `sd`.
+
+    It is that of the noncentral t distribution (Cohen, "Statistical Power Analysis for the Behavioral Sciences", 1988).
+    """
+    error, freedom = _standard_error(sd, seeds, shared)
+    if error == 0:
+        return float(effect != 0)
+    beyond, limit = abs(effect) / error, stdtrit(freedom, 1 - level / 2)
+    wrong_side = np.nan_to_num(nctdtr(freedom, beyond, -limit))  # not a number where it is next to 0
+    return float(1 - nctdtr(freedom, beyond, limit) + wrong_side)
+
+
+def plan_seeds(
+    effect: float, sd: float, level: float = LEVEL, shared: SharedScenes = OWN_SCENES, power: float = POWER
+) -> int | None:
+    """Return the least number of seeds that tell `effect` with the given power; None for more than `MOST_SEEDS`.
+
+    `sd` is the standard deviation over seeds of the effect: of differences, that of the paired differences.
+    """
+    least, most = 1, MOST_SEEDS
+    if power_of_seeds(effect, sd, most, level, shared) < power:
+        return None
+    while most - least > 1:  # power rises with seeds
+        middle = (least + most) // 2
+        enough = power_of_seeds(effect, sd, middle, level, shared) >= power
+        least, most = (least, middle) if enough else (middle, most)
+    return most
+
+
+def half_width(sd: float, seeds: int) -> float:
+    """Return half the width of the 95 % interval of a mean over at least two seeds of standard deviation `sd`."""
+    return float(stdtrit(seeds - 1, TAILS[1])) * sd / float(np.sqrt(seeds))

@@ -1,8 +1,17 @@
-"""Verdicts on claims and targets from 95 % confidence intervals, and their wording."""
+"""Verdicts on claims and targets from 95 % confidence intervals and corrected p-values, and their wording.
 
-from flcav.intervals import MeanOverSeeds
+A page makes several claims. Their p-values are corrected together, so that the chance of any wrong verdict on a page
+is at most 5 % (Holm, "A Simple Sequentially Rejective Multiple Test Procedure", Scandinavian Journal of Statistics 6,
+1979).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from flcav.intervals import LEVEL, MOST_SEEDS, MeanOverSeeds
 
 HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
+REACHED = {HELD: "reached", NOT_HELD: "not reached", UNDECIDED: UNDECIDED}  # the words for an aim
 
 
 def verdict(low: float | None, high: float | None) -> str:
@@ -17,28 +26,95 @@ def verdict(low: float | None, high: float | None) -> str:
     return NOT_HELD if high < 0 else UNDECIDED
 
 
-def explain_verdict(decided: str, runs: int = 1) -> str:
-    """Return a clause that explains the verdict `decided` of `verdict`, for one run or several (`runs`)."""
-    where = " in this run" if runs == 1 else ""
-    who = "this run does" if runs == 1 else "these runs do"
+def explain_verdict(decided: str) -> str:
+    """Return a clause that explains the verdict `decided` of `verdict`, for one run."""
     return {
-        HELD: f"the interval lies above 0, so the claim held{where}",
-        NOT_HELD: f"the interval lies below 0, so the claim did not hold{where}",
-        UNDECIDED: f"the interval contains 0, so {who} not decide",
+        HELD: "the interval lies above 0, so the claim held in this run",
+        NOT_HELD: "the interval lies below 0, so the claim did not hold in this run",
+        UNDECIDED: "the interval contains 0, so this run does not decide",
     }[decided]
 
 
-def describe_aim(aim: str, wanted: float, reached: MeanOverSeeds, seeds: int, *, at_most: bool = False) -> str:
-    """Return the sentence "*aim*: **verdict**, mean (low to high) over n seeds" in Markdown, without a full stop.
+@dataclass(frozen=True)
+class Claim:
+    """The claim that a mean over seeds is above `than`, or with `at_most` below it."""
 
-    The aim is a mean of at least `wanted`, or with `at_most` of at most `wanted`. The verdict is "reached" or "not
-    reached" where the whole interval of `reached` lies on one side of `wanted`, else UNDECIDED.
+    mean: MeanOverSeeds
+    than: float = 0.0
+    at_most: bool = False
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The verdict on one of several claims that are judged together."""
+
+    verdict: str  # HELD, NOT_HELD or UNDECIDED
+    p: float | None  # corrected for the claims of the family; None where the spread over seeds is not known
+    family: int  # number of claims that are judged together
+    seeds: int | None  # that it takes to decide, if the effect is as large as was found; None: unknown, or too many
+
+    def describe(self) -> str:
+        """Return p and the number of claims as text, and of an undecided claim how many seeds it would take."""
+        if self.p is None:
+            return "the spread over seeds is not known"
+        corrected = f", corrected for {self.family} claims" if self.family > 1 else ""
+        said = f"p {format_p(self.p)}{corrected}"
+        if self.verdict != UNDECIDED:
+            return said
+        seeds = f"more than {MOST_SEEDS}" if self.seeds is None else f"about {self.seeds}"
+        return f"{said}; to tell an effect of this size takes {seeds} seeds"
+
+
+def correct_p_values(p_values: Sequence[float]) -> list[float]:
+    """Return Holm's corrected p-values: those up to a level are the hypotheses that are rejected at this level."""
+    order = sorted(range(len(p_values)), key=lambda i: p_values[i])
+    corrected, largest = [0.0] * len(p_values), 0.0
+    for rank, i in enumerate(order):
+        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[i]))
+        corrected[i] = largest
+    return corrected
+
+
+def judge(claims: Sequence[Claim]) -> list[Judged]:
+    """Return the verdicts on all claims of a page, by p-values that are corrected for their number.
+
+    Claims whose spread over seeds is not known are undecided and do not count. The number of seeds is for the level
+    that a single claim has at worst, `LEVEL` divided by the number of claims, and a power of 0.8.
     """
-    low, high = reached.low, reached.high
-    good, bad = (high <= wanted, low > wanted) if at_most else (low >= wanted, high < wanted)
-    said = "reached" if good else "not reached" if bad else UNDECIDED
-    over = f"{reached.describe()} over {seeds} seeds" if seeds > 1 else f"{reached.mean:.3f} of one seed"
-    return f"*{aim}*: **{said}**, {over}"
+    found = [claim.mean.p_value(claim.than) for claim in claims]
+    known = [p for p in found if p is not None]
+    corrected = iter(correct_p_values(known))
+    return [
+        Judged(UNDECIDED, None, len(known), None) if p is None else _judged(claim, next(corrected), len(known))
+        for claim, p in zip(claims, found, strict=True)
+    ]
+
+
+def _judged(claim: Claim, p: float, family: int) -> Judged:
+    above = claim.mean.mean > claim.than
+    said = UNDECIDED if p > LEVEL else HELD if above != claim.at_most else NOT_HELD
+    return Judged(said, p, family, claim.mean.seeds_to_tell(claim.than, LEVEL / family))
+
+
+def describe_aims(aims: Mapping[str, Claim]) -> list[str]:
+    """Return the sentence "*aim*: **verdict**, mean (low to high) over n seeds; p." of each aim, in Markdown.
+
+    All aims of the page are judged together. The verdict is "reached", "not reached" or UNDECIDED.
+    """
+    judged = judge(list(aims.values()))
+    return [_describe_aim(aim, claim.mean, one) for (aim, claim), one in zip(aims.items(), judged, strict=True)]
+
+
+def _describe_aim(aim: str, mean: MeanOverSeeds, judged: Judged) -> str:
+    over = f"{mean.describe()} over {mean.seeds} seeds of standard deviation {mean.sd:.3f}"
+    if mean.seeds == 1:
+        over = f"{mean.mean:.3f} of one seed"
+    return f"*{aim}*: **{REACHED[judged.verdict]}**, {over}; {judged.describe()}."
+
+
+def format_p(p: float) -> str:
+    """Return a p-value with three decimals, or "< 0.001"."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
 def signed(value: float, digits: int = 3) -> str:

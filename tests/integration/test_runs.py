@@ -28,14 +28,14 @@ from flcav.experiments.arms.run import ARMS, ArmsResult, compare_arms
 from flcav.experiments.fig6a.results import AllocationResult
 from flcav.experiments.fig6a.run import compare_plans
 from flcav.network.ledger import LINKS, Ledger
-from flcav.pipeline.comparing import compare
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, load_run_recipe
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, load_run_recipe
 from flcav.pipeline.results import Placed, Pretrained, Run, StageResult, Watched
 from flcav.pipeline.running import RESULTS, SUMMARY, run, run_seeds
+from flcav.pipeline.seeds.comparing import compare
 from flcav.report.pages.run_page import write_report
-from flcav.verdicts import verdict
+from flcav.verdicts import UNDECIDED, verdict
 from flcav.world.map.town import load_town
 
 pytestmark = pytest.mark.slow
@@ -248,8 +248,15 @@ def test_the_comparison_of_arms_is_that_of_the_run(studied: Studied, result: Run
             test = result.test(arm=arm, stage=stage, region=town, task="objects")
             assert seed.ap[town][name].ap50 == test.estimate.mean
     assert set(seed.gap_closed) == set(ARMS["grid"]) - {"pretrained", "oracle"}
-    assert len(seed.differences) == 4 + 3 + 1
+    assert len(seed.differences) == 6 + 4
     assert seed.used_mb["edge + cloud FL"]["wireless"] == result.arms[MAIN].links["wireless"].used_mb
+    further, main = result.arms["further"], result.arms[MAIN]
+    assert further.links["wireless"].used_mb == main.links["wireless"].used_mb  # an edge round instead of a cloud round
+    assert further.links["wireline"].used_mb == pytest.approx(
+        sum(each.mb for each in main.spent if (each.stage, each.link) == (PRETRAIN, "wireline"))
+    )
+    rounds = [each.rounds for each in further.stages if each.stage == MORE_EDGE]
+    assert rounds == [main.plan.tasks["objects"].cloud_rounds] * 2
     assert results.summary.ap50["grid"]["oracle"].mean == seed.ap["grid"]["oracle"].ap50
 
 
@@ -333,6 +340,7 @@ def test_runs_are_compared_on_the_same_frames(finished: Path, tmp_path: Path, mo
     edge = by_key[MAIN, EDGE, "grid"]
     assert edge.second == other.test(stage=EDGE, region="grid", task="objects").estimate.mean
     assert edge.difference.mean == pytest.approx(edge.second - edge.first)
+    assert {row.verdict for row in rows} == {UNDECIDED}  # the spread of retraining is not known
     weights = "grid-edge-fl-objects/weights.safetensors"
     assert (work / weights).read_bytes() != (finished / "work" / weights).read_bytes()
     with pytest.raises(InputError, match="no finished run"):
@@ -376,3 +384,6 @@ def test_the_summary_of_seeds_is_beside_them(studied: tuple[Path, Any, Any]) -> 
     summary = json.loads((studied[0] / SUMMARY).read_text())
     assert summary["seeds"] == [1]
     assert {row["name"] for row in summary["gap_closed"]} >= {"grid, objects: edge FL"}
+    judged = {row["name"] for row in summary["differences"] if "judged" in row}
+    assert "grid, objects: edge + cloud FL - further edge FL" in judged
+    assert "grid, objects: central training (more) - pretrained" not in judged

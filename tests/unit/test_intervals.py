@@ -1,4 +1,4 @@
-"""Intervals against SciPy's own bootstrap and t test, and against redrawings one by one."""
+"""Intervals against SciPy's own bootstrap and against redrawings one by one."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,9 @@ from scipy import stats
 
 from flcav.intervals import (
     Estimate,
-    MeanOverSeeds,
     Spread,
     bootstrap_over_scenes,
-    mean_over_seeds,
+    combine_spreads,
     measure_spread,
     widen,
     widen_share,
@@ -47,14 +46,6 @@ def test_what_no_redrawing_knows_has_no_interval_and_unknown_ones_are_left_out()
     assert known == (1.0, 1.0)
 
 
-def test_means_over_seeds_have_the_interval_of_a_t_test():
-    values = [0.71, 0.78, 0.69, 0.74]
-    wanted = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
-    found = mean_over_seeds(values)
-    assert (found.mean, found.low, found.high) == pytest.approx((0.73, wanted.low, wanted.high))
-    assert mean_over_seeds([0.7]) == MeanOverSeeds(0.7, 0.7, 0.7)
-
-
 def test_an_estimate_is_told_with_its_interval_where_it_has_one():
     assert Estimate(0.1, -0.2, 0.4).describe() == "0.100 (-0.200 to 0.400)"
     assert Estimate(0.1, -0.2, 0.4).describe(sign=True) == "+0.100 (-0.200 to +0.400)"
@@ -67,6 +58,15 @@ def test_the_spread_is_the_standard_deviation_of_several_trainings():
     assert found is not None
     assert (found.sd, found.trainings) == (pytest.approx(stats.tstd(values)), 3)
     assert measure_spread([0.6]) is None
+
+
+def test_a_difference_spreads_by_both_trainings():
+    rng = np.random.default_rng(7)
+    first, second = rng.normal(scale=0.03, size=50_000), rng.normal(scale=0.04, size=50_000)
+    found = combine_spreads(Spread(0.03, 9), Spread(0.04, 5))
+    assert found is not None
+    assert (found.sd, found.trainings) == (pytest.approx((first - second).std(), rel=0.02), 5)
+    assert combine_spreads(Spread(0.03, 9), None) is None
 
 
 def test_widened_intervals_contain_the_mean_over_trainings_and_scenes_as_often_as_they_say():

@@ -126,14 +126,18 @@ def _fig3a(out: Path) -> None:
 
 
 def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.experiments.arms.run import compare_arms, draw_arms
+    from flcav.experiments.arms.run import compare_arms, draw_arms, judge_differences
     from flcav.files import write_bytes, write_json
 
     results = compare_arms(*_run_seeds(Target.demo_arms, "arms", out, seeds, scale, jobs, engine, stale))
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "arms.png", draw_arms(results))
     for arm, closed in results.summary.gap_closed.items():
-        typer.echo(f"{arm}: closes {closed.mean:.2f} of the gap ({closed.low:.2f} to {closed.high:.2f})")
+        typer.echo(f"{arm}: closes of the gap {closed.describe()}")
+    for name, judged in judge_differences(results.summary).items():
+        typer.echo(
+            f"{name}: {results.summary.differences[name].describe(sign=True)}, {judged.verdict}: {judged.describe()}"
+        )
 
 
 def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
@@ -203,7 +207,8 @@ def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: E
     write_bytes(out / f"{study.task.name}.png", study.draw(results))
     for test, numbers in results.summary.items():
         for name, value in numbers.items():
-            typer.echo(f"{test}, {name}: {value.describe()}")
+            spread = f", standard deviation over seeds {value.sd:.3f}" if value.seeds > 1 else ""
+            typer.echo(f"{test}, {name}: {value.describe()}{spread}")
 
 
 def register(app: typer.Typer) -> None:

@@ -104,8 +104,8 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
             typer.echo(f"{finding.question}: {finding.verdict}. {finding.sentence}")
         return
     for row in (*summary.measures, *summary.differences):
-        low, high = row.estimate.low, row.estimate.high
-        typer.echo(f"{row.name}: {row.estimate.mean:.3f} ({low:.3f} to {high:.3f}) over {len(summary.seeds)} seeds")
+        judged = f": {row.judged.verdict}, {row.judged.describe()}" if row.judged else ""
+        typer.echo(f"{row.name}: {row.estimate.describe()} over {len(summary.seeds)} seeds{judged}")
 
 
 def compare(
@@ -114,7 +114,7 @@ def compare(
     as_json: bool = AS_JSON,
 ) -> None:
     """Compare two runs: differences, second minus first, of every test that both made on the same frames."""
-    from flcav.pipeline.comparing import compare as compare_runs
+    from flcav.pipeline.seeds.comparing import compare as compare_runs
 
     rows = compare_runs(first, second)
     if as_json:

@@ -5,7 +5,7 @@ The bootstrap gives 95 % percentile intervals of the measure and of paired diffe
 how the measure is computed from it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -17,7 +17,7 @@ from torch import nn
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.files import atomic_path
-from flcav.intervals import REDRAWS, bootstrap_over_scenes
+from flcav.intervals import REDRAWS, SharedScenes, bootstrap_over_scenes, share_scenes
 from flcav.perception.task import Task
 from flcav.progress import Report, ignore_progress
 from flcav.seeds import stream
@@ -160,6 +160,23 @@ def difference(
         return own.measure(after, times) - own.measure(before, times)
 
     return mean, *_known(bootstrap_over_scenes(change, before.scene, own.redraws, rng=rng))
+
+
+def share_test_scenes(
+    task: Task, seeds: Sequence[Sequence[Outcomes]], number: Callable[[Sequence[Values]], Values], seed: int = 0
+) -> SharedScenes:
+    """Return the spread of a mean over seeds by the test scenes that several seeds share, see `flcav.intervals`.
+
+    Each seed has one or several tests of the same frames. `number` computes the seed's number from their measures, such
+    as the difference of two.
+    """
+    own = as_measurable(task)
+
+    def of_seed(tests: Sequence[Outcomes]) -> Callable[[Times], Values]:
+        return lambda times: number([own.measure(outcomes, times) for outcomes in tests])
+
+    measures, scenes = [of_seed(tests) for tests in seeds], [tests[0].scene for tests in seeds]
+    return share_scenes(measures, scenes, own.redraws, rng=stream(seed, "bootstrap"))
 
 
 def weighted_mean(values: NDArray[np.float64], times: Times) -> Values:

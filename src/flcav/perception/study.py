@@ -1,4 +1,7 @@
-"""Study recipe of a task: training, validation and test recordings, and the length of the training."""
+"""Study recipe of a task: training, validation and test recordings, and the length of the training.
+
+All seeds of a study share the recordings for training and validation; each has test recordings of its own.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -10,20 +13,28 @@ from flcav.sources.recipe import recipe_path
 
 RecipeFields = Mapping[str, Json]  # fields of a recording's `Recipe`, as in YAML
 SCALES = ("full", "quick")
+TEST_SEEDS = 10_000  # test recordings of consecutive seeds are these many seeds apart
 
 
 @dataclass(frozen=True)
 class StudyRecipe:
-    """Recordings to train on, to choose the epoch by, and to test on; no two of them may share town and seed."""
+    """Recordings to train on, to choose the epoch by, and to test on.
+
+    No two of them may share town and seed; seeds are below `TEST_SEEDS`.
+    """
 
     network: str  # name of the configuration
     train: tuple[RecipeFields, ...]
     validation: RecipeFields
-    tests: Mapping[str, RecipeFields]  # by name of the test
+    tests: Mapping[str, RecipeFields]  # by name of the test; each seed of the study records its own: `tests_of`
     epochs: int
     patience: int  # epochs without a better validation score after which training stops
     quick_scenes: int = 2  # most scenes of each recording at the scale "quick"
     quick_epochs: int = 1  # epochs at the scale "quick"
+
+    def tests_of(self, seed: int) -> Mapping[str, RecipeFields]:
+        """Return the test recordings of one seed of the study, by name: traffic and weather are drawn anew."""
+        return {name: {**fields, "seed": test_seed(fields, seed)} for name, fields in self.tests.items()}
 
     def at_scale(self, scale: str) -> "StudyRecipe":
         """Return the recipe itself ("full") or one with few scenes and epochs that runs in minutes ("quick").
@@ -47,6 +58,13 @@ class StudyRecipe:
             tests={name: few(recipe) for name, recipe in self.tests.items()},
             epochs=self.quick_epochs,
         )
+
+
+def test_seed(recipe: RecipeFields, seed: int) -> int:
+    """Return the seed of the test recording by `recipe` of one seed of a study."""
+    own = recipe.get("seed", 0)
+    assert isinstance(own, int)
+    return own + TEST_SEEDS * seed
 
 
 @runtime_checkable

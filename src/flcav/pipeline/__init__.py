@@ -5,17 +5,17 @@ from typing import TYPE_CHECKING
 from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from flcav.pipeline.comparing import Compared, compare
     from flcav.pipeline.recipe import RunRecipe, load_run_recipe
     from flcav.pipeline.results import Run, Summary
     from flcav.pipeline.running import run, run_seeds
+    from flcav.pipeline.seeds.comparing import Compared, compare
 
 PLACES = {
-    "Compared": "flcav.pipeline.comparing",
+    "Compared": "flcav.pipeline.seeds.comparing",
     "Run": "flcav.pipeline.results",
     "RunRecipe": "flcav.pipeline.recipe",
     "Summary": "flcav.pipeline.results",
-    "compare": "flcav.pipeline.comparing",
+    "compare": "flcav.pipeline.seeds.comparing",
     "load_run_recipe": "flcav.pipeline.recipe",
     "run": "flcav.pipeline.running",
     "run_seeds": "flcav.pipeline.running",

@@ -4,7 +4,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, Arm, Federation, Placement, RunRecipe, Training
+from flcav.pipeline.recipe import (
+    CENTRAL,
+    CLOUD,
+    EDGE,
+    MAIN,
+    MORE_EDGE,
+    PRETRAIN,
+    Arm,
+    Federation,
+    Placement,
+    RunRecipe,
+    Training,
+)
 
 PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
 PLANNED = ("plan",)  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
@@ -102,6 +114,10 @@ class Names:
         """Return stage II of a task in a region."""
         return f"{region}-{EDGE}-fl-{task}" + self._suffix(arm, LEARNED, task)
 
+    def more_edge(self, arm: str, region: str, task: str) -> str:
+        """Return the further edge rounds of a task in a region."""
+        return f"{region}-more-{EDGE}-fl-{task}" + self._suffix(arm, LEARNED, task)
+
     def cloud(self, arm: str, task: str) -> str:
         """Return stage III of a task."""
         return f"{CLOUD}-fl-{task}" + self._suffix(arm, LEARNED, task)
@@ -116,7 +132,7 @@ class Names:
             return self.pretrain(arm, task)
         if stage == CLOUD:
             return self.cloud(arm, task)
-        return (self.edge if stage == EDGE else self.central)(arm, region, task)
+        return {EDGE: self.edge, MORE_EDGE: self.more_edge, CENTRAL: self.central}[stage](arm, region, task)
 
     def test(self, trained: str, region: str) -> str:
         """Return the test of a step's network in a region."""

@@ -7,11 +7,17 @@ if the interval contains 0 or the spread is not known: another training on the s
 
 from collections.abc import Mapping, Sequence
 
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results import ArmResult, Difference, Finding, Test
 from flcav.verdicts import UNDECIDED, explain_verdict, signed, verdict
 
-WORDS = {PRETRAIN: "pretrained", EDGE: "edge FL", CLOUD: "edge + cloud FL", CENTRAL: "central training"}
+WORDS = {
+    PRETRAIN: "pretrained",
+    EDGE: "edge FL",
+    MORE_EDGE: "further edge FL",
+    CLOUD: "edge + cloud FL",
+    CENTRAL: "central training",
+}
 
 
 def name_stage(arm: str, stage: str) -> str:

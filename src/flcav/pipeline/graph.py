@@ -12,7 +12,18 @@ from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
 from flcav.pipeline.planning import read_history
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, SPLITS_OF, Region, RunRecipe, SplitName, find_path
+from flcav.pipeline.recipe import (
+    CLOUD,
+    EDGE,
+    MAIN,
+    MORE_EDGE,
+    PRETRAIN,
+    SPLITS_OF,
+    Region,
+    RunRecipe,
+    SplitName,
+    find_path,
+)
 from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.steps import Step
 from flcav.pipeline.work import (
@@ -223,11 +234,16 @@ class Graph:
                 own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
                 name = self.names.edge(arm.name, region, task)
                 self._add(_step(name, edge_step, common | own, _named_in(steps)))
+                if MORE_EDGE in arm.stages:
+                    more = own | {"steps": steps | {"edge": name}}
+                    step = self.names.more_edge(arm.name, region, task)
+                    self._add(_step(step, edge_step, common | more, _named_in(more["steps"])))
             if CLOUD in arm.stages:
-                for region, steps in rests.items():
-                    steps["edge"] = self.names.edge(arm.name, region, task)
-                needs = [step for steps in rests.values() for step in _named_in(steps)]
-                arguments = common | {"budget_mb": self._budget_mb, "regions": rests}
+                edges = {
+                    region: steps | {"edge": self.names.edge(arm.name, region, task)} for region, steps in rests.items()
+                }
+                needs = [step for steps in edges.values() for step in _named_in(steps)]
+                arguments = common | {"budget_mb": self._budget_mb, "regions": edges}
                 self._add(_step(self.names.cloud(arm.name, task), cloud_step, arguments, needs))
 
     def _central(self, arm: Setting, region: str, task: str) -> Step:

@@ -18,6 +18,7 @@ from flcav.world.weather import WeatherSchedule
 
 MAIN = "main"  # the arm that the recipe itself describes
 PRETRAIN, EDGE, CLOUD, CENTRAL = "pretrain", "edge", "cloud", "central"
+MORE_EDGE = "more_edge"  # after stage II: as many further edge rounds as stage III has, without the cloud
 
 Role = Literal["pretrain", "federate", "unseen"]
 SplitName = Literal["pool", "validation", "registry", "edge", "test"]
@@ -183,14 +184,17 @@ class Arm(Config):
     central: Literal["pretrain", "federate"] | None = (
         None  # train centrally on the ground truth of the regions of this role
     )
-    stages: tuple[Literal["edge", "cloud"], ...] = ("edge", "cloud")  # stages of federated learning to run
+    stages: tuple[Literal["edge", "cloud", "more_edge"], ...] = (
+        "edge",
+        "cloud",
+    )  # stages of federated learning to run; more_edge: further edge rounds instead of the cloud rounds
     regions: tuple[str, ...] | None = None  # federating regions that take part; default: all
 
     @field_validator("stages")
     @classmethod
     def _from_the_first(cls, stages: tuple[str, ...]) -> tuple[str, ...]:
-        if stages not in ((EDGE,), (EDGE, CLOUD)):
-            raise ValueError("must be [edge] or [edge, cloud]")
+        if stages not in ((EDGE,), (EDGE, CLOUD), (EDGE, MORE_EDGE)):
+            raise ValueError("must be [edge], [edge, cloud] or [edge, more_edge]")
         return stages
 
 

@@ -3,14 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Annotated, Self
 
 from flcav.config import InputError, read_json
 from flcav.files import write_json
-from flcav.intervals import Estimate, Spread
+from flcav.intervals import Estimate, MeanOverSeeds, Spread
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
-from flcav.records import Record
+from flcav.records import LEFT_OUT, Record
+from flcav.verdicts import Judged
 
 RESULT = "result.json"
 WEIGHTS, LEDGER, ERRORS, OUTCOMES = "weights.safetensors", "ledger.parquet", "errors.parquet", "outcomes.npz"
@@ -294,15 +295,16 @@ class Run(Saved):
 
 @dataclass(frozen=True)
 class Mean:
-    """The mean of a number over seeds, with Student's 95 % interval."""
+    """The mean of a number over seeds, with its 95 % interval."""
 
     name: str
-    estimate: Estimate
+    estimate: MeanOverSeeds
+    judged: Annotated[Judged | None, LEFT_OUT] = None  # of the run's own differences: the claim that they are positive
 
 
 @dataclass(frozen=True)
 class Summary(Saved):
-    """Means over several seeds of a recipe."""
+    """Means over several seeds of a recipe; verdicts on differences are corrected together."""
 
     seeds: tuple[int, ...]
     measures: tuple[Mean, ...]

@@ -1,13 +1,13 @@
 """Running a recipe, with one seed or several, and collecting the results of its steps."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import Estimate, mean_over_seeds, measure_spread, widen, widen_share
+from flcav.intervals import Estimate, measure_spread, widen, widen_share
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
@@ -17,14 +17,13 @@ from flcav.pipeline.graph import Graph
 from flcav.pipeline.labels import LABEL_SOURCES
 from flcav.pipeline.planning import HistoryPoint
 from flcav.pipeline.provenance import provenance
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results import (
     LEDGER,
     OUTCOMES,
     ArmResult,
     Difference,
     LinkUse,
-    Mean,
     Placed,
     Plan,
     Pretrained,
@@ -36,6 +35,7 @@ from flcav.pipeline.results import (
     Tested,
     Watched,
 )
+from flcav.pipeline.seeds.summary import summarise
 from flcav.pipeline.spread import difference_key, list_spreads, test_key
 from flcav.pipeline.steps import Notify, Stale, run_side_by_side, run_steps, stopwatch
 from flcav.pipeline.tables import append_records
@@ -112,7 +112,7 @@ def run_seeds(
         f"seed{seed}": recipe.model_copy(update={"seed": seed}) for seed in range(recipe.seed, recipe.seed + seeds)
     }
     runs = run_several(recipes, out, beside=beside, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    summary = summarise(runs)
+    summary = summarise(runs, [Path(out) / name / WORK for name in recipes])
     summary.save(Path(out), SUMMARY)
     return runs, summary
 
@@ -147,25 +147,6 @@ def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float, name
         append_records(history.with_name(SPREAD), list_spreads(result, name))
     result.save(out, RESULTS)
     return result
-
-
-def summarise(runs: Sequence[Run]) -> Summary:
-    """Return means over the seeds of a recipe with Student's 95 % intervals."""
-
-    def means(of: Callable[[Run], Mapping[str, float]]) -> tuple[Mean, ...]:
-        rows = [of(each) for each in runs]
-        return tuple(Mean(name, mean_over_seeds([row[name] for row in rows])) for name in rows[0])
-
-    return Summary(
-        tuple(each.recipe.seed for each in runs),
-        means(lambda one: {_measure_name(test): test.result.estimate.mean for test in one.tested}),
-        means(lambda one: {each.name: each.estimate.mean for each in one.differences}),
-        means(lambda one: one.gap_closed),
-    )
-
-
-def _measure_name(test: Test) -> str:
-    return f"{test.region}, {test.task}: {name_stage(test.arm, test.stage)}"
 
 
 def seed_folders(folder: Path) -> dict[int, Path]:
@@ -239,9 +220,8 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
     ]
     books = [Ledger.load(work / names.pretrain(arm.name, task) / LEDGER) for task in tasks]
     if arm.stages != (CENTRAL,):
-        books += [
-            Ledger.load(work / names.edge(arm.name, region, task) / LEDGER) for task in tasks for region in arm.regions
-        ]
+        last = names.more_edge if MORE_EDGE in arm.stages else names.edge
+        books += [Ledger.load(work / last(arm.name, region, task) / LEDGER) for task in tasks for region in arm.regions]
     if CLOUD in arm.stages:
         books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they include the others
     budgets = graph.recipe.budgets_mb
@@ -275,10 +255,11 @@ def _differences(graph: Graph, work: Path) -> list[Difference]:
     for arm in graph.settings.values():
         for stage, region, task in () if arm.repeat else graph.tested(arm):
             if stage != PRETRAIN:
-                earlier = EDGE if stage == CLOUD and region in arm.regions else PRETRAIN
+                earlier = EDGE if stage in (CLOUD, MORE_EDGE) and region in arm.regions else PRETRAIN
                 pairs.append(((arm.name, stage), (arm.name, earlier), region, task))
             if arm.name != MAIN and (region in main.regions or stage != EDGE):
-                pairs.append(((MAIN, EDGE if stage == CENTRAL else stage), (arm.name, stage), region, task))
+                own = {CENTRAL: EDGE, MORE_EDGE: CLOUD}.get(stage, stage)
+                pairs.append(((MAIN, own), (arm.name, stage), region, task))
     found: dict[tuple[str, str], Difference] = {}
     for after, before, region, task in pairs:
         steps = test_folder(graph, *after, region, task), test_folder(graph, *before, region, task)

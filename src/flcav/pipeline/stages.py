@@ -240,21 +240,19 @@ def federate_edge(
     learning: Learning,
     network: Any,
     clients: Mapping[str, TaskClient],
-    rounds: int,
-    region: str,
+    schedule: Schedule,
     strategy: Strategy,
     book: Ledger,
     folder: Path,
     report: Report,
 ) -> tuple[float, ...]:
-    """Run stage II of a region from the pretrained `network`; write weights and ledger, return each round's loss."""
+    """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss."""
     federating = FederationCheckpoints(learning.task, folder, book, report)
     start, done = federating.resume(to_arrays(network))
-    schedule = learning.schedule(rounds, learning.training.local_steps, EDGE, region)
     account = Account(book, EDGE, learning.task.name, "wireless")
-    keep = federating.make_saver(rounds)
+    keep = federating.make_saver(schedule.rounds)
     federate(clients, start, schedule, account, strategy=strategy, done=done, on_round=keep)
-    federating.finish(network, rounds, learning.training.average_rounds)
+    federating.finish(network, schedule.rounds, learning.training.average_rounds)
     return tuple(federating.losses)
 
 

@@ -34,7 +34,18 @@ from flcav.pipeline.labels import (
 )
 from flcav.pipeline.placing import find_sites, place_sensors, read_traces
 from flcav.pipeline.planning import PlanRequest, PlanSettings, make_plan, model_mb, parse_history
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, Federation, Placement, Role, RunRecipe, SplitName, Training
+from flcav.pipeline.recipe import (
+    CENTRAL,
+    CLOUD,
+    EDGE,
+    MORE_EDGE,
+    Federation,
+    Placement,
+    Role,
+    RunRecipe,
+    SplitName,
+    Training,
+)
 from flcav.pipeline.results import (
     ERRORS,
     LEDGER,
@@ -211,18 +222,28 @@ def edge_step(
     federation: Fields,
     steps: Mapping[str, Any],
 ) -> None:
-    """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`."""
+    """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`.
+
+    With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III.
+    """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
-    own = Plan.load(work.inputs[steps["plan"]]).tasks[task]
+    own, how = Plan.load(work.inputs[steps["plan"]]).tasks[task], Federation.model_validate(federation)
     stage_one = Ledger.load(work.inputs[steps["pretrain"]] / LEDGER)
-    book = Ledger(region_budget(stage_one, vehicles, region))
-    samples, poles = _label_samples(work, learning, region, labels, steps, book)
-    start = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
+    budget = region_budget(stage_one, vehicles, region)
+    if "edge" in steps:
+        stage, rounds = MORE_EDGE, own.cloud_rounds * how.edge_rounds_per_cloud_round
+        book = Ledger(budget, Ledger.load(work.inputs[steps["edge"]] / LEDGER).entries)
+        samples, poles = _label_samples(work, learning, region, labels, steps)
+    else:
+        stage, rounds, book = EDGE, own.edge_rounds, Ledger(budget)
+        samples, poles = _label_samples(work, learning, region, labels, steps, book)
+    start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
     clients = make_clients(learning, start.config, samples)
-    strategy = strategy_named(Federation.model_validate(federation).strategy)
-    losses = federate_edge(learning, start, clients, own.edge_rounds, region, strategy, book, work.folder, work.report)
+    schedule = learning.schedule(rounds, learning.training.local_steps, stage, region)
+    strategy = strategy_named(how.strategy)
+    losses = federate_edge(learning, start, clients, schedule, strategy, book, work.folder, work.report)
     held = sum(len(client.samples) for client in clients.values())
-    StageResult(EDGE, task, region, own.edge_rounds, held, len(clients), poles, losses).save(work.folder)
+    StageResult(stage, task, region, rounds, held, len(clients), poles, losses).save(work.folder)
 
 
 def cloud_step(

@@ -58,6 +58,20 @@ def test_an_arm_adds_what_it_does_differently_and_no_more() -> None:
     assert {name for name in plain if plain[name] == armed[name]} >= {"plan", "pretrain-objects", "grid-place"}
 
 
+def test_further_edge_rounds_go_on_from_the_runs_own_edge_rounds() -> None:
+    armed = Graph(recipe_of(arms={"further": {"stages": ["edge", "more_edge"]}}), Path())
+    plain = {step.name for step in Graph(recipe_of(), Path()).steps}
+    added = {step.name: step for step in armed.steps if step.name not in plain}
+    more = "grid-more-edge-fl-objects"
+    assert set(added) == {more, f"test-{more}-grid"}
+    assert added[more].arguments["steps"]["edge"] == "grid-edge-fl-objects"
+    assert "grid-edge-fl-objects" in added[more].needs
+    (edge,) = (step for step in armed.steps if step.name == "grid-edge-fl-objects")
+    assert "edge" not in edge.arguments["steps"]
+    with pytest.raises(ValueError, match=r"must be \[edge\], \[edge, cloud\] or \[edge, more_edge\]"):
+        recipe_of(arms={"further": {"stages": ["more_edge"]}})
+
+
 def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
     arms = {"densest": {"placement": {"rule": "densest"}, "stages": ["edge"]}}
     plain = Graph(recipe_of(arms=arms), Path())

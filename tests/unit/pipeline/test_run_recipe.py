@@ -70,7 +70,7 @@ ARM = {"placement": {"rule": "densest"}}
         ({"arms": {"x": {"placement": {"rule": "best"}}}}, "arms.x.placement: field 'rule' = 'best'"),
         ({"arms": {"x": {"regions": ["suburb"]}}}, "arms.x.regions: 'suburb' is none of grid"),
         ({"arms": {"x": {"labels": {"signs": "annotated"}}}}, "arms.x.labels: 'signs' is none of objects"),
-        ({"arms": {"x": {"stages": ["cloud"]}}}, "must be [edge] or [edge, cloud]"),
+        ({"arms": {"x": {"stages": ["cloud"]}}}, "must be [edge], [edge, cloud] or [edge, more_edge]"),
         ({"placement": {"tasks": ["signs"]}}, "'signs' is none of the run's tasks: objects"),
         ({"size": "huge"}, "'toy', 'demo' or 'full'"),
         ({"rounds": 3}, "unknown field 'rounds'; known fields: arms, budgets_mb"),

@@ -1,7 +1,9 @@
 """Ablation: each stage and sensor against its alternatives, as the arms of recipes/runs/arms.yaml on the same frames.
 
-Every arm takes as many optimiser steps as the vehicles of stage II take together, and has a ledger of its own. Within
-a seed, intervals are a bootstrap over test scenes; over seeds, Student's t, which covers training and traffic too.
+Centralised arms continue pretraining for as many optimiser steps as the vehicles of stage II take together; the arm
+with further edge rounds takes as many as stage II and stage III do. Every arm has a ledger of its own. Within a seed,
+intervals are a bootstrap over test scenes; over seeds, which have recordings of their own, they cover training and
+traffic too. The verdicts on all differences are corrected together.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,13 +14,16 @@ from flcav.files import Json
 from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
 from flcav.pipeline.findings import name_stage
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Pole, Run
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.verdicts import Claim, Judged, judge
 
 TASK = "objects"
+FURTHER = "edge FL, as many more rounds"  # instead of those of cloud FL
+EFFECT = 0.02  # difference in AP50 that the comparison is to tell
 ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: name in the tables -> arm, stage
     "grid": {
         "pretrained": (MAIN, PRETRAIN),
@@ -26,6 +31,7 @@ ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: name in the tables -
         "edge FL, no road sensor": ("no_pole", EDGE),
         "edge FL, densest pole": ("densest", EDGE),
         "edge FL, VRCSP pole": (MAIN, EDGE),
+        FURTHER: ("further", MORE_EDGE),
         "edge + cloud FL": (MAIN, CLOUD),
         "oracle": ("oracle", CENTRAL),
     },
@@ -33,6 +39,7 @@ ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: name in the tables -
         "pretrained": (MAIN, PRETRAIN),
         "more pretraining": ("more", CENTRAL),
         "edge FL, VRCSP pole": (MAIN, EDGE),
+        FURTHER: ("further", MORE_EDGE),
         "edge + cloud FL": (MAIN, CLOUD),
     },
 }
@@ -42,6 +49,7 @@ COMPARED = (  # (after, before): claims of the article and controls
     ("edge FL, VRCSP pole", "edge FL, no road sensor"),
     ("edge FL, VRCSP pole", "edge FL, densest pole"),
     ("edge + cloud FL", "edge FL, VRCSP pole"),
+    ("edge + cloud FL", FURTHER),
 )
 
 
@@ -177,7 +185,9 @@ def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
 
     def means(number: Callable[[Reached], float | None]) -> dict[str, dict[str, MeanOverSeeds]]:
         return {
-            town: {arm: mean_over_seeds([_known(number(seed.ap[town][arm])) for seed in seeds]) for arm in arms}
+            town: {
+                arm: mean_over_seeds([_known(number(seed.ap[town][arm])) for seed in seeds], share=True) for arm in arms
+            }
             for town, arms in seeds[0].ap.items()
         }
 
@@ -189,6 +199,12 @@ def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
         },
         gap_closed={arm: mean_over_seeds([seed.gap_closed[arm] for seed in seeds]) for arm in seeds[0].gap_closed},
     )
+
+
+def judge_differences(summary: ArmsSummary) -> dict[str, Judged]:
+    """Return the verdicts on the claims that the differences are positive, corrected together."""
+    judged = judge([Claim(mean) for mean in summary.differences.values()])
+    return dict(zip(summary.differences, judged, strict=True))
 
 
 def _known(number: float | None) -> float:

@@ -2,17 +2,19 @@
 
 from collections import Counter
 
-from flcav.experiments.arms.run import ARMS, ArmsResult
+from flcav.experiments.arms.run import ARMS, EFFECT, ArmsResult, judge_differences
+from flcav.intervals import LEVEL, MOST_SEEDS, MeanOverSeeds, half_width, plan_seeds
 from flcav.markdown import format_table
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, verdict
+from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, format_p, verdict
 
 
 def tables(results: ArmsResult) -> dict[str, str]:
-    """Return Markdown by name: grid, ring, differences, seeds."""
+    """Return Markdown by name: grid, ring, differences, power, seeds."""
     return {
         "grid": _town(results, "grid"),
         "ring": _town(results, "ring"),
         "differences": _differences(results),
+        "power": _power(results),
         "seeds": _seeds(results),
     }
 
@@ -25,23 +27,54 @@ def _town(results: ArmsResult, town: str) -> str:
         [arm, summary.ap50[town][arm].describe(), summary.ap70[town][arm].describe()]
         + ([closed[arm].describe() if arm in closed else ""] if closed else [])
         for arm in ARMS[town]
+        if arm in summary.ap50[town]
     ]
     return format_table((f"arm on `{town}`", "AP50", "AP70", *(["gap closed"] if closed else [])), rows)
 
 
 def _differences(results: ArmsResult) -> str:
-    rows = []
+    rows, judged = [], judge_differences(results.summary)
     for name, mean in results.summary.differences.items():
         own = [seed.differences[name] for seed in results.seeds]
         times = Counter(verdict(each.low, each.high) for each in own)
         counted = " / ".join(str(times[each]) for each in (HELD, UNDECIDED, NOT_HELD))
-        rows.append([name, mean.describe(sign=True), counted])
+        p = judged[name].p
+        rows.append([name, mean.describe(sign=True), "" if p is None else format_p(p), judged[name].verdict, counted])
     header = (
         "difference in AP50",
         "mean over seeds",
+        "p, corrected",
+        "claim that it is positive",
         "seeds whose own 95 % scene interval is above 0 / contains 0 / below 0",
     )
     return format_table(header, rows)
+
+
+def _power(results: ArmsResult) -> str:
+    """Return how many seeds it takes to tell `EFFECT`, and differences of the size found, after correction."""
+    judged, rows = judge_differences(results.summary), []
+    for name, mean in results.summary.differences.items():
+        level = LEVEL / max(judged[name].family, 1)
+        half = f"{half_width(mean.sd, mean.seeds):.3f}" if mean.seeds > 1 else ""
+        wanted = plan_seeds(EFFECT, mean.sd, level) if mean.known else None
+        undecided = judged[name].verdict == UNDECIDED
+        rows.append([name, f"{mean.sd:.3f}", half, _told(wanted, mean)])
+        rows[-1].append(_told(judged[name].seeds, mean) if undecided else "")
+    header = (
+        "difference in AP50",
+        "standard deviation over seeds",
+        f"half width of the interval of {len(results.seeds)} seeds",
+        f"seeds that tell {EFFECT}",
+        "if undecided: seeds that tell a difference of the size found",
+    )
+    return format_table(header, rows)
+
+
+def _told(seeds: int | None, mean: MeanOverSeeds) -> str:
+    """Return a number of seeds as text; None: too many, or not known."""
+    if not mean.known:
+        return ""
+    return f"more than {MOST_SEEDS}" if seeds is None else str(seeds)
 
 
 def _seeds(results: ArmsResult) -> str:

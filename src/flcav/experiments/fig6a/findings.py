@@ -3,58 +3,71 @@
 from collections.abc import Mapping
 
 from flcav.experiments.fig6a.results import EQUAL, JOINT, TOWN, AllocationResult, AllocationSeed, PlanFinding
-from flcav.intervals import MeanOverSeeds, mean_over_seeds
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, explain_verdict, signed, verdict
+from flcav.intervals import LEVEL, MOST_SEEDS, Estimate, MeanOverSeeds, mean_over_seeds, plan_seeds
+from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN
+from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, Claim, Judged, judge, signed
 
 STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"}
+Gain = tuple[str, str]  # plan, stage
+GAINS: tuple[Gain, ...] = tuple((name, stage) for name in (EQUAL, JOINT) for stage in (EDGE, CLOUD))
 COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
 
 
 def allocation_findings(results: AllocationResult) -> tuple[PlanFinding, ...]:
-    """Return the findings: gain, ranking by prediction, gain of every stage, accuracy of prediction, budgets."""
-    return (_better(results), _ranking(results), _every_stage(results), _accuracy(results), _budgets(results))
+    """Return the findings: gain, ranking by prediction, gain of every stage, accuracy of prediction, budgets.
 
-
-def _better(results: AllocationResult) -> PlanFinding:
-    realised = results.summary.realised[TOWN]
-    difference, how = _difference(results)
-    decided = verdict(difference.low, difference.high)
-    words = explain_verdict(decided, len(results.seeds))
-    sentence = (
-        f"On {TOWN}, AP50 after the last stage was {realised[EQUAL]['cloud'].mean:.3f} with equal stages and "
-        f"{realised[JOINT]['cloud'].mean:.3f} with the joint plan: {signed(difference.mean)}, 95 % interval "
-        f"{signed(difference.low)} to {signed(difference.high)} {how}; {words}."
+    The claims that are tests over seeds, the joint plan's gain and those of the stages, are judged together.
+    """
+    difference = results.summary.realised_difference[TOWN][CLOUD]
+    gains = {key: _gain(results, TOWN, *key) for key in GAINS}
+    first, *others = judge([Claim(mean) for mean in (difference, *gains.values())])
+    verdicts = {key: each.verdict for key, each in zip(gains, others, strict=True)}
+    return (
+        _better(results, difference, first),
+        _ranking(results, difference, first),
+        _every_stage(results, gains, verdicts, first.family),
+        _accuracy(results),
+        _budgets(results),
     )
-    return _finding("Does the joint plan beat equal shares for every stage?", decided, sentence)
 
 
-def _difference(results: AllocationResult) -> tuple[MeanOverSeeds, str]:
-    """Return the paired difference after the last stage, and over what its interval is: seeds, or one seed's scenes."""
-    seeds = results.seeds
-    if len(seeds) == 1:
-        own = seeds[0].differences[TOWN]["cloud"]
-        assert own.low is not None  # there are several test scenes
-        assert own.high is not None
-        how = "over test scenes of one seed, in which training does not vary"
-        return MeanOverSeeds(own.mean, own.low, own.high), how
-    return results.summary.realised_difference[TOWN]["cloud"], f"over {len(seeds)} seeds, paired"
+def _better(results: AllocationResult, difference: MeanOverSeeds, judged: Judged) -> PlanFinding:
+    realised = results.summary.realised[TOWN]
+    sentence = (
+        f"On {TOWN}, AP50 after the last stage was {realised[EQUAL][CLOUD].mean:.3f} with equal stages and "
+        f"{realised[JOINT][CLOUD].mean:.3f} with the joint plan: {_interval(difference)}"
+    )
+    if difference.seeds == 1:
+        own = results.seeds[0].differences[TOWN][CLOUD]
+        over_scenes = Estimate(own.mean, own.low, own.high).describe(sign=True)
+        sentence += f"; {over_scenes} over test scenes of one seed, in which training does not vary."
+    else:
+        over = f"over {difference.seeds} seeds, paired, of standard deviation {difference.sd:.3f}"
+        sentence += f" {over}; {judged.describe()}. {_needed(results, difference, judged)}"
+    return _finding("Does the joint plan beat equal shares for every stage?", judged.verdict, sentence)
 
 
-def _ranking(results: AllocationResult) -> PlanFinding:
-    predicted = results.summary.predicted_difference["cloud"]
-    difference, _ = _difference(results)
+def _needed(results: AllocationResult, difference: MeanOverSeeds, judged: Judged) -> str:
+    """Return how many seeds it takes to tell the difference that was predicted."""
+    predicted = results.summary.predicted_difference[CLOUD]
+    seeds = plan_seeds(predicted, difference.sd, LEVEL / max(judged.family, 1))
+    count = f"more than {MOST_SEEDS}" if seeds is None else seeds
+    return f"To tell the predicted difference of {signed(predicted)} takes {count} seeds."
+
+
+def _ranking(results: AllocationResult, difference: MeanOverSeeds, judged: Judged) -> PlanFinding:
+    predicted = results.summary.predicted_difference[CLOUD]
     question = "Does the prediction rank the two plans rightly?"
     if predicted == 0:
         return _finding(question, UNDECIDED, "Both plans are predicted to reach the same: there is nothing to rank.")
     seeds = results.seeds
-    agree = sum(predicted * (_ap(seed, JOINT, "cloud") - _ap(seed, EQUAL, "cloud")) > 0 for seed in seeds)
+    agree = sum(predicted * (_ap(seed, JOINT, CLOUD) - _ap(seed, EQUAL, CLOUD)) > 0 for seed in seeds)
     expected = f"The curve predicts {signed(predicted)} for the joint plan; {agree} of {len(seeds)} seeds agree in sign"
-    towards = sorted((difference.low * _sign(predicted), difference.high * _sign(predicted)))
-    decided = verdict(*towards)
-    if difference.mean * predicted > 0 and decided != NOT_HELD:
-        sure = "with an interval off 0" if decided == HELD else "but its interval contains 0"
-        return _finding(question, decided, f"{expected}, and so does their mean, {sure}.")
-    sure = ", but its interval contains 0" if decided == UNDECIDED else ""
+    turned = {HELD: NOT_HELD, NOT_HELD: HELD, UNDECIDED: UNDECIDED}
+    decided = judged.verdict if predicted > 0 else turned[judged.verdict]
+    sure = ", but that is undecided" if decided == UNDECIDED else ""
+    if difference.mean * predicted > 0:
+        return _finding(question, decided, f"{expected}, and so does their mean{sure}.")
     return _finding(question, decided, f"{expected}, and their mean does not{sure}. {_why(results)}")
 
 
@@ -78,22 +91,23 @@ def _why(results: AllocationResult) -> str:
     return sentence + (f" The curve is extrapolated for {'; '.join(beyond)}." if beyond else "")
 
 
-def _every_stage(results: AllocationResult) -> PlanFinding:
+def _every_stage(
+    results: AllocationResult, gains: Mapping[Gain, MeanOverSeeds], verdicts: Mapping[Gain, str], family: int
+) -> PlanFinding:
     """Return the gain of each federated stage in each plan; the learning curves cannot predict a loss."""
-    gains = {(name, stage): _gain(results, TOWN, name, stage) for name in (EQUAL, JOINT) for stage in ("edge", "cloud")}
     plans = results.seeds[0].plans
     rounds = {(name, stage): plans[name].counts[f"{stage}_rounds"] for name, stage in gains}
     told = [
         f"{STAGE_NAMES[stage]} of the {name} plan ({rounds[name, stage]} round{'s' * (rounds[name, stage] != 1)}) "
-        f"{_interval(gain)}"
+        f"{_interval(gain)}, {verdicts[name, stage]}"
         for (name, stage), gain in gains.items()
     ]
-    sentences = [f"On {TOWN}, over the stage before it: {'; '.join(told)}."]
-    verdicts = {key: verdict(gain.low, gain.high) for key, gain in gains.items()}
+    corrected = f", with verdicts corrected for {family} claims" if family else ""
+    sentences = [f"On {TOWN}, over the stage before it{corrected}: {'; '.join(told)}."]
     lost = [key for key, each in verdicts.items() if each == NOT_HELD]
     if lost:
         sentences.append("The curves fall with every round, so no plan made from them foresees a loss.")
-    for name, stage in (key for key in lost if key[1] == "cloud"):
+    for name, stage in (key for key in lost if key[1] == CLOUD):
         beside = "; ".join(
             f"on {town} the same stage brought {_interval(_gain(results, town, name, stage))}"
             for town in results.summary.realised
@@ -105,15 +119,16 @@ def _every_stage(results: AllocationResult) -> PlanFinding:
 
 
 def _gain(results: AllocationResult, town: str, name: str, stage: str) -> MeanOverSeeds:
-    """Return a stage's gain over the stage before it, as the mean over seeds; of a single seed it is undecided."""
-    before = {"edge": "pretrain", "cloud": "edge"}[stage]
+    """Return a stage's gain over the stage before it, as the mean over seeds."""
+    before = {EDGE: PRETRAIN, CLOUD: EDGE}[stage]
     rows = [seed.realised[town][name] for seed in results.seeds]
-    gain = mean_over_seeds([row[stage].ap50 - row[before].ap50 for row in rows])
-    return gain if len(rows) > 1 else MeanOverSeeds(gain.mean, -1.0, 1.0)
+    return mean_over_seeds([row[stage].ap50 - row[before].ap50 for row in rows])
 
 
-def _interval(gain: MeanOverSeeds) -> str:
-    return f"{signed(gain.mean)} ({signed(gain.low)} to {signed(gain.high)})"
+def _interval(mean: MeanOverSeeds) -> str:
+    if mean.low is None or mean.high is None:
+        return signed(mean.mean)
+    return f"{signed(mean.mean)} ({signed(mean.low)} to {signed(mean.high)})"
 
 
 def _gains(after: Mapping[str, float]) -> dict[str, float]:
@@ -123,11 +138,9 @@ def _gains(after: Mapping[str, float]) -> dict[str, float]:
 
 
 def _accuracy(results: AllocationResult) -> PlanFinding:
-    errors = [
-        _ap(seed, name, "cloud") - seed.predicted[name]["cloud"] for seed in results.seeds for name in (EQUAL, JOINT)
-    ]
+    errors = [_ap(seed, name, CLOUD) - seed.predicted[name][CLOUD] for seed in results.seeds for name in (EQUAL, JOINT)]
     wide = sum(abs(error) for error in errors) / len(errors)
-    claimed = abs(results.summary.predicted_difference["cloud"])
+    claimed = abs(results.summary.predicted_difference[CLOUD])
     decided = HELD if wide < claimed else NOT_HELD
     compared = "less" if wide < claimed else "no less"
     sentence = (
@@ -156,7 +169,3 @@ def _ap(seed: AllocationSeed, name: str, stage: str) -> float:
 
 def _finding(question: str, decided: str, sentence: str) -> PlanFinding:
     return PlanFinding(question, decided, sentence)
-
-
-def _sign(value: float) -> int:
-    return 1 if value > 0 else -1

@@ -114,7 +114,10 @@ def summarise(seeds: Sequence[AllocationSeed]) -> AllocationSummary:
     return AllocationSummary(
         predicted={name: {stage: float(np.mean(predicted(name, stage))) for stage in STAGES} for name in PLANS},
         realised={
-            town: {name: {stage: mean_over_seeds(realised(town, name, stage)) for stage in STAGES} for name in PLANS}
+            town: {
+                name: {stage: mean_over_seeds(realised(town, name, stage), share=True) for stage in STAGES}
+                for name in PLANS
+            }
             for town in towns
         },
         predicted_difference={

@@ -1,10 +1,11 @@
 """Study of one task: record the splits, train a network per seed, and test each once on frames of other scenes.
 
-The best epoch is chosen on the validation frames; the test frames are used for nothing else. Intervals over seeds are
-Student's t.
+The best epoch is chosen on the validation frames; the test frames are used for nothing else. All seeds train on the
+same recordings, and each has test recordings of its own, so that intervals over seeds cover training and test scenes,
+but not the choice of the training scenes.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar, cast, get_type_hints
@@ -13,15 +14,16 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.experiments.splits import open_split, record_split
 from flcav.files import Json
-from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.intervals import LEVEL, MOST_SEEDS, MeanOverSeeds, mean_over_seeds, plan_seeds
 from flcav.perception.card import Card
-from flcav.perception.study import RecipeFields, StudyRecipe
+from flcav.perception.study import RecipeFields, StudyRecipe, test_seed
 from flcav.perception.task import Evaluated, Task
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps import Notify, Step, Work, run_steps
 from flcav.records import LEFT_OUT, from_json, to_json
+from flcav.verdicts import Claim
 
 EvaluationT = TypeVar("EvaluationT", bound=Evaluated)
 VALIDATION = "validation"
@@ -34,6 +36,9 @@ class SeedResult(Generic[EvaluationT]):
     seed: int
     card: Card
     tests: Mapping[str, EvaluationT]  # by name of the test
+    test_seeds: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
+        None  # of its test recordings; None: all seeds share them
+    )
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,7 @@ class Recorded:
 
     train: tuple[RecipeFields, ...]
     validation: RecipeFields
-    tests: Mapping[str, RecipeFields]  # by name
+    tests: Mapping[str, RecipeFields]  # by name; their own seeds are `SeedResult.test_seeds`
 
 
 @dataclass(frozen=True)
@@ -64,9 +69,13 @@ class StudyResult(Generic[EvaluationT]):
         return [seed.tests[test] for seed in self.seeds]
 
 
+def _never(name: str) -> bool:
+    return False
+
+
 @dataclass(frozen=True)
 class Study(Generic[EvaluationT]):
-    """A study: its task and recipe, and how its results are drawn.
+    """A study: its task and recipe, and how its results are summarised and drawn.
 
     Functions are module-level, since steps run in other processes. Fields with `compare=False` are not part of the
     steps' code: a change of what they reach makes no step stale.
@@ -76,6 +85,7 @@ class Study(Generic[EvaluationT]):
     recipe: StudyRecipe
     draw: Callable[[StudyResult[EvaluationT]], bytes] = field(compare=False)  # PNG of the results
     extra: Mapping[str, Callable[[EvaluationT, Any, Dataset], EvaluationT]] = field(default_factory=dict)  # by test
+    is_share: Callable[[str], bool] = field(default=_never, compare=False)  # whether a number, by name, lies in [0, 1]
 
     @property
     def evaluation(self) -> type[EvaluationT]:
@@ -95,7 +105,7 @@ class Study(Generic[EvaluationT]):
         """Return the evaluation of one seed's network on each test, as JSON by test."""
         network = load_network(self.task, work.inputs[_seed_step(seed)] / WEIGHTS)
         return {
-            name: self._tested(name, network, open_split(work.inputs[_test_step(name)]), work)
+            name: self._tested(name, network, open_split(work.inputs[_test_step(seed, name)]), work)
             for name in self.recipe.tests
         }
 
@@ -135,7 +145,7 @@ def run_study(
         recipe.patience,
         Recorded(recipe.train, recipe.validation, recipe.tests),
         runs,
-        {name: _means([run.tests[name].numbers() for run in runs]) for name in recipe.tests},
+        summarise(study, runs),
         provenance(),
     )
 
@@ -146,8 +156,19 @@ def results_as_json(study: Study[EvaluationT], results: StudyResult[EvaluationT]
 
 
 def results_of_json(study: Study[EvaluationT], values: Json, origin: str) -> StudyResult[EvaluationT]:
-    """Return the results that `results_as_json` wrote; raises `InputError`, naming `origin`, for other values."""
-    return from_json(_kind(study), values, origin)
+    """Return the results that `results_as_json` wrote, with means over seeds computed anew.
+
+    Raises `InputError`, naming `origin`, for other values.
+    """
+    found = from_json(_kind(study), values, origin)
+    return replace(found, summary=summarise(study, found.seeds))
+
+
+def summarise(
+    study: Study[EvaluationT], seeds: Sequence[SeedResult[EvaluationT]]
+) -> dict[str, dict[str, MeanOverSeeds]]:
+    """Return means over seeds by test, of the numbers that all seeds have."""
+    return {test: _means([seed.tests[test].numbers() for seed in seeds], study.is_share) for test in seeds[0].tests}
 
 
 def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int, str]]:
@@ -159,25 +180,48 @@ def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int
     return rows
 
 
+def describe_limits(results: StudyResult[EvaluationT], aims: Collection[Claim], effect: float) -> list[str]:
+    """Return sentences on what the findings can tell: seeds for a deviation of `effect` from an aim, shared scenes."""
+    said = []
+    widest = max(aim.mean.sd for aim in aims)
+    if widest and len(results.seeds) > 1:
+        seeds = plan_seeds(effect, widest, LEVEL / len(aims))
+        count = f"more than {MOST_SEEDS}" if seeds is None else seeds
+        said.append(f"At the largest of these standard deviations it takes {count} seeds to tell {effect} from an aim.")
+    if len(results.seeds) > 1 and any(seed.test_seeds is None for seed in results.seeds):
+        said.append("All seeds were tested on the same scenes: intervals and verdicts leave out how these vary.")
+    return said
+
+
+def list_counts(counts: Sequence[int]) -> str:
+    """Return a count as text, once where it is the same in all seeds, else one per seed."""
+    return ", ".join(map(str, counts if len(set(counts)) > 1 else counts[:1]))
+
+
 def steps_of(study: Study, seeds: Sequence[int]) -> list[Step]:
-    """Return the steps of a study: a recording per recipe, a training and a test per seed."""
+    """Return the steps of a study: recordings to train on, and a training, test recordings and a test per seed."""
     recipe = study.recipe
     recipes = dict(zip(_training_steps(study), recipe.train, strict=True)) | {VALIDATION: recipe.validation}
-    tests = {_test_step(name): fields for name, fields in recipe.tests.items()}
-    steps = [Step(name, record_split, {"recipe": fields}) for name, fields in {**recipes, **tests}.items()]
+    steps = [_recording(name, fields) for name, fields in recipes.items()]
     trained = {"network": recipe.network, "epochs": recipe.epochs, "patience": recipe.patience}
     for seed in seeds:
+        tests = {_test_step(seed, name): fields for name, fields in recipe.tests_of(seed).items()}
+        steps += [_recording(name, fields) for name, fields in tests.items()]
         steps.append(Step(_seed_step(seed), study.learn, {"seed": seed, **trained}, tuple(recipes)))
         steps.append(Step(_tested_step(seed), study.test, {"seed": seed}, (_seed_step(seed), *tests)))
     return steps
+
+
+def _recording(name: str, recipe: RecipeFields) -> Step:
+    return Step(name, record_split, {"recipe": recipe})
 
 
 def _training_steps(study: Study) -> list[str]:
     return [f"train-{number}" for number in range(len(study.recipe.train))]
 
 
-def _test_step(name: str) -> str:
-    return f"test-{name}"
+def _test_step(seed: int, name: str) -> str:
+    return f"seed-{seed}-test-{name}"
 
 
 def _seed_step(seed: int) -> str:
@@ -191,12 +235,13 @@ def _tested_step(seed: int) -> str:
 def _seed_result(study: Study[EvaluationT], seed: int, values: Mapping[str, Any]) -> SeedResult[EvaluationT]:
     tests = values[_tested_step(seed)]
     evaluations = {name: study.evaluation.from_json(tests[name], f"test on {name}") for name in study.recipe.tests}
-    return SeedResult(seed, Card.model_validate(values[_seed_step(seed)]), evaluations)
+    recorded = {name: test_seed(fields, seed) for name, fields in study.recipe.tests.items()}
+    return SeedResult(seed, Card.model_validate(values[_seed_step(seed)]), evaluations, recorded)
 
 
-def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, MeanOverSeeds]:
-    """Return means over seeds of the numbers that all seeds have."""
-    return {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
+def _means(rows: Sequence[Mapping[str, float]], is_share: Callable[[str], bool]) -> dict[str, MeanOverSeeds]:
+    common = [name for name in rows[0] if all(name in row for row in rows)]
+    return {name: mean_over_seeds([row[name] for row in rows], share=is_share(name)) for name in common}
 
 
 def _kind(study: Study[EvaluationT]) -> type[StudyResult[EvaluationT]]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flcav.experiments.studies.run import SeedResult, Study, StudyResult
+from flcav.experiments.studies.run import SeedResult, Study, StudyResult, describe_limits
 from flcav.intervals import MeanOverSeeds
 from flcav.markdown import format_bullets, format_table
 from flcav.perception.trajectory import study
@@ -12,9 +12,10 @@ from flcav.perception.trajectory.evaluate import ALL, PathErrors, TrajectoryEval
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.report import style
 from flcav.report.charts.studies import Bar, path_errors
-from flcav.verdicts import describe_aim
+from flcav.verdicts import Claim, describe_aims
 
 WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # aims: largest ratio to constant velocity's final error
+EFFECT = 0.05  # deviation from an aim that the study is to tell
 SLICE = "at junctions"
 PREDICTORS = {
     "single path": ("single_ADE", "single_FDE", "miss_rate_single"),
@@ -27,11 +28,7 @@ PREDICTORS = {
 def tables(results: StudyResult[TrajectoryEvaluation]) -> dict[str, str]:
     """Return Markdown by name: findings (a list), errors, training."""
     return {
-        "findings": format_bullets(
-            _finding(wanted, test, means, len(results.seeds))
-            for test, means in results.summary.items()
-            for wanted in WANTED[results.network]
-        ),
+        "findings": format_bullets(_findings(results)),
         "errors": format_table(
             (
                 "test",
@@ -57,12 +54,16 @@ def tables(results: StudyResult[TrajectoryEvaluation]) -> dict[str, str]:
     }
 
 
-def _finding(wanted: float, test: str, means: Mapping[str, MeanOverSeeds], seeds: int) -> str:
-    ratio = means[f"{SLICE}, ratio_single"]
-    aim = f"A final error of {wanted} times constant velocity's at junctions, {test}"
-    said = describe_aim(aim, wanted, ratio, seeds, at_most=True)
-    best, plain = (means[f"{SLICE}, {key}"].mean for key in ("minFDE_K", "constant_velocity_FDE"))
-    return f"{said}. Of six modes the best ends {best:.2f} m off, constant velocity {plain:.2f} m."
+def _findings(results: StudyResult[TrajectoryEvaluation]) -> list[str]:
+    aims, ends = {}, []
+    for test, means in results.summary.items():
+        best, plain = (means[f"{SLICE}, {key}"].mean for key in ("minFDE_K", "constant_velocity_FDE"))
+        for wanted in WANTED[results.network]:
+            aim = f"A final error of {wanted} times constant velocity's at junctions, {test}"
+            aims[aim] = Claim(means[f"{SLICE}, ratio_single"], wanted, at_most=True)
+            ends.append(f"Of six modes the best ends {best:.2f} m off, constant velocity {plain:.2f} m.")
+    said = [f"{aim} {end}" for aim, end in zip(describe_aims(aims), ends, strict=True)]
+    return [*said, *describe_limits(results, aims.values(), EFFECT)]
 
 
 def _errors(test: str, means: Mapping[str, MeanOverSeeds]) -> list[list[str]]:
@@ -72,7 +73,7 @@ def _errors(test: str, means: Mapping[str, MeanOverSeeds]) -> list[list[str]]:
         for who, (ade, fde, missed) in PREDICTORS.items():
             average, final, misses = (means[f"{name}, {key}"] for key in (ade, fde, missed))
             share = final.mean / means[f"{name}, constant_velocity_FDE"].mean
-            shown = final.describe() if final.high > final.low else f"{final.mean:.3f}"
+            shown = final.describe() if final.sd else f"{final.mean:.3f}"
             numbers = [f"{average.mean:.2f}", shown, f"{misses.mean:.1%}", f"{share:.2f}"]
             rows.append([test, f"{name} ({count})", who, *numbers])
     return rows
@@ -110,5 +111,9 @@ def _bar(name: str, seeds: Sequence[float | None]) -> Bar:
     return Bar(name, float(np.mean(known)), tuple(known))
 
 
-STUDY = Study(TRAJECTORY, TRAJECTORY.study(), draw=_draw)
-CAMERAS = Study(TRAJECTORY, study.CAMERAS, draw=_draw)
+def _is_share(name: str) -> bool:
+    return "miss_rate" in name
+
+
+STUDY = Study(TRAJECTORY, TRAJECTORY.study(), draw=_draw, is_share=_is_share)
+CAMERAS = Study(TRAJECTORY, study.CAMERAS, draw=_draw, is_share=_is_share)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from flcav.dataset.store import Dataset
-from flcav.experiments.studies.run import Study, StudyResult
+from flcav.experiments.studies.run import Study, StudyResult, describe_limits, list_counts
 from flcav.intervals import Estimate
 from flcav.markdown import format_bullets, format_table
 from flcav.perception.weather.evaluate import Classification, evaluate_whole_space
@@ -14,9 +14,10 @@ from flcav.perception.weather.study import WHOLE_SPACE
 from flcav.perception.weather.task import WEATHER
 from flcav.report import style
 from flcav.report.charts.studies import confusions
-from flcav.verdicts import describe_aim
+from flcav.verdicts import Claim, describe_aims
 
 WANTED = 0.95  # aim: least accuracy
+EFFECT = 0.02  # deviation from an aim that the study is to tell
 
 
 def tables(results: StudyResult[Classification]) -> dict[str, str]:
@@ -30,13 +31,12 @@ def tables(results: StudyResult[Classification]) -> dict[str, str]:
 
 
 def _findings(results: StudyResult[Classification]) -> list[str]:
-    said = []
+    aims = {}
     for test, numbers in results.summary.items():
         for name, mean in numbers.items():
             where = "within the classes' regions" if name == "accuracy" else "by the nearest class, everywhere"
-            aim = f"Accuracy of {WANTED} on {test}, {where}"
-            said.append(describe_aim(aim, WANTED, mean, len(results.seeds)) + ".")
-    return said
+            aims[f"Accuracy of {WANTED} on {test}, {where}"] = Claim(mean, WANTED)
+    return [*describe_aims(aims), *describe_limits(results, aims.values(), EFFECT)]
 
 
 def _accuracy(results: StudyResult[Classification]) -> str:
@@ -47,7 +47,8 @@ def _accuracy(results: StudyResult[Classification]) -> str:
             each = [found if name == "accuracy" else found.nearest or found for found in tested]
             over_scenes = ", ".join(Estimate(one.accuracy, one.low, one.high).describe() for one in each)
             what = "within the regions" if name == "accuracy" else "everywhere, nearest class"
-            rows.append([test, what, each[0].pictures, each[0].scenes, mean.describe(), over_scenes])
+            counts = (list_counts([one.pictures for one in each]), list_counts([one.scenes for one in each]))
+            rows.append([test, what, *counts, mean.describe(), over_scenes])
     header = ("test", "pictures", "number", "scenes", "accuracy, over seeds", "each seed, over its scenes")
     return format_table(header, rows)
 
@@ -87,4 +88,8 @@ def _draw(results: StudyResult[Classification]) -> bytes:
     return style.png(confusions(counts, next(iter(shown.values()))[0].classes))
 
 
-STUDY = Study(WEATHER, WEATHER.study(), draw=_draw, extra={WHOLE_SPACE: add_nearest})
+def _is_share(name: str) -> bool:
+    return True  # accuracies
+
+
+STUDY = Study(WEATHER, WEATHER.study(), draw=_draw, extra={WHOLE_SPACE: add_nearest}, is_share=_is_share)

@@ -6,7 +6,8 @@ The sweeps are those of recipes/objects.yaml, in every town.
 from flcav.perception.study import StudyRecipe, read_recipe
 
 RECIPE = read_recipe("objects")
-SEQUENCES = {**RECIPE, "spins_per_scene": 30, "every_s": 0.5, "cavs": 1}
+TESTED = {**RECIPE, "split": "test", "scenes": 10, "spins_per_scene": 4}
+SEQUENCES = {**TESTED, "spins_per_scene": 20, "every_s": 0.5, "cavs": 1}
 TOWNS = ("suburb", "ring", "grid")
 CHANGING = {"classes": ["clear", "light_rain", "heavy_rain", "fog"], "turn_s": 4.0}
 WEATHERS = "weathers"
@@ -17,9 +18,9 @@ STUDY = StudyRecipe(
     train=tuple({**RECIPE, "town": town} for town in TOWNS),
     validation={**RECIPE, "town": "suburb", "seed": 121, "split": "validation", "scenes": 2},
     tests={
-        **{town: {**RECIPE, "town": town, "seed": 431, "split": "test", "scenes": 6} for town in TOWNS},
-        WEATHERS: {**RECIPE, "town": "suburb", "seed": 531, "split": "test", "scenes": 4, "weather": CHANGING},
-        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 631, "split": "test", "scenes": 3},
+        **{town: {**TESTED, "town": town, "seed": 431} for town in TOWNS},
+        WEATHERS: {**TESTED, "town": "suburb", "seed": 531, "weather": CHANGING},
+        TRACKS: {**SEQUENCES, "town": "suburb", "seed": 631},
     },
     epochs=8,
     patience=8,

@@ -15,7 +15,7 @@ STUDY = StudyRecipe(
     validation={**ARTERIAL, "seed": 114, "split": "validation", "scenes": 6},
     tests={
         "held-out scenes": {**ARTERIAL, "seed": 414, "split": "test", "scenes": 12},
-        "held-out town": {**RING, "seed": 514, "split": "test", "scenes": 6},
+        "held-out town": {**RING, "seed": 514, "split": "test", "scenes": 10},
     },
     epochs=15,
     patience=15,

@@ -136,10 +136,13 @@ def draw_arms(axes: Axes, town: str, rows: Mapping[str, MeanOverSeeds]) -> None:
     """Draw the forest plot of a town: mean and interval of each arm, with the numbers."""
     colour = _colour(town, [town])
     for y, ap in enumerate(rows.values()):
-        axes.plot([ap.low, ap.high], [y, y], color=colour, linewidth=2)
+        said = f"{ap.mean:.3f}"
+        if ap.low is not None and ap.high is not None:
+            said += f"  ({ap.low:.3f}–{ap.high:.3f})"
+            axes.plot([ap.low, ap.high], [y, y], color=colour, linewidth=2)
         axes.plot(ap.mean, y, "s", color=colour, markersize=6)
         axes.annotate(
-            f"{ap.mean:.3f}  ({ap.low:.3f}–{ap.high:.3f})",
+            said,
             (1.0, y),
             (6, 0),
             xycoords=axes.get_yaxis_transform(),

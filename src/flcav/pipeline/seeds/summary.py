@@ -1,0 +1,81 @@
+"""Means over the seeds of a run: measures, differences and closed gaps, with intervals over seeds and scenes."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.perception.outcomes import Outcomes, Values, share_test_scenes
+from flcav.perception.tasks import task_named
+from flcav.pipeline.findings import name_stage
+from flcav.pipeline.recipe import MAIN
+from flcav.pipeline.results import OUTCOMES, Difference, Mean, Run, Summary, Test
+from flcav.verdicts import Claim, judge
+
+
+def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
+    """Return means over the seeds of a recipe; `works`: the folder of each run's steps, with the outcomes of its tests.
+
+    The claims that the run itself is better, as in its findings, are judged together. Simulated towns have traffic of
+    their own for each seed. Where seeds are tested on the same recorded scenes, the intervals include what these scenes
+    vary by; those of closed gaps do not.
+    """
+    tests = [{_key(test): test for test in run.tested} for run in runs]
+    measures = [
+        Mean(_name(first), _mean_measure([own[key] for own in tests], works)) for key, first in tests[0].items()
+    ]
+    differences = [
+        Mean(rows[0].name, _mean_difference(rows, tests, works))
+        for rows in zip(*(run.differences for run in runs), strict=True)
+    ]
+    own = [number for number, each in enumerate(runs[0].differences) if each.arm == MAIN]
+    for number, one in zip(own, judge([Claim(differences[number].estimate) for number in own]), strict=True):
+        differences[number] = replace(differences[number], judged=one)
+    closed = [Mean(name, mean_over_seeds([run.gap_closed[name] for run in runs])) for name in runs[0].gap_closed]
+    return Summary(
+        tuple(run.recipe.seed for run in runs),
+        tuple(measures),
+        tuple(differences),
+        tuple(closed),
+    )
+
+
+def mean_of_tests(
+    task: str, values: Sequence[float], tests: Sequence[Sequence[Path]], *, share: bool = False
+) -> MeanOverSeeds:
+    """Return the mean over seeds of a measure, or of the difference of two.
+
+    `tests`: for each seed the folder of the test, or of the later and the earlier one. `share`: a number in [0, 1].
+    """
+    outcomes = [[Outcomes.load(folder / OUTCOMES) for folder in own] for own in tests]
+    return mean_over_seeds(values, shared=share_test_scenes(task_named(task), outcomes, _subtract), share=share)
+
+
+def _subtract(measures: Sequence[Values]) -> Values:
+    return np.subtract(*measures) if len(measures) > 1 else measures[0]
+
+
+def _key(test: Test) -> tuple[str, str, str, str]:
+    return test.arm, test.stage, test.region, test.task
+
+
+def _name(test: Test) -> str:
+    return f"{test.region}, {test.task}: {name_stage(test.arm, test.stage)}"
+
+
+def _mean_measure(tests: Sequence[Test], works: Sequence[Path]) -> MeanOverSeeds:
+    folders = [[work / test.step] for test, work in zip(tests, works, strict=True)]
+    return mean_of_tests(tests[0].task, [test.result.estimate.mean for test in tests], folders, share=True)
+
+
+def _mean_difference(
+    rows: Sequence[Difference], tests: Sequence[dict[tuple[str, str, str, str], Test]], works: Sequence[Path]
+) -> MeanOverSeeds:
+    one, folders = rows[0], []
+    for own, work in zip(tests, works, strict=True):
+        pair = ((one.arm, one.stage), (one.before_arm, one.before_stage))
+        tested = [own.get((*each, one.region, one.task)) or own[MAIN, each[1], one.region, one.task] for each in pair]
+        folders.append([work / test.step for test in tested])
+    return mean_of_tests(one.task, [row.estimate.mean for row in rows], folders)
