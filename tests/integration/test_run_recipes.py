@@ -14,7 +14,6 @@ from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.pipeline import results
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
-from flcav.pipeline.learning_history import ORIGIN, HistoryOrigin
 from flcav.pipeline.planning import parse_history
 from flcav.pipeline.recipe import (
     CLOUD,
@@ -31,6 +30,7 @@ from flcav.pipeline.recipe import (
 )
 from flcav.pipeline.results import WEIGHTS, Difference, Pretrained, Run
 from flcav.pipeline.running import RESULTS, run
+from flcav.pipeline.seeds.learning_history import ORIGIN, HistoryOrigin
 from flcav.report.pages.run_page import page, write_report
 from flcav.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town

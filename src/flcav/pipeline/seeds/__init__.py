@@ -1,1 +1,1 @@
-"""Results over the seeds of a run: their means, and the comparison of two runs."""
+"""Several runs: means over seeds, the comparison of two runs, and runs that measure a learning history."""
