@@ -1,5 +1,6 @@
 """`flcav allocate` and `flcav fit` from files to JSON."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -141,6 +142,39 @@ def test_fit_on_the_articles_points_prints_its_curves_bands_and_warnings(capsys)
         assert "9000 samples (measured up to 2500)" in curve["asked"][0]["warning"]
     assert called("fit", ARTICLE, "--model", "effective", "--repeats", "20") == 0
     assert "signs" in capsys.readouterr().out
+
+
+def federated_history() -> str:
+    """Return a history in which cloud rounds bring the other of two regions' samples and cost accuracy, k = 2."""
+    rows = ["samples,edge_rounds,cloud_rounds,error"]
+    for x, y, z in itertools.product((80, 320, 1280), (0, 1, 2, 4, 8), (0, 1, 2, 4)):
+        t = y + 2 * z
+        n = 0.1 * x + 0.3 * (500 * t / (t + 1) + 0.6 * 500 * z / (z + 1))
+        rows.append(f"{x},{y},{z},{1.2 * n**-0.4 + 0.03 * z / (z + 1):.8f}")
+    return "\n".join(rows) + "\n"
+
+
+def test_a_federated_curve_goes_from_a_history_through_the_problem_file_to_a_plan(tmp_path, capsys):
+    (tmp_path / "objects.csv").write_text(federated_history())
+    asked = ("fit", tmp_path / "objects.csv", "--model", "federated", "-k", "2", "--repeats", "20")
+    groups = ("--group-samples", "400", "--group-samples", "600")
+    assert called(*asked, *groups, "--json", "--problem", tmp_path / "problem.yaml") == 0
+    (curve,) = json.loads(capsys.readouterr().out)["curves"]
+    assert curve["group_samples"] == [400, 600]
+    assert [curve[name] for name in ("b", "beta", "gamma", "drift")] == pytest.approx([0.4, 0.3, 0.6, 0.03], rel=0.01)
+    text = (tmp_path / "problem.yaml").read_text()
+    filled = {"{wireless: , wireline: }": "{wireless: 4000, wireline: 4000}", "sample_mb:": "sample_mb: 1"}
+    for old, new in (filled | {"model_mb:": "model_mb: 10", "edge_groups:": "edge_groups: [4, 3]"}).items():
+        text = text.replace(old, new)
+    (tmp_path / "problem.yaml").write_text(text)
+    assert called("allocate", tmp_path / "problem.yaml", "--json") == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["status"] == "optimal"
+    assert plan["gap"] < 1e-8
+    assert called(*asked, *groups) == 0
+    assert "t rounds, z cloud" in capsys.readouterr().out
+    assert called(*asked) == 2
+    assert "--group-samples of each region" in capsys.readouterr().err
 
 
 def test_numbers_too_different_for_the_solver_are_refused_in_a_sentence(tmp_path, capsys):

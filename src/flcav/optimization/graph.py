@@ -19,10 +19,9 @@ import networkx as nx
 from pydantic import Field, model_validator
 
 from flcav.config import InputError, parse_config, read_yaml
-from flcav.optimization.curves.curves import Additive, Effective, Positive
+from flcav.optimization.curves.curves import OwnCurve, Positive
 from flcav.optimization.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
 
-OwnCurve = Annotated[Additive | Effective, Field(discriminator="model")]
 KINDS = ("task", "network", "modality", "vehicle")  # of nodes; each layer joins two neighbours of this list
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flcav.config import Config
-from flcav.optimization.curves.curves import STAGES, Additive, Curve, Effective, NonNegative, Positive, Shared
+from flcav.optimization.curves.curves import STAGES, Additive, Curve, NonNegative, OwnCurve, Positive, Shared
 
 MOST = 10**9  # largest count
 WORST = 1e6  # largest error that a curve may predict within the limits; that of a fitted curve is about 1
@@ -54,7 +54,7 @@ class Learner(NamedTuple):
 
     name: str
     weight: float
-    curve: Additive | Effective
+    curve: OwnCurve
 
 
 class Measured(Config):
@@ -116,7 +116,7 @@ class AllocationTask(Quantities):
         ranges = (limits.samples, limits.edge_rounds, limits.cloud_rounds)
         for field, curve in (("curve", self.curve), ("upper", self.upper or self.curve)):
             for each in (member.curve for member in curve.members) if isinstance(curve, Shared) else (curve,):
-                if isinstance(each, Effective) and limits.samples[0] == 0:
+                if not isinstance(each, Additive) and limits.samples[0] == 0:
                     raise ValueError(
                         f"limits.samples of task {self.name!r} must start at 1 or more: its error at 0 is infinite"
                     )

@@ -25,7 +25,7 @@ from flcav.optimization.solvers.cutting_planes import Program, continuous_optimu
 from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance
 from flcav.optimization.solvers.rounding import trim
 from flcav.optimization.solvers.separable import relax
-from flcav.optimization.solvers.weighted import list_terms, minimise_weighted_error
+from flcav.optimization.solvers.weighted import list_drifts, list_terms, minimise_weighted_error
 
 Array = NDArray[np.float64]
 
@@ -114,11 +114,14 @@ def max_throughput(problem: Problem, made: Instance) -> Array:
 
 
 def round_down_optimum(problem: Problem, made: Instance) -> Array:
-    """Return the continuous optimum rounded down (3N,), the last step of the article's allocator."""
+    """Return the continuous optimum rounded down (3N,), the last step of the article's allocator.
+
+    Where cloud rounds cost accuracy, it is that of the error's convex envelope.
+    """
     if made.effective is None:
         x = relax(made.separable).x
     else:
-        program = Program(list_terms(made), made.low, made.high, made.cost, made.budget)
+        program = Program(list_terms(made), made.low, made.high, made.cost, made.budget, list_drifts(made))
         starts = [made.low + (made.high - made.low) * share for share in np.linspace(0, 1, 6) ** 3]
         x, _, _ = continuous_optimum(program, starts, GAP)
     return trim(made, np.clip(np.floor(x + 1e-9), made.low, made.high), np.ones(len(x)))

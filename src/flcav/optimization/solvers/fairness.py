@@ -14,16 +14,15 @@ from itertools import chain, repeat
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
-from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.curves.curves import Additive, Federated, OwnCurve, drift_part
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Instance
 from flcav.optimization.solvers.rounding import fill
+from flcav.optimization.solvers.rounds import pair_rounds
 from flcav.optimization.solvers.separable import BUDGET_SLACK
 
 Array = NDArray[np.float64]
 
-MOST_CHOICES = 1_000_000  # pairs of rounds of one task
 MOST_MERGED = 4000  # partial plans kept while tasks are combined
 PROVEN = 1e-9  # of the budgets: tolerance for rounding of sums
 ROUNDING = 1e-12  # relative, of the samples needed for a level
@@ -47,7 +46,7 @@ class Choices:
     rounds: Array  # (C, 2) edge rounds, cloud rounds
     least: float  # samples
     most: float  # samples
-    curves: tuple[Additive | Effective, ...]
+    curves: tuple[OwnCurve, ...]
     k: int  # edge rounds per cloud round
     cost: Array  # (3, 2) of one sample, edge round, cloud round on each link
 
@@ -70,7 +69,8 @@ def minimise_largest_error(problem: Problem, made: Instance, gap: float) -> Fair
     more than `MOST_CHOICES` pairs of rounds.
     """
     tasks = _choices(problem, made)
-    level, bound = (max(map(_largest, tasks, x.reshape(-1, 3))) for x in (made.low, made.high))
+    level = max(map(_largest, tasks, made.low.reshape(-1, 3)))
+    bound = max(map(_least, tasks, made.high.reshape(-1, 3)))
     best, unreached = made.low, level
     while unreached - bound > 0.1 * gap * bound:
         middle = 0.5 * (unreached + bound)
@@ -180,14 +180,7 @@ def _choices(problem: Problem, made: Instance) -> list[Choices]:
     low, high, cost = made.low.reshape(-1, 3), made.high.reshape(-1, 3), made.cost.reshape(-1, 3, 2)
     found = []
     for task, least, most, unit in zip(problem.tasks, low, high, cost):
-        pairs = int(np.prod(most[1:] - least[1:] + 1))
-        if pairs > MOST_CHOICES:
-            raise InputError(
-                f"objective 'max-min' tries every pair of edge and cloud rounds, and task {task.name!r} has {pairs}: "
-                f"set limits that leave at most {MOST_CHOICES}"
-            )
-        edge, cloud = (np.arange(least[stage], most[stage] + 1) for stage in (1, 2))
-        rounds = np.stack(np.meshgrid(edge, cloud, indexing="ij"), axis=-1).reshape(-1, 2)
+        rounds = pair_rounds(least, most, "objective 'max-min'", task.name)
         curves = tuple(learner.curve for learner in task.learners)
         found.append(Choices(rounds, least[0], most[0], curves, problem.edge_rounds_per_cloud_round, unit))
     return found
@@ -197,13 +190,25 @@ def _largest(task: Choices, counts: Array) -> float:
     return max(float(curve.error(*counts, k=task.k)) for curve in task.curves)
 
 
-def _samples_for(curve: Additive | Effective, rounds: Array, k: int, level: float) -> Array:
+def _least(task: Choices, counts: Array) -> float:
+    """Return an error below which no plan brings the task, at the most of its quantities, `counts` (3,).
+
+    That is its error there, but where rounds may cost accuracy: then the least over all choices of rounds.
+    """
+    if not any(isinstance(curve, Federated) and curve.drift > 0 for curve in task.curves):
+        return _largest(task, counts)
+    (curve,) = task.curves
+    return float(curve.error(counts[0], *task.rounds.T, k=task.k).min())
+
+
+def _samples_for(curve: OwnCurve, rounds: Array, k: int, level: float) -> Array:
     """Return the fractional samples (C,) at which the error after `rounds` (C, 2) is `level`; infinite if none do."""
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        if isinstance(curve, Effective):
-            if level <= curve.floor:
-                return np.full(len(rounds), np.inf)
-            needed = ((level - curve.floor) / curve.a) ** (-1 / curve.b)
+        if not isinstance(curve, Additive):
+            left = level - curve.floor
+            if isinstance(curve, Federated):
+                left = left - drift_part(rounds[:, 1], curve.drift)
+            needed = (np.maximum(left, 0.0) / curve.a) ** (-1 / curve.b)
             return (needed - curve.effective_samples(0, rounds[:, 0], rounds[:, 1], k)) / curve.alpha
         left = level - curve.floor - curve.edge.at(rounds[:, 0]) - curve.cloud.at(rounds[:, 1])
         if curve.pretrain.a == 0:

@@ -9,9 +9,9 @@ from scipy.optimize import OptimizeResult
 
 from flcav.config import InputError, shorten
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
-from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.curves.curves import Additive
 from flcav.optimization.problem import AllocationTask, Problem
-from flcav.optimization.solvers.effective import EffectiveTasks, build_effective_tasks
+from flcav.optimization.solvers.effective import Alone, EffectiveTasks, build_effective_tasks
 from flcav.optimization.solvers.rounding import outermost
 from flcav.optimization.solvers.separable import BUDGET_SLACK, Separable, room
 
@@ -37,7 +37,7 @@ class Instance:
     """
 
     separable: Separable  # every additive curve, and all bounds, costs and budgets
-    effective: EffectiveTasks | None  # every effective-samples curve
+    effective: EffectiveTasks | None  # every curve over effective samples
     floor: float  # weighted sum of the floors
 
     @property
@@ -119,11 +119,11 @@ def build_instance(problem: Problem) -> Instance:
     """
     low, high = (np.concatenate(edge) for edge in zip(*(_range(problem, task) for task in problem.tasks)))
     rows: list[tuple[float, float, float, int]] = []
-    alone: list[tuple[int, float, Effective]] = []
+    alone: list[Alone] = []
     for number, task in enumerate(problem.tasks):
         for learner in task.learners:
-            if isinstance(learner.curve, Effective):
-                alone.append((number, learner.weight, learner.curve))
+            if not isinstance(learner.curve, Additive):
+                alone.append(Alone(number, task.name, learner.weight, learner.curve))
                 continue
             for stage, decay in enumerate(learner.curve.decays()):
                 if decay.a > 0:
@@ -136,9 +136,8 @@ def build_instance(problem: Problem) -> Instance:
     powers = Separable(a, b, x0, low, high, unit_costs(problem), budget, own)
     _refuse(powers)
     powers = replace(powers, high=np.minimum(high, low + room(powers)))
-    numbers, weights, curves = zip(*alone) if alone else ((), (), ())
     k = problem.edge_rounds_per_cloud_round
-    effective = build_effective_tasks(numbers, weights, curves, k, low, powers.high, powers.cost) if alone else None
+    effective = build_effective_tasks(alone, k, low, powers.high, powers.cost) if alone else None
     floor = sum(learner.weight * learner.curve.floor for task in problem.tasks for learner in task.learners)
     return Instance(powers, effective, floor)
 

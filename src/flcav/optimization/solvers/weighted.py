@@ -3,7 +3,8 @@
 Minimising the Lagrangian over whole quantities gives the bound. The quantities at the best multipliers, trimmed and
 filled to the budgets, are nearly optimal where tasks are many. Where they are few, quantities that no plan better than
 the best known can have are excluded (Lagrangian bound tightening), and outer approximation over the rest
-(`cutting_planes`) closes the gap. The convex terms of the error and their cuts are `PowerTerm` and `EffectiveTerm`.
+(`cutting_planes`) closes the gap. The convex terms of the error and their cuts are `PowerTerm` and `EffectiveTerm`; a
+drift that costs accuracy is concave, and tabulated as `DriftTerm`.
 """
 
 from collections.abc import Iterator
@@ -14,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from flcav.optimization.curves.curves import effective_samples
+from flcav.optimization.curves.curves import drift_part, effective_samples
 from flcav.optimization.solvers.cutting_planes import Line, Program, Term, outer_approximation
+from flcav.optimization.solvers.effective import EffectiveTasks
 from flcav.optimization.solvers.instance import Instance, require_optimum
 from flcav.optimization.solvers.rounding import fill, trim
 from flcav.optimization.solvers.separable import newton_step, relax
@@ -57,45 +59,73 @@ class PowerTerm:
 class EffectiveTerm:
     """The inverse power gain * n^(-b) of effective samples n; its cuts are tangents.
 
-    n is `effective_samples` of x[first] samples after t = x[first + 1] + k x[first + 2] rounds.
+    n = alpha s + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)), of s = x[first] samples, z = x[first + 2] cloud
+    rounds and t = x[first + 1] + k z rounds.
     """
 
     first: int
     gain: float  # weight * a
     b: float
     alpha: float
-    group: float  # beta * group_samples
+    own: float  # worth of the samples held in the own region
+    others: float  # worth of the samples held in the other regions
     k: int  # edge rounds per cloud round
 
     def value(self, x: Array) -> float:
         """Return the value of the term at x (n,)."""
         samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
-        return self.gain * self._effective(samples, edge_rounds + self.k * cloud_rounds) ** -self.b
+        return self.gain * self._effective(samples, edge_rounds + self.k * cloud_rounds, cloud_rounds) ** -self.b
 
     def lines(self, x: Array) -> list[Line]:
         """Return the tangent at x (n,)."""
         samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
         t = edge_rounds + self.k * cloud_rounds
-        per_round = self.group / (t + 1) ** 2
-        fall = self.gain * self.b * self._effective(samples, t) ** (-self.b - 1)
-        slope = -fall * np.array((self.alpha, per_round, self.k * per_round))
+        per_round = self.own / (t + 1) ** 2
+        per_cloud_round = self.k * per_round + self.others / (cloud_rounds + 1) ** 2
+        fall = self.gain * self.b * self._effective(samples, t, cloud_rounds) ** (-self.b - 1)
+        slope = -fall * np.array((self.alpha, per_round, per_cloud_round))
         index = (self.first, self.first + 1, self.first + 2)
         return [Line(index, tuple(map(float, slope)), self.value(x) - float(slope @ x[self.first : self.first + 3]))]
 
-    def _effective(self, samples: float, t: float) -> float:
-        return float(effective_samples(samples, t, self.alpha, self.group))
+    def _effective(self, samples: float, t: float, cloud_rounds: float) -> float:
+        held = effective_samples(samples, t, self.alpha, self.own)
+        return float(effective_samples(held, cloud_rounds, 1.0, self.others))
+
+
+@dataclass(frozen=True)
+class DriftTerm:
+    """The drift part of x[index] cloud rounds that cost accuracy: drift (1 - 1 / (z + 1)), concave in z."""
+
+    index: int
+    drift: float  # weight * drift, > 0
+
+    def at(self, quantity: Array) -> Array:
+        """Return the values of the term (m,) where the quantity is `quantity` (m,)."""
+        return drift_part(quantity, self.drift)
 
 
 def list_terms(instance: Instance) -> list[Term]:
-    """Return the convex terms whose sum is the weighted error above the floors."""
+    """Return the convex terms of the weighted error above the floors; with `list_drifts` they sum to it."""
     powers, effective = instance.separable, instance.effective
     of = np.arange(len(powers.a)) if powers.of is None else powers.of
     rows = zip(of.tolist(), powers.a.tolist(), powers.b.tolist(), powers.x0.tolist())
     terms: list[Term] = [PowerTerm(*row) for row in rows if row[1] > 0]
     if effective is not None:
-        columns = (effective.quantity, effective.gain, effective.b, effective.alpha, effective.group)
+        columns = (effective.quantity, effective.gain, effective.b, effective.alpha, effective.own, effective.others)
         terms += [EffectiveTerm(*row, k=effective.k) for row in zip(*(column[:, 0].tolist() for column in columns))]
+        terms += [PowerTerm(index, -drift, 1.0, 1.0) for index, drift in _drifts(effective) if drift < 0]
     return terms
+
+
+def list_drifts(instance: Instance) -> list[DriftTerm]:
+    """Return the concave terms of the weighted error: the drift of every task whose cloud rounds cost accuracy."""
+    if instance.effective is None:
+        return []
+    return [DriftTerm(index, drift) for index, drift in _drifts(instance.effective) if drift > 0]
+
+
+def _drifts(effective: EffectiveTasks) -> list[tuple[int, float]]:
+    return list(zip(effective.quantity[:, 2].tolist(), effective.drift[:, 0].tolist()))
 
 
 @dataclass(frozen=True)
@@ -187,7 +217,7 @@ def _closed(instance: Instance, best: Solution, gap: float) -> Solution:
     """Return `best` or a better plan, with its bound, by outer approximation within the tightened bounds."""
     _, bound = instance.minimise_lagrangian(best.multipliers)
     low, high = instance.tighten_bounds(best.multipliers, (best.error - bound) * (1 + 1e-9) + 1e-15)
-    program = Program(list_terms(instance), low, high, instance.cost, instance.budget)
+    program = Program(list_terms(instance), low, high, instance.cost, instance.budget, list_drifts(instance))
     starts = [np.minimum(low + step, high) for step in range(int(min((high - low).max(), 40)) + 1)]
     starts += [np.floor(low + (high - low) * share) for share in np.linspace(0, 1, 9)]
     visited, proven = outer_approximation(program, [*starts, np.clip(best.x, low, high)], gap, instance.floor)
