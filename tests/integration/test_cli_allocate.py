@@ -55,7 +55,7 @@ def test_a_graph_is_planned_down_to_its_vehicles(capsys):
     plan = json.loads(capsys.readouterr().out)
     for task in plan["tasks"]:
         assert set(task) == TASK_KEYS | {"vehicles"}
-        assert all(set(each) == {"vehicle", "samples", "rounds", "wireless_mb"} for each in task["vehicles"])
+        assert all(set(each) == {"vehicle", "samples", "rounds", "wireless_mb", "busy_s"} for each in task["vehicles"])
         assert sum(each["samples"] for each in task["vehicles"]) == task["samples"]
         assert sum(each["wireless_mb"] for each in task["vehicles"]) <= task["wireless_mb"] + 1e-6
     assert called("allocate", graph) == 0

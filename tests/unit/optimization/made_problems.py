@@ -84,12 +84,14 @@ def searched(values: dict) -> float:
         wireless = x * task["sample_mb"] + (y + k * z) * vehicles * model
         wireline = x * task["sample_mb"] + z * servers * model
         kept = z <= (1 if k == 0 else np.inf)
-        choices.append([v[kept] for v in (error, wireless, wireline)])
-    budget = values["budgets_mb"]
-    total = [np.zeros(1), np.zeros(1), np.zeros(1)]
+        busy_s = (y + k * z) * task.get("train_s", 0.0)
+        choices.append([v[kept] for v in (error, wireless, wireline, busy_s)])
+    budget, horizon_s = values["budgets_mb"], values.get("horizon_s", np.inf)
+    total = [np.zeros(1)] * 4
     for choice in choices:
         merge = np.maximum if largest else np.add
-        total = [f.outer(t, v).ravel() for f, t, v in zip((merge, np.add, np.add), total, choice)]
-        fits = (total[1] <= budget["wireless"] + 1e-9) & (total[2] <= budget["wireline"] + 1e-9)
+        total = [f.outer(t, v).ravel() for f, t, v in zip((merge, *[np.add] * 3), total, choice)]
+        fits = total[3] <= horizon_s + 1e-9
+        fits &= (total[1] <= budget["wireless"] + 1e-9) & (total[2] <= budget["wireline"] + 1e-9)
         total = [v[fits] for v in total]
     return float(total[0].min())

@@ -102,7 +102,7 @@ def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
     for name in ("used_mb", "marginal_error_per_gb"):
         if name in values:
             values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
-    return _given(values, "note", "warnings")
+    return _given(values, "busy_s", "note", "warnings")
 
 
 def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
@@ -125,6 +125,8 @@ def _show(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> N
             saved = f"{each.saved:.3g}" if each.saved else "nothing"
             budget = f"{each.added:.0%} more ({each.added_mb:.6g} MB)"
             console.print(f"  {budget}, solved anew: {verb} {saved} ({_proven(each.gap)})")
+    if plan.busy_s is not None:
+        console.print(f"time: {plan.busy_s:.1f} of {problem.horizon_s:.6g} s on the busiest vehicle")
     for sentence in filter(None, (plan.note, *plan.warnings)):
         console.print(sentence)
 

@@ -65,8 +65,8 @@ class Program:
     terms: Sequence[Term]
     low: Array  # (n,) least of each quantity
     high: Array  # (n,) most of each quantity
-    cost: Array  # (n, 2) of one unit on each link
-    budget: Array  # (2,) of each link
+    cost: Array  # (n, L) of one unit under each budget
+    budget: Array  # (L,)
     concave: Sequence[Concave] = ()
 
     def value(self, x: Array) -> float:
@@ -155,14 +155,14 @@ class Cuts:
 
         Its rows are the budgets, scaled to 1, then slope . x - term <= -value for every cut.
         """
-        program, n = self.program, len(self.program.low)
-        link, quantity = np.repeat((0, 1), n), np.tile(np.arange(n), 2)
-        rows, columns, values = [*link], [*quantity], [*(program.cost / program.budget).T.ravel()]
-        for row, (number, line) in enumerate(self._lines, start=2):
+        program, n, budgets = self.program, len(self.program.low), len(self.program.budget)
+        budget, quantity = np.repeat(np.arange(budgets), n), np.tile(np.arange(n), budgets)
+        rows, columns, values = [*budget], [*quantity], [*(program.cost / program.budget).T.ravel()]
+        for row, (number, line) in enumerate(self._lines, start=budgets):
             rows += [row] * (len(line.of) + 1)
             columns += [*line.of, n + number]
             values += [*(self._scale * slope for slope in line.slope), -1.0]
-        limit = np.r_[1.0, 1.0, [-self._scale * line.value for _, line in self._lines]]
+        limit = np.r_[np.ones(budgets), [-self._scale * line.value for _, line in self._lines]]
         return coo_array((values, (rows, columns)), shape=(len(limit), len(self._low()))).tocsr(), limit
 
 

@@ -37,9 +37,9 @@ class EffectiveTasks:
     k: int  # edge rounds per cloud round
     least: Array  # (E, 1) samples
     most: Array  # (E, 1) samples
-    sample_cost: Array  # (E, 2) per link
+    sample_cost: Array  # (E, L) under each budget
     rounds: Array  # (E, T, 2) edge rounds, cloud rounds
-    rounds_cost: Array  # (E, T, 2) per link
+    rounds_cost: Array  # (E, T, L) under each budget
 
     def error(self, x: Array) -> Array:
         """Return the weighted errors (E,) above their floors at x (n,) of the whole problem."""
@@ -47,7 +47,7 @@ class EffectiveTasks:
         return self._error(own[..., 0], own[..., 1:])[:, 0]
 
     def minimise_lagrangian(self, multipliers: Array) -> tuple[Array, Array]:
-        """Return the whole quantities (E, 3) of least error plus price at `multipliers` (2,), and the minima (E,)."""
+        """Return the whole quantities (E, 3) of least error plus price at `multipliers` (L,), and the minima (E,)."""
         samples, value = self._best_samples(multipliers)
         best = np.argmin(value, axis=1)
         task = np.arange(len(best))
@@ -57,7 +57,7 @@ class EffectiveTasks:
     def tighten_bounds(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
         """Return least and most quantities, (E, 3) each, of the choices within `slack` of a task's least Lagrangian.
 
-        The Lagrangian is error plus price at `multipliers` (2,).
+        The Lagrangian is error plus price at `multipliers` (L,).
         """
         samples, value = self._best_samples(multipliers)
         limit = value.min(axis=1, keepdims=True) + slack
@@ -115,14 +115,14 @@ class Alone:
 def build_effective_tasks(tasks: Sequence[Alone], k: int, low: Array, high: Array, cost: Array) -> EffectiveTasks:
     """Return the `tasks` in arrays, with their choices of rounds.
 
-    The problem has N tasks with bounds `low` and `high` (3N,) and `cost` (3N, 2), and `k` edge rounds per cloud round.
+    The problem has N tasks with bounds `low` and `high` (3N,) and `cost` (3N, L), and `k` edge rounds per cloud round.
     Raises `InputError` where a `Federated` curve has more pairs of rounds than can be tried.
     """
     numbers = [task.number for task in tasks]
     quantity = 3 * np.array(numbers)[:, None] + np.arange(3)
     choices = [_choices(task, low[q], high[q], k) for task, q in zip(tasks, quantity)]
     rounds = np.zeros((len(numbers), max(map(len, choices)), 2))
-    rounds_cost = np.full(rounds.shape, np.inf)
+    rounds_cost = np.full((*rounds.shape[:2], cost.shape[1]), np.inf)
     for row, (pairs, q) in enumerate(zip(choices, quantity)):
         rounds[row, : len(pairs)] = pairs
         rounds_cost[row, : len(pairs)] = pairs @ cost[q[1:]]

@@ -135,8 +135,8 @@ class Solution:
     x: Array  # (n,)
     error: float  # above the floors
     bound: float  # above the floors: no whole plan within the budgets has less
-    multipliers: Array  # (2,) at which the bound is proven
-    rates: Array  # (2,) decrease of the error per MB more of each link, of the continuous or dual problem
+    multipliers: Array  # (L,) at which the bound is proven
+    rates: Array  # (L,) decrease of the error per unit more of each budget, of the continuous or dual problem
 
     def gap(self, floor: float) -> float:
         """Return the relative gap (error - bound) / bound, with `floor` added to both; for a bound of 0, 0 or 1."""
@@ -151,7 +151,8 @@ def minimise_weighted_error(instance: Instance, gap: float) -> Solution:
 
     Raises `InputError` where HiGHS fails.
     """
-    best = Solution(instance.low, instance.error(instance.low), -np.inf, np.zeros(2), np.zeros(2))
+    none = np.zeros(len(instance.budget))
+    best = Solution(instance.low, instance.error(instance.low), -np.inf, none, none)
     bound_at = best.multipliers
     for number, (multipliers, bound) in enumerate(_multipliers(instance, gap)):
         x, proven = instance.minimise_lagrangian(multipliers)
@@ -172,11 +173,11 @@ def minimise_weighted_error(instance: Instance, gap: float) -> Solution:
 
 
 def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
-    """Yield multipliers (2,) near the dual optimum, each with a lower bound known there (-inf: none).
+    """Yield multipliers (L,) near the dual optimum, each with a lower bound known there (-inf: none).
 
-    The first are those of the continuous optimum, except where a curve is over effective samples.
+    The first are those of the continuous optimum, except where a curve is over effective samples or time is limited.
     """
-    if instance.effective is not None:
+    if instance.effective is not None or len(instance.budget) > 2:
         yield from _planes(instance, gap)
         return
     problem = instance.separable
@@ -197,6 +198,7 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
     """Yield the best multipliers, with their bounds, of Kelley's cutting-plane method on the dual over whole plans."""
     left = instance.budget - instance.low @ instance.cost
     largest = instance.error(instance.low) / np.maximum(left, 1e-9 * instance.budget)
+    aim = np.r_[-1.0, np.zeros(len(largest))]
     rows, values, proven = [], [], []
     multipliers = [0.01 * largest]
     for _ in range(PLANES):
@@ -204,7 +206,7 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
         proven.append(bound)
         rows.append(np.r_[1.0, (instance.budget - x @ instance.cost) * largest])
         values.append(instance.error(x))
-        model = linprog([-1.0, 0, 0], A_ub=np.array(rows), b_ub=values, bounds=[(None, None), (0, 1), (0, 1)])
+        model = linprog(aim, A_ub=np.array(rows), b_ub=values, bounds=[(None, None), *[(0, 1)] * len(largest)])
         weights = require_optimum(model)[1:]
         if -model.fun - max(proven) <= 0.02 * gap * (max(proven) + instance.floor):
             break
