@@ -125,6 +125,7 @@ def calls() -> list[Call]:
         ),
         *(Call(f"allocate {name} --json", (name,), 0.1) for name in ("problem.yaml", "graph.yaml", "graph.json")),
         Call("allocate problem.yaml --progress progress.yaml", ("problem.yaml", "progress.yaml"), 0.08),
+        Call("replan problem.yaml progress.yaml --json", ("problem.yaml", "progress.yaml"), 0.08),
         Call("allocate graph.yaml --out OUT.html", ("graph.yaml",), 0.25),
         *(
             Call(f"allocate problem.yaml --baseline {name} --json", ("problem.yaml",), 0.09)

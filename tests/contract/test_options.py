@@ -75,6 +75,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         **RUNS,
     },
     "allocate": {"--baseline": ALWAYS, "--progress": ALWAYS},
+    "replan": {"--baseline": ALWAYS},
     "place": {
         "--errors": ALWAYS,
         "--poles": ALWAYS,

@@ -205,9 +205,31 @@ def test_a_plan_goes_on_from_progress(tmp_path, capsys):
     progress = {"tasks": {"objects": {"samples": 700, "edge_rounds": 1, "accuracy": 0.5}}}
     (tmp_path / "progress.yaml").write_text(yaml.safe_dump(progress))
     assert called("allocate", RECIPES[0], "--progress", tmp_path / "progress.yaml", "--json") == 0
-    (task,) = json.loads(capsys.readouterr().out)["tasks"]
+    plan = json.loads(capsys.readouterr().out)
+    (task,) = plan["tasks"]
     assert task["samples"] == 700
     assert task["edge_rounds"] >= 1
+    assert called("replan", RECIPES[0], tmp_path / "progress.yaml", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == plan
+
+
+def test_time_to_train_is_kept_and_said(tmp_path, capsys):
+    values = yaml.safe_load(RECIPES[0].read_text()) | {"horizon_s": 100}
+    limits = {"samples": [100, 400], "edge_rounds": [0, 6], "cloud_rounds": [0, 2]}
+    values["tasks"][0] |= {"train_s": 30, "limits": limits}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))
+    assert called("allocate", tmp_path / "problem.yaml", "--json", "--out", tmp_path / "plan.html") == 0
+    plan = json.loads(capsys.readouterr().out)
+    (task,) = plan["tasks"]
+    assert plan["busy_s"] == 30 * (task["edge_rounds"] + task["cloud_rounds"]) == 90
+    assert called("allocate", tmp_path / "problem.yaml") == 0
+    assert "time: 90.0 of 100 s on the busiest vehicle" in capsys.readouterr().out
+    values["tasks"][0]["vehicle_train_s"] = {f"car {i}": 20 + 5 * i for i in range(7)}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))
+    assert called("allocate", tmp_path / "problem.yaml", "--json", "--out", tmp_path / "named.html") == 0
+    named = json.loads(capsys.readouterr().out)
+    assert all(each["busy_s"] <= 100 for each in named["tasks"][0]["vehicles"])
+    assert "within the 100 s that vehicles may be busy" in (tmp_path / "named.html").read_text()
 
 
 def test_the_area_says_that_it_has_no_certificate(tmp_path, capsys):
