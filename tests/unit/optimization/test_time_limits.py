@@ -1,5 +1,6 @@
 """Plans within the time in which vehicles train and send, against trying every plan."""
 
+import contextlib
 import itertools
 from typing import Any
 
@@ -10,11 +11,12 @@ from hypothesis import strategies as st
 from made_problems import SMALL, parsed, searched, written
 from test_fleet import best_carried, fleet, problem
 
-from flcav.optimization.allocation.allocate import allocate
+from flcav.optimization.allocation.allocate import TaskPlan, allocate
 from flcav.optimization.allocation.baselines import BASELINES, baseline
 from flcav.optimization.allocation.budget_sweep import compute_savings
 from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.allocation.replanning import PlanState, condition_problem
+from flcav.optimization.allocation.vehicles import split_plan
 from flcav.optimization.solvers.fairness import find_undominated
 from flcav.optimization.solvers.instance import Infeasible
 
@@ -126,6 +128,27 @@ def test_named_vehicles_come_near_the_best_of_all_plans(seed: int, linked: bool)
     }
     assert plan.busy_s == pytest.approx(max(busy_s.values()))
     assert max(busy_s.values()) <= (asked.horizon_s or 0) * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounds_hold_for_fleets_that_train_one_task_fast_and_another_slowly(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    limits = {"samples": [1, 2], "edge_rounds": [0, 3], "cloud_rounds": [0, 0]}
+    slow = [{f"cav{i}": float(rng.choice([1.0, 12.0])) for i in range(3)} for _ in range(2)]
+    asked = problem(
+        [{"vehicle_train_s": each, "limits": limits} for each in slow], horizon_s=float(rng.uniform(12, 30))
+    )
+    plan, _ = allocate_fleet(asked)
+    errors = []
+    for counts in itertools.product(itertools.product((1, 2), range(4)), repeat=2):
+        errors_of = [float(task.curve.error(*own, 0)) for task, own in zip(asked.tasks, counts)]
+        plans = [TaskPlan(task.name, *own, 0, 0.0, 0.0, 0.0) for task, own in zip(asked.tasks, counts)]
+        with contextlib.suppress(Infeasible):
+            split_plan(asked, plans)
+            errors.append(sum(errors_of))
+    assert plan.lower_bound is not None
+    assert plan.lower_bound <= min(errors) * (1 + 1e-9)
+    assert min(errors) * (1 - 1e-9) <= plan.objective <= min(errors) * 1.1
 
 
 def test_training_time_that_limits_a_named_fleet_is_said() -> None:
