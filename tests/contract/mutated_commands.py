@@ -118,8 +118,14 @@ def calls() -> list[Call]:
             0.03,
         ),
         Call("fit joint.csv --repeats 20 --model effective --group-samples #700", ("joint.csv",), 0.03),
+        Call(
+            "fit joint.csv --json --repeats 20 --model federated --group-samples #700 --group-samples #300",
+            ("joint.csv",),
+            0.03,
+        ),
         *(Call(f"allocate {name} --json", (name,), 0.1) for name in ("problem.yaml", "graph.yaml", "graph.json")),
         Call("allocate problem.yaml --progress progress.yaml", ("problem.yaml", "progress.yaml"), 0.08),
+        Call("replan problem.yaml progress.yaml --json", ("problem.yaml", "progress.yaml"), 0.08),
         Call("allocate graph.yaml --out OUT.html", ("graph.yaml",), 0.25),
         *(
             Call(f"allocate problem.yaml --baseline {name} --json", ("problem.yaml",), 0.09)

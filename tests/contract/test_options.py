@@ -32,7 +32,7 @@ CHOICES: dict[str, dict[str, str]] = {
     "errors": {
         task: f"{task} --data none --out errors.csv" for task in TASKS if isinstance(task_named(task), RegistersErrors)
     },
-    "fit": {model: f"none --model {model}" for model in ("additive", "effective")},
+    "fit": {model: f"none --model {model}" for model in ("additive", "effective", "federated")},
     "reproduce": {target: f"{target} --out out" for target in TARGETS},
 }
 RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads", "--device"), ALWAYS)
@@ -75,6 +75,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         **RUNS,
     },
     "allocate": {"--baseline": ALWAYS, "--progress": ALWAYS},
+    "replan": {"--baseline": ALWAYS},
     "place": {
         "--errors": ALWAYS,
         "--poles": ALWAYS,
@@ -86,7 +87,9 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     },
     "fit": {
         **dict.fromkeys(("--model", "--at", "--problem", "--level", "--repeats", "--seed"), ALWAYS),
-        **dict.fromkeys(("--group-samples", "--alpha", "--beta", "--edge-rounds-per-cloud-round"), ("effective",)),
+        **dict.fromkeys(
+            ("--group-samples", "--alpha", "--beta", "--edge-rounds-per-cloud-round"), ("effective", "federated")
+        ),
     },
     "reproduce": {
         **dict.fromkeys(("--seeds", "--scale"), STUDIES),
@@ -148,8 +151,9 @@ def test_no_number_that_is_none_passes(name: str) -> None:
     command = app_commands()[name]
     for option in command.params:
         if isinstance(option.type, click.types.FloatParamType | click.FloatRange) and (name, option.name) not in LATER:
+            value = ["nan"] if isinstance(option, click.Option) and option.multiple else "nan"
             with pytest.raises(InputError, match=f"{option.opts[0]} nan: a finite number"):
-                option.process_value(click.Context(command), "nan")
+                option.process_value(click.Context(command), value)
 
 
 def said(capsys: pytest.CaptureFixture[str], command: str, choice: str, option: str) -> str:

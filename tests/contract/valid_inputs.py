@@ -63,10 +63,13 @@ PROBLEM: dict[str, Any] = {
             **{"limits": LIMITS, "curve": CURVE, "upper": UPPER, "measured": {"samples": 300}},
             "uplink_mbps": {f"car{i}": {"wireless": 8.0 + i, "wireline": 50.0} for i in range(3)},
             "samples_held": {"car0": 200},
+            "train_s": 20.0,
+            "vehicle_train_s": {"car2": 30.0},
             "data_quality": {"car1": 0.8},
         },
         {
             **{"name": "signs", "weight": 0.4, "sample_mb": 0.5, "model_mb": 3.0, "edge_groups": [3], "limits": LIMITS},
+            "train_s": 10.0,
             "curve": {
                 **{"model": "effective", "floor": 0.0, "a": 8.0, "b": 0.6},
                 **{"alpha": 0.1, "beta": 0.5, "group_samples": 700},

@@ -1,5 +1,6 @@
 """`flcav allocate` and `flcav fit` from files to JSON."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -54,7 +55,7 @@ def test_a_graph_is_planned_down_to_its_vehicles(capsys):
     plan = json.loads(capsys.readouterr().out)
     for task in plan["tasks"]:
         assert set(task) == TASK_KEYS | {"vehicles"}
-        assert all(set(each) == {"vehicle", "samples", "rounds", "wireless_mb"} for each in task["vehicles"])
+        assert all(set(each) == {"vehicle", "samples", "rounds", "wireless_mb", "busy_s"} for each in task["vehicles"])
         assert sum(each["samples"] for each in task["vehicles"]) == task["samples"]
         assert sum(each["wireless_mb"] for each in task["vehicles"]) <= task["wireless_mb"] + 1e-6
     assert called("allocate", graph) == 0
@@ -143,6 +144,39 @@ def test_fit_on_the_articles_points_prints_its_curves_bands_and_warnings(capsys)
     assert "signs" in capsys.readouterr().out
 
 
+def federated_history() -> str:
+    """Return a history in which cloud rounds bring the other of two regions' samples and cost accuracy, k = 2."""
+    rows = ["samples,edge_rounds,cloud_rounds,error"]
+    for x, y, z in itertools.product((80, 320, 1280), (0, 1, 2, 4, 8), (0, 1, 2, 4)):
+        t = y + 2 * z
+        n = 0.1 * x + 0.3 * (500 * t / (t + 1) + 0.6 * 500 * z / (z + 1))
+        rows.append(f"{x},{y},{z},{1.2 * n**-0.4 + 0.03 * z / (z + 1):.8f}")
+    return "\n".join(rows) + "\n"
+
+
+def test_a_federated_curve_goes_from_a_history_through_the_problem_file_to_a_plan(tmp_path, capsys):
+    (tmp_path / "objects.csv").write_text(federated_history())
+    asked = ("fit", tmp_path / "objects.csv", "--model", "federated", "-k", "2", "--repeats", "20")
+    groups = ("--group-samples", "400", "--group-samples", "600")
+    assert called(*asked, *groups, "--json", "--problem", tmp_path / "problem.yaml") == 0
+    (curve,) = json.loads(capsys.readouterr().out)["curves"]
+    assert curve["group_samples"] == [400, 600]
+    assert [curve[name] for name in ("b", "beta", "gamma", "drift")] == pytest.approx([0.4, 0.3, 0.6, 0.03], rel=0.01)
+    text = (tmp_path / "problem.yaml").read_text()
+    filled = {"{wireless: , wireline: }": "{wireless: 4000, wireline: 4000}", "sample_mb:": "sample_mb: 1"}
+    for old, new in (filled | {"model_mb:": "model_mb: 10", "edge_groups:": "edge_groups: [4, 3]"}).items():
+        text = text.replace(old, new)
+    (tmp_path / "problem.yaml").write_text(text)
+    assert called("allocate", tmp_path / "problem.yaml", "--json") == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["status"] == "optimal"
+    assert plan["gap"] < 1e-8
+    assert called(*asked, *groups) == 0
+    assert "t rounds, z cloud" in capsys.readouterr().out
+    assert called(*asked) == 2
+    assert "--group-samples of each region" in capsys.readouterr().err
+
+
 def test_numbers_too_different_for_the_solver_are_refused_in_a_sentence(tmp_path, capsys):
     limits = {name: [0, 9] for name in ("edge_rounds", "cloud_rounds")} | {"samples": [40, 400]}
     shared = {"model_mb": 5.0, "limits": limits, "edge_groups": [3]}
@@ -171,9 +205,31 @@ def test_a_plan_goes_on_from_progress(tmp_path, capsys):
     progress = {"tasks": {"objects": {"samples": 700, "edge_rounds": 1, "accuracy": 0.5}}}
     (tmp_path / "progress.yaml").write_text(yaml.safe_dump(progress))
     assert called("allocate", RECIPES[0], "--progress", tmp_path / "progress.yaml", "--json") == 0
-    (task,) = json.loads(capsys.readouterr().out)["tasks"]
+    plan = json.loads(capsys.readouterr().out)
+    (task,) = plan["tasks"]
     assert task["samples"] == 700
     assert task["edge_rounds"] >= 1
+    assert called("replan", RECIPES[0], tmp_path / "progress.yaml", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == plan
+
+
+def test_time_to_train_is_kept_and_said(tmp_path, capsys):
+    values = yaml.safe_load(RECIPES[0].read_text()) | {"horizon_s": 100}
+    limits = {"samples": [100, 400], "edge_rounds": [0, 6], "cloud_rounds": [0, 2]}
+    values["tasks"][0] |= {"train_s": 30, "limits": limits}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))
+    assert called("allocate", tmp_path / "problem.yaml", "--json", "--out", tmp_path / "plan.html") == 0
+    plan = json.loads(capsys.readouterr().out)
+    (task,) = plan["tasks"]
+    assert plan["busy_s"] == 30 * (task["edge_rounds"] + task["cloud_rounds"]) == 90
+    assert called("allocate", tmp_path / "problem.yaml") == 0
+    assert "time: 90.0 of 100 s on the busiest vehicle" in capsys.readouterr().out
+    values["tasks"][0]["vehicle_train_s"] = {f"car {i}": 20 + 5 * i for i in range(7)}
+    (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))
+    assert called("allocate", tmp_path / "problem.yaml", "--json", "--out", tmp_path / "named.html") == 0
+    named = json.loads(capsys.readouterr().out)
+    assert all(each["busy_s"] <= 100 for each in named["tasks"][0]["vehicles"])
+    assert "within the 100 s that vehicles may be busy" in (tmp_path / "named.html").read_text()
 
 
 def test_the_area_says_that_it_has_no_certificate(tmp_path, capsys):

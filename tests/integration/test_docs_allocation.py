@@ -28,7 +28,7 @@ def test_every_command_prints_what_the_page_says(
     for name, body in FILES.items():
         Path(name).write_text(body, encoding="utf-8")
     assert [command[:2] for command, _ in COMMANDS if command[0] == "flcav"] == [
-        ["flcav", "fit"], ["flcav", "allocate"], ["flcav", "fit"],
+        ["flcav", "fit"], ["flcav", "allocate"], ["flcav", "fit"], ["flcav", "fit"],
     ]  # fmt: skip
     for command, told in COMMANDS:
         assert_same(printed(command, capsys), told, " ".join(command))

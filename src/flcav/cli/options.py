@@ -92,6 +92,13 @@ def check_finite(parameter: click.Parameter, value: float | None) -> float | Non
     return value
 
 
+def check_all_finite(parameter: click.Parameter, values: list[float]) -> list[float]:
+    """Callback of a number's option that may be given several times: as `check_finite`, of each value."""
+    for value in values:
+        check_finite(parameter, value)
+    return values
+
+
 def refuse_unused(what: str, *names: str) -> None:
     """Raise `InputError` where an option of the parameters `names` was given, which has no effect on `what`."""
     context = click.get_current_context()

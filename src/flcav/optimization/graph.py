@@ -19,10 +19,9 @@ import networkx as nx
 from pydantic import Field, model_validator
 
 from flcav.config import InputError, parse_config, read_yaml
-from flcav.optimization.curves.curves import Additive, Effective, Positive
+from flcav.optimization.curves.curves import NonNegative, OwnCurve, Positive
 from flcav.optimization.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
 
-OwnCurve = Annotated[Additive | Effective, Field(discriminator="model")]
 KINDS = ("task", "network", "modality", "vehicle")  # of nodes; each layer joins two neighbours of this list
 
 
@@ -41,6 +40,7 @@ class NetworkNode(Quantities):
     modalities: Annotated[tuple[str, ...], Field(min_length=1)]
     limits: Limits
     curve: OwnCurve | None = None
+    train_s: NonNegative = 0.0  # time that a vehicle of speed 1 trains in one round [s]
 
 
 class ModalityNode(Quantities):
@@ -61,6 +61,7 @@ class VehicleNode(Quantities):
 
     edge: str
     uplink_mbps: Uplink | None = None  # None: not known
+    speed: Positive = 1.0  # rounds that it trains while a vehicle of speed 1 trains one
     holds: Annotated[Mapping[str, Holding], Field(min_length=1)]
 
 
@@ -151,6 +152,7 @@ def extract_layers(graph: nx.Graph) -> Layers:
         networks = {
             key[1]: {
                 **{name: graph.nodes[key][name] for name in ("model_mb", "limits", "curve")},
+                "train_s": graph.nodes[key].get("train_s", 0.0),
                 "modalities": [other[1] for other in graph[key] if other[0] == "modality"],
             }
             for key in nodes["network"]
@@ -159,6 +161,7 @@ def extract_layers(graph: nx.Graph) -> Layers:
         vehicles = {
             key[1]: {
                 **{name: graph.nodes[key][name] for name in ("edge", "uplink_mbps")},
+                "speed": graph.nodes[key].get("speed", 1.0),
                 "holds": {m[1]: {name: graph.edges[m, key][name] for name in Holding.model_fields} for m in graph[key]},
             }
             for key in nodes["vehicle"]
@@ -219,8 +222,8 @@ def to_problem(graph: nx.Graph) -> Problem:
 
     A cluster's name joins those of its tasks, and its weight is the sum of theirs. A sample is one of each modality of
     its network. Its edge groups are the vehicles, by edge server, that hold all these modalities; a vehicle's number of
-    samples, and their quality, is the least over them. Vehicles are named only where all their links are known. Raises
-    `InputError` where `graph` is none that `build_graph` returns.
+    samples, and their quality, is the least over them. Vehicles are named only where all their links are known; else
+    all train as long as the slowest. Raises `InputError` where `graph` is none that `build_graph` returns.
     """
     layers = extract_layers(graph)
     tasks = []
@@ -237,7 +240,7 @@ def to_problem(graph: nx.Graph) -> Problem:
                 "sample_mb": sum(layers.modalities[modality].sample_mb for modality in network.modalities),
                 "model_mb": network.model_mb,
                 "edge_groups": [sum(each.edge == edge for each in ordered.values()) for edge in edges],
-                **_named(ordered, held),
+                **_named(ordered, held, network.train_s),
                 "limits": network.limits.model_dump(),
                 "curve": _cluster_curve(layers, name, tasks_of),
             }
@@ -260,14 +263,16 @@ def _cluster_curve(layers: Layers, network: str, tasks: Mapping[str, float]) -> 
     return {"model": "shared", "members": members}
 
 
-def _named(fleet: Mapping[str, VehicleNode], held: Mapping[str, Sequence[Holding]]) -> dict[str, Any]:
-    """Return the fields of a cluster that name its vehicles; none where a link is not known."""
+def _named(fleet: Mapping[str, VehicleNode], held: Mapping[str, Sequence[Holding]], train_s: float) -> dict[str, Any]:
+    """Return the fields of a cluster that name its vehicles; where a link is not known, only the time to train."""
     links = {key: each.uplink_mbps.model_dump() for key, each in fleet.items() if each.uplink_mbps is not None}
+    times = {key: train_s / each.speed for key, each in fleet.items()}
     if len(links) < len(fleet):
-        return {}
+        return {"train_s": max(times.values())}
     counted = {key: [each.samples for each in own if each.samples is not None] for key, own in held.items()}
     return {
         "uplink_mbps": links,
+        "vehicle_train_s": times if train_s > 0 else {},
         "samples_held": {key: min(samples) for key, samples in counted.items() if samples},
         "data_quality": {key: min(each.quality for each in own) for key, own in held.items()},
     }

@@ -8,10 +8,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flcav.config import Config
-from flcav.optimization.curves.curves import STAGES, Additive, Curve, Effective, NonNegative, Positive, Shared
+from flcav.optimization.curves.curves import STAGES, Additive, Curve, NonNegative, OwnCurve, Positive, Shared
 
 MOST = 10**9  # largest count
 WORST = 1e6  # largest error that a curve may predict within the limits; that of a fitted curve is about 1
+BITS_PER_BYTE = 8
 Count = Annotated[int, Field(ge=0, le=MOST)]
 Vehicles = Annotated[int, Field(ge=1, le=MOST)]
 Range = tuple[Count, Count]  # least and most, both allowed
@@ -54,7 +55,7 @@ class Learner(NamedTuple):
 
     name: str
     weight: float
-    curve: Additive | Effective
+    curve: OwnCurve
 
 
 class Measured(Config):
@@ -80,6 +81,8 @@ class AllocationTask(Quantities):
     uplink_mbps: Mapping[str, Uplink] | None = None  # by vehicle, in the order of the edge groups
     samples_held: Mapping[str, Count] = {}  # by vehicle; not limited for one that is not named
     data_quality: Mapping[str, Positive] = {}  # by vehicle: worth of one of its samples; 1 if not named
+    train_s: NonNegative = 0.0  # time that a vehicle trains in one round [s]
+    vehicle_train_s: Mapping[str, NonNegative] = {}  # by vehicle, where it is another; names them all if uplinks do not
     limits: Limits
     curve: Curve
     upper: Curve | None = None  # the upper band of `curve`, for robust plans
@@ -96,18 +99,34 @@ class AllocationTask(Quantities):
             Learner(member.name, self.weight * member.weight / total, member.curve) for member in self.curve.members
         )
 
+    @property
+    def vehicles(self) -> tuple[str, ...]:
+        """Names of the vehicles, in the order of the edge groups; none where they are not named."""
+        return tuple(self.vehicle_train_s if self.uplink_mbps is None else self.uplink_mbps)
+
+    def sample_s(self, vehicle: str) -> float:
+        """Return the time in which a vehicle sends one sample [s]; 0 where its link is not known."""
+        return self._sending_s(vehicle, self.sample_mb)
+
+    def round_s(self, vehicle: str) -> float:
+        """Return the time in which a vehicle trains in one round and sends its update [s]."""
+        return self.vehicle_train_s.get(vehicle, self.train_s) + self._sending_s(vehicle, self.model_mb)
+
+    def _sending_s(self, vehicle: str, mb: float) -> float:
+        return 0.0 if self.uplink_mbps is None else BITS_PER_BYTE * mb / self.uplink_mbps[vehicle].wireless
+
     @model_validator(mode="after")
     def _vehicles(self) -> Self:
-        known = self.uplink_mbps or {}
-        if self.uplink_mbps is not None and len(known) != sum(self.edge_groups):
+        naming = "vehicle_train_s" if self.uplink_mbps is None else "uplink_mbps"
+        known = self.vehicles
+        if (known or self.uplink_mbps is not None) and len(known) != sum(self.edge_groups):
             raise ValueError(
-                f"uplink_mbps of task {self.name!r} names {len(known)} vehicles, edge_groups have "
-                f"{sum(self.edge_groups)}"
+                f"{naming} of task {self.name!r} names {len(known)} vehicles, edge_groups have {sum(self.edge_groups)}"
             )
-        for field in ("samples_held", "data_quality"):
+        for field in ("samples_held", "data_quality", "vehicle_train_s"):
             for vehicle in getattr(self, field):
                 if vehicle not in known:
-                    raise ValueError(f"{field} of task {self.name!r} names {vehicle!r}, which uplink_mbps does not")
+                    raise ValueError(f"{field} of task {self.name!r} names {vehicle!r}, which {naming} does not")
         return self
 
     @model_validator(mode="after")
@@ -116,7 +135,7 @@ class AllocationTask(Quantities):
         ranges = (limits.samples, limits.edge_rounds, limits.cloud_rounds)
         for field, curve in (("curve", self.curve), ("upper", self.upper or self.curve)):
             for each in (member.curve for member in curve.members) if isinstance(curve, Shared) else (curve,):
-                if isinstance(each, Effective) and limits.samples[0] == 0:
+                if not isinstance(each, Additive) and limits.samples[0] == 0:
                     raise ValueError(
                         f"limits.samples of task {self.name!r} must start at 1 or more: its error at 0 is infinite"
                     )
@@ -170,7 +189,7 @@ class Problem(Quantities):
 
     budgets_mb: Budgets
     edge_rounds_per_cloud_round: Count = 1  # k: each cloud round runs, and pays, k edge rounds in every region
-    horizon_s: Positive | None = None  # longest time that each vehicle's own link may be busy with the plan
+    horizon_s: Positive | None = None  # longest time that each vehicle may be busy, on its own link and training
     objective: Objective = "weighted"
     robust: bool = False  # whether to plan for the upper bands of the curves
     performance: Fraction | None = (

@@ -32,6 +32,10 @@ def written(seed: int, tasks: int, model: str, limits: dict = LIMITS, budget: fl
                 for each, decays in (("a", own), ("b", other))
             ]
             return {"model": "shared", "members": members}
+        if model == "federated":
+            numbers = {"a": draw(0.5, 8), "b": draw(0.1, 0.7), "alpha": 0.1, "beta": 0.5, "gamma": draw(0, 1.5)}
+            regions = rng.integers(100, 1500, 2).tolist()
+            return {"model": model, "floor": 0.01, **numbers, "group_samples": regions, "drift": draw(-0.2, 0.2)}
         group = int(draw(200, 3000))
         numbers = {"a": draw(0.5, 8), "b": draw(0.1, 0.7), "alpha": 0.1, "beta": 0.5, "group_samples": group}
         return {"model": model, "floor": 0.01, **numbers}
@@ -57,6 +61,12 @@ def _error(curve: dict, x: NDArray, y: NDArray, z: NDArray, k: int) -> list[tupl
     if curve["model"] == "additive":
         powers = ((curve["pretrain"], x), (curve["edge"], y), (curve["cloud"], z))
         return [(1.0, curve.get("floor", 0) + sum(p["a"] * (v + p["x0"]) ** -p["b"] for p, v in powers))]
+    if curve["model"] == "federated":
+        groups, drift = curve["group_samples"], curve["drift"]
+        own = sum(groups) / len(groups)
+        known = own * (1 - 1 / (y + k * z + 1)) + curve["gamma"] * (sum(groups) - own) * z / (z + 1)
+        power = curve["a"] * (curve["alpha"] * x + curve["beta"] * known) ** -curve["b"]
+        return [(1.0, curve["floor"] + power + (drift * z / (z + 1) if drift > 0 else -drift / (z + 1)))]
     n = curve["alpha"] * x + curve["beta"] * curve["group_samples"] * (1 - 1 / (y + k * z + 1))
     return [(1.0, curve["floor"] + curve["a"] * n ** -curve["b"])]
 
@@ -74,12 +84,14 @@ def searched(values: dict) -> float:
         wireless = x * task["sample_mb"] + (y + k * z) * vehicles * model
         wireline = x * task["sample_mb"] + z * servers * model
         kept = z <= (1 if k == 0 else np.inf)
-        choices.append([v[kept] for v in (error, wireless, wireline)])
-    budget = values["budgets_mb"]
-    total = [np.zeros(1), np.zeros(1), np.zeros(1)]
+        busy_s = (y + k * z) * task.get("train_s", 0.0)
+        choices.append([v[kept] for v in (error, wireless, wireline, busy_s)])
+    budget, horizon_s = values["budgets_mb"], values.get("horizon_s", np.inf)
+    total = [np.zeros(1)] * 4
     for choice in choices:
         merge = np.maximum if largest else np.add
-        total = [f.outer(t, v).ravel() for f, t, v in zip((merge, np.add, np.add), total, choice)]
-        fits = (total[1] <= budget["wireless"] + 1e-9) & (total[2] <= budget["wireline"] + 1e-9)
+        total = [f.outer(t, v).ravel() for f, t, v in zip((merge, *[np.add] * 3), total, choice)]
+        fits = total[3] <= horizon_s + 1e-9
+        fits &= (total[1] <= budget["wireless"] + 1e-9) & (total[2] <= budget["wireline"] + 1e-9)
         total = [v[fits] for v in total]
     return float(total[0].min())

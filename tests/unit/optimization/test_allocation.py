@@ -16,8 +16,10 @@ from flcav.optimization.allocation.allocate import Allocation, allocate, weighte
 from flcav.optimization.solvers.instance import Infeasible, build_instance
 from flcav.optimization.solvers.separable import ContinuousOptimum, Separable, relax
 
+MODELS = ("additive", "effective", "federated")
 
-@pytest.mark.parametrize(("model", "seed", "k"), itertools.product(("additive", "effective"), range(4), (0, 1, 2)))
+
+@pytest.mark.parametrize(("model", "seed", "k"), itertools.product(MODELS, range(4), (0, 1, 2)))
 def test_one_task_is_solved_exactly(model, seed, k):
     limits = {"samples": [1, 600], "edge_rounds": [0, 12], "cloud_rounds": [0, 8]}
     values = written(seed, 1, model, limits, budget=900.0, k=k)
@@ -28,7 +30,7 @@ def test_one_task_is_solved_exactly(model, seed, k):
 
 @pytest.mark.parametrize(
     ("model", "seed", "objective"),
-    itertools.product(("additive", "effective", "shared"), range(3), ("weighted", "max-min")),
+    itertools.product((*MODELS, "shared"), range(3), ("weighted", "max-min")),
 )
 def test_small_instances_equal_exhaustive_search(model, seed, objective):
     values = written(seed, 3, model, SMALL, budget=300.0) | {"objective": objective}
@@ -40,7 +42,9 @@ def test_small_instances_equal_exhaustive_search(model, seed, objective):
 
 
 @pytest.mark.parametrize("tasks", [3, 10, 30, 100, 300])
-@pytest.mark.parametrize(("model", "seed"), [("additive", 0), ("additive", 1), ("effective", 0), ("shared", 0)])
+@pytest.mark.parametrize(
+    ("model", "seed"), [("additive", 0), ("additive", 1), ("effective", 0), ("federated", 0), ("shared", 0)]
+)
 def test_random_instances_are_proven_within_a_thousandth_and_within_budget(tasks, model, seed):
     values = written(seed, tasks, model)
     plan = allocate(parsed(values))
@@ -49,7 +53,7 @@ def test_random_instances_are_proven_within_a_thousandth_and_within_budget(tasks
     assert_within(values, plan)
 
 
-@pytest.mark.parametrize(("tasks", "model"), [(10, "additive"), (30, "effective"), (30, "shared")])
+@pytest.mark.parametrize(("tasks", "model"), [(10, "additive"), (30, "effective"), (10, "federated"), (30, "shared")])
 def test_the_largest_error_is_proven_within_a_thousandth_and_within_budget(tasks, model):
     values = written(tasks, tasks, model) | {"objective": "max-min"}
     plan = allocate(parsed(values))
@@ -117,7 +121,7 @@ def test_marginal_values_are_the_slope_of_the_relaxed_optimum():
 @given(
     seed=st.integers(0, 10**6),
     tasks=st.integers(1, 5),
-    model=st.sampled_from(("additive", "effective", "shared")),
+    model=st.sampled_from((*MODELS, "shared")),
     budget=st.floats(200, 4000),
     k=st.integers(0, 2),
 )

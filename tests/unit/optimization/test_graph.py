@@ -92,6 +92,22 @@ def test_groups_are_the_vehicles_that_hold_every_modality_of_the_network() -> No
     assert (fused.data_quality["car 1"], fused.data_quality["car 4"]) == (0.5, 0.6)
 
 
+def test_a_vehicle_of_twice_the_speed_trains_half_as_long() -> None:
+    changed = values()
+    changed["networks"]["lidar detector"]["train_s"] = 30.0
+    changed["vehicles"]["car 2"]["speed"] = 2.0
+    changed["vehicles"]["car 4"]["speed"] = 0.5
+    graph = build_graph(parse_config(Layers, changed, "test"))
+    weather, _, objects = to_problem(graph).tasks
+    assert (weather.train_s, weather.vehicle_train_s) == (0.0, {})
+    assert [objects.vehicle_train_s[f"car {i}"] for i in (1, 2, 4)] == [30.0, 15.0, 60.0]
+    sending_s = 8 * 60 / 9
+    assert objects.round_s("car 2") == pytest.approx(15.0 + sending_s)
+    del changed["vehicles"]["car 1"]["uplink_mbps"]
+    unknown = to_problem(build_graph(parse_config(Layers, changed, "test"))).tasks[2]
+    assert (unknown.vehicles, unknown.train_s) == ((), 60.0)
+
+
 def test_the_vehicles_of_a_graph_carry_its_plan() -> None:
     problem = load_problem(RECIPE)
     plan = allocate(problem)

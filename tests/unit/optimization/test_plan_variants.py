@@ -31,7 +31,7 @@ def banded(seed: int, tasks: int, model: str) -> dict:
     return values
 
 
-@pytest.mark.parametrize(("seed", "model"), [(0, "additive"), (1, "additive"), (2, "effective")])
+@pytest.mark.parametrize(("seed", "model"), [(0, "additive"), (1, "additive"), (2, "effective"), (1, "federated")])
 def test_a_robust_plan_is_best_for_the_bands_and_never_better_for_the_curves(seed, model):
     values = banded(seed, 3, model)
     nominal, robust = allocate(parsed(values)), allocate(parsed(values | {"robust": True}))
@@ -57,7 +57,8 @@ def test_an_unknown_baseline_is_refused_by_name():
 
 @pytest.mark.parametrize("name", BASELINES)
 @pytest.mark.parametrize(
-    ("tasks", "model", "k"), [(1, "additive", 1), (3, "effective", 1), (2, "shared", 2), (5, "additive", 0)]
+    ("tasks", "model", "k"),
+    [(1, "additive", 1), (3, "effective", 1), (3, "federated", 1), (2, "shared", 2), (5, "additive", 0)],
 )
 @pytest.mark.parametrize("objective", ["weighted", "max-min"])
 def test_no_baseline_is_better_than_the_optimum_or_over_budget(name, tasks, model, k, objective):

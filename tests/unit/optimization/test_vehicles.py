@@ -49,8 +49,13 @@ def busy_s(asked: Problem, shares: dict[str, tuple[VehicleShare, ...]], with_rou
         for share in shares[task.name]:
             mbps = (task.uplink_mbps or {})[share.vehicle].wireless
             sent = share.wireless_mb if with_rounds else share.samples * task.sample_mb
-            spent[share.vehicle] = spent.get(share.vehicle, 0.0) + 8 * sent / mbps
+            trained = len(share.rounds) * train_s(task, share.vehicle) if with_rounds else 0.0
+            spent[share.vehicle] = spent.get(share.vehicle, 0.0) + 8 * sent / mbps + trained
     return spent
+
+
+def train_s(task: AllocationTask, vehicle: str) -> float:
+    return task.vehicle_train_s.get(vehicle, task.train_s)
 
 
 def values(asked: Problem, shares: dict[str, tuple[VehicleShare, ...]]) -> tuple[float, float, float]:
@@ -90,13 +95,14 @@ def every_split(asked: Problem, plans: list[TaskPlan]) -> Iterator[tuple[float, 
                 quality = task.data_quality.get(name, 1.0)
                 joined, worth = joined + quality * rounds, worth + quality * samples
                 sent = samples * task.sample_mb + rounds * task.model_mb
-                busy[name] = busy.get(name, 0.0) + 8 * sent / link.wireless
+                trained = rounds * train_s(task, name)
+                busy[name] = busy.get(name, 0.0) + 8 * sent / link.wireless + trained
                 uploading[name] = uploading.get(name, 0.0) + 8 * samples * task.sample_mb / link.wireless
         if max(busy.values()) <= (asked.horizon_s or np.inf) * (1 + 1e-9):
             yield joined, worth, -max(uploading.values())
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(20))
 def test_no_split_is_better(seed: int) -> None:
     rng = np.random.default_rng(seed)
     mbps = rng.uniform(1, 8, 3)
@@ -111,6 +117,7 @@ def test_no_split_is_better(seed: int) -> None:
                 "samples_held": {"cav0": int(rng.integers(1, 4))},
                 "data_quality": {"cav1": float(rng.uniform(0.3, 1))} if seed % 3 else {},
             }
+            | ({"train_s": float(rng.uniform(0, 6)), "vehicle_train_s": {"cav2": 3.0}} if seed >= 12 else {})
         )
         plans.append(plan(int(rng.integers(2, 5)), 1, int(rng.integers(0, 2)), name))
     asked = problem(tasks, horizon_s=float(rng.uniform(5, 30)))
@@ -119,7 +126,12 @@ def test_no_split_is_better(seed: int) -> None:
         with pytest.raises(Infeasible, match="horizon_s"):
             split_plan(asked, plans)
         return
-    joined, worth, end = values(asked, split_plan(asked, plans))
+    shares = split_plan(asked, plans)
+    joined, worth, end = values(asked, shares)
+    busy = busy_s(asked, shares)
+    assert max(busy.values()) <= (asked.horizon_s or 0) * (1 + 1e-6)
+    told = {name: sum(s.busy_s for own in shares.values() for s in own if s.vehicle == name) for name in busy}
+    assert told == pytest.approx(busy)
     assert (joined, worth) == pytest.approx(best[:2], rel=1e-6)
     assert end == pytest.approx(best[2], rel=2e-4)
 
@@ -182,6 +194,9 @@ def test_tasks_without_links_have_no_shares() -> None:
         ({"uplink_mbps": links(1, 2, float("nan"))}, "finite"),
         ({"uplink_mbps": links(1, 2, 3), "samples_held": {"tram": 4}}, "names 'tram'"),
         ({"uplink_mbps": links(1, 2, 3), "data_quality": {"cav0": 0}}, "greater than 0"),
+        ({"uplink_mbps": links(1, 2, 3), "vehicle_train_s": {"tram": 4}}, "names 'tram', which uplink_mbps does not"),
+        ({"vehicle_train_s": {"cav0": 4}}, "vehicle_train_s of task 'objects' names 1 vehicles, edge_groups have 3"),
+        ({"train_s": -1}, "greater than or equal to 0"),
     ],
 )
 def test_bad_vehicles_are_named(change: dict[str, Any], sentence: str) -> None:

@@ -1,4 +1,4 @@
-"""`flcav allocate`: samples, edge rounds and cloud rounds per task under both uplink budgets (MLGRA)."""
+"""`flcav allocate` and `flcav replan`: samples and rounds per task under both uplink budgets (MLGRA)."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -31,24 +31,49 @@ class Compared(StrEnum):
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
+    """Add the commands to `app`."""
     app.command("allocate")(allocate)
+    app.command("replan")(replan)
+
+
+PROBLEM = typer.Argument(
+    ..., help="YAML: budgets, sizes, limits and learning curves of every task; or a three-layer graph."
+)
+AS_JSON = typer.Option(False, "--json", help="Print one JSON object.")
+BASELINE = typer.Option(
+    None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {join_choices(Compared)}."
+)
+PROGRESS = "YAML: what is spent and observed so far; the plan goes on from there."
+OUT = typer.Option(None, "--out", help="Write a page about the plan (HTML): where megabytes go, why.")
 
 
 def allocate(
-    problem: Path = typer.Argument(
-        ..., help="YAML: budgets, sizes, limits and learning curves of every task; or a three-layer graph."
-    ),
-    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
-    baseline: Compared | None = typer.Option(
-        None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {join_choices(Compared)}."
-    ),
-    progress: Path | None = typer.Option(
-        None, "--progress", help="YAML: what is spent and observed so far; the plan goes on from there."
-    ),
-    out: Path | None = typer.Option(None, "--out", help="Write a page about the plan (HTML): where megabytes go, why."),
+    problem: Path = PROBLEM,
+    as_json: bool = AS_JSON,
+    baseline: Compared | None = BASELINE,
+    progress: Path | None = typer.Option(None, "--progress", help=f"{PROGRESS} As `flcav replan`."),
+    out: Path | None = OUT,
 ) -> None:
     """Split both uplink budgets over tasks and training stages so that they err least, by the problem's objective."""
+    _plan(problem, progress, as_json, baseline, out)
+
+
+def replan(
+    problem: Path = PROBLEM,
+    progress: Path = typer.Argument(..., help=PROGRESS),
+    as_json: bool = AS_JSON,
+    baseline: Compared | None = BASELINE,
+    out: Path | None = OUT,
+) -> None:
+    """Plan the rest of a training that is under way, from what it has spent and reached; counts include what is done.
+
+    Finished stages stay as they are, learning curves are scaled to pass through the accuracies reached, and what was
+    not spent goes back to the budgets.
+    """
+    _plan(problem, progress, as_json, baseline, out)
+
+
+def _plan(problem: Path, progress: Path | None, as_json: bool, baseline: Compared | None, out: Path | None) -> None:
     from flcav.config import read_config
     from flcav.optimization.allocation.baselines import baseline as compared
     from flcav.optimization.allocation.budget_sweep import compute_savings
@@ -102,7 +127,7 @@ def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
     for name in ("used_mb", "marginal_error_per_gb"):
         if name in values:
             values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
-    return _given(values, "note", "warnings")
+    return _given(values, "busy_s", "note", "warnings")
 
 
 def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
@@ -125,6 +150,8 @@ def _show(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> N
             saved = f"{each.saved:.3g}" if each.saved else "nothing"
             budget = f"{each.added:.0%} more ({each.added_mb:.6g} MB)"
             console.print(f"  {budget}, solved anew: {verb} {saved} ({_proven(each.gap)})")
+    if plan.busy_s is not None:
+        console.print(f"time: {plan.busy_s:.1f} of {problem.horizon_s:.6g} s on the busiest vehicle")
     for sentence in filter(None, (plan.note, *plan.warnings)):
         console.print(sentence)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from flcav.cli.options import check_finite, refuse_unused
+from flcav.cli.options import check_all_finite, check_finite, refuse_unused
 from flcav.cli.terminal import print_json
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from flcav.optimization.allocation.problem_file import FittedFields
     from flcav.optimization.curves.bands import Array, Bands
-    from flcav.optimization.curves.curves import Additive, Effective
+    from flcav.optimization.curves.curves import OwnCurve
     from flcav.optimization.curves.fitting import CurveFit
 
 
@@ -23,6 +23,14 @@ class Model(StrEnum):
 
     additive = "additive"
     effective = "effective"
+    federated = "federated"
+
+
+ROUNDS = {  # by model: the letters of its formula
+    "additive": "y edge, z cloud rounds",
+    "effective": "t rounds",
+    "federated": "t rounds, z cloud rounds",
+}
 
 
 def register(app: typer.Typer) -> None:
@@ -45,17 +53,21 @@ def fit(
         [], "--at", metavar="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]]", help="Where to predict the error; may be given "
         "several times."
     ),
-    group_samples: float = typer.Option(
-        0.0, "--group-samples", min=0, max=1e9, callback=check_finite, help="effective: samples that vehicles hold."
+    group_samples: list[float] = typer.Option(
+        [], "--group-samples", min=0, max=1e9, callback=check_all_finite, help="effective, federated: samples that "
+        "the vehicles of a region hold; given once per region."
     ),
     alpha: float = typer.Option(
-        0.1, "--alpha", min=1e-9, max=1e9, callback=check_finite, help="effective: worth of a pretraining sample."
+        0.1, "--alpha", min=1e-9, max=1e9, callback=check_finite, help="effective, federated: worth of a pretraining "
+        "sample."
     ),
     beta: float | None = typer.Option(
-        None, "--beta", min=0, max=1e9, callback=check_finite, help="effective: worth of a held sample; else fitted."
+        None, "--beta", min=0, max=1e9, callback=check_finite, help="effective, federated: worth of a held sample; "
+        "else fitted."
     ),
     k: int = typer.Option(
-        1, "--edge-rounds-per-cloud-round", "-k", min=0, max=10**9, help="effective: edge rounds in a cloud round."
+        1, "--edge-rounds-per-cloud-round", "-k", min=0, max=10**9, help="effective, federated: edge rounds in a cloud "
+        "round."
     ),
     level: float = typer.Option(
         0.9, "--level", min=0.01, max=0.999, callback=check_finite, help="Share of repeats between the bands."
@@ -152,7 +164,7 @@ def _answer(
     task: str,
     fit: "CurveFit",
     found: "Bands | None",
-    upper: "Additive | Effective | None",
+    upper: "OwnCurve | None",
     measured: "Array",
     asked: list[list[float]],
     k: int,
@@ -186,11 +198,9 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
     from rich.table import Table
 
     from flcav.cli.terminal import plain_console
-    from flcav.optimization.curves.curves import Effective
 
     console = plain_console()
-    rounds = "t rounds" if isinstance(fits[0].curve, Effective) else "y edge, z cloud rounds"
-    table = Table("task", f"error after x samples, {rounds}", "rmse", "R²", "points")
+    table = Table("task", f"error after x samples, {ROUNDS[fits[0].curve.model]}", "rmse", "R²", "points")
     for answer, fit in zip(answers, fits):
         explained = "–" if fit.r_squared is None else f"{fit.r_squared:.3f}"
         table.add_row(answer["task"], str(fit.curve), f"{fit.rmse:.4f}", explained, str(fit.points))

@@ -16,7 +16,7 @@ from flcav.optimization.curves.curves import Curve, Shared
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.area import area, maximise_area
 from flcav.optimization.solvers.fairness import minimise_largest_error
-from flcav.optimization.solvers.instance import Instance, build_instance, price_counts
+from flcav.optimization.solvers.instance import Clock, Instance, build_instance, price_counts, shared_clock
 from flcav.optimization.solvers.weighted import minimise_weighted_error
 
 Array = NDArray[np.float64]
@@ -64,6 +64,7 @@ class Allocation:
     tasks: tuple[TaskPlan, ...]
     used_mb: Price
     marginal_error_per_gb: Price  # derivative by each budget, per 1000 MB: see `allocate`
+    busy_s: float | None = None  # time of the busiest vehicle, where horizon_s limits what vehicles train
     note: str | None = None
     warnings: tuple[str, ...] = ()
 
@@ -76,14 +77,15 @@ class _Best:
     rates: Array
 
 
-def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
+def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = ()) -> Allocation:
     """Return the best plan within both budgets, with its certificate: MLGRA of Wang et al., IEEE Network 37(3), 2023.
 
     It is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS` tasks. Robust plans minimise the upper
     bands of the learning curves. `marginal_error_per_gb` is the derivative of the continuous optimum by each budget,
     times 1000 MB: a shadow price at these budgets, not a forecast of what 1000 MB more bring, for which see
-    `budget_sweep.compute_savings`. Raises `Infeasible`, naming the budget, the cost of the least plan within the limits
-    and the excess, and `InputError` where the solver cannot handle the problem's numbers.
+    `budget_sweep.compute_savings`. Of limits of time only the problem's `shared_clock` and `clocks` are kept; for those
+    of vehicles with names see `fleet.allocate_fleet`. Raises `Infeasible`, naming the budget, the cost of the least
+    plan within the limits and the excess, and `InputError` where the solver cannot handle the problem's numbers.
 
     >>> from flcav import allocate, load_problem
     >>> plan = allocate(load_problem("recipes/allocation/objects.yaml"))
@@ -92,7 +94,7 @@ def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
     """
     asked = resolve_problem(problem)
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
-    best = _METHODS[problem.objective](asked, build_instance(asked), sought)
+    best = _METHODS[problem.objective](asked, build_instance(asked, clocks), sought, clocks)
     plans = build_task_plans(problem, best.x)
     lower = None if best.lower is None else min(best.lower, best.objective)
     achieved = None if lower is None else relative_gap(best.objective, lower)
@@ -103,10 +105,19 @@ def allocate(problem: Problem, *, gap: float = 1e-4) -> Allocation:
         gap=achieved,
         tasks=plans,
         used_mb=sum_prices(plans),
-        marginal_error_per_gb=Price(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates)),
+        marginal_error_per_gb=Price(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates[:2])),
+        busy_s=_busy_s(asked, plans),
         note=NO_CERTIFICATE if lower is None else None,
         warnings=_beyond(problem, plans),
     )
+
+
+def _busy_s(problem: Problem, plans: Sequence[TaskPlan]) -> float | None:
+    """Return the time [s] on the problem's `shared_clock`; None where it has none."""
+    clock, k = shared_clock(problem), problem.edge_rounds_per_cloud_round
+    if clock is None:
+        return None
+    return sum(each * (plan.edge_rounds + k * plan.cloud_rounds) for each, plan in zip(clock.per_round, plans))
 
 
 def relative_gap(objective: float, lower: float) -> float:
@@ -184,20 +195,20 @@ def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:
     )
 
 
-def _weighted(problem: Problem, made: Instance, gap: float) -> _Best:
+def _weighted(problem: Problem, made: Instance, gap: float, _clocks: Sequence[Clock]) -> _Best:
     found = minimise_weighted_error(made, gap)
     return _Best(
         found.x, weighted_error(problem, build_task_plans(problem, found.x)), found.bound + made.floor, found.rates
     )
 
 
-def _fair(problem: Problem, made: Instance, gap: float) -> _Best:
+def _fair(problem: Problem, made: Instance, gap: float, _clocks: Sequence[Clock]) -> _Best:
     found = minimise_largest_error(problem, made, gap)
     return _Best(found.x, found.level, found.bound, found.rates)
 
 
-def _area(problem: Problem, made: Instance, gap: float) -> _Best:
-    found = maximise_area(problem, max(gap, AREA_GAP))
+def _area(problem: Problem, made: Instance, gap: float, clocks: Sequence[Clock]) -> _Best:
+    found = maximise_area(problem, max(gap, AREA_GAP), clocks)
     return _Best(found.x, found.area, None, found.rates)
 
 

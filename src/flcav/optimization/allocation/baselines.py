@@ -19,19 +19,20 @@ from flcav.optimization.allocation.allocate import (
     resolve_problem,
     sum_prices,
 )
-from flcav.optimization.allocation.vehicles import split_plan
+from flcav.optimization.allocation.vehicles import split_plan, trains
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
 from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance
 from flcav.optimization.solvers.rounding import trim
 from flcav.optimization.solvers.separable import relax
-from flcav.optimization.solvers.weighted import list_terms, minimise_weighted_error
+from flcav.optimization.solvers.weighted import list_drifts, list_terms, minimise_weighted_error
 
 Array = NDArray[np.float64]
 
 GAP = 1e-4  # relative optimality gap
 LONGEST_S = 5.0  # time limit of the search for most messages
 NOT_CARRIED = "its vehicles do not hold the samples for it, or their links do not carry it within horizon_s"
+NOT_IN_TIME = "its vehicles do not hold the samples for it, or do not send and train it within horizon_s"
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ def baseline(problem: Problem, name: str) -> Baseline:
     try:
         split_plan(problem, plans)
     except Infeasible:
-        return Baseline(name, evaluate_objective(asked, plans), plans, sum_prices(plans), NOT_CARRIED)
+        note = NOT_IN_TIME if trains(problem) else NOT_CARRIED
+        return Baseline(name, evaluate_objective(asked, plans), plans, sum_prices(plans), note)
     return Baseline(name, evaluate_objective(asked, plans), plans, sum_prices(plans))
 
 
@@ -68,8 +70,8 @@ def equal_stages(problem: Problem, made: Instance) -> Array:
     Within a stage's share the tasks get the quantities of least weighted error: stage I first, then II, then III.
     """
     low, high = made.low.reshape(-1, 3), made.high.reshape(-1, 3)
-    cost = made.cost.reshape(-1, 3, 2)
-    uses = np.any(cost > 0, axis=0)  # (3, 2)
+    cost = made.cost.reshape(-1, 3, len(made.budget))
+    uses = np.any(cost > 0, axis=0)  # (3, L)
     share = (made.budget - made.low @ made.cost) / np.maximum(uses.sum(axis=0), 1)
     x = low.copy()
     for stage in range(3):
@@ -86,7 +88,7 @@ def equal_tasks(problem: Problem, made: Instance) -> Array:
     Each task is then planned alone for least error within its share.
     """
     low, high = made.low.reshape(-1, 3), made.high.reshape(-1, 3)
-    cost = made.cost.reshape(-1, 3, 2)
+    cost = made.cost.reshape(-1, 3, len(made.budget))
     share = (made.budget - made.low @ made.cost) / len(low)
     x = low.copy()
     for number, task in enumerate(problem.tasks):
@@ -114,18 +116,21 @@ def max_throughput(problem: Problem, made: Instance) -> Array:
 
 
 def round_down_optimum(problem: Problem, made: Instance) -> Array:
-    """Return the continuous optimum rounded down (3N,), the last step of the article's allocator."""
-    if made.effective is None:
+    """Return the continuous optimum rounded down (3N,), the last step of the article's allocator.
+
+    Where cloud rounds cost accuracy, it is that of the error's convex envelope.
+    """
+    if made.effective is None and len(made.budget) == 2:
         x = relax(made.separable).x
     else:
-        program = Program(list_terms(made), made.low, made.high, made.cost, made.budget)
+        program = Program(list_terms(made), made.low, made.high, made.cost, made.budget, list_drifts(made))
         starts = [made.low + (made.high - made.low) * share for share in np.linspace(0, 1, 6) ** 3]
         x, _, _ = continuous_optimum(program, starts, GAP)
     return trim(made, np.clip(np.floor(x + 1e-9), made.low, made.high), np.ones(len(x)))
 
 
 def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Problem:
-    """Return `problem` with other limits (N, 3) and budgets (2,)."""
+    """Return `problem` with other limits (N, 3) and budgets (L,): of both links, and the horizon if time is limited."""
     tasks = []
     for task, least, most in zip(problem.tasks, low, high):
         limits = {
@@ -134,7 +139,8 @@ def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Proble
         }
         tasks.append(task.model_copy(update={"limits": task.limits.model_copy(update=limits)}))
     budgets = problem.budgets_mb.model_copy(update=dict(zip(("wireless", "wireline"), budget.tolist())))
-    return problem.model_copy(update={"budgets_mb": budgets, "tasks": tuple(tasks)})
+    horizon_s = {"horizon_s": float(budget[2]) or None} if len(budget) > 2 else {}  # 0 s: only before the first round
+    return problem.model_copy(update={"budgets_mb": budgets, "tasks": tuple(tasks), **horizon_s})
 
 
 BASELINES: dict[str, Callable[[Problem, Instance], Array]] = {

@@ -1,19 +1,26 @@
-"""Allocation under the fleet budgets and the limits of each vehicle: samples held, and link capacity within a horizon.
+"""Allocation under the fleet budgets and the limits of each vehicle: samples held, and its time within a horizon.
 
-The budgets constrain the fleet as a whole, and the optimum within them may ask more of slow links than `horizon_s`
-allows. Then two relaxations are solved, each with one budget reduced by bisection until the plan can be split over the
-vehicles (`split_plan`):
+The budgets constrain the fleet as a whole, and the optimum within them may ask more of slow vehicles than `horizon_s`
+allows. Then relaxations are solved, each with one budget reduced by bisection until the plan can be split over the
+vehicles (`split_plan`). Where links alone take time:
 
 - *all join*: every vehicle joins every round, as the budgets are priced; the wireless budget is reduced.
 - *one joins*: one vehicle per edge group joins each round, the least that a split needs; the wireless budget is
   replaced by what all links together carry within the horizon, and that is reduced.
 
-At full size each relaxation is a lower bound of the error of any feasible plan; the larger of the two bounds is kept.
-The better of the two plans is returned, with its gap to that bound.
+Where vehicles also take time to train, time is the third budget (`Clock`) and is reduced:
+
+- *all join*: the slowest vehicle joins every round; with and without the time in which the fleet sends the samples.
+- *one joins*: one vehicle per edge group joins each round. The time of all vehicles, each weighted by its speed, is
+  limited to the horizon, and no split takes less of it than the quickest vehicles by weight would.
+
+The problem without a horizon, and *one joins* at full size, are lower bounds of the error of any feasible plan; the
+larger of the two bounds is kept. The best of the plans is returned, with its gap to that bound.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain, islice
 
 import numpy as np
 
@@ -27,33 +34,37 @@ from flcav.optimization.allocation.allocate import (
     resolve_problem,
     sum_prices,
 )
-from flcav.optimization.allocation.vehicles import BITS_PER_BYTE, Shares, TooSlow, split_plan
-from flcav.optimization.problem import AllocationTask, Problem
-from flcav.optimization.solvers.instance import Infeasible
+from flcav.optimization.allocation.vehicles import Shares, TooSlow, split_plan, trains
+from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
+from flcav.optimization.solvers.instance import Clock, Infeasible
 
 HALVINGS = 9  # steps of the bisection over the share of a budget
 ROUNDING = 1e-9  # relative tolerance of budgets and objectives
+SHORTEST_S = 1e-9  # a round's time, to divide by
 OPTIMAL = 1e-4  # largest gap of a plan that is called optimal
 CARRIED = "the vehicles' own links, within horizon_s, limit this plan"
+IN_TIME = "the vehicles' time to send and to train, within horizon_s, limits this plan"
 
 Carried = tuple[Allocation, Shares]  # a plan and its split over the vehicles
-Relaxation = Callable[[float], Problem]  # the relaxation by the share of its budget, 0 to 1
+Relaxation = Callable[[float], Allocation]  # the plan of a relaxation by the share of its budget, 0 to 1
 
 
 def allocate_fleet(problem: Problem) -> Carried:
     """Return the best plan that the vehicles can carry out, and each vehicle's share of it, by task.
 
     Tasks that do not name their vehicles are planned under the budgets alone and have no shares. Raises `Infeasible`
-    where the limits ask for more than the budgets or the samples held, and `TooSlow` where no plan fits the links.
+    where the limits ask for more than the budgets or the samples held, and `TooSlow` where no plan fits the horizon.
     """
     asked = problem.model_copy(update={"tasks": tuple(_within_held(task) for task in problem.tasks)})
     plan = allocate(asked)
     try:
-        return plan, split_plan(asked, plan.tasks)
+        return _timed(asked, (plan, split_plan(asked, plan.tasks)))
     except TooSlow as error:
-        relaxations, bounds = [_all_join(asked, plan)], [plan.lower_bound]
-        if all(task.uplink_mbps for task in asked.tasks):
-            relaxations.insert(0, _one_joins(asked))
+        training = trains(asked)
+        relaxations = _all_join_in_time(asked) if training else [_all_join(asked, plan)]
+        bounds = [plan.lower_bound]
+        if training or all(task.vehicles for task in asked.tasks):
+            relaxations.insert(0, (_one_joins_in_time if training else _one_joins)(asked))
             bounds.append(_bound(relaxations[0]))
         lower = max((bound for bound in bounds if bound is not None), default=None)
         found: list[Carried] = []
@@ -64,7 +75,7 @@ def allocate_fleet(problem: Problem) -> Carried:
                     break  # no plan is better
         if not found:
             raise error
-        return _certified(asked, found, lower)
+        return _timed(asked, _certified(asked, found, lower, IN_TIME if training else CARRIED))
 
 
 def _within_held(task: AllocationTask) -> AllocationTask:
@@ -72,7 +83,7 @@ def _within_held(task: AllocationTask) -> AllocationTask:
 
     Raises `Infeasible` if its lower limit is more.
     """
-    vehicles = task.uplink_mbps or {}
+    vehicles = task.vehicles
     if not vehicles or any(vehicle not in task.samples_held for vehicle in vehicles):
         return task
     held = sum(task.samples_held[vehicle] for vehicle in vehicles)
@@ -86,15 +97,65 @@ def _within_held(task: AllocationTask) -> AllocationTask:
 
 
 def _all_join(asked: Problem, plan: Allocation) -> Relaxation:
-    return lambda share: _with_wireless(asked, share * plan.used_mb.wireless_mb, asked.tasks)
+    return lambda share: allocate(_with_wireless(asked, share * plan.used_mb.wireless_mb, asked.tasks))
 
 
 def _one_joins(asked: Problem) -> Relaxation:
-    assert asked.horizon_s is not None
     links = {name: link.wireless for task in asked.tasks for name, link in (task.uplink_mbps or {}).items()}
-    carried_mb = min(sum(links.values()) * asked.horizon_s / BITS_PER_BYTE, asked.budgets_mb.wireless)
-    tasks = tuple(task.model_copy(update={"edge_groups": (1,) * len(task.edge_groups)}) for task in asked.tasks)
-    return lambda share: _with_wireless(asked, share * carried_mb, tasks)
+    carried_mb = min(sum(links.values()) * _horizon_s(asked) / BITS_PER_BYTE, asked.budgets_mb.wireless)
+    tasks = _of_one_each(asked)
+    return lambda share: allocate(_with_wireless(asked, share * carried_mb, tasks))
+
+
+def _of_one_each(asked: Problem) -> tuple[AllocationTask, ...]:
+    """Return the tasks, of those whose vehicles have names with one vehicle in each edge group."""
+    ones = ({"edge_groups": (1,) * len(task.edge_groups)} if task.vehicles else {} for task in asked.tasks)
+    return tuple(task.model_copy(update=update) for task, update in zip(asked.tasks, ones))
+
+
+def _all_join_in_time(asked: Problem) -> list[Relaxation]:
+    """Return the plans by the rounds that the slowest vehicle has time for, with and without time for the samples."""
+    horizon_s = _horizon_s(asked)
+    vehicles = {name for task in asked.tasks for name in task.vehicles}
+    slowest = max(vehicles, key=lambda name: (sum(t.round_s(name) for t in asked.tasks if name in t.vehicles), name))
+    per_round = tuple(task.round_s(slowest) if slowest in task.vehicles else 0.0 for task in asked.tasks)
+    mbps = [sum(link.wireless for link in (task.uplink_mbps or {}).values()) for task in asked.tasks]
+    sending = (BITS_PER_BYTE * task.sample_mb / each if each else 0.0 for task, each in zip(asked.tasks, mbps))
+    return [
+        _reduced(asked, Clock((0.0,) * len(per_round), per_round, horizon_s)),
+        _reduced(asked, Clock(tuple(sending), per_round, 2 * horizon_s)),
+    ]
+
+
+def _one_joins_in_time(asked: Problem) -> Relaxation:
+    times: dict[str, list[float]] = {}
+    for task in asked.tasks:
+        for name in task.vehicles:
+            times.setdefault(name, []).append(task.round_s(name))
+    speed = {name: 1 / max(float(np.mean(own)), SHORTEST_S) for name, own in times.items()}
+    per_sample = tuple(
+        min((speed[name] * task.sample_s(name) for name in task.vehicles), default=0.0) for task in asked.tasks
+    )
+    per_round = tuple(
+        sum(min(speed[name] * task.round_s(name) for name in group) for group in _groups(task)) for task in asked.tasks
+    )
+    clock = Clock(per_sample, per_round, _horizon_s(asked) * sum(speed.values()))
+    return _reduced(asked.model_copy(update={"tasks": _of_one_each(asked)}), clock)
+
+
+def _groups(task: AllocationTask) -> list[tuple[str, ...]]:
+    """Return the names of the vehicles of each edge group; no group where they have no names."""
+    left = iter(task.vehicles)
+    return [tuple(islice(left, size)) for size in task.edge_groups] if task.vehicles else []
+
+
+def _reduced(asked: Problem, clock: Clock) -> Relaxation:
+    return lambda share: allocate(asked, clocks=(replace(clock, seconds=share * clock.seconds),))
+
+
+def _horizon_s(asked: Problem) -> float:
+    assert asked.horizon_s is not None
+    return asked.horizon_s
 
 
 def _with_wireless(asked: Problem, wireless_mb: float, tasks: tuple[AllocationTask, ...]) -> Problem:
@@ -107,7 +168,7 @@ def _largest(asked: Problem, relaxed: Relaxation) -> Carried | None:
     low, high, share, found = 0.0, 1.0, 1.0, None
     for _ in range(HALVINGS + 1):
         try:
-            found, low = _carried(asked, allocate(relaxed(share))), share
+            found, low = _carried(asked, relaxed(share)), share
         except TooSlow:
             high = share
         except Infeasible:
@@ -133,19 +194,33 @@ def _carried(asked: Problem, plan: Allocation) -> Carried:
 
 def _bound(relaxed: Relaxation) -> float | None:
     try:
-        return allocate(relaxed(1.0)).lower_bound
+        return relaxed(1.0).lower_bound
     except Infeasible:
         return None
 
 
-def _certified(asked: Problem, found: Sequence[Carried], bound: float | None) -> Carried:
-    """Return the best plan with its certificate; its derivative by the wireless budget is not known and set to 0."""
+def _timed(asked: Problem, carried: Carried) -> Carried:
+    """Return the plan with the time of the busiest vehicle, with a name or without, where vehicles train."""
+    plan, shares = carried
+    if asked.horizon_s is None or not trains(asked):
+        return carried
+    busy: dict[str, float] = {}
+    for share in chain.from_iterable(shares.values()):
+        busy[share.vehicle] = busy.get(share.vehicle, 0.0) + share.busy_s
+    return replace(plan, busy_s=max([plan.busy_s or 0.0, *busy.values()])), shares
+
+
+def _certified(asked: Problem, found: Sequence[Carried], bound: float | None, limit: str) -> Carried:
+    """Return the best plan with its certificate; its derivative by the wireless budget is not known and set to 0.
+
+    `limit` is a sentence on what limits it.
+    """
     larger = asked.objective == "area"
     plan, shares = (max if larger else min)(found, key=lambda carried: carried[0].objective)
     lower = None if bound is None else min(bound, plan.objective)
     gap = None if lower is None else relative_gap(plan.objective, lower)
     rates = Price(0.0, plan.marginal_error_per_gb.wireline_mb)
-    notes = (plan.note, CARRIED)
+    notes = (plan.note, limit)
     certified = replace(
         plan,
         status="optimal" if gap is not None and gap <= OPTIMAL else "feasible",

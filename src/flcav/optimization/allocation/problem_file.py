@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.optimization.allocation.allocate import resolve_problem
-from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.curves.curves import Additive, OwnCurve
 from flcav.optimization.curves.fitting import QUANTITIES, CurveFit
 from flcav.optimization.problem import Problem
 
@@ -65,13 +65,13 @@ def explain_objective(problem: Problem, objective: float) -> str:
 class FittedFields:
     """The fields of a task in an allocation problem that a history determines."""
 
-    curve: Additive | Effective
-    upper: Additive | Effective | None  # of the upper band; None: too few points for one
+    curve: OwnCurve
+    upper: OwnCurve | None  # of the upper band; None: too few points for one
     limits: Mapping[str, list[int]]  # least and most of each quantity in the history
     measured: Mapping[str, float]  # most of each quantity that varies in the history
 
 
-def collect_fitted_fields(fit: CurveFit, resources: Array, upper: Additive | Effective | None) -> FittedFields:
+def collect_fitted_fields(fit: CurveFit, resources: Array, upper: OwnCurve | None) -> FittedFields:
     """Return the fields of a task from its `fit`, its `upper` band and the `resources` (n, 3) of its history."""
     least = np.ceil(resources.min(axis=0)).astype(int).tolist()
     most = np.floor(resources.max(axis=0)).astype(int).tolist()
@@ -117,7 +117,7 @@ def insert_curves(text: str, tasks: Mapping[str, FittedFields], k: int, origin: 
     """
     (values, found), edits = _tasks(text, origin), []
     planned = values.get("edge_rounds_per_cloud_round", 1)
-    if planned != k and any(isinstance(own.curve, Effective) for own in tasks.values()):
+    if planned != k and not all(isinstance(own.curve, Additive) for own in tasks.values()):
         raise InputError(f"{origin}: edge_rounds_per_cloud_round = {planned}, and the curves are fitted with {k}")
     for name, own in tasks.items():
         if name not in found:
@@ -206,13 +206,19 @@ def _end(node: yaml.Node) -> int:
     return _end(last[1] if isinstance(last, tuple) else last)
 
 
-def _written(curve: Additive | Effective) -> dict[str, Any]:
+def _written(curve: OwnCurve) -> dict[str, Any]:
     return {"model": curve.model} | _rounded(curve.model_dump(exclude_defaults=True, exclude={"model"}))
 
 
 def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return `values` with numbers rounded to `DIGITS` digits, whole ones as int."""
-    return {name: _rounded(value) if isinstance(value, dict) else _number(value) for name, value in values.items()}
+    return {name: _short(value) for name, value in values.items()}
+
+
+def _short(value: Any) -> Any:
+    if isinstance(value, dict):
+        return _rounded(value)
+    return [_number(each) for each in value] if isinstance(value, tuple) else _number(value)
 
 
 def _number(value: float) -> float:

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flcav.config import Config, InputError
 from flcav.optimization.allocation.allocate import Allocation, allocate
-from flcav.optimization.curves.curves import Additive, Curve, Decay, Effective, NonNegative
+from flcav.optimization.curves.curves import Additive, Curve, Decay, Effective, Federated, NonNegative
 from flcav.optimization.problem import AllocationTask, Budgets, Count, Fraction, Problem
 from flcav.optimization.solvers.instance import price_counts
 
@@ -100,6 +100,9 @@ def _scaled(curve: Curve, factor: float) -> Curve:
         return curve.model_copy(update={"floor": curve.floor * factor, **decays})
     if isinstance(curve, Effective):
         return curve.model_copy(update={"floor": curve.floor * factor, "a": curve.a * factor})
+    if isinstance(curve, Federated):
+        scaled = {name: factor * getattr(curve, name) for name in ("floor", "a", "drift")}
+        return curve.model_copy(update=scaled)
     members = (member.model_copy(update={"curve": _scaled(member.curve, factor)}) for member in curve.members)
     return curve.model_copy(update={"members": tuple(members)})
 

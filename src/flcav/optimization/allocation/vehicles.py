@@ -1,13 +1,14 @@
-"""Split of a plan over the vehicles of a fleet: a lexicographic mixed-integer program under each vehicle's own link.
+"""Split of a plan over the vehicles of a fleet: a lexicographic mixed-integer program under each vehicle's own time.
 
 A plan gives the number of samples and rounds of each task for the whole fleet. The split has whole x samples and y
 rounds for every task and vehicle, with
 
 - sum(x) = the planned samples of the task, and x at most the samples that the vehicle holds;
 - at least one vehicle of each edge group in every round;
-- on each link of a vehicle, all its uplink messages over all tasks sent within the horizon.
+- within the horizon, each vehicle's own training in its rounds and all its uplink messages, one after the other, over
+  all tasks; on its edge server's wireline all samples sent on its behalf.
 
-The objectives, in this order: most rounds joined (a straggler drops out of rounds only where its link cannot carry
+The objectives, in this order: most rounds joined (a straggler drops out of rounds only where its time is too short for
 them); samples of most worth; both weighted by data quality; then the earliest end of stage I, when all samples have
 arrived. For IID data all samples have the same worth and throughput decides. Each objective is a program for HiGHS,
 solved to optimality for small fleets; for large ones the search ends after `NODES` nodes, so that the result does not
@@ -23,12 +24,11 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array, csr_array
 
 from flcav.optimization.allocation.allocate import TaskPlan
-from flcav.optimization.problem import AllocationTask, Problem, Uplink
+from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
 
 Array = NDArray[np.float64]
 
-BITS_PER_BYTE = 8
 TIE = 1e-7  # relative: how much an earlier objective may lose to a later one, against rounding
 GAP = 1e-6  # relative optimality gap for rounds and samples
 END_GAP = 1e-4  # relative optimality gap for times
@@ -36,7 +36,7 @@ NODES = 100  # most nodes of a branch-and-bound search
 
 
 class TooSlow(Infeasible):
-    """The vehicles' own links cannot carry the plan within the horizon."""
+    """The vehicles cannot send, and train, what the plan asks for within the horizon."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class VehicleShare:
     samples: int  # uploaded in stage I
     rounds: tuple[int, ...]  # joined, of 1 ... edge_rounds + k * cloud_rounds, in the order of the run
     wireless_mb: float  # uplink
+    busy_s: float  # time to send them on the own link, as far as that is known, and to train in the rounds
 
 
 Shares = dict[str, tuple[VehicleShare, ...]]  # by task
@@ -59,37 +60,47 @@ class _Part:
     task: AllocationTask
     group: int  # index of its edge group
     vehicle: str
-    link: Uplink
+    wireline: float | None  # rate [Mbit/s]; None: not limited
+    sample_s: float  # time to send a sample
+    round_s: float  # time to train in a round and to send the update
     held: int  # most samples
     rounds: int  # most rounds
     quality: float
+
+
+def trains(problem: Problem) -> bool:
+    """Return whether the vehicles' time to train is known for any task, so that a horizon limits it."""
+    return any(task.train_s > 0 or any(task.vehicle_train_s.values()) for task in problem.tasks)
 
 
 def split_plan(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
     """Return the split of `plans` (one per task, in their order) over the vehicles: by task, a share per vehicle.
 
     Tasks that do not name their vehicles are left out. Raises `Infeasible` where the vehicles hold too few samples,
-    `TooSlow` where their links need longer than `horizon_s`.
+    `TooSlow` where they need longer than `horizon_s`.
     """
-    planned = [(task, plan) for task, plan in zip(problem.tasks, plans, strict=True) if task.uplink_mbps]
+    planned = [(task, plan) for task, plan in zip(problem.tasks, plans, strict=True) if task.vehicles]
     if not planned:
         return {}
     for task, plan in planned:
-        held = sum(_held(task, plan, vehicle) for vehicle in task.uplink_mbps or ())
+        held = sum(_held(task, plan, vehicle) for vehicle in task.vehicles)
         if held < plan.samples:
             raise Infeasible(
                 f"task {task.name!r}: its vehicles hold {held} samples (samples_held), and the plan uploads "
                 f"{plan.samples}"
             )
     parts = [part for task, plan in planned for part in _parts(problem, task, plan)]
-    counts = _split(parts, [plan for _, plan in planned], problem.horizon_s)
+    subject = "the vehicles" if trains(problem) else "the vehicles' own links"
+    counts = _split(parts, [plan for _, plan in planned], problem.horizon_s, subject)
     shares: Shares = {}
     for task, _ in planned:
         own = [(part, row) for part, row in zip(parts, counts) if part.task is task]
         joined = _rounds([part.group for part, _ in own], [int(row[1]) for _, row in own], own[0][0].rounds)
         shares[task.name] = tuple(
             VehicleShare(
-                part.vehicle, int(row[0]), rounds, float(row[0] * task.sample_mb + len(rounds) * task.model_mb)
+                *(part.vehicle, int(row[0]), rounds),
+                wireless_mb=float(row[0] * task.sample_mb + len(rounds) * task.model_mb),
+                busy_s=float(row[0] * part.sample_s + len(rounds) * part.round_s),
             )
             for (part, row), rounds in zip(own, joined)
         )
@@ -104,13 +115,17 @@ def _parts(problem: Problem, task: AllocationTask, plan: TaskPlan) -> list[_Part
     groups = np.repeat(np.arange(len(task.edge_groups)), task.edge_groups)
     rounds = plan.edge_rounds + problem.edge_rounds_per_cloud_round * plan.cloud_rounds
     return [
-        _Part(task, int(group), name, link, _held(task, plan, name), rounds, float(task.data_quality.get(name, 1.0)))
-        for group, (name, link) in zip(groups, (task.uplink_mbps or {}).items(), strict=True)
+        _Part(
+            *(task, int(group), name, None if task.uplink_mbps is None else task.uplink_mbps[name].wireline),
+            *(task.sample_s(name), task.round_s(name)),
+            *(_held(task, plan, name), rounds, float(task.data_quality.get(name, 1.0))),
+        )
+        for group, name in zip(groups, task.vehicles, strict=True)
     ]
 
 
-def _split(parts: Sequence[_Part], plans: Sequence[TaskPlan], horizon_s: float | None) -> Array:
-    """Return the samples and rounds (P, 2) of every part; raises `TooSlow` where no split fits the horizon."""
+def _split(parts: Sequence[_Part], plans: Sequence[TaskPlan], horizon_s: float | None, subject: str) -> Array:
+    """Return the samples and rounds (P, 2) of every part; raises `TooSlow` of `subject` where none fits the horizon."""
     size = 2 * len(parts) + 1  # the last variable is a time [s]: the end of stage I, or of the plan
     needs, least = _needs(parts, plans)
     joined_by_all = LinearConstraint(needs, least[:, 0], least[:, 1])  # pyright: ignore[reportArgumentType]
@@ -129,7 +144,7 @@ def _split(parts: Sequence[_Part], plans: Sequence[TaskPlan], horizon_s: float |
         found = better
         if found is None:
             until = LinearConstraint(_busy(parts, with_rounds=True, less_last=True), ub=0.0)  # pyright: ignore[reportArgumentType]
-            raise _too_slow(_least(end, [joined_by_all, until], high, END_GAP), horizon_s)
+            raise _too_slow(_least(end, [joined_by_all, until], high, END_GAP), horizon_s, subject)
         value = float(aim @ found)
         fixed.append(LinearConstraint(csr_array(aim[None]), ub=value + TIE * max(abs(value), 1.0)))  # pyright: ignore[reportArgumentType]
     assert found is not None
@@ -159,16 +174,15 @@ def _needs(parts: Sequence[_Part], plans: Sequence[TaskPlan]) -> tuple[csr_array
 
 
 def _busy(parts: Sequence[_Part], *, with_rounds: bool, less_last: bool = False) -> csr_array:
-    """Return a row per vehicle and link: the time it is busy [s]; with `less_last`, minus the last variable."""
+    """Return the time of each vehicle and its wireline [s], a row each; with `less_last`, minus the last variable."""
     lines: dict[tuple[str, str], Array] = {}
     for number, part in enumerate(parts):
-        for link, mbps in (("wireless", part.link.wireless), ("wireline", part.link.wireline)):
-            if mbps is None:
-                continue
-            line = lines.setdefault((part.vehicle, link), np.r_[np.zeros(2 * len(parts)), -float(less_last)])
-            line[2 * number] = BITS_PER_BYTE * part.task.sample_mb / mbps
-            if with_rounds and link == "wireless":
-                line[2 * number + 1] = BITS_PER_BYTE * part.task.model_mb / mbps
+        times = {"own": (part.sample_s, part.round_s)}
+        if part.wireline is not None:
+            times["wireline"] = (BITS_PER_BYTE * part.task.sample_mb / part.wireline, 0.0)
+        for whose, (sample_s, round_s) in times.items():
+            line = lines.setdefault((part.vehicle, whose), np.r_[np.zeros(2 * len(parts)), -float(less_last)])
+            line[2 * number : 2 * number + 2] = sample_s, round_s * with_rounds
     return csr_array(np.stack(list(lines.values())))
 
 
@@ -185,11 +199,11 @@ def _least(aim: Array, constraints: Sequence[LinearConstraint], high: Array, gap
     return result.x
 
 
-def _too_slow(soonest: Array | None, horizon_s: float | None) -> TooSlow:
+def _too_slow(soonest: Array | None, horizon_s: float | None, subject: str) -> TooSlow:
     assert soonest is not None
     assert horizon_s is not None
     return TooSlow(
-        f"the vehicles' own links need {soonest[-1]:.6g} s for the plan even if stragglers leave out rounds, "
+        f"{subject} need {soonest[-1]:.6g} s for the plan even if stragglers leave out rounds, "
         f"{soonest[-1] - horizon_s:.6g} s more than horizon_s = {horizon_s:g}"
     )
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.curves.curves import OwnCurve
 from flcav.optimization.curves.fitting import CurveFit, refit
 from flcav.seeds import stream
 
@@ -27,7 +27,7 @@ class Bands:
 
     level: float  # share of the repeats between the lower and the upper band
     seed: int
-    curves: tuple[Additive | Effective, ...]  # one per repeat
+    curves: tuple[OwnCurve, ...]  # one per repeat
     k: int  # edge rounds per cloud round
 
     def between(self, resources: Array) -> tuple[Array, Array]:
@@ -57,7 +57,7 @@ def bootstrap_bands(
     return Bands(level, seed, tuple(curves), k)
 
 
-def fit_upper_curve(fit: CurveFit, found: Bands) -> Additive | Effective:
+def fit_upper_curve(fit: CurveFit, found: Bands) -> OwnCurve:
     """Return a curve of the fit's form that is not below the upper band: the worst case of a robust plan.
 
     It is fitted to the band, then its floor is raised until it is not below the band at the measured resources and at

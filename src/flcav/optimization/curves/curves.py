@@ -1,9 +1,11 @@
 """Learning curves: models of the error as a function of samples, edge rounds and cloud rounds.
 
-`Additive` sums an inverse power law per stage; `Effective` is one inverse power law of effective samples; `Shared` is
-the weighted mean of the curves of tasks with the same network.
+`Additive` sums an inverse power law per stage; `Effective` is one inverse power law of effective samples; `Federated`
+is one, too, in which cloud rounds bring the samples of the other regions and may cost accuracy; `Shared` is the
+weighted mean of the curves of tasks with the same network.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal, Self, overload
 
 import numpy as np
@@ -17,6 +19,7 @@ STAGES = ("pretrain", "edge", "cloud")  # their resources are samples, edge roun
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Sizeable = Annotated[float, Field(ge=1e-9)]  # large enough to divide by
+Change = Annotated[float, Field(ge=-1, le=1)]  # of an error
 
 
 Array = NDArray[np.float64]
@@ -119,18 +122,86 @@ class Effective(CurveConfig):
         return effective_samples(np.asarray(samples, np.float64), t, self.alpha, self.beta * self.group_samples)
 
 
+class Federated(CurveConfig):
+    """Learning curve of regions that learn from each other in cloud rounds: error = floor + a * n^(-b) + drift part.
+
+    With t = edge_rounds + k * cloud_rounds, z cloud rounds, R regions and G samples held in all of them,
+
+        n = alpha * samples + beta * (G / R * (1 - 1 / (t + 1)) + gamma * (G - G / R) * (1 - 1 / (z + 1))):
+
+    rounds bring the samples of a region's own vehicles, cloud rounds also those of the other regions. The drift part
+    max(drift, 0) - drift / (z + 1) changes the error by `drift` from no cloud round to endless ones. Where it is
+    positive, cloud rounds cost accuracy: averaging networks that drifted apart in different regions, the client drift
+    of Karimireddy et al. (2020, "SCAFFOLD", ICML).
+    """
+
+    model: Literal["federated"]
+    floor: NonNegative = 0.0
+    a: Sizeable
+    b: Sizeable
+    alpha: Sizeable  # worth of an uploaded sample
+    beta: NonNegative  # worth of a sample that a vehicle of the own region holds
+    gamma: NonNegative = 0.0  # worth of a sample of another region, relative to beta
+    group_samples: Annotated[tuple[NonNegative, ...], Field(min_length=2)]  # held by the vehicles of each region
+    drift: Change = 0.0  # change of the error by endless cloud rounds, beside what they bring
+
+    def __str__(self) -> str:
+        """Return the formula in x samples, t rounds and z cloud rounds."""
+        floor = f"{self.floor:.4g} + " if self.floor else ""
+        held = f" + {self.others:.4g} (1 - 1/(z + 1))" if self.others else ""
+        effective = f"{self.alpha:.4g} x + {self.own:.4g} (1 - 1/(t + 1)){held}"
+        drift = f" + {self.drift:.4g} (1 - 1/(z + 1))" if self.drift > 0 else f" + {-self.drift:.4g}/(z + 1)"
+        return f"{floor}{self.a:.4g} ({effective})^-{self.b:.4g}{drift if self.drift else ''}"
+
+    @property
+    def own(self) -> float:
+        """Worth of the samples held in a region: beta * G / R."""
+        return self.beta * split_regions(self.group_samples)[0]
+
+    @property
+    def others(self) -> float:
+        """Worth of the samples held in the other regions: beta * gamma * (G - G / R)."""
+        return self.beta * self.gamma * split_regions(self.group_samples)[1]
+
+    def error(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1) -> Array:
+        """Return the error after the samples and rounds given, elementwise, at `k` edge rounds per cloud round."""
+        power = self.a * self.effective_samples(samples, edge_rounds, cloud_rounds, k) ** -self.b
+        return self.floor + power + drift_part(cloud_rounds, self.drift)
+
+    def effective_samples(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int) -> Array:
+        """Return the number of effective samples n, elementwise, at `k` edge rounds per cloud round."""
+        z = np.asarray(cloud_rounds, np.float64)
+        t = np.asarray(edge_rounds, np.float64) + k * z
+        own = effective_samples(np.asarray(samples, np.float64), t, self.alpha, self.own)
+        return np.asarray(effective_samples(own, z, 1.0, self.others), dtype=np.float64)
+
+
+def split_regions(group_samples: Sequence[float]) -> tuple[float, float]:
+    """Return the samples held in a region, and in all others, in the mean over regions that hold `group_samples`."""
+    total = sum(group_samples)
+    return total / len(group_samples), total - total / len(group_samples)
+
+
+def drift_part(cloud_rounds: ArrayLike, drift: float | Array) -> Array:
+    """Return max(drift, 0) - drift / (z + 1) after z = `cloud_rounds`, elementwise: the drift part of a `Federated`."""
+    return np.maximum(drift, 0.0) - drift / (np.asarray(cloud_rounds, np.float64) + 1)
+
+
+OwnCurve = Annotated[Additive | Effective | Federated, Field(discriminator="model")]  # of one task
+
+
 class Member(Config):
     """A member of a cluster: one of the tasks that share a network and its data."""
 
     name: Annotated[str, Field(min_length=1)]  # name of the task
     weight: Positive = 1.0  # weight of the task's error in the cluster's mean
-    curve: Annotated[Additive | Effective, Field(discriminator="model")]  # the task's learning curve
+    curve: OwnCurve  # the task's learning curve
 
 
 class Shared(Config):
     """Learning curve of a cluster: the weighted mean error of its members, which all learn from each sample and round.
 
-    Construction raises pydantic's ValidationError where one of several members has an `Effective` curve.
+    Construction raises pydantic's ValidationError where one of several members has a curve that is not `Additive`.
     """
 
     model: Literal["shared"]  # discriminator
@@ -139,7 +210,7 @@ class Shared(Config):
     @model_validator(mode="after")
     def _additive(self) -> Self:
         for member in self.members:
-            if len(self.members) > 1 and isinstance(member.curve, Effective):
+            if len(self.members) > 1 and not isinstance(member.curve, Additive):
                 raise ValueError(f"members: {member.name!r} shares its network, so its curve must be additive")
         return self
 
@@ -150,4 +221,4 @@ class Shared(Config):
         return np.asarray(np.average(errors, axis=0, weights=weights), dtype=np.float64)
 
 
-Curve = Annotated[Additive | Effective | Shared, Field(discriminator="model")]
+Curve = Annotated[Additive | Effective | Federated | Shared, Field(discriminator="model")]

@@ -1,7 +1,8 @@
 """Fits of learning curves to history: bounded, robust least squares with model selection by AICc.
 
-AICc (Hurvich and Tsai 1989) decides whether the floor and each x0 are fitted. For few points neither is, and the fit is
-plain least squares: the article's curve, accuracy = 1 - a x^(-b). From `ROBUST_FROM` points on, the loss is soft L1,
+AICc (Hurvich and Tsai 1989) decides whether the floor and each x0 are fitted; of `Federated` curves the floor, gamma
+and drift. For few points none is, and the fit is plain least squares: the article's curve, accuracy = 1 - a x^(-b).
+From `ROBUST_FROM` points on, the loss is soft L1,
 which turns from squares to absolute values at three standard deviations (estimated by the median absolute residual).
 """
 
@@ -14,8 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from flcav.config import InputError
-from flcav.optimization.curves.curves import STAGES, Additive, Effective
-from flcav.optimization.curves.forms import STEEPEST, CurveT, Form, additive_forms, effective_forms
+from flcav.optimization.curves.curves import STAGES, Additive, Effective, Federated
+from flcav.optimization.curves.forms import (
+    STEEPEST,
+    CurveT,
+    Form,
+    additive_forms,
+    effective_forms,
+    federated_forms,
+)
 from flcav.optimization.curves.history import History
 
 Array = NDArray[np.float64]
@@ -87,7 +95,7 @@ class Fit(Generic[CurveT]):
         return f"extrapolated beyond the history: {', '.join(over)}" if over else None
 
 
-CurveFit = Fit[Additive] | Fit[Effective]
+CurveFit = Fit[Additive] | Fit[Effective] | Fit[Federated]
 
 
 @dataclass(frozen=True)
@@ -105,17 +113,17 @@ class FitState(Generic[CurveT]):
 def fit(
     history: History,
     *,
-    model: Literal["additive", "effective"] = "additive",
-    group_samples: float = 0.0,
+    model: Literal["additive", "effective", "federated"] = "additive",
+    group_samples: float | Sequence[float] = 0.0,
     k: int = 1,
     alpha: float = 0.1,
     beta: float | None = None,
 ) -> CurveFit:
     """Return the learning curve fitted to the history of one task: the error by samples, edge rounds and cloud rounds.
 
-    `model` is `Additive` or `Effective`; the other settings belong to the latter, see `fit_effective`. Raises
-    `InputError` where there are too few points, and where the effective model lacks `group_samples` for a history with
-    rounds.
+    `model` is `Additive`, `Effective` or `Federated`; the other settings belong to the last two, see `fit_effective`
+    and `fit_federated`. `group_samples` are those of all regions, or of each. Raises `InputError` where there are too
+    few points, where the effective model lacks `group_samples` for a history with rounds, and as `fit_federated` does.
 
     >>> from flcav import fit
     >>> from flcav.optimization import article_histories  # the points of Wang et al., Fig. 3a
@@ -127,9 +135,12 @@ def fit(
     columns = (samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
     if model == "additive":
         return fit_additive(*columns)
-    if group_samples == 0 and history.resources[:, 1:].any():
+    held = (group_samples,) if isinstance(group_samples, int | float) else tuple(group_samples)
+    if model == "federated":
+        return fit_federated(*columns, group_samples=held, k=k, alpha=alpha, beta=beta)
+    if sum(held) == 0 and history.resources[:, 1:].any():
         raise InputError("--model effective needs --group-samples, as the history has rounds")
-    return fit_effective(*columns, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
+    return fit_effective(*columns, group_samples=sum(held), k=k, alpha=alpha, beta=beta)
 
 
 def fit_additive(
@@ -169,6 +180,28 @@ def fit_effective(
     """
     spent = _columns(samples, edge_rounds, cloud_rounds)
     return _chosen(effective_forms(spent, alpha, beta, group_samples, k), spent, accuracy, weight)
+
+
+def fit_federated(
+    samples: ArrayLike,
+    edge_rounds: ArrayLike,
+    cloud_rounds: ArrayLike,
+    accuracy: ArrayLike,
+    weight: ArrayLike | None = None,
+    *,
+    group_samples: Sequence[float],
+    k: int = 1,
+    alpha: float = 0.1,
+    beta: float | None = None,
+) -> Fit[Federated]:
+    """Return the `Federated` curve fitted to accuracies (n,) at samples and rounds (n,) each.
+
+    `group_samples` are the samples that the vehicles of each region hold, the rest is as in `fit_effective`. AICc
+    decides whether other regions' samples are worth something, and whether the curve has a drift. Raises `InputError`
+    as `fit_effective` does, for fewer than two regions, and where the cloud rounds never vary.
+    """
+    spent = _columns(samples, edge_rounds, cloud_rounds)
+    return _chosen(federated_forms(spent, alpha, beta, group_samples, k), spent, accuracy, weight)
 
 
 def refit(fitted: FitState[Any], error: Array) -> Array:

@@ -2,9 +2,10 @@
 
 A decay a (x + x0)^(-b) is fitted as h ((x + x0) / (m + x0))^(-b), where m is the geometric mean of the resources. h is
 the error in the middle of the data, of order 1 and almost independent of b, whereas a varies by orders of magnitude
-with b. Parameters are bounded to be >= 0, so every curve falls with every resource.
+with b. Parameters but the drift are bounded to be >= 0, so every curve without drift falls with every resource.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Protocol, TypeVar
@@ -13,15 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, parse_config
-from flcav.optimization.curves.curves import STAGES, Additive, CurveConfig, Effective, effective_samples
+from flcav.optimization.curves.curves import (
+    STAGES,
+    Additive,
+    CurveConfig,
+    Effective,
+    Federated,
+    drift_part,
+    effective_samples,
+    split_regions,
+)
 
 Array = NDArray[np.float64]
-CurveT = TypeVar("CurveT", Additive, Effective, covariant=True)
+CurveT = TypeVar("CurveT", Additive, Effective, Federated, covariant=True)
 
 STEEPEST = 10.0  # largest exponent tried
 STARTS = (0.1, 0.5, 1.5)  # exponents at the starts of the search
 LARGEST_BETA = 1e3  # relative to alpha
 DEFAULT_BETA = 0.5  # of the article
+LARGEST_GAMMA = 1e2
+START_GAMMA, START_DRIFT = 0.5, 0.02  # starts of the search; of the drift with either sign
 FITTED = "the fitted curve"  # origin in error messages
 
 
@@ -204,3 +216,94 @@ def effective_forms(
         raise InputError(f"history of {len(resources)} points: {parameters} parameters need that many different points")
     middle = float(np.exp(np.log(effective).mean()))
     return [EffectiveForm(floor, alpha, beta, group_samples, k, middle) for floor in (False, True)]
+
+
+@dataclass(frozen=True)
+class FederatedForm:
+    """Form of a `Federated` curve: floor + a n^(-b) of n effective samples, and the drift part of the cloud rounds.
+
+    The parameters p are h, b, and those of floor, gamma, drift and beta that are fitted; the first three are 0 where
+    they are not.
+    """
+
+    floor: bool  # whether the floor is fitted
+    gamma: bool  # whether the worth of other regions' samples is fitted
+    drift: bool  # whether the drift is fitted
+    alpha: float
+    beta: float | None  # None: fitted
+    group_samples: tuple[float, ...]  # held in each region
+    k: int  # edge rounds per cloud round
+    middle: float  # geometric mean of the effective samples, without those of other regions
+
+    @property
+    def simplest(self) -> bool:
+        """True where neither floor nor gamma nor drift is fitted."""
+        return not (self.floor or self.gamma or self.drift)
+
+    def bounds(self) -> tuple[list[float], list[float]]:
+        """Return the least and most of each parameter."""
+        most = self._fitted(1.0, LARGEST_GAMMA, 1.0, LARGEST_BETA * self.alpha)
+        return [1e-9, 1e-6, *self._fitted(0.0, 0.0, -1.0, 0.0)], [np.inf, STEEPEST, *most]
+
+    def starts(self, level: float) -> list[list[float]]:
+        """Return one start per exponent of `STARTS`, and sign of the drift if that is fitted."""
+        drifts = (START_DRIFT, -START_DRIFT) if self.drift else (0.0,)
+        return [
+            [level, b, *self._fitted(level / 10, START_GAMMA, drift, DEFAULT_BETA)]
+            for b, drift in product(STARTS, drifts)
+        ]
+
+    def predict(self, p: Array, resources: Array) -> Array:
+        """Return the errors (n,) at `resources` (n, 3)."""
+        floor, gamma, drift, beta = self._named(p)
+        samples, edge_rounds, cloud_rounds = resources.T
+        own, others = split_regions(self.group_samples)
+        effective = effective_samples(samples, edge_rounds + self.k * cloud_rounds, self.alpha, beta * own)
+        effective = effective_samples(effective, cloud_rounds, 1.0, beta * gamma * others)
+        return p[0] * (effective / self.middle) ** -p[1] + floor + drift_part(cloud_rounds, drift)
+
+    def curve(self, p: Array) -> Federated:
+        """Return the curve of parameters p."""
+        floor, gamma, drift, beta = map(float, self._named(p))
+        values = {
+            **{"model": "federated", "floor": _share(floor), "a": float(p[0] * self.middle ** p[1]), "b": float(p[1])},
+            **{"alpha": self.alpha, "beta": _share(beta), "gamma": _share(gamma)},
+            **{"group_samples": self.group_samples, "drift": float(np.copysign(_share(abs(drift)), drift))},
+        }
+        return parse_config(Federated, values, FITTED)
+
+    def _fitted(self, floor: float, gamma: float, drift: float, beta: float) -> list[float]:
+        """Return those of the values whose parameters are fitted."""
+        fitted = (self.floor, self.gamma, self.drift, self.beta is None)
+        return [value for value, wanted in zip((floor, gamma, drift, beta), fitted) if wanted]
+
+    def _named(self, p: Array) -> tuple[float, float, float, float]:
+        """Return floor, gamma, drift and beta, each fitted or given."""
+        left = iter(p[2:])
+        floor, gamma, drift = (next(left) if fitted else 0.0 for fitted in (self.floor, self.gamma, self.drift))
+        return floor, gamma, drift, next(left) if self.beta is None else self.beta
+
+
+def federated_forms(
+    resources: Array, alpha: float, beta: float | None, group_samples: Sequence[float], k: int
+) -> list[FederatedForm]:
+    """Return the candidate forms for `resources` (n, 3): with and without a fitted floor, gamma and drift.
+
+    Raises `InputError` as `effective_forms` does, and for fewer than two regions, regions without samples, and a
+    history in which the cloud rounds never vary.
+    """
+    if len(group_samples) < 2 or sum(group_samples) == 0:
+        raise InputError(
+            "--model federated needs --group-samples of each region: once for each of two or more, and not all 0"
+        )
+    if len(np.unique(resources[:, 2])) < 2:
+        raise InputError(
+            "the cloud rounds of the history never vary, so nothing is known of what the samples of other regions bring"
+        )
+    own, _ = split_regions(group_samples)
+    plain = effective_forms(resources, alpha, beta, own, k)[0]
+    middle, given = plain.middle, plain.beta
+    return [
+        FederatedForm(floor, gamma, drift, alpha, given, tuple(group_samples), k, middle)
+        for floor, gamma, drift in product((False, True), repeat=3)
+    ]

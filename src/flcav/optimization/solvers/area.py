@@ -6,6 +6,7 @@ successive linearisation: the next plan is the one of least weighted error with 
 not concave, the climb has several starts.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from flcav.optimization.curves.curves import Shared
 from flcav.optimization.problem import Problem
-from flcav.optimization.solvers.instance import build_instance
+from flcav.optimization.solvers.instance import Clock, build_instance
 from flcav.optimization.solvers.weighted import minimise_weighted_error
 
 Array = NDArray[np.float64]
@@ -30,7 +31,7 @@ class Polygon:
 
     x: Array  # (n,)
     area: float
-    rates: Array  # (2,) increase of the area per MB of each link
+    rates: Array  # (L,) increase of the area per unit of each budget
 
 
 def area(accuracy: Array) -> float:
@@ -39,24 +40,24 @@ def area(accuracy: Array) -> float:
     return 0.5 * float(np.sin(2 * np.pi / len(corners)) * (corners @ np.roll(corners, -1)))
 
 
-def maximise_area(problem: Problem, gap: float) -> Polygon:
+def maximise_area(problem: Problem, gap: float, clocks: Sequence[Clock] = ()) -> Polygon:
     """Return the plan of largest area among the local optima from several starts; there is no certificate.
 
-    `gap` is the relative gap of each weighted problem, and the least relative gain of a step. Raises `Infeasible` where
-    no plan is within the budgets.
+    `gap` is the relative gap of each weighted problem, and the least relative gain of a step; `clocks` are as in
+    `build_instance`. Raises `Infeasible` where no plan is within the budgets.
     """
     corners = sum(len(task.learners) for task in problem.tasks)
     starts = [np.ones(corners)]
     if corners <= MOST_EMPHASISED:
         starts += [1 + (EMPHASIS - 1) * np.eye(corners)[corner] for corner in range(corners)]
-    return max((_climb(problem, start, gap) for start in starts), key=lambda found: found.area)
+    return max((_climb(problem, start, gap, clocks) for start in starts), key=lambda found: found.area)
 
 
-def _climb(problem: Problem, weights: Array, gap: float) -> Polygon:
+def _climb(problem: Problem, weights: Array, gap: float, clocks: Sequence[Clock]) -> Polygon:
     best = Polygon(np.zeros(0), -np.inf, np.zeros(2))
     for _ in range(STEPS):
         weighed = _weighed(problem, np.maximum(weights, LEAST_WEIGHT))
-        found = minimise_weighted_error(build_instance(weighed), gap)
+        found = minimise_weighted_error(build_instance(weighed, clocks), gap)
         accuracy = _accuracy(problem, found.x)
         reached = Polygon(found.x, area(accuracy), found.rates)
         if reached.area <= best.area * (1 + gap):

@@ -1,8 +1,12 @@
-"""Convex integer programs under linear budgets, by outer approximation (Duran and Grossmann 1986) with HiGHS.
+"""Integer programs of convex and concave terms under linear budgets, by outer approximation with HiGHS.
 
-Each convex term is bounded from below by linear cuts: tangents, or secants through neighbouring whole numbers.
-With the cuts in place of the terms, the problem is a (mixed-integer) linear program. Its optimum is a proven lower
-bound, and the next cuts are added at its solution.
+The method is that of Duran and Grossmann (1986). Each convex term is bounded from below by linear cuts: tangents, or
+secants through neighbouring whole numbers. With the cuts in place of the terms, the problem is a (mixed-integer) linear
+program. Its optimum is a proven lower bound, and the next cuts are added at its solution.
+
+Concave terms are functions of one quantity each. Every whole number j in its range has a variable w_j in [0, 1]: the
+w_j sum to 1, j w_j sums to the quantity, and the term is the sum of its values at j times w_j. For whole w that is
+exact; in the continuous relaxation it is the term's convex envelope, and so a lower bound.
 """
 
 from collections.abc import Sequence
@@ -41,19 +45,33 @@ class Term(Protocol):
         ...
 
 
+class Concave(Protocol):
+    """A concave function of one quantity."""
+
+    @property
+    def index(self) -> int:
+        """Index of the quantity."""
+        ...
+
+    def at(self, quantity: Array) -> Array:
+        """Return the values of the term (m,) where its quantity is `quantity` (m,)."""
+        ...
+
+
 @dataclass(frozen=True)
 class Program:
-    """Convex integer program: minimise the sum of the terms over whole x in [low, high] with x @ cost <= budget."""
+    """Integer program: minimise the sum of all terms over whole x in [low, high] with x @ cost <= budget."""
 
     terms: Sequence[Term]
     low: Array  # (n,) least of each quantity
     high: Array  # (n,) most of each quantity
-    cost: Array  # (n, 2) of one unit on each link
-    budget: Array  # (2,) of each link
+    cost: Array  # (n, L) of one unit under each budget
+    budget: Array  # (L,)
+    concave: Sequence[Concave] = ()
 
     def value(self, x: Array) -> float:
         """Return the objective at x (n,)."""
-        return sum(term.value(x) for term in self.terms)
+        return sum(term.value(x) for term in self.terms) + sum(float(term.at(x[term.index])) for term in self.concave)
 
 
 class Cuts:
@@ -63,6 +81,7 @@ class Cuts:
         self.program = program
         self._lines: dict[tuple[int, Line], None] = {}
         self._scale = LARGE / max(program.value(program.low), 1e-12)
+        self._steps = [np.arange(program.low[term.index], program.high[term.index] + 1) for term in program.concave]
 
     def add(self, x: Array) -> bool:
         """Add the cuts at x (n,); return whether any was new."""
@@ -75,7 +94,12 @@ class Cuts:
         """Return the optimum x (n,) of the continuous relaxation, and its value; raises `InputError` if HiGHS fails."""
         matrix, limit = self._rows()
         bounds = np.stack((self._low(), self._high()), axis=1)
-        result = linprog(self._objective(), A_ub=matrix, b_ub=limit, bounds=bounds, method="highs")
+        equal, total = self._equations()
+        result = linprog(
+            *(self._objective(), matrix, limit, equal, total),
+            bounds=bounds,
+            method="highs",
+        )
         return require_optimum(result)[: len(self.program.low)], float(result.fun) / self._scale
 
     def solve(self, gap: float) -> tuple[Array, float]:
@@ -84,39 +108,62 @@ class Cuts:
         Raises `InputError` where HiGHS fails.
         """
         matrix, limit = self._rows()
-        whole = np.r_[np.ones(len(self.program.low)), np.zeros(len(self.program.terms))]
+        whole = np.r_[np.ones(len(self.program.low)), np.zeros(len(self.program.terms)), np.ones(self._tabulated)]
+        equal, total = self._equations()
+        constraints = [LinearConstraint(matrix, ub=limit)]  # pyright: ignore[reportArgumentType]
+        if equal is not None:
+            constraints.append(LinearConstraint(equal, total, total))  # pyright: ignore[reportArgumentType]
         result = milp(
             self._objective(),
             integrality=whole,
             bounds=Bounds(self._low(), self._high()),  # pyright: ignore[reportArgumentType]
-            constraints=LinearConstraint(matrix, ub=limit),  # pyright: ignore[reportArgumentType]
+            constraints=constraints,
             options={"mip_rel_gap": gap},
         )
         return np.round(require_optimum(result)[: len(self.program.low)]), float(result.mip_dual_bound) / self._scale
 
+    @property
+    def _tabulated(self) -> int:
+        """Number of the variables of concave terms."""
+        return sum(map(len, self._steps))
+
     def _objective(self) -> Array:
-        return np.r_[np.zeros(len(self.program.low)), np.ones(len(self.program.terms))]
+        tables = [self._scale * term.at(steps) for term, steps in zip(self.program.concave, self._steps)]
+        return np.r_[np.zeros(len(self.program.low)), np.ones(len(self.program.terms)), *tables]
 
     def _low(self) -> Array:
-        return np.r_[self.program.low, np.zeros(len(self.program.terms))]
+        return np.r_[self.program.low, np.zeros(len(self.program.terms) + self._tabulated)]
 
     def _high(self) -> Array:
-        return np.r_[self.program.high, np.full(len(self.program.terms), np.inf)]
+        return np.r_[self.program.high, np.full(len(self.program.terms), np.inf), np.ones(self._tabulated)]
+
+    def _equations(self) -> tuple[csr_array | None, Array | None]:
+        """Return the equations of the concave terms, as a matrix and the right-hand side; None where there are none."""
+        if not self._steps:
+            return None, None
+        column = len(self.program.low) + len(self.program.terms)
+        rows = np.zeros((2 * len(self._steps), column + self._tabulated))
+        for i, (term, steps) in enumerate(zip(self.program.concave, self._steps)):
+            own = slice(column, column + len(steps))
+            rows[2 * i, own], rows[2 * i + 1, own] = 1.0, steps
+            rows[2 * i + 1, term.index] = -1.0
+            column += len(steps)
+        return csr_array(rows), np.tile((1.0, 0.0), len(self._steps))
 
     def _rows(self) -> tuple[csr_array, Array]:
-        """Return the constraint matrix over (quantities, terms) and its upper limits.
+        """Return the constraint matrix over (quantities, terms, variables of concave terms) and its upper limits.
 
         Its rows are the budgets, scaled to 1, then slope . x - term <= -value for every cut.
         """
-        program, n = self.program, len(self.program.low)
-        link, quantity = np.repeat((0, 1), n), np.tile(np.arange(n), 2)
-        rows, columns, values = [*link], [*quantity], [*(program.cost / program.budget).T.ravel()]
-        for row, (number, line) in enumerate(self._lines, start=2):
+        program, n, budgets = self.program, len(self.program.low), len(self.program.budget)
+        budget, quantity = np.repeat(np.arange(budgets), n), np.tile(np.arange(n), budgets)
+        rows, columns, values = [*budget], [*quantity], [*(program.cost / program.budget).T.ravel()]
+        for row, (number, line) in enumerate(self._lines, start=budgets):
             rows += [row] * (len(line.of) + 1)
             columns += [*line.of, n + number]
             values += [*(self._scale * slope for slope in line.slope), -1.0]
-        limit = np.r_[1.0, 1.0, [-self._scale * line.value for _, line in self._lines]]
-        return coo_array((values, (rows, columns)), shape=(len(limit), n + len(program.terms))).tocsr(), limit
+        limit = np.r_[np.ones(budgets), [-self._scale * line.value for _, line in self._lines]]
+        return coo_array((values, (rows, columns)), shape=(len(limit), len(self._low()))).tocsr(), limit
 
 
 def continuous_optimum(

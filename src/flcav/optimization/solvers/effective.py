@@ -1,12 +1,13 @@
-"""Least Lagrangian of effective-samples curves over whole samples and rounds, vectorised over tasks.
+"""Least Lagrangian of curves over effective samples, over whole samples and rounds, vectorised over tasks.
 
 A task's error above its floor is
 
-    weight a n^(-b),   n = `effective_samples` of x samples and t = y + k z rounds.
+    weight (a n^(-b) + drift part of z),   n = alpha x + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)),
 
-A cloud round costs as much as k edge rounds on the wireless link, and more on the wireline one. So among all (y, z)
-with the same t the one with the fewest cloud rounds is optimal, and only the values of t are enumerated. For each of
-them the best x has a closed form.
+with x samples, t = y + k z rounds and z cloud rounds. Where cloud rounds bring more than edge rounds do, every pair
+(y, z) is tried; for `Effective` curves, and `Federated` ones whose cloud rounds bring nothing, only those with the
+fewest cloud rounds for each t. For each pair the best x has a closed form. No step needs the error to be convex in the
+rounds, or to fall with them.
 """
 
 from collections.abc import Sequence
@@ -15,37 +16,38 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.curves.curves import Effective, effective_samples
+from flcav.optimization.curves.curves import Effective, Federated, drift_part, effective_samples
 from flcav.optimization.solvers.rounding import outermost
+from flcav.optimization.solvers.rounds import fewest_cloud_rounds, pair_rounds
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class EffectiveTasks:
-    """The E tasks with effective-samples curves, and T choices of rounds each; a missing choice has infinite cost."""
+    """The E tasks with such curves, and T choices of rounds each; a missing choice has infinite cost."""
 
     quantity: NDArray[np.intp]  # (E, 3) indices of samples, edge rounds, cloud rounds in the whole problem
     gain: Array  # (E, 1) weight * a
     b: Array  # (E, 1)
     alpha: Array  # (E, 1)
-    group: Array  # (E, 1) beta * G
+    own: Array  # (E, 1) worth of the samples held in a task's own region
+    others: Array  # (E, 1) worth of the samples held in the other regions
+    drift: Array  # (E, 1) weight * drift
     k: int  # edge rounds per cloud round
     least: Array  # (E, 1) samples
     most: Array  # (E, 1) samples
-    sample_cost: Array  # (E, 2) per link
+    sample_cost: Array  # (E, L) under each budget
     rounds: Array  # (E, T, 2) edge rounds, cloud rounds
-    rounds_cost: Array  # (E, T, 2) per link
+    rounds_cost: Array  # (E, T, L) under each budget
 
     def error(self, x: Array) -> Array:
         """Return the weighted errors (E,) above their floors at x (n,) of the whole problem."""
-        own = x[self.quantity]
-        t = own[:, 1] + self.k * own[:, 2]
-        effective = effective_samples(own[:, 0], t, self.alpha[:, 0], self.group[:, 0])
-        return self.gain[:, 0] * effective ** -self.b[:, 0]
+        own = x[self.quantity][:, None]
+        return self._error(own[..., 0], own[..., 1:])[:, 0]
 
     def minimise_lagrangian(self, multipliers: Array) -> tuple[Array, Array]:
-        """Return the whole quantities (E, 3) of least error plus price at `multipliers` (2,), and the minima (E,)."""
+        """Return the whole quantities (E, 3) of least error plus price at `multipliers` (L,), and the minima (E,)."""
         samples, value = self._best_samples(multipliers)
         best = np.argmin(value, axis=1)
         task = np.arange(len(best))
@@ -55,7 +57,7 @@ class EffectiveTasks:
     def tighten_bounds(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
         """Return least and most quantities, (E, 3) each, of the choices within `slack` of a task's least Lagrangian.
 
-        The Lagrangian is error plus price at `multipliers` (2,).
+        The Lagrangian is error plus price at `multipliers` (L,).
         """
         samples, value = self._best_samples(multipliers)
         limit = value.min(axis=1, keepdims=True) + slack
@@ -76,7 +78,7 @@ class EffectiveTasks:
         price = (self.sample_cost @ multipliers)[:, None]
         with np.errstate(divide="ignore"):
             level = (self.gain * self.b * self.alpha / price) ** (1 / (self.b + 1))
-        ideal = (level - self._effective(0.0)) / self.alpha
+        ideal = (level - self._effective(0.0, self.rounds)) / self.alpha
         below = np.clip(np.floor(np.minimum(ideal, self.most)), self.least, self.most)
         above = np.minimum(below + 1, self.most)
         values = self._value(below, multipliers), self._value(above, multipliers)
@@ -84,45 +86,63 @@ class EffectiveTasks:
 
     def _value(self, samples: Array, multipliers: Array) -> Array:
         price = (self.sample_cost @ multipliers)[:, None]
-        error = self.gain * self._effective(samples) ** -self.b
         with np.errstate(invalid="ignore"):
             rounds = self.rounds_cost @ multipliers
-        return error + price * samples + np.where(np.isinf(self.rounds_cost[:, :, 0]), np.inf, rounds)
+        spent = price * samples + np.where(np.isinf(self.rounds_cost[:, :, 0]), np.inf, rounds)
+        return self._error(samples, self.rounds) + spent
 
-    def _effective(self, samples: Array | float) -> Array:
-        """Return the effective samples (E, T) of each choice of rounds with `samples` (E, T)."""
-        return effective_samples(samples, self.rounds[:, :, 0] + self.k * self.rounds[:, :, 1], self.alpha, self.group)
+    def _error(self, samples: Array, rounds: Array) -> Array:
+        """Return the weighted errors (E, T) above the floors after `samples` (E, T) and `rounds` (E, T, 2)."""
+        power = self.gain * self._effective(samples, rounds) ** -self.b
+        return power + drift_part(rounds[..., 1], self.drift) if self.drift.any() else power
+
+    def _effective(self, samples: Array | float, rounds: Array) -> Array:
+        """Return the effective samples (E, T) of `samples` (E, T) and `rounds` (E, T, 2)."""
+        held = effective_samples(samples, rounds[..., 0] + self.k * rounds[..., 1], self.alpha, self.own)
+        return effective_samples(held, rounds[..., 1], 1.0, self.others) if self.others.any() else held
 
 
-def build_effective_tasks(
-    numbers: Sequence[int], weights: Sequence[float], curves: Sequence[Effective], k: int, low: Array, high: Array,
-    cost: Array,
-) -> EffectiveTasks:  # fmt: skip
-    """Return the tasks with effective-samples `curves` and `weights`, and their choices of rounds.
+@dataclass(frozen=True)
+class Alone:
+    """A task whose curve is over effective samples."""
 
-    `numbers` are the tasks' indices in a problem of N tasks with bounds `low` and `high` (3N,) and `cost` (3N, 2); `k`
-    is the number of edge rounds per cloud round.
+    number: int  # index of the task in the problem
+    name: str
+    weight: float
+    curve: Effective | Federated
+
+
+def build_effective_tasks(tasks: Sequence[Alone], k: int, low: Array, high: Array, cost: Array) -> EffectiveTasks:
+    """Return the `tasks` in arrays, with their choices of rounds.
+
+    The problem has N tasks with bounds `low` and `high` (3N,) and `cost` (3N, L), and `k` edge rounds per cloud round.
+    Raises `InputError` where a `Federated` curve has more pairs of rounds than can be tried.
     """
+    numbers = [task.number for task in tasks]
     quantity = 3 * np.array(numbers)[:, None] + np.arange(3)
-    choices = [_rounds(low[q], high[q], k) for q in quantity]
+    choices = [_choices(task, low[q], high[q], k) for task, q in zip(tasks, quantity)]
     rounds = np.zeros((len(numbers), max(map(len, choices)), 2))
-    rounds_cost = np.full(rounds.shape, np.inf)
-    for row, (own, q) in enumerate(zip(choices, quantity)):
-        rounds[row, : len(own)] = own
-        rounds_cost[row, : len(own)] = own @ cost[q[1:]]
-    numbers_of = [(w * c.a, c.b, c.alpha, c.beta * c.group_samples) for w, c in zip(weights, curves)]
-    gain, b, alpha, group = np.array(numbers_of).T[:, :, None]
+    rounds_cost = np.full((*rounds.shape[:2], cost.shape[1]), np.inf)
+    for row, (pairs, q) in enumerate(zip(choices, quantity)):
+        rounds[row, : len(pairs)] = pairs
+        rounds_cost[row, : len(pairs)] = pairs @ cost[q[1:]]
+    rows = [(task.weight * task.curve.a, task.curve.b, task.curve.alpha, *_held(task)) for task in tasks]
+    gain, b, alpha, own, others, drift = np.array(rows).T[:, :, None]
     least, most = low[quantity[:, :1]], high[quantity[:, :1]]
     sample_cost = cost[quantity[:, 0]]
-    return EffectiveTasks(quantity, gain, b, alpha, group, k, least, most, sample_cost, rounds, rounds_cost)
+    worth = (gain, b, alpha, own, others, drift)
+    return EffectiveTasks(quantity, *worth, k, least, most, sample_cost, rounds, rounds_cost)
 
 
-def _rounds(low: Array, high: Array, k: int) -> Array:
-    """Return the choices of edge and cloud rounds (T, 2): for each t = y + k z the one with the fewest cloud rounds."""
-    if k == 0:
-        edge = np.arange(low[1], high[1] + 1)
-        return np.column_stack((edge, np.full(len(edge), low[2])))
-    t = np.arange(low[1] + k * low[2], high[1] + k * high[2] + 1)
-    cloud = np.maximum(np.ceil((t - high[1]) / k), low[2])
-    edge = t - k * cloud
-    return np.column_stack((edge, cloud))[edge >= low[1]]
+def _held(task: Alone) -> tuple[float, float, float]:
+    """Return the worth of the samples held in the own region and in the others, and the weighted drift."""
+    curve = task.curve
+    if isinstance(curve, Federated):
+        return curve.own, curve.others, task.weight * curve.drift
+    return curve.beta * curve.group_samples, 0.0, 0.0
+
+
+def _choices(task: Alone, low: Array, high: Array, k: int) -> Array:
+    if isinstance(task.curve, Federated) and (task.curve.others > 0 or task.curve.drift < 0):
+        return pair_rounds(low, high, "a federated curve", task.name)
+    return fewest_cloud_rounds(low, high, k)

@@ -9,9 +9,9 @@ from scipy.optimize import OptimizeResult
 
 from flcav.config import InputError, shorten
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
-from flcav.optimization.curves.curves import Additive, Effective
+from flcav.optimization.curves.curves import Additive
 from flcav.optimization.problem import AllocationTask, Problem
-from flcav.optimization.solvers.effective import EffectiveTasks, build_effective_tasks
+from flcav.optimization.solvers.effective import Alone, EffectiveTasks, build_effective_tasks
 from flcav.optimization.solvers.rounding import outermost
 from flcav.optimization.solvers.separable import BUDGET_SLACK, Separable, room
 
@@ -26,7 +26,28 @@ def require_optimum(result: OptimizeResult) -> Array:
 
 
 class Infeasible(InputError):
-    """No plan within the limits fits: even the least one exceeds a budget, the samples held or the links' capacity."""
+    """No plan within the limits fits: even the least one exceeds a budget, the samples held or the vehicles' time."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A limit of time, which samples and rounds of N tasks spend as they spend megabytes."""
+
+    per_sample: tuple[float, ...]  # (N,) [s]
+    per_round: tuple[float, ...]  # (N,) [s] of an edge round; a cloud round is k of them
+    seconds: float  # there are
+
+
+def shared_clock(problem: Problem) -> Clock | None:
+    """Return the limit of training time on a vehicle that takes part in every round of every task without names.
+
+    Vehicles without names cannot be told apart, so each of them may be that one. None where no such task has a
+    `train_s`, or the problem no `horizon_s`.
+    """
+    per_round = tuple(0.0 if task.vehicles else task.train_s for task in problem.tasks)
+    if problem.horizon_s is None or not any(per_round):
+        return None
+    return Clock((0.0,) * len(per_round), per_round, problem.horizon_s)
 
 
 @dataclass(frozen=True)
@@ -37,7 +58,7 @@ class Instance:
     """
 
     separable: Separable  # every additive curve, and all bounds, costs and budgets
-    effective: EffectiveTasks | None  # every effective-samples curve
+    effective: EffectiveTasks | None  # every curve over effective samples
     floor: float  # weighted sum of the floors
 
     @property
@@ -52,12 +73,12 @@ class Instance:
 
     @property
     def cost(self) -> Array:
-        """Cost of one unit of each quantity on each link (n, 2) [MB]."""
+        """Cost of one unit of each quantity under each budget (n, L): on each link [MB], on each clock [s]."""
         return self.separable.cost
 
     @property
     def budget(self) -> Array:
-        """Budget of each link, wireless and wireline (2,) [MB]."""
+        """Budgets (L,): of each link, wireless and wireline [MB], then of each clock [s]."""
         return self.separable.budget
 
     def error(self, x: Array) -> float:
@@ -78,7 +99,7 @@ class Instance:
         return change
 
     def minimise_lagrangian(self, multipliers: Array) -> tuple[Array, float]:
-        """Return the whole x (n,) of least Lagrangian at `multipliers` (2,), and the lower bound that it proves."""
+        """Return the whole x (n,) of least Lagrangian at `multipliers` (L,), and the lower bound that it proves."""
         problem, prices = self.separable, self.separable.prices(multipliers)
         below = np.floor(problem.minimise_lagrangian(multipliers))
         above = np.minimum(below + 1, problem.high)
@@ -95,7 +116,7 @@ class Instance:
     def tighten_bounds(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
         """Return least and most of each quantity, (n,) each, whose error plus price is within `slack` of its minimum.
 
-        Prices are those at `multipliers` (2,). If `slack` is the distance from the dual bound to a known plan's error,
+        Prices are those at `multipliers` (L,). If `slack` is the distance from the dual bound to a known plan's error,
         no better plan has a quantity outside these bounds.
         """
         problem, prices = self.separable, self.separable.prices(multipliers)
@@ -112,18 +133,19 @@ class Instance:
         return low, high
 
 
-def build_instance(problem: Problem) -> Instance:
+def build_instance(problem: Problem, clocks: Sequence[Clock] = ()) -> Instance:
     """Return `problem` in arrays, its upper bounds lowered to what the budgets have room for.
 
-    Raises `Infeasible`, naming the budget, the cost of the least plan and the excess, where that exceeds a budget.
+    The budgets are those of both links, of the problem's `shared_clock`, and of `clocks`. Raises `Infeasible`, naming
+    the budget, the cost of the least plan and the excess, where that exceeds a budget.
     """
     low, high = (np.concatenate(edge) for edge in zip(*(_range(problem, task) for task in problem.tasks)))
     rows: list[tuple[float, float, float, int]] = []
-    alone: list[tuple[int, float, Effective]] = []
+    alone: list[Alone] = []
     for number, task in enumerate(problem.tasks):
         for learner in task.learners:
-            if isinstance(learner.curve, Effective):
-                alone.append((number, learner.weight, learner.curve))
+            if not isinstance(learner.curve, Additive):
+                alone.append(Alone(number, task.name, learner.weight, learner.curve))
                 continue
             for stage, decay in enumerate(learner.curve.decays()):
                 if decay.a > 0:
@@ -131,14 +153,17 @@ def build_instance(problem: Problem) -> Instance:
     idle = np.setdiff1d(np.arange(len(low)), [row[3] for row in rows])
     rows += [(0.0, 1.0, 1.0, int(quantity)) for quantity in idle]
     a, b, x0, of = np.array(sorted(rows, key=lambda row: row[3])).T
-    budget = np.array((problem.budgets_mb.wireless, problem.budgets_mb.wireline))
+    own_clock = shared_clock(problem)
+    clocks = clocks if own_clock is None else (own_clock, *clocks)
+    links = (problem.budgets_mb.wireless, problem.budgets_mb.wireline)
+    budget = np.array((*links, *(clock.seconds for clock in clocks)))
+    k = problem.edge_rounds_per_cloud_round
+    cost = np.column_stack((unit_costs(problem), *(_spent(clock, k) for clock in clocks)))
     own = None if len(of) == len(low) else of.astype(np.intp)
-    powers = Separable(a, b, x0, low, high, unit_costs(problem), budget, own)
+    powers = Separable(a, b, x0, low, high, cost, budget, own)
     _refuse(powers)
     powers = replace(powers, high=np.minimum(high, low + room(powers)))
-    numbers, weights, curves = zip(*alone) if alone else ((), (), ())
-    k = problem.edge_rounds_per_cloud_round
-    effective = build_effective_tasks(numbers, weights, curves, k, low, powers.high, powers.cost) if alone else None
+    effective = build_effective_tasks(alone, k, low, powers.high, powers.cost) if alone else None
     floor = sum(learner.weight * learner.curve.floor for task in problem.tasks for learner in task.learners)
     return Instance(powers, effective, floor)
 
@@ -173,7 +198,19 @@ def _range(problem: Problem, task: AllocationTask) -> tuple[Array, Array]:
     return ranges[:, 0], ranges[:, 1]
 
 
+def _spent(clock: Clock, k: int) -> Array:
+    """Return the seconds (3N,) that one sample, edge round and cloud round of each task spend."""
+    per_round = np.array(clock.per_round)
+    return np.column_stack((clock.per_sample, per_round, k * per_round)).ravel()
+
+
 def _refuse(problem: Separable) -> None:
+    for need, have in zip(problem.spent(problem.low)[2:], problem.budget[2:]):
+        if need > have * (1 + BUDGET_SLACK):
+            raise Infeasible(
+                f"the least that the limits allow takes {need:.6g} s on a vehicle, {need - have:.6g} s more than "
+                f"horizon_s = {have:.6g}"
+            )
     for link, need, have in zip(("wireless", "wireline"), problem.spent(problem.low), problem.budget):
         if need > have * (1 + BUDGET_SLACK):
             raise Infeasible(

@@ -1,4 +1,4 @@
-"""Greedy rounding under two budgets: units are removed at the least loss per price, or added at the most gain."""
+"""Greedy rounding under linear budgets: units are removed at the least loss per price, or added at the most gain."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class Budgeted(Protocol):
-    """A problem of n whole quantities under two budgets, whose error falls as any quantity grows."""
+    """A problem of n whole quantities under L budgets, whose error falls as any quantity grows."""
 
     @property
     def low(self) -> Array:
@@ -26,12 +26,12 @@ class Budgeted(Protocol):
 
     @property
     def cost(self) -> Array:
-        """Cost of one unit of each quantity on each link (n, 2)."""
+        """Cost of one unit of each quantity under each budget (n, L)."""
         ...
 
     @property
     def budget(self) -> Array:
-        """Budget of each link (2,)."""
+        """Budgets (L,)."""
         ...
 
     def change(self, x: Array, step: int) -> Array:

@@ -1,11 +1,11 @@
-"""Separable convex programs of inverse powers under two budgets: the continuous optimum by Lagrangian duality.
+"""Separable convex programs of inverse powers under linear budgets: the continuous optimum by Lagrangian duality.
 
     minimise sum_m a_m (x_of(m) + x0_m)^(-b_m)   subject to   sum_j cost_jl x_j <= budget_l,   low_j <= x_j <= high_j
 
 At multipliers lambda >= 0, x_j is the point at which its marginal gain equals its price p_j = sum_l cost_jl lambda_l,
 or a bound (water-filling). For a single power it is (a b / p)^(1 / (b + 1)) - x0; for several, Newton's method finds
 it, starting from the largest of the single powers' points. The dual function is concave in the two multipliers, and its
-gradient is the overspend. All steps are vectorised over the quantities.
+gradient is the overspend. All steps are vectorised over the quantities. `relax` is for two budgets, all else for any.
 """
 
 from dataclasses import dataclass
@@ -37,8 +37,8 @@ class Separable:
     x0: Array  # (m,) >= 0
     low: Array  # (n,) whole numbers
     high: Array  # (n,) whole numbers
-    cost: Array  # (n, 2) of one unit on each link, >= 0
-    budget: Array  # (2,)
+    cost: Array  # (n, L) of one unit under each budget, >= 0
+    budget: Array  # (L,)
     of: NDArray[np.intp] | None = None  # (m,) the quantity of each power; default: one each, in order
 
     def error(self, x: Array) -> Array:
@@ -52,15 +52,18 @@ class Separable:
         return bool(np.all(self.spent(x) <= self.budget * (1 + BUDGET_SLACK)))
 
     def spent(self, x: Array) -> Array:
-        """Return the cost of x (n,) on each link (2,)."""
+        """Return the cost of x (n,) under each budget (L,)."""
         return np.array([x @ column for column in self._columns])
 
     def prices(self, multipliers: Array) -> Array:
-        """Return the price (n,) of one unit of each quantity at `multipliers` (2,)."""
-        return multipliers[0] * self._columns[0] + multipliers[1] * self._columns[1]
+        """Return the price (n,) of one unit of each quantity at `multipliers` (L,)."""
+        prices = multipliers[0] * self._columns[0]
+        for each, column in zip(multipliers[1:], self._columns[1:]):
+            prices = prices + each * column
+        return prices
 
     def minimise_lagrangian(self, multipliers: Array) -> Array:
-        """Return the continuous x (n,) that minimises the Lagrangian, error plus price, at `multipliers` (2,)."""
+        """Return the continuous x (n,) that minimises the Lagrangian, error plus price, at `multipliers` (L,)."""
         return self._level(self.prices(multipliers))
 
     def bend(self, x: Array, prices: Array) -> Array:
@@ -93,8 +96,8 @@ class Separable:
         return np.bincount(self.of, weights=values, minlength=len(self.low)).astype(np.float64)  # pyright: ignore[reportArgumentType]
 
     @cached_property
-    def _columns(self) -> tuple[Array, Array]:
-        return np.ascontiguousarray(self.cost[:, 0]), np.ascontiguousarray(self.cost[:, 1])
+    def _columns(self) -> list[Array]:
+        return [np.ascontiguousarray(column) for column in self.cost.T]
 
     @cached_property
     def _log_gain(self) -> Array:
@@ -128,7 +131,7 @@ def room(problem: Separable) -> Array:
 
 
 def relax(problem: Separable) -> ContinuousOptimum:
-    """Return the continuous optimum, by an active-set search over the budgets that bind.
+    """Return the continuous optimum under two budgets, by an active-set search over those that bind.
 
     The sets are tried in this order: none, the scarcer budget, both, the other one.
     """

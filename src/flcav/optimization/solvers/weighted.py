@@ -3,7 +3,8 @@
 Minimising the Lagrangian over whole quantities gives the bound. The quantities at the best multipliers, trimmed and
 filled to the budgets, are nearly optimal where tasks are many. Where they are few, quantities that no plan better than
 the best known can have are excluded (Lagrangian bound tightening), and outer approximation over the rest
-(`cutting_planes`) closes the gap. The convex terms of the error and their cuts are `PowerTerm` and `EffectiveTerm`.
+(`cutting_planes`) closes the gap. The convex terms of the error and their cuts are `PowerTerm` and `EffectiveTerm`; a
+drift that costs accuracy is concave, and tabulated as `DriftTerm`.
 """
 
 from collections.abc import Iterator
@@ -14,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from flcav.optimization.curves.curves import effective_samples
+from flcav.optimization.curves.curves import drift_part, effective_samples
 from flcav.optimization.solvers.cutting_planes import Line, Program, Term, outer_approximation
+from flcav.optimization.solvers.effective import EffectiveTasks
 from flcav.optimization.solvers.instance import Instance, require_optimum
 from flcav.optimization.solvers.rounding import fill, trim
 from flcav.optimization.solvers.separable import newton_step, relax
@@ -57,45 +59,73 @@ class PowerTerm:
 class EffectiveTerm:
     """The inverse power gain * n^(-b) of effective samples n; its cuts are tangents.
 
-    n is `effective_samples` of x[first] samples after t = x[first + 1] + k x[first + 2] rounds.
+    n = alpha s + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)), of s = x[first] samples, z = x[first + 2] cloud
+    rounds and t = x[first + 1] + k z rounds.
     """
 
     first: int
     gain: float  # weight * a
     b: float
     alpha: float
-    group: float  # beta * group_samples
+    own: float  # worth of the samples held in the own region
+    others: float  # worth of the samples held in the other regions
     k: int  # edge rounds per cloud round
 
     def value(self, x: Array) -> float:
         """Return the value of the term at x (n,)."""
         samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
-        return self.gain * self._effective(samples, edge_rounds + self.k * cloud_rounds) ** -self.b
+        return self.gain * self._effective(samples, edge_rounds + self.k * cloud_rounds, cloud_rounds) ** -self.b
 
     def lines(self, x: Array) -> list[Line]:
         """Return the tangent at x (n,)."""
         samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
         t = edge_rounds + self.k * cloud_rounds
-        per_round = self.group / (t + 1) ** 2
-        fall = self.gain * self.b * self._effective(samples, t) ** (-self.b - 1)
-        slope = -fall * np.array((self.alpha, per_round, self.k * per_round))
+        per_round = self.own / (t + 1) ** 2
+        per_cloud_round = self.k * per_round + self.others / (cloud_rounds + 1) ** 2
+        fall = self.gain * self.b * self._effective(samples, t, cloud_rounds) ** (-self.b - 1)
+        slope = -fall * np.array((self.alpha, per_round, per_cloud_round))
         index = (self.first, self.first + 1, self.first + 2)
         return [Line(index, tuple(map(float, slope)), self.value(x) - float(slope @ x[self.first : self.first + 3]))]
 
-    def _effective(self, samples: float, t: float) -> float:
-        return float(effective_samples(samples, t, self.alpha, self.group))
+    def _effective(self, samples: float, t: float, cloud_rounds: float) -> float:
+        held = effective_samples(samples, t, self.alpha, self.own)
+        return float(effective_samples(held, cloud_rounds, 1.0, self.others))
+
+
+@dataclass(frozen=True)
+class DriftTerm:
+    """The drift part of x[index] cloud rounds that cost accuracy: drift (1 - 1 / (z + 1)), concave in z."""
+
+    index: int
+    drift: float  # weight * drift, > 0
+
+    def at(self, quantity: Array) -> Array:
+        """Return the values of the term (m,) where the quantity is `quantity` (m,)."""
+        return drift_part(quantity, self.drift)
 
 
 def list_terms(instance: Instance) -> list[Term]:
-    """Return the convex terms whose sum is the weighted error above the floors."""
+    """Return the convex terms of the weighted error above the floors; with `list_drifts` they sum to it."""
     powers, effective = instance.separable, instance.effective
     of = np.arange(len(powers.a)) if powers.of is None else powers.of
     rows = zip(of.tolist(), powers.a.tolist(), powers.b.tolist(), powers.x0.tolist())
     terms: list[Term] = [PowerTerm(*row) for row in rows if row[1] > 0]
     if effective is not None:
-        columns = (effective.quantity, effective.gain, effective.b, effective.alpha, effective.group)
+        columns = (effective.quantity, effective.gain, effective.b, effective.alpha, effective.own, effective.others)
         terms += [EffectiveTerm(*row, k=effective.k) for row in zip(*(column[:, 0].tolist() for column in columns))]
+        terms += [PowerTerm(index, -drift, 1.0, 1.0) for index, drift in _drifts(effective) if drift < 0]
     return terms
+
+
+def list_drifts(instance: Instance) -> list[DriftTerm]:
+    """Return the concave terms of the weighted error: the drift of every task whose cloud rounds cost accuracy."""
+    if instance.effective is None:
+        return []
+    return [DriftTerm(index, drift) for index, drift in _drifts(instance.effective) if drift > 0]
+
+
+def _drifts(effective: EffectiveTasks) -> list[tuple[int, float]]:
+    return list(zip(effective.quantity[:, 2].tolist(), effective.drift[:, 0].tolist()))
 
 
 @dataclass(frozen=True)
@@ -105,8 +135,8 @@ class Solution:
     x: Array  # (n,)
     error: float  # above the floors
     bound: float  # above the floors: no whole plan within the budgets has less
-    multipliers: Array  # (2,) at which the bound is proven
-    rates: Array  # (2,) decrease of the error per MB more of each link, of the continuous or dual problem
+    multipliers: Array  # (L,) at which the bound is proven
+    rates: Array  # (L,) decrease of the error per unit more of each budget, of the continuous or dual problem
 
     def gap(self, floor: float) -> float:
         """Return the relative gap (error - bound) / bound, with `floor` added to both; for a bound of 0, 0 or 1."""
@@ -121,7 +151,8 @@ def minimise_weighted_error(instance: Instance, gap: float) -> Solution:
 
     Raises `InputError` where HiGHS fails.
     """
-    best = Solution(instance.low, instance.error(instance.low), -np.inf, np.zeros(2), np.zeros(2))
+    none = np.zeros(len(instance.budget))
+    best = Solution(instance.low, instance.error(instance.low), -np.inf, none, none)
     bound_at = best.multipliers
     for number, (multipliers, bound) in enumerate(_multipliers(instance, gap)):
         x, proven = instance.minimise_lagrangian(multipliers)
@@ -142,11 +173,11 @@ def minimise_weighted_error(instance: Instance, gap: float) -> Solution:
 
 
 def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
-    """Yield multipliers (2,) near the dual optimum, each with a lower bound known there (-inf: none).
+    """Yield multipliers (L,) near the dual optimum, each with a lower bound known there (-inf: none).
 
-    The first are those of the continuous optimum, except where a curve is over effective samples.
+    The first are those of the continuous optimum, except where a curve is over effective samples or time is limited.
     """
-    if instance.effective is not None:
+    if instance.effective is not None or len(instance.budget) > 2:
         yield from _planes(instance, gap)
         return
     problem = instance.separable
@@ -167,6 +198,7 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
     """Yield the best multipliers, with their bounds, of Kelley's cutting-plane method on the dual over whole plans."""
     left = instance.budget - instance.low @ instance.cost
     largest = instance.error(instance.low) / np.maximum(left, 1e-9 * instance.budget)
+    aim = np.r_[-1.0, np.zeros(len(largest))]
     rows, values, proven = [], [], []
     multipliers = [0.01 * largest]
     for _ in range(PLANES):
@@ -174,7 +206,7 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
         proven.append(bound)
         rows.append(np.r_[1.0, (instance.budget - x @ instance.cost) * largest])
         values.append(instance.error(x))
-        model = linprog([-1.0, 0, 0], A_ub=np.array(rows), b_ub=values, bounds=[(None, None), (0, 1), (0, 1)])
+        model = linprog(aim, A_ub=np.array(rows), b_ub=values, bounds=[(None, None), *[(0, 1)] * len(largest)])
         weights = require_optimum(model)[1:]
         if -model.fun - max(proven) <= 0.02 * gap * (max(proven) + instance.floor):
             break
@@ -187,7 +219,7 @@ def _closed(instance: Instance, best: Solution, gap: float) -> Solution:
     """Return `best` or a better plan, with its bound, by outer approximation within the tightened bounds."""
     _, bound = instance.minimise_lagrangian(best.multipliers)
     low, high = instance.tighten_bounds(best.multipliers, (best.error - bound) * (1 + 1e-9) + 1e-15)
-    program = Program(list_terms(instance), low, high, instance.cost, instance.budget)
+    program = Program(list_terms(instance), low, high, instance.cost, instance.budget, list_drifts(instance))
     starts = [np.minimum(low + step, high) for step in range(int(min((high - low).max(), 40)) + 1)]
     starts += [np.floor(low + (high - low) * share) for share in np.linspace(0, 1, 9)]
     visited, proven = outer_approximation(program, [*starts, np.clip(best.x, low, high)], gap, instance.floor)

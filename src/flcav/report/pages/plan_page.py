@@ -11,7 +11,7 @@ from flcav.optimization.allocation.allocate import Allocation, TaskPlan, resolve
 from flcav.optimization.allocation.budget_sweep import LINKS, BudgetPoint
 from flcav.optimization.allocation.comparison import PlanComparison
 from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, explain_objective
-from flcav.optimization.allocation.vehicles import Shares
+from flcav.optimization.allocation.vehicles import Shares, trains
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.report import style
 from flcav.report.charts import curves, plans
@@ -72,6 +72,7 @@ def plan_results(compared: PlanComparison) -> dict[str, Any]:
         "parts": _parts(problem, plan),
         "vehicles": _vehicles(problem, compared.shares),
         "horizon_s": problem.horizon_s,
+        "trains": trains(problem),
         "robust": problem.robust,
         "note": plan.note,
         "warnings": plan.warnings,
@@ -114,17 +115,18 @@ def _stage_prices(problem: Problem, task: AllocationTask, row: TaskPlan) -> dict
 
 
 def _vehicles(problem: Problem, shares: Shares) -> list[dict[str, Any]]:
-    """Return a row per vehicle: its samples and rounds of all tasks, and how long its wireless link is busy [s]."""
+    """Return a row per vehicle: its samples and rounds of all tasks, and how long it sends and trains [s]."""
     rows: dict[str, dict[str, Any]] = {}
     for task in problem.tasks:
         for share in shares.get(task.name, ()):
-            mbps = (task.uplink_mbps or {})[share.vehicle].wireless
-            row = rows.setdefault(share.vehicle, {"vehicle": share.vehicle, "mbps": mbps, "mb": 0.0, "parts": []})
+            mbps = None if task.uplink_mbps is None else task.uplink_mbps[share.vehicle].wireless
+            empty = {"vehicle": share.vehicle, "mbps": mbps, "mb": 0.0, "busy_s": 0.0, "parts": []}
+            row = rows.setdefault(share.vehicle, empty)
             row["mb"] += share.wireless_mb
+            row["busy_s"] += share.busy_s
             row["parts"].append({"task": task.name, "samples": share.samples, "rounds": len(share.rounds)})
     most = {task: max(len(share.rounds) for share in own) for task, own in shares.items()}
     for row in rows.values():
-        row["busy_s"] = 8 * row["mb"] / row["mbps"]
         row["missed"] = sum(most[part["task"]] - part["rounds"] for part in row["parts"])
     return list(rows.values())
 
@@ -136,7 +138,7 @@ def _sentences(values: Mapping[str, Any], both: Sequence[BudgetPoint]) -> dict[s
         "stages": _stages(values["parts"]),
         "budgets": _budgets(values["measure"]["name"], values["objective"], both),
         "others": _others(values),
-        "vehicles": _stragglers(values["vehicles"], values["horizon_s"]),
+        "vehicles": _stragglers(values["vehicles"], values["horizon_s"], values["trains"]),
     }
 
 
@@ -193,14 +195,17 @@ def _budgets(measure: str, objective: float, both: Sequence[BudgetPoint]) -> str
     return f"{half}; with these it is {objective:.4f}; with double, {at[2.0]:.4f}."
 
 
-def _stragglers(vehicles: Sequence[Mapping[str, Any]], horizon_s: float | None) -> str:
+def _stragglers(vehicles: Sequence[Mapping[str, Any]], horizon_s: float | None, trains: bool) -> str:
     if not vehicles:
         return ""
     missing = [row for row in vehicles if row["missed"]]
     slowest = max(vehicles, key=lambda row: row["busy_s"])
-    within = f", within the {horizon_s:,.0f} s that links may be busy" if horizon_s is not None else ""
-    busy = f"The busiest link is that of {slowest['vehicle']}: {slowest['busy_s']:,.0f} s{within}."
+    of, whose, cause = "links", "link is that of", "its link cannot carry them"
+    if trains:
+        of, whose, cause = "vehicles", "vehicle is", "its time is too short for them"
+    within = f", within the {horizon_s:,.0f} s that {of} may be busy" if horizon_s is not None else ""
+    busy = f"The busiest {whose} {slowest['vehicle']}: {slowest['busy_s']:,.0f} s{within}."
     if not missing:
         return f"Every vehicle joins every round. {busy}"
     names = ", ".join(f"{row['vehicle']} ({row['missed']})" for row in missing)
-    return f"Rounds that a vehicle leaves out because its link cannot carry them: {names}. {busy}"
+    return f"Rounds that a vehicle leaves out because {cause}: {names}. {busy}"

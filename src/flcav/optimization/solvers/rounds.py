@@ -1,0 +1,40 @@
+"""The choices of edge and cloud rounds of one task, for solvers that try each of them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+
+Array = NDArray[np.float64]
+
+MOST_CHOICES = 1_000_000  # pairs of rounds of one task
+
+
+def pair_rounds(low: Array, high: Array, reason: str, task: str) -> Array:
+    """Return all pairs of edge and cloud rounds (C, 2) of `task` with quantities from `low` (3,) to `high` (3,).
+
+    Raises `InputError` with the `reason` for which pairs are tried, where there are more than `MOST_CHOICES`.
+    """
+    pairs = int(np.prod(high[1:] - low[1:] + 1))
+    if pairs > MOST_CHOICES:
+        raise InputError(
+            f"{reason} tries every pair of edge and cloud rounds, and task {task!r} has {pairs}: "
+            f"set limits that leave at most {MOST_CHOICES}"
+        )
+    edge, cloud = (np.arange(low[stage], high[stage] + 1) for stage in (1, 2))
+    return np.stack(np.meshgrid(edge, cloud, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def fewest_cloud_rounds(low: Array, high: Array, k: int) -> Array:
+    """Return the choices of edge and cloud rounds (T, 2): for each t = y + k z the one with the fewest cloud rounds.
+
+    A cloud round costs as much as k edge rounds on the wireless link, and more on the wireline one. So for a curve that
+    depends on t alone no other choice is better. `low` and `high` (3,) are the least and most of the quantities.
+    """
+    if k == 0:
+        edge = np.arange(low[1], high[1] + 1)
+        return np.column_stack((edge, np.full(len(edge), low[2])))
+    t = np.arange(low[1] + k * low[2], high[1] + k * high[2] + 1)
+    cloud = np.maximum(np.ceil((t - high[1]) / k), low[2])
+    edge = t - k * cloud
+    return np.column_stack((edge, cloud))[edge >= low[1]]
