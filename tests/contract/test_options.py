@@ -91,6 +91,13 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
             ("--group-samples", "--alpha", "--beta", "--edge-rounds-per-cloud-round"), ("effective", "federated")
         ),
     },
+    "history": dict.fromkeys(
+        (
+            *("--task", "--samples", "--edge-rounds", "--cloud-rounds", "--seeds", "--first-seed"),
+            *("--jobs", "--engine", "--stale"),
+        ),
+        ALWAYS,
+    ),
     "reproduce": {
         **dict.fromkeys(("--seeds", "--scale"), STUDIES),
         "--jobs": (*STUDIES, "sim-to-real"),

@@ -51,7 +51,7 @@ def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
         for row in tested:
             if row["town"] == town:
                 _draw_interval(axes, stages.index(row["stage"]) + aside, row, colour)
-    axes.set(xlim=(-0.5, len(stages) - 0.5), xlabel="test frames", ylabel=measure)
+    axes.set(xlim=(-0.5, max(len(stages), 1) - 0.5), xlabel="test frames", ylabel=measure)
     axes.set_ylim(0, None)
     axes.set_xticks(range(len(stages)), stages)
     axes.grid(axis="y")
