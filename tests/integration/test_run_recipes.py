@@ -168,6 +168,8 @@ def test_a_history_is_made_of_recorded_datasets(
     assert dealt.vehicles == Frames.open(before / "grid-edge-weather").vehicles
     flcav("history", str(tmp_path / "few.yaml"), "--task", "weather", "--samples", "4;2", *asked, code=2)
     assert "--samples '4;2': whole numbers from 1" in capsys.readouterr().err
+    flcav("history", str(tmp_path / "few.yaml"), "--task", "weather", "--samples", "9999999", *asked, code=2)
+    assert "the run of seed 101 with 9999999 samples: field 'tasks.weather.plan.samples'" in capsys.readouterr().err
     flcav("history", str(tmp_path / "few.yaml"), "--task", "signs", "--samples", "4", *asked, code=2)
     assert "'signs' is none of the recipe's tasks: weather" in capsys.readouterr().err
 

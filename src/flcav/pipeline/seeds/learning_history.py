@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from flcav.config import InputError
+from flcav.config import InputError, parse_config
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe, Split
 from flcav.pipeline.results import Run, Saved
@@ -37,7 +37,10 @@ class HistoryOrigin(Saved):
 def history_recipes(
     recipe: RunRecipe, task: str, samples: Sequence[int], edge_rounds: int, cloud_rounds: int, seeds: Sequence[int]
 ) -> dict[str, RunRecipe]:
-    """Return the recipe of each run by the name of its folder; raises `InputError` for a task that `recipe` lacks."""
+    """Return the recipe of each run by the name of its folder.
+
+    Raises `InputError` for a task that `recipe` lacks, and for a seed or a count that a recipe cannot have.
+    """
     if task not in recipe.tasks:
         raise InputError(f"'{task}' is none of the recipe's tasks: {', '.join(recipe.tasks)}")
     return {
@@ -52,7 +55,8 @@ def _fix_plan(recipe: RunRecipe, task: str, seed: int, samples: int, edge_rounds
     plan = {"samples": samples, "edge_rounds": edge_rounds, "cloud_rounds": cloud_rounds}
     placed = {} if task in recipe.placement.tasks else {"rule": "none", "tasks": []}
     splits = recipe.sized_splits.model_copy(update={"test": UNUSED})
-    return RunRecipe.model_validate(
+    return parse_config(
+        RunRecipe,
         asked
         | {
             "seed": seed,
@@ -62,7 +66,8 @@ def _fix_plan(recipe: RunRecipe, task: str, seed: int, samples: int, edge_rounds
             "budgets_mb": {"wireless": AMPLE_MB, "wireline": AMPLE_MB},
             "placement": asked["placement"] | placed,
             "arms": {},
-        }
+        },
+        f"the run of seed {seed} with {samples} samples",
     )
 
 
