@@ -3,7 +3,8 @@ from pathlib import Path
 import pytest
 from reproduction_pages import TABLES, fill, fill_folder, tables_of
 
-from flcav.config import InputError
+from flcav.config import InputError, read_json
+from flcav.experiments.arms.run import ARMS, ArmsResult, order_arms
 from flcav.markdown import format_table
 
 REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"
@@ -43,3 +44,14 @@ def test_filling_replaces_what_stood_there_and_names_what_is_not_known() -> None
 
 def test_markdown() -> None:
     assert format_table(("x", "y"), [[1, ""], ["b", 2]]) == "| x | y |\n|---|---|\n| 1 | |\n| b | 2 |"
+
+
+def test_arms_are_drawn_in_their_own_order_whatever_that_of_the_file() -> None:
+    results = ArmsResult.from_json(read_json(REPRODUCTIONS / "demo" / "result.json"), "demo")
+    drawn = order_arms(results.summary.ap50)
+    assert {town: set(arms) for town, arms in drawn.items()} == {
+        town: set(arms) for town, arms in results.summary.ap50.items()
+    }
+    for town, arms in drawn.items():
+        assert list(arms) == [arm for arm in ARMS[town] if arm in arms]
+    assert list(drawn["grid"])[::6] == ["pretrained", "oracle"]

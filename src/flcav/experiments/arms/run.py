@@ -213,5 +213,14 @@ def _known(number: float | None) -> float:
 
 
 def draw_arms(results: ArmsResult) -> bytes:
-    """Return the forest plot of all arms' AP over seeds as a PNG."""
-    return style.png(figures.arms(results.summary.ap50))
+    """Return the forest plot of all arms' AP over seeds as a PNG, in the order of `ARMS`."""
+    return style.png(figures.arms(order_arms(results.summary.ap50)))
+
+
+def order_arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> dict[str, dict[str, MeanOverSeeds]]:
+    """Return the numbers by town and arm in the order of `ARMS`: files have their keys sorted."""
+    return {
+        town: {arm: towns[town][arm] for arm in arms if arm in towns[town]}
+        for town, arms in ARMS.items()
+        if town in towns
+    }

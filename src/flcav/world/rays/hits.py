@@ -1,4 +1,4 @@
-"""What rays hit."""
+"""First hits of rays: distance, instance and face."""
 
 from typing import NamedTuple
 

@@ -135,7 +135,7 @@ class JsonMessage(NamedTuple):
 
 
 class Place(TypedDict):
-    """When and in which coordinate frame a sensor measured: fields of most of Foxglove's messages."""
+    """Timestamp and coordinate frame of a measurement: fields of most of Foxglove's messages."""
 
     timestamp: Timestamp
     frame_id: str
