@@ -100,11 +100,18 @@ def train_until_level(
     training, task = learning.training, learning.task
     blocks: list[Block] = []
     network = learning.build_network()
-    moving = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(training.average), use_buffers=True)
+    moving = None
+    if training.average:
+        moving = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(training.average), use_buffers=True)
+
+    def follow(_step: int, _values: Mapping[str, float]) -> None:
+        if moving is not None:
+            moving.update_parameters(network)
+
     if (folder / BLOCKS).exists():
         blocks = [Block(**row) for row in json.loads((folder / BLOCKS).read_text())]
         load_weights(task, network, folder / f"block{len(blocks)}.safetensors")
-        if training.average:
+        if moving is not None:
             moving.load_state_dict(load_tensors(folder / f"average{len(blocks)}.safetensors"))
     while (rate := next_rate([block.score for block in blocks], training)) is not None:
         number = len(blocks) + 1
@@ -116,16 +123,16 @@ def train_until_level(
             batch=learning.batch,
             learning_rate=rate * task.practice.learning_rate,
             seed=derive_seed(learning.seed, PRETRAIN, number),
-            watch=lambda _step, _values: moving.update_parameters(network),
+            watch=follow,
         )
         score = mean_score(task, network, validation)
         blocks.append(Block(rate, loss, score))
         save_network(task, network, folder / f"block{number}.safetensors")
-        if training.average:
+        if moving is not None:
             write_bytes(folder / f"average{number}.safetensors", save_tensors(moving.state_dict()))
         write_json(folder / BLOCKS, [vars(block) for block in blocks])
         report(number, training.max_blocks + len(training.cooldown), f"validation {score:.3f}")
-    if training.average:
+    if moving is not None:
         network.load_state_dict(moving.module.state_dict())
     save_network(task, network, folder / WEIGHTS)
     return tuple(blocks)
