@@ -24,7 +24,7 @@ from flcav.perception.device import select_device
 from flcav.perception.objects import Sample, Second, detect, sample_from_frame
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.task import fresh
+from flcav.perception.task import build_network
 from flcav.perception.training import adamw, step
 from flcav.seeds import stream
 from flcav.sources.embedded import EmbeddedSource
@@ -55,7 +55,7 @@ def time_on_cpu(names: tuple[str, ...]) -> None:
     torch.set_num_threads(1)
     print(f"SECOND, CPU-ms per sample (median; reference {REFERENCE_MS} for a training step of tiny, 90 degrees)")
     for name in names:
-        network = fresh(OBJECTS, OBJECTS.configurations[name], 0)
+        network = build_network(OBJECTS, OBJECTS.configurations[name], 0)
         whole = _sweeps(network, RIGS[name])
         sector = [replace(s, points=s.points[s.points[:, 0] > np.abs(s.points[:, 1])]) for s in whole]
         for part, samples in (("90 degrees", sector), ("whole spin", whole)):
@@ -67,7 +67,7 @@ def time_on_gpu() -> None:
     print(f"paper on {torch.cuda.get_device_name(device)}, torch {torch.__version__}, batches of {GPU_BATCH}")
     for bfloat16 in (False, True):
         config = replace(OBJECTS.configurations["paper"], bfloat16=bfloat16)
-        _time_on_gpu(fresh(OBJECTS, config, 0).to(device).train(), device)
+        _time_on_gpu(build_network(OBJECTS, config, 0).to(device).train(), device)
 
 
 def _time_on_gpu(network: Second, device: torch.device) -> None:

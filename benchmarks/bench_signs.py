@@ -17,7 +17,7 @@ from flcav.perception.signs.outcomes import LOWEST_SCORE
 from flcav.perception.signs.predict import detect
 from flcav.perception.signs.samples import Sample, sample_from_frame
 from flcav.perception.signs.task import SIGNS
-from flcav.perception.task import fresh
+from flcav.perception.task import build_network
 from flcav.perception.training import adamw, step
 from flcav.seeds import stream
 from flcav.sources.embedded import EmbeddedSource
@@ -36,7 +36,10 @@ def main() -> None:
     works: list[Callable[[], object]] = []
     for config in CONFIGURATIONS.values():
         samples = [sample_from_frame(frame, "camera", frame.images["camera"].rgb, config) for frame in frames]
-        works += [training(fresh(SIGNS, config, 0), samples, batch), inference(fresh(SIGNS, config, 0), samples)]
+        works += [
+            training(build_network(SIGNS, config, 0), samples, batch),
+            inference(build_network(SIGNS, config, 0), samples),
+        ]
     taken = cpu_ms(works, REPEATS)
     height, width = frames[0].images["camera"].rgb.shape[:2]
     print(f"CPU-ms per sample, medians of {REPEATS}; training in batches of {batch}, inference {width} x {height}")

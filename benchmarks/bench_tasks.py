@@ -17,7 +17,7 @@ from cpu_time import cpu_ms
 
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.perception.task import Task, fresh
+from flcav.perception.task import Task, build_network
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.training import adamw, step
 from flcav.seeds import stream
@@ -53,7 +53,7 @@ def main(names: list[str]) -> None:
 
 
 def time_network(task: Task, name: str, config: Any, data: Dataset) -> None:
-    network = fresh(task, config, 0)
+    network = build_network(task, config, 0)
     samples = task.samples(data, config)
     batch = 2 if name.startswith("paper") else min(task.practice.batch, len(samples))
     [trained] = cpu_ms([training(task, network, samples, batch)], 1 if name.startswith("paper") else REPEATS)

@@ -10,7 +10,7 @@ import torch
 from cpu_time import cpu_ms
 
 from flcav.dataset.layout import FrameKey
-from flcav.perception.task import fresh
+from flcav.perception.task import build_network
 from flcav.perception.training import adamw, step
 from flcav.perception.trajectory.config import CONFIGURATIONS, FUTURE, PAST, TrajectoryConfig
 from flcav.perception.trajectory.predict import predict
@@ -31,7 +31,7 @@ def main() -> None:
     print(f"CPU-ms per sample (median of {REPEATS} batches of {BATCH}; reference {REFERENCE_MS} for a training step)")
     print(f"  extraction: {extraction_ms():.2f}")
     for name, config in CONFIGURATIONS.items():
-        network = fresh(TRAJECTORY, config, 0)
+        network = build_network(TRAJECTORY, config, 0)
         batch = 1 if name == "paper-cameras" else BATCH  # a gigabyte of attention for 16
         samples = [made_sample(config)] * batch
         optimizer = adamw(network, 1e-3)

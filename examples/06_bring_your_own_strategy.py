@@ -17,7 +17,7 @@ from flcav.federation.strategies.fedavg import FedAvg, average
 from flcav.federation.trainable import Update, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.client import TaskClient
-from flcav.perception.task import fresh
+from flcav.perception.task import build_network
 from flcav.perception.weather.config import LeNetConfig
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import from_arrays, to_arrays
@@ -47,7 +47,7 @@ def main(out: Path) -> None:
         seen = [sample for sample in samples if CONFIG.classes[sample.label] in weathers]
         clients[vehicle] = TaskClient(WEATHER, CONFIG, seen)
     for strategy in (FedAvg(), LossWeighted()):
-        network = fresh(WEATHER, CONFIG, seed=1)
+        network = build_network(WEATHER, CONFIG, seed=1)
         account = Account(Ledger(Budget(wireless_mb=10.0, wireline_mb=0.0)), "edge", WEATHER.name, "wireless")
         update = federate(clients, to_arrays(network), SCHEDULE, account, strategy=strategy)
         from_arrays(network, update.weights)

@@ -27,7 +27,7 @@ from flcav.perception.card import CARD_KEY
 from flcav.perception.client import TaskClient
 from flcav.perception.device import select_device
 from flcav.perception.signs.task import SIGNS
-from flcav.perception.task import Task, find_configuration, fresh
+from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.training import Checkpointing, Validation, train
 from flcav.perception.training.run import Request, train_network
@@ -87,19 +87,19 @@ def test_samples_are_those_of_the_frames_asked_for(task, data, samples):
 
 @each_task
 def test_a_seed_names_a_training(task, samples):
-    networks = [fresh(task, small(task), 1) for _ in range(3)]
+    networks = [build_network(task, small(task), 1) for _ in range(3)]
     for network, seed in zip(networks, (3, 3, 4), strict=True):
         history = train(task, network, samples[task.name], steps=2, batch=2, seed=seed)
         assert np.isfinite(history.losses).all()
     assert same(networks[0], networks[1])
     assert not same(networks[0], networks[2])
-    assert not same(networks[0], fresh(task, small(task), 1))
+    assert not same(networks[0], build_network(task, small(task), 1))
 
 
 @each_task
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_a_gpu_trains_evaluates_and_goes_on_to_the_same_weights(task, data, samples, tmp_path):
-    network, again = (fresh(task, small(task), 1).to(select_device("cuda")) for _ in range(2))
+    network, again = (build_network(task, small(task), 1).to(select_device("cuda")) for _ in range(2))
     checkpointing = Checkpointing(tmp_path / "checkpoint.pt", every=2)
     history = train(task, network, samples[task.name], steps=2, batch=2, seed=3, checkpointing=checkpointing)
     train(task, again, samples[task.name], steps=2, batch=2, seed=3, checkpointing=checkpointing)
@@ -121,7 +121,7 @@ def test_a_killed_training_goes_on_to_the_same_weights(task, validated, samples,
     validation = Validation(score, every=2, patience=9) if validated else None
     settings = {"steps": 5, "batch": 2, "seed": 3, "validation": validation}
     learned = samples[task.name]
-    whole, cut, resumed = (fresh(task, small(task), 1) for _ in range(3))
+    whole, cut, resumed = (build_network(task, small(task), 1) for _ in range(3))
     losses = train(task, whole, learned, **settings)
     checkpointing = Checkpointing(tmp_path / "checkpoint.pt", every=3)
 
@@ -140,7 +140,7 @@ def test_a_killed_training_goes_on_to_the_same_weights(task, validated, samples,
 
 @each_task
 def test_weights_come_back_and_those_of_another_task_are_refused(task, tmp_path):
-    network, path = fresh(task, small(task), 1), tmp_path / "weights.safetensors"
+    network, path = build_network(task, small(task), 1), tmp_path / "weights.safetensors"
     save_network(task, network, path)
     loaded = load_network(task, path)
     assert same(network, loaded)
@@ -155,7 +155,7 @@ def test_weights_come_back_and_those_of_another_task_are_refused(task, tmp_path)
 def test_a_client_is_trainable(task, samples):
     client: Trainable = TaskClient(task, small(task), samples[task.name], batch=2)
     assert inspect.signature(client.train).parameters.keys() == {"weights", "steps", "learning_rate", "seed"}
-    weights = to_arrays(fresh(task, small(task), 1))
+    weights = to_arrays(build_network(task, small(task), 1))
     before = {key: array.copy() for key, array in weights.items()}
     one, other = (client.train(weights, steps=1, learning_rate=1e-3, seed=3) for _ in range(2))
     assert list(one.weights) == list(weights)
@@ -172,7 +172,7 @@ def test_a_client_is_trainable(task, samples):
 def test_two_clients_federate(task, samples):
     learned = samples[task.name]
     clients = {f"cav{i}": TaskClient(task, small(task), learned[i::2], batch=2) for i in range(2)}
-    weights = to_arrays(fresh(task, small(task), 1))
+    weights = to_arrays(build_network(task, small(task), 1))
     ledger = Ledger(Budget(wireless_mb=100.0, wireline_mb=0.0))
     schedule = Schedule(rounds=1, steps=1, learning_rate=1e-3, final_learning_rate=1e-3, seed=1)
     result = federate(clients, weights, schedule, Account(ledger, "edge", task.name, "wireless"))
@@ -190,7 +190,7 @@ def assert_comes_back(result):
 
 @each_task
 def test_evaluations_and_findings_are_json_and_words_and_pictures(task, data):
-    network = fresh(task, small(task), 1)
+    network = build_network(task, small(task), 1)
     result = task.evaluate(network, data, [0, 3])
     assert_comes_back(result)
     assert 0 <= result.score <= 1
@@ -206,7 +206,7 @@ def test_evaluations_and_findings_are_json_and_words_and_pictures(task, data):
 
 @pytest.mark.parametrize("task", [task_named(name) for name in LAYERS], ids=LAYERS)
 def test_the_layers_that_fig1b_shows_are_all_seen(task, data):
-    network = fresh(task, small(task), 1).eval()
+    network = build_network(task, small(task), 1).eval()
     layers = LAYERS[task.name](network)
     with capture_outputs(layers) as seen:
         list(task.infer(network, data.folder, 0.9))
@@ -238,7 +238,7 @@ def test_a_dataset_without_its_sensor_is_one_sentence(task, tmp_path, capsys):
     lacking, said = LACKING.get(task.name, ({"camera": False}, "no camera pictures"))
     blind = Drives(spins=1, **lacking)
     folder, weights = folder_of(blind, tmp_path / "data"), tmp_path / "weights.safetensors"
-    save_network(task, fresh(task, small(task), 1), weights)
+    save_network(task, build_network(task, small(task), 1), weights)
     for command in (
         ("train", task.name, "--data", folder, "--out", tmp_path / "out"),
         ("evaluate", task.name, "--data", folder, "--weights", weights),
@@ -267,7 +267,7 @@ def test_validation_data_without_its_sensor_are_refused_before_training(task, da
 
 @each_task
 def test_weights_that_are_no_numbers_are_refused(task, tmp_path):
-    network = fresh(task, small(task), 1)
+    network = build_network(task, small(task), 1)
     name, first = next(iter(network.named_parameters()))
     first.data.flatten()[0] = float("nan")
     save_network(task, network, tmp_path / "weights.safetensors")
@@ -279,7 +279,7 @@ def test_weights_that_are_no_numbers_are_refused(task, tmp_path):
 def test_where_no_picture_can_be_drawn_nothing_is_inferred(task, data, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(type(task), "infer", None)  # not even called
     weights, taken = tmp_path / "weights.safetensors", tmp_path / "file"
-    save_network(task, fresh(task, small(task), 1), weights)
+    save_network(task, build_network(task, small(task), 1), weights)
     taken.touch()
     assert called("infer", task.name, data.folder, "--weights", weights, "--pictures", taken) == 1
     assert capsys.readouterr() == ("", f"flcav: {taken}: Not a directory\n")
@@ -298,7 +298,7 @@ def test_where_nothing_can_be_written_no_training_starts(task, data, tmp_path, c
 @pytest.mark.parametrize("task", [WEATHER, SIGNS], ids=lambda task: task.name)
 def test_a_bad_picture_is_one_sentence(task, tmp_path, capsys):
     weights = tmp_path / "weights.safetensors"
-    save_network(task, fresh(task, small(task), 1), weights)
+    save_network(task, build_network(task, small(task), 1), weights)
     bad = {
         "a picture of 1 channels (L); 3 are wanted": np.zeros((40, 60), np.uint8),
         "a picture of 1 channels (I;16); 3 are wanted": np.zeros((40, 60), np.uint16),
@@ -322,7 +322,7 @@ def test_a_bad_picture_is_one_sentence(task, tmp_path, capsys):
 @each_task
 def test_infer_writes_a_picture_of_each_input(task, data, tmp_path, capsys):
     weights, out = tmp_path / "weights.safetensors", tmp_path / "pictures"
-    save_network(task, fresh(task, small(task), 1), weights)
+    save_network(task, build_network(task, small(task), 1), weights)
     source = next(iter(sorted(data.folder.glob(FILES.get(task.name, "none")))), data.folder)
     assert called("infer", task.name, source, "--weights", weights, "--pictures", out) == 0
     assert capsys.readouterr().out.startswith(str(source))
@@ -336,7 +336,7 @@ def test_a_picture_of_the_whole_space_counts_as_of_the_nearest_class(tmp_path):
             return replace(super().frame(scene, index), weather=Weather(cloud_cover=0.31))  # nearest: cloudy
 
     record(Between(spins=2), tmp_path)
-    data, network = Dataset.open(tmp_path), fresh(WEATHER, small(WEATHER), 1)
+    data, network = Dataset.open(tmp_path), build_network(WEATHER, small(WEATHER), 1)
     with pytest.raises(InputError, match="no picture in any of the weathers clear"):
         WEATHER.evaluate(network, data)
     nearest = evaluate_whole_space(network, data)

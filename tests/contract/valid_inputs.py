@@ -17,7 +17,7 @@ import flcav.world
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
 from flcav.perception.signs.task import SIGNS
-from flcav.perception.task import find_configuration, fresh
+from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import save_network
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
@@ -182,7 +182,7 @@ def make_inputs(folder: Path) -> None:
     networks["signs"] = replace(find_configuration(SIGNS, "n"), window_px=(WIDTH, HEIGHT))
     for name in TASKS:
         task = task_named(name)
-        save_network(task, fresh(task, networks[name], 1), folder / "weights" / f"{name}.safetensors")
+        save_network(task, build_network(task, networks[name], 1), folder / "weights" / f"{name}.safetensors")
     shutil.copytree(TOWN, folder / "town")
     for name, values in (("recipe", RECIPE), ("problem", PROBLEM), ("graph", GRAPH), ("progress", PROGRESS)):
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False))

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
     from flcav.perception.networks import Evaluation, Inference, TrainedNetwork, evaluate, infer, register_errors, train
     from flcav.perception.study import StudyRecipe
-    from flcav.perception.task import Evaluated, Finding, Practice, Result, Task, fresh
+    from flcav.perception.task import Evaluated, Finding, Practice, Result, Task, build_network
     from flcav.perception.tasks import TASKS, task_named
     from flcav.perception.weights import from_arrays, load_network, save_network, to_arrays
 
@@ -37,7 +37,7 @@ PLACES = {
     "Practice": "flcav.perception.task",
     "Result": "flcav.perception.task",
     "Task": "flcav.perception.task",
-    "fresh": "flcav.perception.task",
+    "build_network": "flcav.perception.task",
     "TASKS": "flcav.perception.tasks",
     "task_named": "flcav.perception.tasks",
     "from_arrays": "flcav.perception.weights",

@@ -180,7 +180,7 @@ def find_configuration(task: Task[ConfigT, NetworkT, SampleT], name: str | None)
     return known[name]
 
 
-def fresh(task: Task[ConfigT, NetworkT, SampleT], config: ConfigT, seed: int) -> NetworkT:
+def build_network(task: Task[ConfigT, NetworkT, SampleT], config: ConfigT, seed: int) -> NetworkT:
     """Return a network with random initial weights drawn from `seed`; torch's global generator is left as it was."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(seed, "weights"))

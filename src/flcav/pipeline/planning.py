@@ -18,7 +18,7 @@ from flcav.optimization.allocation.baselines import baseline
 from flcav.optimization.curves.fitting import fit_additive
 from flcav.optimization.curves.history import History, parse_histories
 from flcav.optimization.problem import Problem
-from flcav.perception.task import Task, find_configuration, fresh
+from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
@@ -143,7 +143,7 @@ def _planned(task: PlanRequest, own: Allotted, problem: Problem) -> TaskPlan:
 
 def model_mb(task: Task, network: str | None) -> float:
     """Return the serialised size of one model update [MB], by a dry run of the message."""
-    return update_bytes(to_arrays(fresh(task, find_configuration(task, network), 0))) / BYTES_PER_MB
+    return update_bytes(to_arrays(build_network(task, find_configuration(task, network), 0))) / BYTES_PER_MB
 
 
 def read_history(task: str, name: str, beside: Path) -> str:

@@ -27,7 +27,7 @@ from flcav.files import write_bytes, write_json
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.outcomes import score_network
-from flcav.perception.task import Task, find_configuration, fresh
+from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.training import train_steps
 from flcav.perception.weights import from_arrays, load_network, load_weights, save_network, to_arrays
 from flcav.pipeline.frames import Frames
@@ -60,7 +60,7 @@ class Learning:
 
     def build_network(self) -> Any:
         """Return a network with initial weights drawn from the seed."""
-        return fresh(self.task, self.config, self.seed)
+        return build_network(self.task, self.config, self.seed)
 
     def schedule(self, rounds: int, steps: int, *names: str) -> Schedule:
         """Return the clients' schedule of `rounds` rounds with `steps` local steps; `names` seed the stream."""

@@ -17,7 +17,7 @@ from flcav.perception.signs.predict import Detections, detect
 from flcav.perception.signs.samples import Sample
 from flcav.perception.signs.targets import MOST_TIMES, assign_anchors
 from flcav.perception.signs.task import SIGNS, SignsTask
-from flcav.perception.task import fresh
+from flcav.perception.task import build_network
 from flcav.perception.training import train
 
 TINY = replace(CONFIGURATIONS["n"], window_px=(96, 64), classes=("a", "b", "c"))
@@ -58,7 +58,7 @@ def test_published_sizes():
 
 
 def test_raw_predictions_have_a_cell_for_every_stride_and_few_objects_at_first():
-    raw = fresh(SIGNS, TINY, 0).eval()(torch.rand(2, 3, 64, 96))
+    raw = build_network(SIGNS, TINY, 0).eval()(torch.rand(2, 3, 64, 96))
     assert [tuple(maps.shape) for maps in raw] == [(2, 3, 64 // s, 96 // s, 8) for s in STRIDES]
     assert all(maps[..., 4].sigmoid().mean() < 0.01 for maps in raw)
 
@@ -141,7 +141,7 @@ def test_the_loss_is_the_sum_of_its_parts():
 
 def test_half_precision_hardly_changes_the_loss():
     samples = [painted(seed) for seed in range(4)]
-    network = fresh(SIGNS, TINY, 0)
+    network = build_network(SIGNS, TINY, 0)
     pictures = torch.from_numpy(np.stack([sample.picture for sample in samples])).permute(0, 3, 1, 2).float() / 255
     whole = detection_loss(network(pictures), assign_anchors(samples, TINY), TINY)
     loss = SIGNS.loss(network, samples)
@@ -150,7 +150,7 @@ def test_half_precision_hardly_changes_the_loss():
 
 
 def test_pictures_without_signs_have_a_loss():
-    network = fresh(SIGNS, TINY, 0)
+    network = build_network(SIGNS, TINY, 0)
     empty = Sample(painted(0).picture, NO_BOXES, np.zeros(0, np.int64), NO_BOXES)
     loss = SIGNS.loss(network, [empty, empty])
     loss.backward()
@@ -248,7 +248,7 @@ def test_nothing_found_and_nothing_to_find():
 
 
 def test_any_size_of_picture_is_looked_at():
-    network = fresh(SIGNS, SignsConfig(width=0.25, depth=0.33), 0)
+    network = build_network(SIGNS, SignsConfig(width=0.25, depth=0.33), 0)
     for shape in ((64, 96, 3), (37, 131, 3)):
         seen = detect(network, np.zeros(shape, np.uint8), threshold=0.0)
         assert len(seen)
@@ -266,7 +266,7 @@ class WithoutAugmentation(SignsTask):
 
 def test_it_learns_eight_pictures():
     samples = [painted(seed) for seed in range(8)]
-    network = fresh(SIGNS, TINY, 0)
+    network = build_network(SIGNS, TINY, 0)
 
     def map50() -> float:
         seen = [detect(network, sample.picture, threshold=0.01) for sample in samples]

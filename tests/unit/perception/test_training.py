@@ -12,7 +12,7 @@ from flcav.perception.objects.evaluate import score_detections
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import FrameTruth
-from flcav.perception.task import find_configuration, fresh
+from flcav.perception.task import build_network, find_configuration
 from flcav.perception.training import Checkpointing, Validation, batches, train, train_steps
 from flcav.perception.training.loop import one_cycle
 from flcav.perception.weights import to_arrays
@@ -28,7 +28,7 @@ def samples():
 
 
 def tiny(seed=1):
-    return fresh(OBJECTS, find_configuration(OBJECTS, "tiny"), seed)
+    return build_network(OBJECTS, find_configuration(OBJECTS, "tiny"), seed)
 
 
 def same(one, other):

@@ -13,7 +13,7 @@ from shapely.geometry import LineString, Polygon
 from flcav.config import InputError
 from flcav.dataset.layout import FrameKey
 from flcav.geometry import inverse, pose
-from flcav.perception.task import find_configuration, fresh
+from flcav.perception.task import build_network, find_configuration
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S, CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.cross_view import (
     FAR_M,
@@ -263,7 +263,7 @@ def test_a_map_is_judged_by_its_own_layers():
 
 
 def test_paths_begin_as_constant_velocity_and_look_where_they_are():
-    network = fresh(TRAJECTORY, find_configuration(TRAJECTORY, None), 1).eval()
+    network = build_network(TRAJECTORY, find_configuration(TRAJECTORY, None), 1).eval()
     past = torch.zeros(2, PAST + 1, 4)
     past[:, :, 3] = torch.tensor([6.0, 0.0])[:, None]
     forecast = network(Inputs(past, raster=torch.zeros(2, len(LAYERS), 64, 64)))
@@ -323,7 +323,7 @@ def test_resized_pictures_keep_their_rays():
 
 
 def test_cameras_are_learned_through_end_to_end():
-    network = fresh(TRAJECTORY, TrajectoryConfig(cameras=CrossView(width_px=128, height_px=64)), 1)
+    network = build_network(TRAJECTORY, TrajectoryConfig(cameras=CrossView(width_px=128, height_px=64)), 1)
     random = torch.Generator().manual_seed(0)
     pictures = torch.rand(2, 6, 3, 64, 128, generator=random)
     intrinsics = torch.tensor([[60.0, 0, 63.5], [0, 60.0, 31.5], [0, 0, 1]]).expand(2, 6, 3, 3)

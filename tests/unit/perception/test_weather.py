@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from flcav.perception.task import find_configuration, fresh
+from flcav.perception.task import build_network, find_configuration
 from flcav.perception.training import train
 from flcav.perception.weather.augment import augment
 from flcav.perception.weather.config import LeNetConfig
@@ -66,7 +66,7 @@ def test_it_learns_colours(name):
     colours = random.integers(0, 256, (8, 3))
     noisy = [colours[i % 8] + random.normal(0, 12, (32, 32, 3)) for i in range(48)]
     samples = [Sample(np.clip(picture, 0, 255).astype(np.uint8), i % 8) for i, picture in enumerate(noisy)]
-    network = fresh(WEATHER, find_configuration(WEATHER, name), 0)
+    network = build_network(WEATHER, find_configuration(WEATHER, name), 0)
     train(WEATHER, network, samples, steps=120, batch=16, seed=0)
     found = predict_probabilities(network, [sample.picture for sample in samples])
     assert found.shape == (48, 8)

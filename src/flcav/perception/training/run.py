@@ -17,7 +17,7 @@ from flcav.files import check_writable
 from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, DataEntry, data_entry, write_card
 from flcav.perception.device import CPU, processor_of
-from flcav.perception.task import Calibrates, Evaluated, Task, find_configuration, fresh
+from flcav.perception.task import Calibrates, Evaluated, Task, build_network, find_configuration
 from flcav.perception.training.checkpoint import Settings, find_finished_card, part_of
 from flcav.perception.training.loop import Checkpointing, Validation, Watch, train
 from flcav.perception.weights import save_network
@@ -149,7 +149,7 @@ def train_prepared(prepared: Prepared, progress: Report = ignore_progress) -> Tr
         return TrainingResult(prepared.finished)
     task, request, out, held = prepared.task, prepared.request, prepared.out, prepared.held
     settings, samples = prepared.settings, prepared.samples
-    network = fresh(task, prepared.config, request.seed).to(request.device)
+    network = build_network(task, prepared.config, request.seed).to(request.device)
     per_epoch = max(1, len(samples) // task.practice.batch)
     with event_files(out / EVENTS) as watch:
         history = train(
