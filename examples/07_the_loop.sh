@@ -35,7 +35,7 @@ splits:
   registry: {scenes: 1, spins: 2, cavs: 2}
   edge: {scenes: $scenes, spins: 2, cavs: 2}
   test: {scenes: $((scenes + 1)), spins: 1, cavs: 3}
-training: {block_steps: $steps, max_blocks: 3, patience: 2, cooldown: [0.2], local_steps: $((steps / 7 + 1))}
+training: {steps: $((steps * 4)), local_steps: $((steps / 7 + 1))}
 tasks:
   objects: {network: tiny, plan: {samples: $((scenes * 12)), edge_rounds: 3, cloud_rounds: 2}}
 regions:

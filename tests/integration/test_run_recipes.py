@@ -45,7 +45,7 @@ TINY = Splits(
     edge=Split(scenes=1, spins=1, cavs=1),
     test=Split(scenes=2, spins=1, cavs=2),
 )
-QUICK = Training(block_steps=1, max_blocks=1, patience=1, cooldown=(), local_steps=1)
+QUICK = Training(steps=1, local_steps=1)
 
 
 def shrunk(name: str) -> RunRecipe:
@@ -185,7 +185,7 @@ def test_retrainings_measure_a_spread_that_another_run_of_the_recipe_takes(tmp_p
     few = {"scenes": 2, "spins": 1, "cavs": 1}
     asked = {
         "splits": dict.fromkeys(("pool", "validation", "registry", "edge", "test"), few),
-        "training": {"block_steps": 2, "max_blocks": 1, "cooldown": (), "local_steps": 1},
+        "training": {"steps": 2, "local_steps": 1},
         "tasks": {"weather": {"plan": {"samples": 2, "edge_rounds": 1, "cloud_rounds": 1}}},
         "regions": {"suburb": {"role": "pretrain"}, "ring": {"role": "federate"}},
         "budgets_mb": {"wireless": 9, "wireline": 9},

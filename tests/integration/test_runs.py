@@ -192,16 +192,30 @@ def test_no_two_splits_share_a_scene(finished: Path) -> None:
     assert not any(a & b for a, b in combinations(scenes, 2))
 
 
+def test_the_plan_is_made_anew_from_what_the_run_reached_and_sent(finished: Path, result: Run) -> None:
+    main = result.arms[MAIN]
+    assert main.earlier is not None
+    assert [plan.after for plan in (*main.earlier, main.plan)] == [None, PRETRAIN, EDGE]
+    for plan in (*main.earlier[1:], main.plan):
+        frames, scores = zip(
+            *((each.frames, each.rounds[-1].score) for each in result.watched if each.stage == plan.after), strict=True
+        )
+        assert plan.reached == {"objects": pytest.approx(np.average(scores, weights=frames))}
+    (own,) = (each for each in main.plan.tasks.values())
+    assert len(Watched.load(finished / "work/rounds-grid-edge-fl-objects-grid").rounds) == own.edge_rounds
+    assert result.arms["equal"].earlier is None
+
+
 def test_rounds_are_watched_on_validation_frames(finished: Path, result: Run) -> None:
     graph = Graph(RECIPE, TOY.parent)
     for step in graph.steps:
         if step.name.startswith("rounds-"):
             assert "-validation-" in step.arguments["frames"]
     assert {(each.stage, each.region) for each in result.watched} == {
-        (s, r) for s in (EDGE, CLOUD) for r in ("grid", "ring")
+        (s, r) for s in (PRETRAIN, EDGE, CLOUD) for r in ("grid", "ring")
     }
     watched = Watched.load(finished / "work/rounds-grid-edge-fl-objects-grid")
-    assert [each.round for each in watched.rounds] == [0, 1, 2]
+    assert [each.round for each in watched.rounds] == [1, 2]
 
 
 def test_findings_say_what_their_intervals_say(result: Run) -> None:
@@ -308,16 +322,16 @@ def test_a_run_killed_in_edge_fl_ends_the_same(finished: Path, tmp_path: Path) -
         assert (work / path).read_bytes() == (finished / "work" / path).read_bytes(), path
 
 
-def test_a_run_killed_in_pretraining_goes_on_from_its_last_block(finished: Path, tmp_path: Path) -> None:
+def test_a_run_killed_in_pretraining_goes_on_from_its_last_validation(finished: Path, tmp_path: Path) -> None:
     work = without(finished, tmp_path, lambda name: name == "pretrain-objects")
-    killed_at(work / "pretrain-objects" / "block1.safetensors", tmp_path)
+    killed_at(work / "pretrain-objects" / "checkpoint.pt", tmp_path)
     assert not (work / "pretrain-objects" / "done.json").exists()
     run(RECIPE, tmp_path, beside=TOY.parent)
     for name in ("weights.safetensors", "ledger.parquet", "result.json"):
         assert (work / "pretrain-objects" / name).read_bytes() == (
             finished / "work/pretrain-objects" / name
         ).read_bytes()
-    assert Pretrained.load(work / "pretrain-objects").steps == 4 * 3
+    assert [each.step for each in Pretrained.load(work / "pretrain-objects").validated] == list(range(1, 13))
 
 
 def test_runs_are_compared_on_the_same_frames(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -329,7 +343,9 @@ def test_runs_are_compared_on_the_same_frames(finished: Path, tmp_path: Path, mo
     )
 
     def again(name: str) -> bool:
-        return "-fl-" in name or name == "look" or name.startswith(("test-", "rounds-", "grid-edge", "ring-edge"))
+        return (
+            "-fl-" in name or name == "look" or name.startswith(("test-", "rounds-", "plan-", "grid-edge", "ring-edge"))
+        )
 
     work = without(finished, tmp_path / "own", again)
     other = run(load_run_recipe(tmp_path / "own.yaml"), work.parent)

@@ -40,6 +40,7 @@ class Setting:
     central: Literal["pretrain", "federate"] | None
     regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
+    replanned: bool  # whether the plan is made anew after stages I and II, from what the run itself reached
 
     @property
     def pretraining(self) -> Mapping[str, Training]:
@@ -81,6 +82,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         arm.central,
         arm.regions or recipe.with_role("federate"),
         (CENTRAL,) if arm.central else arm.stages,
+        recipe.replan and arm.plan == "joint" and any(task.history for task in recipe.tasks.values()),
     )
 
 
@@ -94,9 +96,14 @@ class Names:
         """Return the step that records a split for a task; all arms share it."""
         return f"{region}-{split}-{task}"
 
-    def plan(self, arm: str) -> str:
-        """Return the step that allocates the budgets."""
-        return "plan" + self._suffix(arm, PLANNED)
+    def plan(self, arm: str, stage: str = PRETRAIN) -> str:
+        """Return the step that allocates the budgets, in the state in which `stage` is carried out.
+
+        All arms with the same rule follow the same plan, that of the first of them: so they differ in nothing else.
+        """
+        before = {EDGE: PRETRAIN, CENTRAL: PRETRAIN, CLOUD: EDGE, MORE_EDGE: EDGE}.get(stage)
+        replanned = self._settings[arm].replanned and before is not None
+        return "plan" + (f"-after-{before}" if replanned else "") + self._suffix(arm, PLANNED)
 
     def pretrain(self, arm: str, task: str) -> str:
         """Return stage I of a task."""

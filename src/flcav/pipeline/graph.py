@@ -13,6 +13,7 @@ from flcav.pipeline.frames import hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
 from flcav.pipeline.planning import read_history
 from flcav.pipeline.recipe import (
+    CENTRAL,
     CLOUD,
     EDGE,
     MAIN,
@@ -37,6 +38,7 @@ from flcav.pipeline.work import (
     plan_step,
     pretrain_step,
     record_step,
+    replan_step,
     rounds_step,
     test_step,
 )
@@ -66,11 +68,17 @@ class Graph:
         self._add_recordings()
         for arm in self.settings.values():
             self._add_start(arm)
+        if self.settings[MAIN].replanned:
+            self._add_replan(PRETRAIN)
         for region in self.federating:
             for task in recipe.tasks:
                 self._add(self._recording(region, EDGE, task, self.sites(region)))
         for arm in self.settings.values():
-            self._add_stages(arm)
+            self._add_edge(arm)
+        if self.settings[MAIN].replanned:
+            self._add_replan(EDGE)
+        for arm in self.settings.values():
+            self._add_further(arm)
             self._add_tests(arm)
 
     @property
@@ -99,9 +107,22 @@ class Graph:
         return tests
 
     def watched(self) -> list[tuple[str, str, str]]:
-        """Return stage, region and task of each federation that is validated after each round: the main arm's."""
+        """Return stage, region and task of what is validated in each federating region: the main arm's stages."""
         main = self.settings[MAIN]
-        return [(stage, region, task) for task in self.recipe.tasks for stage in main.stages for region in main.regions]
+        stages = (PRETRAIN, *main.stages)
+        return [(stage, region, task) for task in self.recipe.tasks for stage in stages for region in main.regions]
+
+    def _add_watched(self, stage: str, task: str) -> list[str]:
+        """Add the validations of a stage in the federating regions, and return their names."""
+        added = []
+        for region in self.settings[MAIN].regions:
+            trained = self.names.stage(MAIN, stage, region, task)
+            frames = self.names.recording(region, "validation", task)
+            arguments = {"task": task, "region": region, "stage": stage, "trained": trained, "frames": frames}
+            arguments["averaged"] = self.settings[MAIN].training[task].average_rounds
+            added.append(self.names.rounds(trained, region))
+            self._add(_step(added[-1], rounds_step, arguments, [trained, frames]))
+        return added
 
     def _add(self, step: Step) -> None:
         self._steps.setdefault(step.name, step)
@@ -165,8 +186,9 @@ class Graph:
         recipe, names = self.recipe, self.names
         starts = recipe.with_role("pretrain")
         pools = {task: [names.recording(region, "pool", task) for region in starts] for task in recipe.tasks}
-        others = {"retrainings", "spread", "test_draw", "arms", "splits", "training", "recording", "placement"}
+        others = {"retrainings", "spread", "test_draw", "replan", "arms", "training", "recording", "placement"}
         asked = recipe.model_dump(mode="json", exclude=others)
+        asked["splits"] = recipe.sized_splits.model_dump(mode="json")
         asked["placement"] = {"tasks": []}  # not part of the plan; the default would depend on objects
         asked["federation"] = {"edge_rounds_per_cloud_round": recipe.federation.edge_rounds_per_cloud_round}
         planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "histories": self._histories()}
@@ -182,6 +204,20 @@ class Graph:
             self._add(_step(step, pretrain_step, arguments, [plan, *own.values(), *validation]))
         for region in arm.regions:
             self._add_placement(arm, region)
+
+    def _add_replan(self, stage: str) -> None:
+        """Add the step that plans the rest of the run anew after stage I or II, from what the run itself reached."""
+        names, main = self.names, self.settings[MAIN]
+        tasks = [name for name, task in self.recipe.tasks.items() if task.history is not None]
+        watched = {task: self._add_watched(stage, task) for task in tasks}
+        books = {task: [names.pretrain(MAIN, task)] for task in tasks}
+        if stage == EDGE:
+            for task, steps in books.items():
+                steps += [names.edge(MAIN, region, task) for region in main.regions]
+        first, plan = names.plan(MAIN), names.plan(MAIN, stage)
+        arguments = {"first": first, "plan": plan, "stage": stage, "watched": watched, "books": books}
+        needs = [first, plan, *(step for each in (watched, books) for steps in each.values() for step in steps)]
+        self._add(_step(names.plan(MAIN, CLOUD if stage == EDGE else EDGE), replan_step, arguments, needs))
 
     def _add_placement(self, arm: Setting, region: str) -> None:
         names, errors = self.names, {}
@@ -207,12 +243,12 @@ class Graph:
         needs = [*errors.values(), registry, *([edge] if edge else [])]
         self._add(_step(names.place(arm.name, region), place_step, arguments, needs))
 
-    def _rests_on(self, arm: Setting, region: str, task: str) -> dict[str, Any]:
-        """Return the steps and settings that a vehicle's labelled samples depend on, see `flcav.pipeline.work`."""
+    def _rests_on(self, arm: Setting, region: str, task: str, stage: str) -> dict[str, Any]:
+        """Return the steps and settings that a stage and its labelled samples depend on, see `flcav.pipeline.work`."""
         names = self.names
         helped = any(LABEL_SOURCES[each.labels[task]].from_poles for each in self.settings.values())
         return {
-            "plan": names.plan(arm.name),
+            "plan": names.plan(arm.name, stage),
             "pretrain": names.pretrain(arm.name, task),
             "frames": names.recording(region, EDGE, task),
             "place": names.place(arm.name, region),
@@ -221,33 +257,46 @@ class Graph:
             "recorded": self.recipe.regions[region].data is not None,
         }
 
-    def _add_stages(self, arm: Setting) -> None:
+    def _federation(self, arm: Setting, task: str) -> dict[str, Any]:
+        """Return the settings that all federated stages of a task have in common."""
+        federation = arm.federation.model_dump(mode="json")
+        own = {"labels": arm.labels[task], "federation": federation, "budget_mb": self._budget_mb}
+        return self._learning(arm, task) | own
+
+    def _add_edge(self, arm: Setting) -> None:
+        """Add stage II of an arm, or its centralised training."""
         for task in self.recipe.tasks:
-            if arm.central:
-                for region in arm.regions:
+            for region in arm.regions:
+                if arm.central:
                     self._add(self._central(arm, region, task))
-                continue
-            rests = {region: self._rests_on(arm, region, task) for region in arm.regions}
-            federation = arm.federation.model_dump(mode="json")
-            common = {**self._learning(arm, task), "labels": arm.labels[task], "federation": federation}
-            for region, steps in rests.items():
+                    continue
+                steps = self._rests_on(arm, region, task, EDGE)
                 own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
                 name = self.names.edge(arm.name, region, task)
-                self._add(_step(name, edge_step, common | own, _named_in(steps)))
-                if MORE_EDGE in arm.stages:
-                    more = own | {"steps": steps | {"edge": name}}
-                    step = self.names.more_edge(arm.name, region, task)
-                    self._add(_step(step, edge_step, common | more, _named_in(more["steps"])))
-            if CLOUD in arm.stages:
-                edges = {
-                    region: steps | {"edge": self.names.edge(arm.name, region, task)} for region, steps in rests.items()
-                }
+                self._add(_step(name, edge_step, self._federation(arm, task) | own, _named_in(steps)))
+
+    def _add_further(self, arm: Setting) -> None:
+        """Add what follows stage II: stage III or further edge rounds."""
+        names = self.names
+        for task in self.recipe.tasks:
+            last = next((stage for stage in (CLOUD, MORE_EDGE) if stage in arm.stages), None)
+            if last is None:
+                continue
+            edges = {
+                region: self._rests_on(arm, region, task, last) | {"edge": names.edge(arm.name, region, task)}
+                for region in arm.regions
+            }
+            if last == CLOUD:
                 needs = [step for steps in edges.values() for step in _named_in(steps)]
-                arguments = common | {"budget_mb": self._budget_mb, "regions": edges}
-                self._add(_step(self.names.cloud(arm.name, task), cloud_step, arguments, needs))
+                arguments = self._federation(arm, task) | {"regions": edges}
+                self._add(_step(names.cloud(arm.name, task), cloud_step, arguments, needs))
+                continue
+            for region, steps in edges.items():
+                more = self._federation(arm, task) | {"region": region, "vehicles": self._vehicles(), "steps": steps}
+                self._add(_step(names.more_edge(arm.name, region, task), edge_step, more, _named_in(steps)))
 
     def _central(self, arm: Setting, region: str, task: str) -> Step:
-        steps = self._rests_on(arm, region, task)
+        steps = self._rests_on(arm, region, task, CENTRAL)
         starts = self.recipe.with_role("pretrain")
         pools = {name: self.names.recording(name, "pool", task) for name in starts}
         arguments = {
@@ -283,12 +332,9 @@ class Graph:
                 frames = self.names.recording(region, "test", OBJECTS)
                 arguments = {"before": before, "after": after, "frames": frames}
                 self._add(_step(LOOK, look_step, arguments, [before, after, frames]))
-            for stage, region, task in self.watched():
-                trained = self.names.stage(MAIN, stage, region, task)
-                frames = self.names.recording(region, "validation", task)
-                start = self.names.pretrain(MAIN, task)
-                arguments = {"task": task, "region": region, "trained": trained, "start": start, "frames": frames}
-                self._add(_step(self.names.rounds(trained, region), rounds_step, arguments, [trained, start, frames]))
+            for stage in (PRETRAIN, *arm.stages):
+                for task in self.recipe.tasks:
+                    self._add_watched(stage, task)
 
 
 def _step(name: str, function: Callable[..., None], arguments: Mapping[str, Any], needs: Sequence[str]) -> Step:

@@ -1,9 +1,13 @@
-"""Allocation of both uplink budgets to the samples and rounds of all tasks, by learning curves of earlier runs."""
+"""Allocation of both uplink budgets to the samples and rounds of all tasks, by learning curves of earlier runs.
+
+`remake_plan` plans the rest of a run anew, from what it has reached and spent.
+"""
 
 import io
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow.csv
@@ -15,9 +19,11 @@ from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import TaskPlan as Allotted
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.baselines import baseline
-from flcav.optimization.curves.fitting import fit_additive
+from flcav.optimization.allocation.replanning import PlanState, Sent, TaskState, condition_problem
+from flcav.optimization.curves.fitting import CurveFit, fit
 from flcav.optimization.curves.history import History, parse_histories
 from flcav.optimization.problem import Problem
+from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
@@ -49,6 +55,7 @@ class PlanRequest:
     pool: int  # samples available for upload
     history: History | None  # None: the plan is fixed
     fixed: FixedPlan | None
+    train_s: float = 0.0  # time that a vehicle trains in one round [s]
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,8 @@ class PlanSettings:
     limits: Limits
     edge_groups: tuple[int, ...]  # vehicles of each edge server
     edge_rounds_per_cloud_round: int
+    group_samples: tuple[int, ...] = ()  # samples that the vehicles of each edge server hold, of each task
+    horizon_s: float | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]
 
     def stage_plan(self, samples: int, edge_rounds: int, cloud_rounds: int) -> StagePlan:
         """Return the transfers of a task with these counts."""
@@ -88,8 +97,54 @@ def make_plan(tasks: tuple[PlanRequest, ...], frame: PlanSettings, rule: PlanRul
     if problem is not None:
         allotted = allocate(problem).tasks if rule == "joint" else baseline(problem, rule).tasks
         for task, own in zip(learned, allotted, strict=True):
-            plans[task.name] = _planned(task, own, problem)
+            plans[task.name] = _planned(task.sizes, own, problem)
     return Plan(rule, {task.name: plans[task.name] for task in tasks}), problem
+
+
+def remake_plan(
+    plan: Plan, problem: Problem, stage: Literal["pretrain", "edge"], reached: Mapping[str, float], used_mb: Price
+) -> Plan:
+    """Return the plan of the rest of a run after `stage`, which `plan` was carried out in; fixed plans stay.
+
+    `problem` is that of the first plan, `reached` the score of each of its tasks now, `used_mb` what they have sent.
+    Counts are totals, including what is spent. Scores predicted of stages that are over are kept. Where what is left of
+    the budgets allows no other plan, the counts are those of `plan`.
+    """
+    states = {}
+    for task in problem.tasks:
+        own = plan.tasks[task.name]
+        counts = (own.samples, own.edge_rounds if stage == EDGE else 0, 0)
+        predicted = float(task.curve.error(*counts, problem.edge_rounds_per_cloud_round))
+        known = 0 < predicted < np.inf  # a curve without points before the first round has no error there
+        states[task.name] = TaskState(
+            samples=counts[0], edge_rounds=counts[1], accuracy=reached[task.name] if known else None, ended=stage
+        )
+    sent = Sent(wireless=used_mb.wireless_mb, wireline=used_mb.wireline_mb)
+    rest = condition_problem(problem, PlanState(tasks=states, used_mb=sent))
+    tasks = dict(plan.tasks)
+    try:
+        allotted = allocate(rest).tasks
+    except Infeasible:
+        allotted = ()
+    for own in allotted:
+        before = tasks[own.name]
+        new = _planned(MessageSizes(before.sample_mb, before.model_mb), own, rest)
+        assert new.predicted is not None
+        assert before.predicted is not None
+        past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)
+        tasks[own.name] = replace(new, predicted={**new.predicted, **{each: before.predicted[each] for each in past}})
+    return Plan(plan.rule, tasks, stage, dict(reached))
+
+
+def fit_curve(history: History, group_samples: tuple[int, ...], k: int) -> CurveFit:
+    """Return the learning curve of least AICc: additive or, where cloud rounds vary between regions, federated.
+
+    `group_samples` are the samples held in each region, `k` the edge rounds per cloud round.
+    """
+    fits: list[CurveFit] = [fit(history)]
+    if len(group_samples) > 1 and np.ptp(history.resources[:, 2]) > 0:
+        fits.append(fit(history, model="federated", group_samples=group_samples, k=k))
+    return min(fits, key=lambda found: found.aicc)
 
 
 def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarray) -> Problem:
@@ -98,6 +153,7 @@ def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarr
     values = {
         "budgets_mb": {"wireless": wireless, "wireline": wireline},
         "edge_rounds_per_cloud_round": frame.edge_rounds_per_cloud_round,
+        "horizon_s": frame.horizon_s,
         "tasks": [_task(task, frame) for task in tasks],
     }
     return parse_config(Problem, values, "the run's allocation problem")
@@ -105,10 +161,14 @@ def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarr
 
 def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
     assert task.history is not None
-    samples, edge_rounds, cloud_rounds = task.history.resources.T
-    fit = fit_additive(samples, edge_rounds, cloud_rounds, task.history.accuracy, task.history.weight)
+    found = fit_curve(task.history, frame.group_samples, frame.edge_rounds_per_cloud_round)
     least, most = frame.limits.samples
     most = task.pool if most is None else min(most, task.pool)
+    measured = task.history.resources.max(axis=0)
+    edge, cloud = (
+        (low, max(low, int(reached)) if cap is None else cap)
+        for (low, cap), reached in zip((frame.limits.edge_rounds, frame.limits.cloud_rounds), measured[1:], strict=True)
+    )
     return {
         "name": task.name,
         "weight": task.weight,
@@ -117,10 +177,11 @@ def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
         "edge_groups": list(frame.edge_groups),
         "limits": {
             "samples": [min(least, most), most],
-            "edge_rounds": list(frame.limits.edge_rounds),
-            "cloud_rounds": list(frame.limits.cloud_rounds),
+            "edge_rounds": edge,
+            "cloud_rounds": cloud,
         },
-        "curve": fit.curve.model_dump(),
+        "train_s": task.train_s,
+        "curve": found.curve.model_dump(),
     }
 
 
@@ -132,12 +193,11 @@ def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan
     return TaskPlan(*counts, cost.wireless_mb, cost.wireline_mb, task.sizes.sample_mb, task.sizes.model_mb, None)
 
 
-def _planned(task: PlanRequest, own: Allotted, problem: Problem) -> TaskPlan:
-    curve = next(each.curve for each in problem.tasks if each.name == task.name)
+def _planned(sizes: MessageSizes, own: Allotted, problem: Problem) -> TaskPlan:
+    curve = next(each.curve for each in problem.tasks if each.name == own.name)
     k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
     spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
     predicted = {stage: max(1 - float(curve.error(*each, k)), 0.0) for stage, each in spent.items()}
-    sizes = task.sizes
     return TaskPlan(*counts, own.wireless_mb, own.wireline_mb, sizes.sample_mb, sizes.model_mb, predicted)
 
 

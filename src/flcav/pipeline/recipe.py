@@ -60,21 +60,14 @@ class Splits(Config):
 
 
 class Training(Config):
-    """Training schedule of a task's networks. Rates are fractions of the task's own learning rate."""
+    """Training of a task's networks. Rates are fractions of the task's own learning rate."""
 
     batch: int | None = Field(default=None, ge=1, le=4096)  # samples per optimiser step; default: the task's
-    block_steps: int = Field(default=100, ge=1, le=10**6)  # optimiser steps of one pretraining block
-    max_blocks: int = Field(default=12, ge=1, le=10**4)  # most blocks before the cooldown
-    patience: int = Field(
-        default=3, ge=1
-    )  # plateau: the best of these last blocks is less than `min_gain` above the best before
-    min_gain: float = Field(default=0.01, ge=0)  # least gain of the validation measure over `patience` blocks
-    cooldown: tuple[float, ...] = (0.3, 0.05)  # learning rates of the blocks after the plateau, one block each
-    average: float = Field(default=0.0, ge=0, lt=1)  # decay per step of a moving average of pretrained weights
+    steps: int = Field(default=1400, ge=1, le=10**6)  # optimiser steps of pretraining, with the task's own schedule
     local_steps: int = Field(default=16, ge=1, le=10**6)  # optimiser steps of one vehicle in one round
     local_rate: float = Field(default=0.5, gt=0)  # learning rate of the first round
     final_rate: float = Field(default=0.1, gt=0)  # learning rate of the last round
-    average_rounds: int = Field(default=1, ge=1)  # last rounds of a federation whose models its result averages
+    average_rounds: int = Field(default=3, ge=1)  # last rounds of a federation whose models its result averages
 
 
 class FixedPlan(Config):
@@ -107,6 +100,7 @@ class TaskRecipe(Config):
     network: str | None = None  # name of a network configuration; default: the task's first
     weight: Positive = 1.0  # weight of the task's error in the plan's objective
     labels: str | None = None  # kind of labels in stages II and III; default: the task's first
+    train_s: float = Field(default=0.0, ge=0)  # time that a vehicle trains in one round [s], for `horizon_s`
     history: str | None = None  # history of the learning curve: a name of the package, or a CSV file
     plan: FixedPlan | None = None  # a plan given by hand, instead of a history
     recording: Recording = Recording()  # changes to how the task is recorded
@@ -146,8 +140,8 @@ class Limits(Config):
     """Bounds (least, most) of a plan's decision variables."""
 
     samples: tuple[Count, Count | None] = (40, None)  # of pretraining; None: all that the pools hold
-    edge_rounds: tuple[Count, Count] = (1, 6)  # of edge FL
-    cloud_rounds: tuple[Count, Count] = (1, 3)  # of cloud FL
+    edge_rounds: tuple[Count, Count | None] = (1, None)  # of edge FL; None: as many as the history has
+    cloud_rounds: tuple[Count, Count | None] = (0, None)  # of cloud FL; None: as many as the history has
 
 
 class Placement(Config):
@@ -224,8 +218,10 @@ class RunRecipe(Config):
     tasks: Annotated[Mapping[str, TaskRecipe], Field(min_length=1)]  # tasks by name
     regions: Annotated[Mapping[Name, Region], Field(min_length=1)]  # regions by name
     budgets_mb: Budgets  # uplink budgets
+    replan: bool = True  # whether the plan is made anew after stages I and II, from what they reached and spent
     headroom: float = Field(default=0.02, ge=0, lt=0.5)  # fraction left unspent: samples differ in size
     limits: Limits = Limits()  # bounds of the plan's quantities
+    horizon_s: Positive | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]
     placement: Placement = Placement()  # placement of roadside sensors
     federation: Federation = Federation()  # settings of aggregation
     recording: Recording = Recording()  # changes to how all regions are recorded
@@ -308,7 +304,7 @@ SIZES: Mapping[str, tuple[Splits, Training]] = {
             edge=Split(scenes=1, spins=2, cavs=2),
             test=Split(scenes=3, spins=1, cavs=2),
         ),
-        Training(block_steps=4, max_blocks=2, patience=1, cooldown=(0.2,), local_steps=1),
+        Training(steps=12, local_steps=1),
     ),
     "demo": (  # under ten minutes on two cores
         Splits(
@@ -318,7 +314,7 @@ SIZES: Mapping[str, tuple[Splits, Training]] = {
             edge=Split(scenes=16, spins=5, cavs=4),
             test=Split(scenes=30, spins=1, cavs=4),
         ),
-        Training(max_blocks=9),
+        Training(steps=1100),
     ),
     "full": (
         Splits(

@@ -1,9 +1,11 @@
 """Records of the results of a run and of its steps, saved to and loaded from JSON in their folders."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Self
+
+import numpy as np
 
 from flcav.config import InputError, read_json
 from flcav.files import write_json
@@ -60,14 +62,16 @@ class Plan(Saved):
 
     rule: str
     tasks: Mapping[str, TaskPlan]
+    after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was made anew; None: before the run
+    reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score then, by task, which it rests on
 
 
 @dataclass(frozen=True)
-class Block:
-    """One block of pretraining and the validation after it."""
+class Validated:
+    """A validation during pretraining."""
 
-    rate: float  # fraction of the task's learning rate
-    loss: float
+    step: int  # optimiser steps taken
+    loss: float  # mean since the validation before
     score: float  # on validation frames
 
 
@@ -78,7 +82,7 @@ class Pretrained(Saved):
     task: str
     network: str  # name of the configuration
     uploaded: Mapping[str, tuple[int, ...]]  # frames by region
-    blocks: tuple[Block, ...]
+    validated: tuple[Validated, ...]
     steps: int  # of the optimiser
     threshold: float | None  # lowest score of detections that serve as labels; None where none do
 
@@ -152,13 +156,22 @@ class StageResult(Saved):
 
 @dataclass(frozen=True)
 class Watched(Saved):
-    """Validation scores of a federation in a region after each round; of stage II also before it, as round 0."""
+    """Validation scores of a federation in a region after each round; of a pretrained network, as round 0."""
 
     stage: str
     task: str
     region: str
     frames: int
     rounds: tuple[Round, ...]
+
+
+def average_regions(watched: Sequence[Watched]) -> tuple[Round, ...]:
+    """Return the mean score over regions of each round that all of `watched` have, weighted by frames."""
+    frames = [each.frames for each in watched]
+    return tuple(
+        Round(at[0].round, float(np.average([each.score for each in at], weights=frames)))
+        for at in zip(*(each.rounds for each in watched), strict=True)
+    )
 
 
 @dataclass(frozen=True)
@@ -256,13 +269,14 @@ class LinkUse:
 
 @dataclass(frozen=True)
 class ArmResult:
-    """Results of one arm: its plan, placements, stages, and uplink traffic."""
+    """Results of one arm: its plans, placements, stages, and uplink traffic."""
 
-    plan: Plan
+    plan: Plan  # carried out: the last one
     placed: tuple[Placed, ...]
     stages: tuple[StageResult, ...]
     links: Mapping[str, LinkUse]
     spent: tuple[Spent, ...]
+    earlier: Annotated[tuple[Plan, ...] | None, LEFT_OUT] = None  # plans that others took the place of, oldest first
 
     def sent_mb(self, task: str, link: str) -> float:
         """Return the uplink traffic of a task on a link, over all stages [MB]."""

@@ -4,8 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from flcav.config import InputError
 from flcav.intervals import Estimate, measure_spread, widen, widen_share
 from flcav.network.ledger import LINKS, Budget, Ledger
@@ -34,6 +32,7 @@ from flcav.pipeline.results import (
     Test,
     Tested,
     Watched,
+    average_regions,
 )
 from flcav.pipeline.seeds.summary import summarise
 from flcav.pipeline.spread import difference_key, list_spreads, test_key
@@ -67,7 +66,7 @@ def run(
     >>> few = {"scenes": 2, "spins": 1, "cavs": 1}
     >>> recipe = flcav.RunRecipe.model_validate({
     ...     "splits": dict.fromkeys(("pool", "validation", "registry", "edge", "test"), few),
-    ...     "training": {"block_steps": 1, "max_blocks": 1, "cooldown": (), "local_steps": 1},
+    ...     "training": {"steps": 1, "local_steps": 1},
     ...     "tasks": {"weather": {"plan": {"samples": 2, "edge_rounds": 1, "cloud_rounds": 1}}},
     ...     "regions": {"suburb": {"role": "pretrain"}, "ring": {"role": "federate"}},
     ...     "budgets_mb": {"wireless": 9, "wireline": 9},
@@ -211,7 +210,8 @@ def test_folder(graph: Graph, arm: str, stage: str, region: str, task: str) -> s
 
 def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
     names, tasks = graph.names, graph.recipe.tasks
-    plan = Plan.load(work / names.plan(arm.name))
+    plans = dict.fromkeys(names.plan(arm.name, stage) for stage in (PRETRAIN, *arm.stages))
+    *earlier, plan = (Plan.load(work / name) for name in plans)
     trained = [
         names.stage(arm.name, stage, region, task)
         for task in tasks
@@ -245,6 +245,7 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
             for stage in (PRETRAIN, EDGE, CLOUD)
             for link in LINKS
         ),
+        earlier=tuple(earlier) or None,
     )
 
 
@@ -329,12 +330,10 @@ def make_history_points(result: Run, run: str) -> list[HistoryPoint]:
     """
     points: list[HistoryPoint] = []
     for task, own in result.arms[MAIN].plan.tasks.items():
-        for stage in (EDGE, CLOUD):
+        for stage in (PRETRAIN, EDGE, CLOUD):
             each = [watched for watched in result.watched if (watched.task, watched.stage) == (task, stage)]
-            frames = [watched.frames for watched in each]
-            for rounds in zip(*(watched.rounds for watched in each), strict=True):
-                number = rounds[0].round
-                counts = (number, 0) if stage == EDGE else (own.edge_rounds, number)
-                score = float(np.average([at.score for at in rounds], weights=frames))
-                points.append(HistoryPoint(task, own.samples, *counts, score, sum(frames), run))
+            frames = sum(watched.frames for watched in each)
+            for at in average_regions(each):
+                counts = (own.edge_rounds, at.round) if stage == CLOUD else (at.round, 0)
+                points.append(HistoryPoint(task, own.samples, *counts, at.score, frames, run))
     return points

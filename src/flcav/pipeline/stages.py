@@ -1,6 +1,6 @@
 """The three stages of training: centralised pretraining, edge federated learning, cloud federated learning.
 
-Stage I: labelled samples are uploaded to the cloud, which trains on them until validation reaches a plateau. Stage II:
+Stage I: labelled samples are uploaded to the cloud, which trains on them. Stage II:
 vehicles federate with their edge server. Stage III: edge servers federate with the cloud (Wang et al., IEEE Network
 37(3), 2023). Every message is entered in a ledger.
 """
@@ -13,9 +13,6 @@ from typing import Any
 
 import numpy as np
 from safetensors.numpy import load_file, save
-from safetensors.torch import load_file as load_tensors
-from safetensors.torch import save as save_tensors
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from flcav.federation.rounds import OnRound
 from flcav.federation.runtimes.metered import Account
@@ -28,15 +25,16 @@ from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
-from flcav.perception.training import train_steps
-from flcav.perception.weights import from_arrays, load_network, load_weights, save_network, to_arrays
+from flcav.perception.training import Checkpointing, Validation, train, train_steps
+from flcav.perception.weights import from_arrays, load_network, save_network, to_arrays
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, Training
-from flcav.pipeline.results import LEDGER, WEIGHTS, Block
+from flcav.pipeline.results import LEDGER, WEIGHTS, Validated
 from flcav.progress import Report
 from flcav.seeds import derive_seed, stream
 
-BLOCKS, ROUND = "blocks.json", "round.json"
+CHECKPOINT, ROUND = "checkpoint.pt", "round.json"
+VALIDATIONS = 10  # during pretraining
 
 
 @dataclass(frozen=True)
@@ -89,79 +87,39 @@ def book_uploads(book: Ledger, task: Task, config: Any, region: str, pool: Frame
         book.enter(LedgerEntry(PRETRAIN, task.name, "wireline", "up", 0, region, size))
 
 
-def train_until_level(
+def pretrain(
     learning: Learning, samples: Sequence[Any], validation: Sequence[Frames], folder: Path, report: Report
-) -> tuple[Block, ...]:
-    """Pretrain in blocks until validation reaches a plateau, then at falling rates; return the record of each block.
+) -> tuple[Validated, ...]:
+    """Pretrain with the task's schedule of the learning rate; return the validations on the way.
 
-    Writes the weights of the last block, whose rate is the lowest, or their moving average over all steps
-    (`Training.average`). An interrupted training resumes after its last complete block.
+    Writes the weights of the last step. An interrupted training resumes after its last validation.
     """
-    training, task = learning.training, learning.task
-    blocks: list[Block] = []
+    task, steps = learning.task, learning.training.steps
+    every = max(steps // VALIDATIONS, 1)
     network = learning.build_network()
-    moving = None
-    if training.average:
-        moving = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(training.average), use_buffers=True)
-
-    def follow(_step: int, _values: Mapping[str, float]) -> None:
-        if moving is not None:
-            moving.update_parameters(network)
-
-    if (folder / BLOCKS).exists():
-        blocks = [Block(**row) for row in json.loads((folder / BLOCKS).read_text())]
-        load_weights(task, network, folder / f"block{len(blocks)}.safetensors")
-        if moving is not None:
-            moving.load_state_dict(load_tensors(folder / f"average{len(blocks)}.safetensors"))
-    while (rate := next_rate([block.score for block in blocks], training)) is not None:
-        number = len(blocks) + 1
-        loss = train_steps(
-            task,
-            network,
-            samples,
-            steps=training.block_steps,
-            batch=learning.batch,
-            learning_rate=rate * task.practice.learning_rate,
-            seed=derive_seed(learning.seed, PRETRAIN, number),
-            watch=follow,
-        )
-        score = mean_score(task, network, validation)
-        blocks.append(Block(rate, loss, score))
-        save_network(task, network, folder / f"block{number}.safetensors")
-        if moving is not None:
-            write_bytes(folder / f"average{number}.safetensors", save_tensors(moving.state_dict()))
-        write_json(folder / BLOCKS, [vars(block) for block in blocks])
-        report(number, training.max_blocks + len(training.cooldown), f"validation {score:.3f}")
-    if moving is not None:
-        network.load_state_dict(moving.module.state_dict())
+    history = train(
+        task,
+        network,
+        samples,
+        steps=steps,
+        batch=learning.batch,
+        seed=derive_seed(learning.seed, PRETRAIN),
+        checkpointing=Checkpointing(folder / CHECKPOINT, every),
+        validation=Validation(lambda now: mean_score(task, now, validation), every),
+        progress=report,
+    )
     save_network(task, network, folder / WEIGHTS)
-    return tuple(blocks)
+    (folder / CHECKPOINT).unlink()
+    means = history.losses[: every * len(history.scores)].reshape(-1, every).mean(axis=1)
+    return tuple(
+        Validated(every * number, float(loss), float(score))
+        for number, (loss, score) in enumerate(zip(means, history.scores, strict=True), start=1)
+    )
 
 
 def mean_score(task: Task, network: Any, splits: Sequence[Frames]) -> float:
     """Return the task's measure on the vehicles' frames, as the mean over `splits`."""
     return float(np.mean([score_network(task, network, split.data, split.vehicles) for split in splits]))
-
-
-def next_rate(scores: Sequence[float], training: Training) -> float | None:
-    """Return the rate of the next block, as a fraction, from the scores so far; None when training is over."""
-    full = _full_rate_blocks(scores, training)
-    if full is None:
-        return 1.0
-    cooled = len(scores) - full
-    return training.cooldown[cooled] if cooled < len(training.cooldown) else None
-
-
-def _full_rate_blocks(scores: Sequence[float], training: Training) -> int | None:
-    """Return the number of blocks until the plateau of validation, at most `max_blocks`; None before that.
-
-    Plateau: the best of the last `patience` blocks is less than `min_gain` above the best before them.
-    """
-    for spent in range(training.patience + 1, min(len(scores), training.max_blocks) + 1):
-        before, recent = scores[: spent - training.patience], scores[spent - training.patience : spent]
-        if max(recent) < max(before) + training.min_gain:
-            return spent
-    return training.max_blocks if len(scores) >= training.max_blocks else None
 
 
 def train_centrally(
@@ -235,10 +193,7 @@ class FederationCheckpoints:
         Without rounds, the weights are those of `network`.
         """
         if rounds:
-            last = range(max(rounds - averaged, 0) + 1, rounds + 1)
-            weights = average([load_file(round_path(self._folder, number)) for number in last], [1.0] * len(last))
-            network = self._task.build(network.config)
-            from_arrays(network, weights)
+            network = load_round_network(self._task, network.config, self._folder, rounds, averaged)
         save_network(self._task, network, self._folder / WEIGHTS)
         self._book.save(self._folder / LEDGER)
 
@@ -316,10 +271,11 @@ def round_path(folder: Path, round_: int) -> Path:
     return folder / f"round{round_}.safetensors"
 
 
-def load_round_network(task: Task, config: Any, folder: Path, round_: int) -> Any:
-    """Return a network with a federation's weights after a round."""
+def load_round_network(task: Task, config: Any, folder: Path, round_: int, averaged: int) -> Any:
+    """Return the network of a federation that ends with a round: the mean of the last `averaged` rounds' weights."""
+    last = range(max(round_ - averaged, 0) + 1, round_ + 1)
     network = task.build(config)
-    from_arrays(network, load_file(round_path(folder, round_)))
+    from_arrays(network, average([load_file(round_path(folder, number)) for number in last], [1.0] * len(last)))
     return network.eval()
 
 

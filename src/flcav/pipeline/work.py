@@ -6,16 +6,17 @@ folders.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from flcav.config import InputError
+from flcav.config import InputError, read_config
 from flcav.federation.strategies import strategy_named
 from flcav.files import write_json
 from flcav.intervals import Estimate
-from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.network.ledger import BYTES_PER_MB, LINKS, Budget, Ledger, LedgerEntry, Link
 from flcav.network.plan import MessageSizes, Price
+from flcav.optimization.problem import Problem
 from flcav.perception.client import as_shared
 from flcav.perception.errors import THRESHOLD, RegistersErrors, load_errors, save_errors
 from flcav.perception.outcomes import as_measurable, compute_interval, compute_measure, score_network
@@ -33,12 +34,13 @@ from flcav.pipeline.labels import (
     select_frames_near,
 )
 from flcav.pipeline.placing import find_sites, place_sensors, read_traces
-from flcav.pipeline.planning import PlanRequest, PlanSettings, make_plan, model_mb, parse_history
+from flcav.pipeline.planning import PlanRequest, PlanSettings, make_plan, model_mb, parse_history, remake_plan
 from flcav.pipeline.recipe import (
     CENTRAL,
     CLOUD,
     EDGE,
     MORE_EDGE,
+    PRETRAIN,
     Federation,
     Placement,
     Role,
@@ -59,6 +61,7 @@ from flcav.pipeline.results import (
     StageResult,
     Tested,
     Watched,
+    average_regions,
 )
 from flcav.pipeline.stages import (
     Learning,
@@ -69,10 +72,10 @@ from flcav.pipeline.stages import (
     load_round_network,
     load_stage_network,
     make_clients,
+    pretrain,
     region_budget,
     share_budget,
     train_centrally,
-    train_until_level,
 )
 from flcav.pipeline.steps import Work
 
@@ -107,7 +110,8 @@ def plan_step(
 ) -> None:
     """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables."""
     asked_for = RunRecipe.model_validate(recipe)
-    asked, groups = [], _edge_groups(asked_for)
+    asked, groups, each = [], _edge_groups(asked_for), asked_for.sized_splits.edge
+    held = tuple(vehicles * each.scenes * each.spins for vehicles in groups)
     for name in asked_for.tasks:
         task, network = task_named(name), asked_for.tasks[name].network
         config = find_configuration(task, network)
@@ -120,14 +124,39 @@ def plan_step(
         messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network))
         own = asked_for.tasks[name]
         history = parse_history(name, histories[name], name) if name in histories else None
-        asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan))
+        asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan, own.train_s))
     budgets = Price(asked_for.budgets_mb.wireless, asked_for.budgets_mb.wireline)
     k = asked_for.federation.edge_rounds_per_cloud_round
-    frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k)
+    frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k, held, asked_for.horizon_s)
     plan, problem = make_plan(tuple(asked), frame, rule)
     if problem is not None:
         write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
     plan.save(work.folder)
+
+
+def replan_step(
+    work: Work,
+    first: str,
+    plan: str,
+    stage: Literal["pretrain", "edge"],
+    watched: Mapping[str, Sequence[str]],
+    books: Mapping[str, Sequence[str]],
+) -> None:
+    """Plan the rest of the run anew after `stage`: by task, `watched` are its validations, `books` its ledgers.
+
+    `first` is the step of the first plan, `plan` that of the one carried out in `stage`.
+    """
+    problem = read_config(Problem, work.inputs[first] / PROBLEM)
+    done = Plan.load(work.inputs[plan])
+    reached: dict[str, float] = {}
+    used: dict[Link, int] = dict.fromkeys(LINKS, 0)
+    for task in problem.tasks:
+        last = average_regions([Watched.load(work.inputs[step]) for step in watched[task.name]])[-1]
+        reached[task.name] = last.score
+        for entry in _entries(work, *books[task.name]):
+            used[entry.link] += entry.bytes * (entry.direction == "up")
+    used_mb = Price(used["wireless"] / BYTES_PER_MB, used["wireline"] / BYTES_PER_MB)
+    remake_plan(done, problem, stage, reached, used_mb).save(work.folder)
 
 
 def pretrain_step(
@@ -159,14 +188,14 @@ def pretrain_step(
             book_uploads(book, learning.task, config, region, opened[region], frames)
             samples += _each(learning.task.samples(opened[region].data, config, frames))
     book.save(work.folder / LEDGER)
-    blocks = train_until_level(learning, samples, watched, work.folder, work.report)
+    validated = pretrain(learning, samples, watched, work.folder, work.report)
     trained = load_stage_network(learning.task, work.folder)
     Pretrained(
         task=task,
         network=network or next(iter(learning.task.configurations)),
         uploaded=chosen,
-        blocks=blocks,
-        steps=learning.training.block_steps * len(blocks),
+        validated=validated,
+        steps=learning.training.steps,
         threshold=fit_label_threshold(trained, watched) if thresholded else None,
     ).save(work.folder)
 
@@ -216,6 +245,7 @@ def edge_step(
     network: str | None,
     training: Fields,
     seed: int,
+    budget_mb: tuple[float, float],
     region: str,
     vehicles: Mapping[str, int],
     labels: str,
@@ -227,9 +257,10 @@ def edge_step(
     With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III.
     """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
-    own, how = Plan.load(work.inputs[steps["plan"]]).tasks[task], Federation.model_validate(federation)
+    plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
+    own = plan.tasks[task]
     stage_one = Ledger.load(work.inputs[steps["pretrain"]] / LEDGER)
-    budget = region_budget(stage_one, vehicles, region)
+    budget = region_budget(Ledger(_share_budget(plan, budget_mb, task), stage_one.entries), vehicles, region)
     if "edge" in steps:
         stage, rounds = MORE_EDGE, own.cloud_rounds * how.edge_rounds_per_cloud_round
         book = Ledger(budget, Ledger.load(work.inputs[steps["edge"]] / LEDGER).entries)
@@ -334,21 +365,25 @@ def test_step(work: Work, task: str, region: str, trained: str, frames: str, see
     ).save(work.folder)
 
 
-def rounds_step(work: Work, task: str, region: str, trained: str, start: str, frames: str) -> None:
+def rounds_step(work: Work, task: str, region: str, stage: str, trained: str, frames: str, averaged: int) -> None:
     """Validate a federation's network after each round on a region's validation frames, used for nothing else.
 
-    For stage II the pretrained network is validated too, as round 0.
+    The network is that of a federation which ends with this round, the mean of the last `averaged` rounds' weights. A
+    pretrained network is validated as round 0.
     """
     learned, split = task_named(task), Frames.open(work.inputs[frames])
-    stage = StageResult.load(work.inputs[trained])
-    first = load_stage_network(learned, work.inputs[start])
-    config = first.config
-    rounds = [Round(0, score_network(learned, first, split.data, split.vehicles))] if stage.stage == EDGE else []
-    for number in range(1, stage.rounds + 1):
-        network = load_round_network(learned, config, work.inputs[trained], number)
+    last = load_stage_network(learned, work.inputs[trained])
+    networks = {0: last}
+    if stage != PRETRAIN:
+        numbers = range(1, StageResult.load(work.inputs[trained]).rounds + 1)
+        networks = {
+            each: load_round_network(learned, last.config, work.inputs[trained], each, averaged) for each in numbers
+        }
+    rounds = []
+    for number, network in networks.items():
         rounds.append(Round(number, score_network(learned, network, split.data, split.vehicles)))
-        work.report(number, stage.rounds, "")
-    Watched(stage.stage, task, region, len(split.vehicles), tuple(rounds)).save(work.folder)
+        work.report(number, len(networks), "")
+    Watched(stage, task, region, len(split.vehicles), tuple(rounds)).save(work.folder)
 
 
 def look_step(work: Work, before: str, after: str, frames: str) -> None:

@@ -14,6 +14,7 @@ from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.plan import MessageSizes, Price, price
+from flcav.optimization.curves.curves import Additive, Federated
 from flcav.optimization.curves.history import History
 from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.objects.model import second_tiny
@@ -23,10 +24,12 @@ from flcav.pipeline.planning import (
     HistoryPoint,
     PlanRequest,
     PlanSettings,
+    fit_curve,
     load_history,
     make_plan,
     model_mb,
     parse_history,
+    remake_plan,
 )
 from flcav.pipeline.recipe import FixedPlan, Limits
 from flcav.pipeline.tables import append_records
@@ -91,6 +94,73 @@ def test_the_curve_predicts_every_stage() -> None:
     equal = make_plan((asked(),), frame(), "equal-stages")[0].tasks["objects"].predicted
     assert equal is not None
     assert equal["cloud"] <= predicted["cloud"] + 1e-9
+
+
+def test_a_plan_made_anew_is_the_best_of_what_is_left() -> None:
+    first, problem = make_plan((asked(),), frame(120, 60), "joint")
+    assert problem is not None
+    own = first.tasks["objects"]
+    for stage, reached, saved_mb in (
+        ("pretrain", 0.2, 0.0),
+        ("pretrain", 0.7, 9.0),
+        ("edge", 0.6, 0.0),
+        ("edge", 0.3, 4.0),
+    ):
+        rounds = own.edge_rounds if stage == "edge" else 0
+        sent = price(frame().stage_plan(own.samples, rounds, 0), SIZES)
+        used = Price(sent.wireless_mb - saved_mb, sent.wireline_mb)
+        plan = remake_plan(first, problem, stage, {"objects": reached}, used)
+        new = plan.tasks["objects"]
+        factor = (1 - reached) / float(problem.tasks[0].curve.error(own.samples, rounds, 0))
+        best = min(
+            (factor * float(problem.tasks[0].curve.error(own.samples, edge, cloud)), edge, cloud)
+            for edge in (range(1, 13) if stage == "pretrain" else (rounds,))
+            for cloud in range(1, 7)
+            for cost in (price(frame().stage_plan(own.samples, edge, cloud), SIZES),)
+            if cost.wireless_mb - saved_mb <= 0.98 * 120 + 1e-9 and cost.wireline_mb <= 0.98 * 60 + 1e-9
+        )
+        assert (new.samples, new.edge_rounds, new.cloud_rounds) == (own.samples, *best[1:])
+        assert new.predicted is not None
+        assert own.predicted is not None
+        assert new.predicted["cloud"] == pytest.approx(1 - best[0], abs=1e-6)
+        assert new.predicted["pretrain"] == own.predicted["pretrain"]
+        assert (plan.after, plan.reached) == (stage, {"objects": reached})
+    more = remake_plan(first, problem, "pretrain", {"objects": 0.5}, Price(0.0, 0.0)).tasks["objects"]
+    assert more.wireless_mb > own.wireless_mb  # what stage I did not send is free
+
+
+def test_no_other_plan_fits_what_is_left() -> None:
+    first, problem = make_plan((asked(),), frame(), "joint")
+    assert problem is not None
+    counts = first.tasks["objects"]
+    sent = price(frame().stage_plan(counts.samples, 0, 0), SIZES)
+    plan = remake_plan(first, problem, "pretrain", {"objects": 0.5}, Price(sent.wireless_mb + 60.0, sent.wireline_mb))
+    assert plan.tasks == first.tasks
+
+
+def test_the_curve_of_least_aicc_is_planned_by() -> None:
+    counts = history().resources
+    samples, edge, cloud = counts.T
+    curve = Federated(
+        model="federated", a=1.6, b=0.4, alpha=0.1, beta=0.3, gamma=0.8, group_samples=(40, 30), drift=0.0
+    )
+    error = curve.error(samples, edge, cloud, k=1)
+    regional = fit_curve(History(counts, 1 - error, np.ones(len(counts))), (40, 30), 1)
+    assert isinstance(regional.curve, Federated)
+    assert float(regional.curve.error(160, 2, 1)) == pytest.approx(float(curve.error(160, 2, 1)), abs=2e-3)
+    assert isinstance(fit_curve(history(), (40, 30), 1).curve, Additive)
+    assert isinstance(fit_curve(history(), (40,), 1).curve, Additive)  # one region has nobody to learn from
+
+
+def test_rounds_without_limits_are_those_that_were_measured_and_there_is_time_for() -> None:
+    open_ended = replace(frame(9000.0, 9000.0), limits=Limits())
+    free = make_plan((asked(),), open_ended, "joint")[0].tasks["objects"]
+    assert (free.edge_rounds, free.cloud_rounds) == (6, 3)
+    timed = make_plan((replace(asked(), train_s=4.0),), replace(open_ended, horizon_s=25.0), "joint")[0].tasks[
+        "objects"
+    ]
+    assert 4.0 * (timed.edge_rounds + timed.cloud_rounds) <= 25.0
+    assert 4.0 * (timed.edge_rounds + timed.cloud_rounds) > 21.0
 
 
 def test_a_small_pool_limits_the_samples() -> None:

@@ -72,6 +72,31 @@ def test_further_edge_rounds_go_on_from_the_runs_own_edge_rounds() -> None:
         recipe_of(arms={"further": {"stages": ["more_edge"]}})
 
 
+def test_plans_are_made_anew_between_stages_from_what_the_run_itself_reached() -> None:
+    arms = {"densest": {"placement": {"rule": "densest"}}, "equal": {"plan": "equal-stages"}}
+    recipe = recipe_of(arms=arms, retrainings=1)
+    steps = {step.name: step for step in Graph(recipe, Path()).steps}
+    followed = {
+        name: step.arguments.get("plan") or step.arguments["steps"]["plan"]
+        for name, step in steps.items()
+        if name.startswith(("pretrain-", "grid-edge-fl"))
+    } | {name: step.arguments["regions"]["grid"]["plan"] for name, step in steps.items() if name.startswith("cloud-")}
+    for name, plan in followed.items():
+        after = "" if "pretrain" in name else "-after-edge" if "cloud" in name else "-after-pretrain"
+        assert plan == ("plan-equal" if "equal" in name else f"plan{after}"), name
+    assert len(followed) == 2 * (2 + 3 + 3)  # densest shares the pretraining of the run itself
+    first, second = steps["plan-after-pretrain"], steps["plan-after-edge"]
+    assert set(first.needs) == {"plan", "pretrain-objects", "rounds-pretrain-objects-grid"}
+    ledgers = {"pretrain-objects", "grid-edge-fl-objects"}
+    assert set(second.needs) == {"plan", "plan-after-pretrain", *ledgers, "rounds-grid-edge-fl-objects-grid"}
+    assert all("-validation-" in steps[f"rounds-{name}-grid"].arguments["frames"] for name in ledgers)
+    for fixed in (
+        recipe_of(replan=False),
+        recipe_of(tasks={"objects": {"plan": {"samples": 9, "edge_rounds": 1, "cloud_rounds": 1}}}),
+    ):
+        assert not [step.name for step in Graph(fixed, Path()).steps if step.name.startswith("plan-")]
+
+
 def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
     arms = {"densest": {"placement": {"rule": "densest"}, "stages": ["edge"]}}
     plain = Graph(recipe_of(arms=arms), Path())
@@ -93,9 +118,9 @@ def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
 
 
 def test_an_arm_may_train_otherwise_on_the_same_frames() -> None:
-    armed = Graph(recipe_of(arms={"slow": {"training": {"cooldown": [0.1, 0.01]}}}), Path())
+    armed = Graph(recipe_of(arms={"slow": {"training": {"steps": 77}}}), Path())
     steps = {step.name: step for step in armed.steps}
-    assert steps["pretrain-objects-slow"].arguments["training"]["cooldown"] == [0.1, 0.01]
+    assert steps["pretrain-objects-slow"].arguments["training"]["steps"] == 77
     assert "grid-place-slow" not in steps
     assert steps["grid-edge-fl-objects-slow"].arguments["steps"]["place"] == "grid-place"
     with pytest.raises(ValueError, match=r"arms\.slow\.training: unknown field 'cooldowns'"):
@@ -112,12 +137,12 @@ def test_another_draw_changes_the_test_scenes_alone() -> None:
 
 
 def test_what_decides_federations_alone_leaves_pretraining_shared() -> None:
-    arms = {"mean": {"training": {"average_rounds": 3}}, "moving": {"training": {"average": 0.9}}}
+    arms = {"mean": {"training": {"average_rounds": 5}}, "longer": {"training": {"steps": 99}}}
     names = Graph(recipe_of(arms=arms, retrainings=1), Path()).names
     assert names.pretrain("mean", "objects") == "pretrain-objects"
     assert names.pretrain("mean-again1", "objects") == "pretrain-objects-main-again1"
     assert names.edge("mean", "grid", "objects") == "grid-edge-fl-objects-mean"
-    assert names.pretrain("moving", "objects") == "pretrain-objects-moving"
+    assert names.pretrain("longer", "objects") == "pretrain-objects-longer"
 
 
 def test_another_plan_shares_recordings_that_no_plan_decides() -> None:

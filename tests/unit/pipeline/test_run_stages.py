@@ -1,6 +1,5 @@
-"""Stages as functions: when training is over, what a kill leaves, who pays, how many steps a control takes."""
+"""Stages as functions: how pretraining ends, what a kill leaves, who pays, how many steps a control takes."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -18,54 +17,28 @@ from flcav.files import write_bytes
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Practice, Task
+from flcav.perception.training import train
 from flcav.perception.weights import to_arrays
 from flcav.pipeline import stages
 from flcav.pipeline.recipe import Training
 from flcav.pipeline.results import WEIGHTS
 from flcav.pipeline.stages import (
-    BLOCKS,
     FederationCheckpoints,
     Learning,
     choose_uploads,
-    next_rate,
+    pretrain,
     region_budget,
     round_path,
     share_budget,
     train_centrally,
-    train_until_level,
 )
+from flcav.progress import ignore_progress
+from flcav.seeds import derive_seed
 
-TRAINING = Training(max_blocks=6, patience=2, min_gain=0.01, cooldown=(0.3, 0.05))
 START = {"w": np.zeros(3, dtype=np.float32), "count": np.array(0, dtype=np.int64)}
 STAGE_ONE = LedgerEntry("pretrain", "t", "wireless", "up", 0, "suburb/cav0", 4_000_000)
 ROAD = LedgerEntry("edge", "t", "wireless", "down", 0, "grid/cav0", 900)
 SCHEDULE = Schedule(rounds=3, steps=4, learning_rate=0.1, final_learning_rate=0.05, seed=5)
-
-
-def rates(scores: list[float], training: Training = TRAINING) -> list[float | None]:
-    """Return the rate of each block of a training whose validation reaches `scores`, and what comes after it."""
-    return [next_rate(scores[:block], training) for block in range(len(scores) + 1)]
-
-
-def test_training_cools_down_once_validation_has_levelled_off() -> None:
-    assert rates([0.1, 0.2, 0.205, 0.209, 0.3, 0.3]) == [1, 1, 1, 1, 0.3, 0.05, None]
-
-
-def test_a_late_gain_within_the_patience_goes_on_at_the_full_rate() -> None:
-    assert rates([0.1, 0.2, 0.2, 0.25, 0.25, 0.25]) == [1, 1, 1, 1, 1, 1, 0.3]
-
-
-def test_the_cooldown_comes_after_the_last_block_too() -> None:
-    scores = [0.1 * block for block in range(1, 9)]  # never levels off
-    assert rates(scores) == [1] * 6 + [0.3, 0.05, None]
-
-
-def test_fewer_blocks_than_the_patience_needs() -> None:
-    assert rates([0.5, 0.5, 0.5], TRAINING.model_copy(update={"max_blocks": 1})) == [1, 0.3, 0.05, None]
-
-
-def test_without_a_cooldown_training_ends_level() -> None:
-    assert rates([0.5, 0.5, 0.5], TRAINING.model_copy(update={"cooldown": ()})) == [1, 1, 1, None]
 
 
 class Walk:
@@ -188,30 +161,41 @@ def test_the_mean_of_the_last_rounds_is_the_federation_s_result(tmp_path: Path) 
             np.testing.assert_allclose(found[name], np.mean([each[name] for each in last], axis=0), rtol=1e-6)
 
 
-def pretrain(folder: Path, average: float) -> Weights:
-    training = Training(block_steps=1, max_blocks=4, patience=3, cooldown=(0.5,), average=average)
-    folder.mkdir(exist_ok=True)
-    samples = [np.float32(number) for number in range(5)]
-    train_until_level(Learning(LINEAR, None, training, 3), samples, (), folder, lambda done, total, note="": None)
-    return load_file(folder / WEIGHTS)
+SAMPLES = [np.float32(number) for number in range(5)]
 
 
-def test_pretrained_weights_are_a_moving_average_that_a_kill_does_not_change(
+def test_pretraining_takes_the_tasks_schedule_and_ends_with_its_last_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stages, "mean_score", lambda task, network, splits: 0.5)
-    last, found = pretrain(tmp_path / "last", 0.0), pretrain(tmp_path / "mean", 0.8)
-    blocks = [load_file(tmp_path / f"mean/block{number}.safetensors") for number in range(1, 6)]
-    for name, mean in blocks[0].items():
-        np.testing.assert_array_equal(last[name], blocks[-1][name])
-        for block in blocks[1:]:
-            mean = 0.8 * mean + 0.2 * block[name]
-        np.testing.assert_allclose(found[name], mean, rtol=1e-5)
-        assert not np.allclose(found[name], last[name], rtol=1e-5)
-    rows = json.loads((tmp_path / "mean" / BLOCKS).read_text())
-    (tmp_path / "mean" / BLOCKS).write_text(json.dumps(rows[:2]))
-    again = pretrain(tmp_path / "mean", 0.8)
-    assert all(np.array_equal(again[name], found[name]) for name in found)
+    learning = Learning(LINEAR, None, Training(steps=25), 3)
+    monkeypatch.setattr(stages, "mean_score", lambda task, network, splits: -float(network.weight.detach()))
+    found = pretrain(learning, SAMPLES, (), tmp_path, ignore_progress)
+    other = learning.build_network()
+    history = train(LINEAR, other, SAMPLES, steps=25, schedule="one_cycle", seed=derive_seed(3, "pretrain"))
+    kept = load_file(tmp_path / WEIGHTS)
+    assert all(np.array_equal(kept[name], array) for name, array in to_arrays(other).items())
+    assert [each.step for each in found] == list(range(2, 26, 2))
+    assert [each.loss for each in found] == pytest.approx(history.losses[:24].reshape(12, 2).mean(axis=1))
+    assert max(found, key=lambda each: each.score) != found[-1]  # the best validation is not what is kept
+
+
+def test_a_kill_does_not_change_pretraining(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages, "mean_score", lambda task, network, splits: float(network.bias.detach()))
+
+    def killed(done: int, total: int, note: str = "") -> None:
+        if done == 70:
+            raise KeyboardInterrupt
+
+    learning = Learning(LINEAR, None, Training(steps=90), 3)
+    whole = pretrain(learning, SAMPLES, (), tmp_path, ignore_progress)
+    (tmp_path / "killed").mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        pretrain(learning, SAMPLES, (), tmp_path / "killed", killed)
+    taken: list[int] = []
+    again = pretrain(learning, SAMPLES, (), tmp_path / "killed", lambda done, total, note="": taken.append(done))
+    assert taken[0] == 64  # validated, and kept, every 9 steps
+    assert again == whole
+    assert (tmp_path / "killed" / WEIGHTS).read_bytes() == (tmp_path / WEIGHTS).read_bytes()
 
 
 def test_regions_share_what_stage_one_left_by_their_vehicles() -> None:

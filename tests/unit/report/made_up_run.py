@@ -10,7 +10,6 @@ from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import (
     ArmResult,
-    Block,
     Difference,
     Finding,
     LinkUse,
@@ -23,6 +22,7 @@ from flcav.pipeline.results import (
     TaskPlan,
     Test,
     Tested,
+    Validated,
 )
 from flcav.report.pictures.clouds import Detections, Sweep
 from flcav.report.pictures.maps import ErrorMap, poles_of
@@ -70,7 +70,7 @@ def run() -> Run:
                 spent=tuple(Spent(stage, "objects", link, mb) for stage, link, mb in SENT),
             )
         },
-        pretrained=(Pretrained("objects", "tiny", {"suburb": (0,)}, (Block(1.0, 2.0, 0.4),), 100, 0.5),),
+        pretrained=(Pretrained("objects", "tiny", {"suburb": (0,)}, (Validated(100, 2.0, 0.4),), 100, 0.5),),
         watched=(),
         tested=tuple(
             Test(MAIN, stage, town, "objects", "test", result_of(town, mean), result_of(town, mean).estimate, None)

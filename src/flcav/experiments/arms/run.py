@@ -78,7 +78,7 @@ class Pretraining:
 
     steps: int
     threshold: float | None  # lowest score of detections that serve as labels
-    curve: tuple[Mapping[str, float], ...]  # of every `Block`
+    curve: tuple[Mapping[str, float], ...]  # step, loss and score of every validation
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def one_seed(run: Run) -> ArmsSeed:
         for arm, stage in ARMS["grid"].items()
         if (name := f"grid, {TASK}: {name_stage(*stage)}") in run.gap_closed
     }
-    curve = tuple(vars(block) for block in pretrained.blocks)
+    curve = tuple(vars(each) for each in pretrained.validated)
     return ArmsSeed(
         seed=run.recipe.seed,
         plan=Counts(plan.samples, plan.edge_rounds, plan.cloud_rounds),

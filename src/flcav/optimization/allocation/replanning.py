@@ -4,13 +4,13 @@ Stages follow each other: after the first edge round no sample is added, after t
 """
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from flcav.config import Config, InputError
 from flcav.optimization.allocation.allocate import Allocation, allocate
-from flcav.optimization.curves.curves import Additive, Curve, Decay, Effective, Federated, NonNegative
+from flcav.optimization.curves.curves import STAGES, Additive, Curve, Decay, Effective, Federated, NonNegative
 from flcav.optimization.problem import AllocationTask, Budgets, Count, Fraction, Problem
 from flcav.optimization.solvers.instance import price_counts
 
@@ -25,6 +25,9 @@ class TaskState(Config):
     cloud_rounds: Count = 0  # cloud rounds done
     accuracy: Fraction | None = (
         None  # accuracy now; None: not measured; of a cluster: the weighted mean of its members'
+    )
+    ended: Literal["pretrain", "edge"] | None = (
+        None  # last stage that nothing more is spent in; default: the one before the last in which something was
     )
 
     @property
@@ -76,9 +79,10 @@ def condition_problem(problem: Problem, progress: PlanState) -> Problem:
 def _continued(problem: Problem, task: AllocationTask, spent: TaskState) -> AllocationTask:
     fields = ("samples", "edge_rounds", "cloud_rounds")
     limits = {}
+    ended = 0 if spent.ended is None else 1 + STAGES.index(spent.ended)
     for stage, (name, done) in enumerate(zip(fields, spent.counts)):
         least, most = getattr(task.limits, name)
-        over = any(spent.counts[stage + 1 :])
+        over = any(spent.counts[stage + 1 :]) or stage < ended
         limits[name] = (done, done) if over else (max(least, done), max(most, done))
     update: dict[str, object] = {"limits": task.limits.model_copy(update=limits)}
     if spent.accuracy is not None:

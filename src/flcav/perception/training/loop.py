@@ -64,10 +64,14 @@ class Validation:
 
     score: Callable[[Any], float]  # validation score of a network; more is better
     every: int  # steps between validations
-    patience: int  # validations without a new best after which training stops
+    patience: int | None = (
+        None  # validations without a new best after which training stops, with the best weights; None: it goes on
+    )
 
     def is_over(self, scores: Sequence[float]) -> bool:
         """Return whether training stops: none of the last `patience` of `scores` is above all scores before them."""
+        if self.patience is None:
+            return False
         return len(scores) > self.patience and max(scores[-self.patience :]) <= max(scores[: -self.patience])
 
 
@@ -96,10 +100,10 @@ def train(
 ) -> TrainingHistory:
     """Train `network` in place for `steps` optimiser steps; hyperparameters default to `task.practice`.
 
-    Each epoch goes through the samples in a new random order. With `validation`, training may stop early, and the
-    network gets the weights of the best validation. With `checkpointing`, an interrupted run is resumed from its file
-    and ends with the same weights. `watch` receives loss, learning rate and validation score. Raises `InputError`
-    without samples, for an unknown schedule, and if the checkpoint is of another run.
+    Each epoch goes through the samples in a new random order. With the `patience` of `validation`, training may stop
+    early, and the network gets the weights of the best validation. With `checkpointing`, an interrupted run is resumed
+    from its file and ends with the same weights. `watch` receives loss, learning rate and validation score. Raises
+    `InputError` without samples, for an unknown schedule, and if the checkpoint is of another run.
     """
     batch = task.practice.batch if batch is None else batch
     learning_rate = task.practice.learning_rate if learning_rate is None else learning_rate
@@ -201,7 +205,7 @@ def batches(samples: int, batch: int, steps: int, seed: int) -> NDArray[np.int64
 
 def _validate(validation: Validation, network: nn.Module, done: RunState) -> None:
     score = validation.score(network)
-    if score > max(done.scores, default=-np.inf):
+    if validation.patience is not None and score > max(done.scores, default=-np.inf):
         done.best = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     done.scores.append(score)
 

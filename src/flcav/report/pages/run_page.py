@@ -138,12 +138,12 @@ def _chart(run: Run, task: str) -> tuple[list[Row], list[Row]]:
     starts = " + ".join(run.recipe.with_role("pretrain"))
     (pretrained,) = (each for each in run.pretrained if each.task == task)
     rounds: list[Row] = [
-        {"stage": CHART_NAMES[PRETRAIN], "round": number, "town": starts, "score": block.score}
-        for number, block in enumerate(pretrained.blocks, start=1)
+        {"stage": CHART_NAMES[PRETRAIN], "round": number, "town": starts, "score": each.score}
+        for number, each in enumerate(pretrained.validated, start=1)
     ]
     for watched in run.watched:
         if watched.task == task:
-            stage = CHART_NAMES[watched.stage]
+            stage = CHART_NAMES[EDGE if watched.stage == PRETRAIN else watched.stage]  # pretrained: before round 1
             rounds += [
                 {"stage": stage, "round": each.round, "town": watched.region, "score": each.score}
                 for each in watched.rounds
