@@ -118,8 +118,9 @@ class Graph:
         for region in self.settings[MAIN].regions:
             trained = self.names.stage(MAIN, stage, region, task)
             frames = self.names.recording(region, "validation", task)
-            arguments = {"task": task, "region": region, "stage": stage, "trained": trained, "frames": frames}
-            arguments["averaged"] = self.settings[MAIN].training[task].average_rounds
+            averaged = self.settings[MAIN].training[task].average_rounds
+            watched = {"task": task, "region": region, "stage": stage, "trained": trained, "frames": frames}
+            arguments = watched | {"averaged": averaged}
             added.append(self.names.rounds(trained, region))
             self._add(_step(added[-1], rounds_step, arguments, [trained, frames]))
         return added

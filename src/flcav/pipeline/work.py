@@ -376,9 +376,8 @@ def rounds_step(work: Work, task: str, region: str, stage: str, trained: str, fr
     networks = {0: last}
     if stage != PRETRAIN:
         numbers = range(1, StageResult.load(work.inputs[trained]).rounds + 1)
-        networks = {
-            each: load_round_network(learned, last.config, work.inputs[trained], each, averaged) for each in numbers
-        }
+        folder, config = work.inputs[trained], last.config
+        networks = {each: load_round_network(learned, config, folder, each, averaged) for each in numbers}
     rounds = []
     for number, network in networks.items():
         rounds.append(Round(number, score_network(learned, network, split.data, split.vehicles)))

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -100,12 +101,13 @@ def test_a_plan_made_anew_is_the_best_of_what_is_left() -> None:
     first, problem = make_plan((asked(),), frame(120, 60), "joint")
     assert problem is not None
     own = first.tasks["objects"]
-    for stage, reached, saved_mb in (
+    cases: tuple[tuple[Literal["pretrain", "edge"], float, float], ...] = (
         ("pretrain", 0.2, 0.0),
         ("pretrain", 0.7, 9.0),
         ("edge", 0.6, 0.0),
         ("edge", 0.3, 4.0),
-    ):
+    )
+    for stage, reached, saved_mb in cases:
         rounds = own.edge_rounds if stage == "edge" else 0
         sent = price(frame().stage_plan(own.samples, rounds, 0), SIZES)
         used = Price(sent.wireless_mb - saved_mb, sent.wireline_mb)
