@@ -125,6 +125,13 @@ def measure_spread(values: Sequence[float]) -> Spread | None:
     return Spread(float(np.std(values, ddof=1)), len(values)) if len(values) > 1 else None
 
 
+def pool_spreads(spreads: Sequence[Spread]) -> Spread:
+    """Return the spread over several sets of frames: variances are averaged, weighted by their degrees of freedom."""
+    freedom = [each.trainings - 1 for each in spreads]
+    variance = np.average([each.sd**2 for each in spreads], weights=freedom)
+    return Spread(float(np.sqrt(variance)), sum(freedom) + 1)
+
+
 def combine_spreads(first: Spread | None, second: Spread | None) -> Spread | None:
     """Return the spread of the difference of two numbers whose trainings vary independently; None where one is unknown.
 

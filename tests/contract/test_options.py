@@ -86,7 +86,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--map": ALWAYS,
     },
     "fit": {
-        **dict.fromkeys(("--model", "--at", "--problem", "--level", "--repeats", "--seed"), ALWAYS),
+        **dict.fromkeys(("--model", "--at", "--problem", "--level", "--repeats", "--seed", "--held-out"), ALWAYS),
         **dict.fromkeys(
             ("--group-samples", "--alpha", "--beta", "--edge-rounds-per-cloud-round"), ("effective", "federated")
         ),

@@ -10,6 +10,7 @@ from flcav.intervals import (
     bootstrap_over_scenes,
     combine_spreads,
     measure_spread,
+    pool_spreads,
     widen,
     widen_share,
 )
@@ -58,6 +59,14 @@ def test_the_spread_is_the_standard_deviation_of_several_trainings():
     assert found is not None
     assert (found.sd, found.trainings) == (pytest.approx(stats.tstd(values)), 3)
     assert measure_spread([0.6]) is None
+
+
+def test_pooled_spreads_are_those_of_trainings_around_their_own_means():
+    rng = np.random.default_rng(3)
+    sets = [rng.normal(mean, 0.03, size) for mean, size in ((0.2, 4000), (0.7, 9000))]
+    found = pool_spreads([measure_spread(each) for each in sets])
+    around = np.concatenate([each - each.mean() for each in sets])
+    assert (found.sd, found.trainings) == (pytest.approx(around.std(ddof=2)), len(around) - 1)
 
 
 def test_a_difference_spreads_by_both_trainings():

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from flcav.config import InputError
-from flcav.intervals import Spread
+from flcav.intervals import Spread, pool_spreads
 from flcav.pipeline.results import Difference, Run
 from flcav.pipeline.tables import read_table
 
@@ -53,12 +53,12 @@ def list_spreads(run: Run, name: str) -> list[SpreadRow]:
 
 
 def read_spreads(name: str, beside: Path) -> Spreads:
-    """Return the spreads in a table of the package, or in a file below `beside`.
+    """Return the spreads in a table of the package, or in a file below `beside`; those of several runs are pooled.
 
     Raises `InputError` where there is no such table, or a row is not a spread.
     """
     rows = csv.DictReader(io.StringIO(read_table("spread", name, "spread", "spreads", beside)))
-    spreads: dict[Key, Spread] = {}
+    spreads: dict[Key, list[Spread]] = {}
     for number, row in enumerate(rows, start=1):
         if missing := [field.name for field in fields(SpreadRow) if row.get(field.name) is None]:
             raise InputError(f"{name}: row {number}: column '{missing[0]}' is missing")
@@ -68,5 +68,6 @@ def read_spreads(name: str, beside: Path) -> Spreads:
             raise InputError(f"{name}: row {number}: sd and trainings must be numbers") from None
         if not (0 <= spread.sd < 1 and spread.trainings >= 2):
             raise InputError(f"{name}: row {number}: sd must be from 0 to 1, trainings 2 or more")
-        spreads[row["task"], row["region"], row["arm"], row["stage"], row["before_arm"], row["before_stage"]] = spread
-    return spreads
+        key = (row["task"], row["region"], row["arm"], row["stage"], row["before_arm"], row["before_stage"])
+        spreads.setdefault(key, []).append(spread)
+    return {key: pool_spreads(own) for key, own in spreads.items()}

@@ -21,6 +21,12 @@ def test_a_table_is_read_by_measure_and_by_difference(tmp_path: Path) -> None:
     }
 
 
+def test_runs_of_one_measure_are_pooled(tmp_path: Path) -> None:
+    append_records(tmp_path / "own.csv", [ROW, replace(ROW, sd=0.04, trainings=3, run="seed2")])
+    (pooled,) = read_spreads("own.csv", tmp_path).values()
+    assert (pooled.sd, pooled.trainings) == (pytest.approx(((8 * 0.021**2 + 2 * 0.04**2) / 10) ** 0.5), 11)
+
+
 @pytest.mark.parametrize(
     ("cells", "said"),
     [

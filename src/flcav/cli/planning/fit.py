@@ -1,5 +1,6 @@
 """`flcav fit`: learning curves from a history of training runs."""
 
+import dataclasses
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -74,6 +75,9 @@ def fit(
     ),
     repeats: int = typer.Option(200, "--repeats", min=20, max=10**5, help="Bootstrap repeats of the bands."),
     seed: int = typer.Option(0, "--seed", min=0, help="Seed of the bootstrap."),
+    held_out: bool = typer.Option(
+        False, "--held-out", help="Also predict each run (column run) by the curve of all other runs."
+    ),
 ) -> None:  # fmt: skip
     """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
     from flcav.cli.tables import read_table
@@ -81,7 +85,8 @@ def fit(
     from flcav.optimization.allocation.problem_file import collect_fitted_fields
     from flcav.optimization.curves import fitting
     from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
-    from flcav.optimization.curves.history import parse_histories
+    from flcav.optimization.curves.held_out import hold_out_runs
+    from flcav.optimization.curves.history import History, parse_histories
 
     if model is Model.additive:
         refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
@@ -89,14 +94,20 @@ def fit(
     asked = [_counts(text) for text in at]
     held, unnamed = _held(problem, history.stem)
     answers, shown, found_of = [], [], {}
+
+    def fit_curve(points: History) -> "CurveFit":
+        return fitting.fit(points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
+
     for task, points in parse_histories(read_table(history, ()).to_pydict(), str(history), unnamed).items():
         try:
-            found = fitting.fit(points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
+            found = fit_curve(points)
+            checked = hold_out_runs(points, fit_curve, k) if held_out else None
         except InputError as error:
             raise InputError(f"{history}: task {task!r}: {error}") from None
         band = bootstrap_bands(found, level=level, repeats=repeats, seed=seed, k=k)
         upper = None if band is None else fit_upper_curve(found, band)
-        answers.append(_answer(task, found, band, upper, points.resources, asked, k))
+        own = _answer(task, found, band, upper, points.resources, asked, k)
+        answers.append(own if checked is None else own | {"held_out": dataclasses.asdict(checked)})
         shown.append(found)
         found_of[task] = collect_fitted_fields(found, points.resources, upper)
     if problem is not None:
@@ -214,5 +225,11 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
             )
             counts = f"{row['samples']:g} samples, {row['edge_rounds']:g} edge, {row['cloud_rounds']:g} cloud rounds"
             console.print(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}")
+        if "held_out" in answer:
+            checked = answer["held_out"]
+            console.print(
+                f"{answer['task']}: {checked['runs']} runs held out, {checked['points']} points: mean error of the "
+                f"prediction {checked['mean_error']:.4f}, rank correlation {checked['rank_correlation']:.3f}"
+            )
         for warning in answer["warnings"]:
             console.print(f"{answer['task']}: {warning}")

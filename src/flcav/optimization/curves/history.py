@@ -4,7 +4,7 @@ Tables of two forms are read:
 
 - Long: `task, stage, resource, accuracy[, weight]`. A row gives the resource of its own stage. Stages follow each
   other, so its other resources are the largest of each earlier stage, and 0 of each later one.
-- Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight]`, as the project's own runs write it.
+- Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight][, run]`, as the project's own runs write it.
 
 Either may have `error`, which is 1 - accuracy, in place of `accuracy`.
 """
@@ -38,6 +38,12 @@ class History:
     resources: Array  # (n, 3) samples, edge rounds, cloud rounds
     accuracy: Array  # (n,) 0 ... 1
     weight: Array  # (n,) of each point's squared residual in a fit
+    runs: tuple[str, ...] = ()  # that the points are of; none where the history does not name them
+
+    def select(self, chosen: NDArray[np.bool_]) -> "History":
+        """Return the points that are true in `chosen` (n,)."""
+        runs = tuple(run for run, taken in zip(self.runs, chosen) if taken)
+        return History(self.resources[chosen], self.accuracy[chosen], self.weight[chosen], runs)
 
 
 def article_histories() -> dict[str, History]:
@@ -73,7 +79,8 @@ def parse_histories(columns: Table, origin: str, unnamed: str) -> dict[str, Hist
         own = amounts[rows]
         if not joint:
             own = accumulate_resources([str(columns["stage"][row]) for row in rows], own[:, 0])
-        found[task] = History(own, accuracy[rows], weight[rows])
+        runs = tuple(str(columns["run"][row]) for row in rows) if "run" in columns else ()
+        found[task] = History(own, accuracy[rows], weight[rows], runs)
     return found
 
 

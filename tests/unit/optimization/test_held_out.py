@@ -1,0 +1,66 @@
+"""Prediction of runs that a learning curve was not fitted to."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import rankdata
+
+from flcav.cli.main import run as command
+from flcav.config import InputError
+from flcav.optimization.curves.fitting import fit
+from flcav.optimization.curves.held_out import hold_out_runs
+from flcav.optimization.curves.history import History
+
+COUNTS = np.array([(s, e, 0) for s in (40, 80, 160, 320) for e in range(4)], dtype=float)
+RUNS = tuple(f"n{int(samples)}" for samples, _, _ in COUNTS)
+
+
+def history(noise: float) -> History:
+    error = 1.5 * COUNTS[:, 0] ** -0.4 + 0.3 * (COUNTS[:, 1] + 1) ** -0.8
+    drawn = np.random.default_rng(1).normal(scale=noise, size=len(COUNTS))
+    return History(COUNTS, 1 - error + drawn, np.ones(len(COUNTS)), RUNS)
+
+
+def test_a_run_is_predicted_by_the_others_alone() -> None:
+    told = history(0.02)
+    found = hold_out_runs(told, fit)
+    errors, predicted = [], []
+    for run in dict.fromkeys(RUNS):
+        rows = [row for row, name in enumerate(RUNS) if name != run]
+        others = fit(History(COUNTS[rows], told.accuracy[rows], told.weight[rows])).curve
+        for row in sorted(set(range(len(RUNS))) - set(rows)):
+            predicted.append(1 - float(others.error(*COUNTS[row])))
+            errors.append(abs(predicted[-1] - told.accuracy[row]))
+    ranks = np.corrcoef(rankdata(predicted), rankdata(told.accuracy))[0, 1]
+    assert (found.runs, found.points) == (4, 16)
+    assert found.mean_error == pytest.approx(np.mean(errors))
+    assert found.rank_correlation == pytest.approx(ranks)
+    assert found.mean_error > np.abs(1 - fit(told).curve.error(*COUNTS.T) - told.accuracy).mean()
+
+
+def test_an_exact_curve_predicts_exactly() -> None:
+    found = hold_out_runs(history(0.0), fit)
+    assert found.mean_error < 2e-3
+    assert found.rank_correlation == pytest.approx(1.0)
+
+
+def test_two_runs_are_too_few() -> None:
+    with pytest.raises(InputError, match="3 or more are wanted in the column 'run', not 2"):
+        hold_out_runs(history(0.0).select(COUNTS[:, 0] < 100), fit)
+
+
+def test_the_command_tells_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = history(0.02)
+    rows = [f"t,{s:g},{e:g},{c:g},{a:.6f},{r}" for (s, e, c), a, r in zip(COUNTS, told.accuracy, RUNS, strict=True)]
+    table = tmp_path / "own.csv"
+    table.write_text("task,samples,edge_rounds,cloud_rounds,accuracy,run\n" + "\n".join(rows) + "\n")
+    with pytest.raises(SystemExit, match="0"):
+        command(["fit", str(table), "--held-out", "--json"])
+    (answer,) = json.loads(capsys.readouterr().out)["curves"]
+    assert answer["held_out"]["runs"] == 4
+    assert answer["held_out"]["mean_error"] == pytest.approx(hold_out_runs(told, fit).mean_error, abs=1e-5)
+    with pytest.raises(SystemExit, match="0"):
+        command(["fit", str(table), "--held-out"])
+    assert "4 runs held out, 16 points" in " ".join(capsys.readouterr().out.split())
