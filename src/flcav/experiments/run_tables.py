@@ -3,7 +3,7 @@
 from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
 from flcav.pipeline.findings import name_stage
-from flcav.pipeline.recipe import MAIN
+from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results import Run
 
 
@@ -39,14 +39,22 @@ def _differences(run: Run) -> str:
 
 
 def _plan(run: Run) -> str:
+    """Return every plan of each task: when it was made, from which score on validation frames, and what it predicts."""
     rows = []
-    for task, own in run.arms[MAIN].plan.tasks.items():
-        source = "fixed by hand" if own.predicted is None else f"planned: {own.predicted['cloud']:.3f}"
-        counts = (own.samples, own.edge_rounds, own.cloud_rounds)
-        sizes = (f"{mb:.3f}" for mb in (own.sample_mb, own.model_mb))
-        rows.append([task, *counts, *sizes, f"{own.wireless_mb:.1f}", f"{own.wireline_mb:.1f}", source])
+    made = {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"}
+    for task in run.recipe.tasks:
+        for plan in run.arms[MAIN].plans:
+            own = plan.tasks[task]
+            if own.predicted is None and plan.after is not None:
+                continue
+            source = "fixed by hand" if own.predicted is None else f"planned: {own.predicted['cloud']:.3f}"
+            reached = f"{plan.reached[task]:.3f}" if plan.reached else ""
+            counts = (own.samples, own.edge_rounds, own.cloud_rounds)
+            sizes = (f"{mb:.3f}" for mb in (own.sample_mb, own.model_mb))
+            megabytes = (f"{own.wireless_mb:.1f}", f"{own.wireline_mb:.1f}")
+            rows.append([task, made[plan.after], reached, *counts, *sizes, *megabytes, source])
     header = ("samples", "edge rounds", "cloud rounds", "sample MB", "network MB", "wireless MB", "wireline MB")
-    return format_table(("task", *header, "predicted"), rows)
+    return format_table(("task", "made", "reached", *header, "predicted"), rows)
 
 
 def _budgets(run: Run) -> str:

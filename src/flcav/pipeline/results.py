@@ -278,6 +278,11 @@ class ArmResult:
     spent: tuple[Spent, ...]
     earlier: Annotated[tuple[Plan, ...] | None, LEFT_OUT] = None  # plans that others took the place of, oldest first
 
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Return all plans in the order in which they were made."""
+        return (*(self.earlier or ()), self.plan)
+
     def sent_mb(self, task: str, link: str) -> float:
         """Return the uplink traffic of a task on a link, over all stages [MB]."""
         return sum(row.mb for row in self.spent if (row.task, row.link) == (task, link))

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from html.parser import HTMLParser
 from typing import Any
 
@@ -5,7 +6,7 @@ import made_up_run
 import pytest
 from jinja2 import UndefinedError
 
-from flcav.pipeline.results import Finding
+from flcav.pipeline.results import Finding, Plan
 from flcav.report.pages.html import render
 from flcav.report.pages.run_page import page
 
@@ -68,7 +69,7 @@ def test_the_page_tells_the_numbers() -> None:
         "wireless 230.0 216.0 214.7",
         "2 · placed 19 of 61 6.2",
         "8 · densest traffic 6 of 61 12.4",
-        "objects 320 6 3 216.0 128.1 0.530",
+        "objects before the run 320 6 3 216.0 128.1 0.530",
         "Seed 7; 538 s; x86-64; revision 0123456789; flcav 0.1.0",
     ):
         assert shown in text
@@ -88,6 +89,16 @@ def test_verdicts_stand_at_their_findings() -> None:
     assert '<span class="badge did-not-hold">did not hold</span>' in text
 
 
+def test_plans_that_were_made_anew_are_told() -> None:
+    told = results()
+    (first,) = told["plans"]
+    later = replace(first.tasks["objects"], cloud_rounds=5)
+    told["plans"] = (first, Plan("joint", {"objects": later}, "pretrain", {"objects": 0.471}))
+    text = Page(render(told, {})).text
+    assert "objects after stage I 0.471 320 6 5 216.0 128.1 0.530" in text
+    assert "made anew between stages" in text
+
+
 def test_values_are_escaped() -> None:
     told = results()
     told["findings"] = (Finding("grid", "Really?", "held", "<script>alert('x')</script> & more"),)
@@ -103,6 +114,6 @@ def test_a_picture_that_was_not_made_is_left_out() -> None:
 
 def test_missing_results_are_not_passed_over() -> None:
     told = results()
-    del told["plan"]
-    with pytest.raises(UndefinedError, match="plan"):
+    del told["plans"]
+    with pytest.raises(UndefinedError, match="plans"):
         render(told, PICTURES)
