@@ -8,6 +8,7 @@ from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, Re
 from flcav.federation.trainable import LocalUpdate, Update, Weights
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"  # records of a message, by key
+EXTRA = "extra"  # a strategy's arrays beside the weights, where it has any
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
 
 
@@ -40,14 +41,19 @@ def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
     return {name: array.numpy() for name, array in arrays.items()}
 
 
-def reply(message: Message, update: Update) -> Message:
-    """Return the reply to a training message: the weights, and the number of samples and the loss as metrics."""
+def reply(message: Message, update: Update, extra: Weights) -> Message:
+    """Return the reply to a training message: the weights, a strategy's `extra` arrays, samples and loss.
+
+    Without extra arrays there is no record of them.
+    """
+    records = {ARRAYS: to_arrays(update.weights)} | ({EXTRA: to_arrays(extra)} if extra else {})
     metrics = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
-    return Message(RecordDict({ARRAYS: to_arrays(update.weights), METRICS: metrics}), reply_to=message)
+    return Message(RecordDict({**records, METRICS: metrics}), reply_to=message)
 
 
 def to_update(answer: Message) -> LocalUpdate:
     """Return the update in a client's reply: the inverse of `reply`. Raises KeyError where a record is missing."""
-    metrics = answer.content.metric_records[METRICS]
-    weights = to_weights(answer.content.array_records[ARRAYS])
-    return LocalUpdate(weights, int(metrics[SAMPLES]), float(metrics[LOSS]))  # type: ignore[arg-type]
+    metrics, arrays = answer.content.metric_records[METRICS], answer.content.array_records
+    extra = to_weights(arrays[EXTRA]) if EXTRA in arrays else {}
+    weights, samples, loss = to_weights(arrays[ARRAYS]), metrics[SAMPLES], metrics[LOSS]
+    return LocalUpdate(weights, int(samples), float(loss), extra=extra)  # type: ignore[arg-type]

@@ -6,20 +6,24 @@ server is k rounds of federation with the vehicles of its region (Wang et al., I
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from flwr.app import ArrayRecord
 
 from flcav.config import InputError
-from flcav.federation.client import CLIENT, client_app
+from flcav.federation.client import CLIENT, check_arguments, client_app
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.rounds import OnRound, Rounds
+from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.strategies.strategy import Corrects, Robust
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.seeds import derive_seed
 
+EVERYBODY = Rules()
 logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each round; a stage reports its own
 
 
@@ -51,6 +55,8 @@ def federate(
     account: Account,
     *,
     strategy: Strategy = FEDAVG,
+    rules: Rules = EVERYBODY,
+    state: FederationState | None = None,
     done: int = 0,
     on_round: OnRound = _ignore,
 ) -> LocalUpdate:
@@ -58,13 +64,16 @@ def federate(
 
     Returns the weights after the last round, and of that round the number of samples of all clients and their mean
     training loss, weighted by samples; without a round to run, `weights`, 0 samples and a loss of 0. In each round
-    every client trains, and `strategy` combines their updates: by default federated averaging (McMahan et al., AISTATS
-    2017, algorithm 1). `on_round` is called after each round with its number, weights and mean loss. Every message is
-    entered in the ledger of `account`. To resume, pass the same strategy, and the weights and the number of the last
-    round that `on_round` was given.
+    every client trains, unless `rules` say otherwise, and `strategy` combines their updates: by default federated
+    averaging (McMahan et al., AISTATS 2017, algorithm 1). `on_round` is called after each round with its number,
+    weights and mean loss; `state` is then that of the round, with a record of it. Every message is entered in the
+    ledger of `account`. To resume, pass the same strategy and rules, the weights and the number of the last round that
+    `on_round` was given, and the state after it.
 
-    Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where a client raised, `InputError`
-    where there are no clients, ValueError where `strategy` changes names, shapes or types of the arrays.
+    Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
+    no update, and fewer are left than `rules` ask for (by default all), `InputError` where there are no clients, or
+    `rules` or `strategy` ask for what they cannot do, ValueError where `strategy` changes names, shapes or types of the
+    arrays.
 
     >>> import numpy as np
     >>> from flcav import Ledger, federate
@@ -81,18 +90,36 @@ def federate(
     >>> federate(vehicles, {"w": np.zeros(2)}, schedule, Account(ledger, "edge", "toy", "wireless")).weights["w"]
     array([2.5, 2.5])
     """
-    if not clients:
-        raise InputError("a federation of 0 clients: nobody trains")
+    check_federation(clients, strategy, rules)
     if schedule.rounds <= done:
         return LocalUpdate(weights, 0, 0.0)
+    state = FederationState() if state is None else state
     nodes = {name: {CLIENT: name} for name in clients}
-    with EmbeddedGrid(client_app(clients), nodes) as grid:
+    with EmbeddedGrid(client_app(clients, strategy), nodes, state.clients) as grid:
+
+        def keep(round_: int, aggregated: Weights, loss: float) -> None:
+            state.clients = grid.read_states()
+            on_round(round_, aggregated, loss)
+
         metered = MeteredGrid(grid, account, grid.names)
-        rounds = Rounds(strategy, schedule.work, done, on_round)
+        rounds = Rounds(strategy, rules, schedule.work, grid.names, state, done, keep)
         result = rounds.start(metered, to_arrays(weights), schedule.rounds - done)
     arrays: ArrayRecord = result.arrays
     metrics = result.train_metrics_clientapp[schedule.rounds - done]
     return LocalUpdate(to_weights(arrays), int(metrics[SAMPLES]), float(metrics[LOSS]))  # type: ignore[arg-type]
+
+
+def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> None:
+    """Raise `InputError` where these clients cannot federate by this strategy and these rules."""
+    if not clients:
+        raise InputError("a federation of 0 clients: nobody trains")
+    name = type(strategy).__name__
+    if rules.least_clients is not None and rules.least_clients > len(clients):
+        raise InputError(f"least_clients: {rules.least_clients} are wanted in a round, and there are {len(clients)}")
+    if isinstance(strategy, Robust):
+        strategy.check_clients(len(clients))
+    if isinstance(strategy, Corrects):
+        check_arguments(clients, strategy.correct({}, {}).arguments(), name)
 
 
 @dataclass
@@ -105,6 +132,8 @@ class EdgeServer:
     own: Weights  # the region's model at the end of stage II
     cloud_rounds_done: int = 0
     strategy: Strategy = FEDAVG  # of aggregation in the region
+    rules: Rules = EVERYBODY  # of the region's rounds
+    state: FederationState = field(default_factory=FederationState)  # of the region's rounds
 
     def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
         """Return the update of the region after k edge rounds from the cloud's `weights`; raises as `federate` does.
@@ -115,6 +144,14 @@ class EdgeServer:
         start = weights if self.cloud_rounds_done else self.own
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
-        update = federate(self.vehicles, start, schedule, self.account, strategy=self.strategy, done=done)
-        self.cloud_rounds_done += 1
-        return update
+        self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
+        return federate(
+            self.vehicles,
+            start,
+            schedule,
+            self.account,
+            strategy=self.strategy,
+            rules=self.rules,
+            state=self.state,
+            done=done,
+        )

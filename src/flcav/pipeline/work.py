@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from flcav.config import InputError, read_config
-from flcav.federation.strategies import strategy_named
+from flcav.federation.strategies import of_servers, strategy_named
 from flcav.files import write_json
 from flcav.intervals import Estimate
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Budget, Ledger, LedgerEntry, Link
@@ -65,6 +65,7 @@ from flcav.pipeline.results import (
 )
 from flcav.pipeline.stages import (
     Learning,
+    Strategies,
     book_uploads,
     choose_uploads,
     federate_cloud,
@@ -272,7 +273,7 @@ def edge_step(
     clients = make_clients(learning, start.config, samples)
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region)
     strategy = strategy_named(how.strategy)
-    losses = federate_edge(learning, start, clients, schedule, strategy, book, work.folder, work.report)
+    losses = federate_edge(learning, start, clients, schedule, strategy, how, book, work.folder, work.report)
     held = sum(len(client.samples) for client in clients.values())
     StageResult(stage, task, region, rounds, held, len(clients), poles, losses).save(work.folder)
 
@@ -305,7 +306,9 @@ def cloud_step(
         count, helped = count + len(clients), [*helped, *poles]
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
     strategy = strategy_named(how.strategy)
-    losses = federate_cloud(learning, start, servers, rounds, k, strategy, book, work.folder, work.report)
+    cloud = of_servers(strategy) if how.cloud_strategy is None else strategy_named(how.cloud_strategy)
+    federating = Strategies(strategy, cloud)
+    losses = federate_cloud(learning, start, servers, rounds, k, federating, how, book, work.folder, work.report)
     StageResult(CLOUD, task, None, rounds, held, count, tuple(helped), losses).save(work.folder)
 
 

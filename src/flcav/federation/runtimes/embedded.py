@@ -7,6 +7,7 @@ record, the id of a message, and the serialised form of a record.
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 
+import numpy as np
 from flwr.app import ConfigRecord, Context, Error, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 from flwr.common.serde import recorddict_to_proto
@@ -14,7 +15,7 @@ from flwr.serverapp import Grid
 from flwr.supercore.run import Run
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.records import ARRAYS, LOSS, METRICS, SAMPLES, to_arrays
+from flcav.federation.records import ARRAYS, LOSS, METRICS, SAMPLES, to_arrays, to_weights
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import BudgetExceeded
 
@@ -48,12 +49,18 @@ def _server_identity() -> Iterator[None]:
 class EmbeddedGrid(Grid):
     """Flower grid whose nodes are in this process; a context manager."""
 
-    def __init__(self, app: ClientApp, nodes: Mapping[str, Mapping[str, str]]) -> None:
-        """Register a node for each name in `nodes`, in their order; the values are the node configs."""
+    def __init__(
+        self, app: ClientApp, nodes: Mapping[str, Mapping[str, str]], states: Mapping[str, Mapping[str, Weights]] = {}
+    ) -> None:
+        """Register a node for each name in `nodes`, in their order; the values are the node configs.
+
+        `states` are the arrays that nodes have kept from earlier rounds, by node and record.
+        """
         self._app = app
         self.names = dict(enumerate(nodes, FIRST_NODE))
         self._contexts = {
-            node: Context(RUN_ID, node, dict(nodes[name]), RecordDict(), {}) for node, name in self.names.items()
+            node: Context(RUN_ID, node, dict(nodes[name]), _node_state(states.get(name, {})), {})
+            for node, name in self.names.items()
         }
         self._replies: dict[str, Message] = {}
         self._sent = 0
@@ -66,6 +73,14 @@ class EmbeddedGrid(Grid):
 
     def __exit__(self, *exception: object) -> None:
         self._identity.__exit__(None, None, None)
+
+    def read_states(self) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+        """Return the arrays that nodes keep between rounds, by node and record; nodes without any are left out."""
+        return {
+            self.names[node]: {key: to_weights(arrays) for key, arrays in context.state.array_records.items()}
+            for node, context in self._contexts.items()
+            if context.state.array_records
+        }
 
     def set_run(self, run: Run) -> None:
         """Set Flower's record of the run."""
@@ -115,6 +130,10 @@ class EmbeddedGrid(Grid):
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
         """Deliver messages one after another and return their replies."""
         return [reply for message in messages for reply in self.pull_messages(self.push_messages([message]))]
+
+
+def _node_state(arrays: Mapping[str, Weights]) -> RecordDict:
+    return RecordDict({key: to_arrays(weights) for key, weights in arrays.items()})
 
 
 def _copied(record):
