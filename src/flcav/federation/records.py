@@ -9,6 +9,8 @@ from flcav.federation.trainable import LocalUpdate, Update, Weights
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"  # records of a message, by key
 EXTRA = "extra"  # a strategy's arrays beside the weights, where it has any
+ASK = "ask"  # record and its entry: what is to be sent, where it is not the update after training
+NORM, SEND = "norm", "send"  # ask for the norm of the update after training; for the update whose norm was sent
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
 
 
@@ -33,7 +35,7 @@ class LocalWork:
 
 def to_arrays(weights: Weights) -> ArrayRecord:
     """Return weights as a Flower array record, in the same order."""
-    return ArrayRecord({name: Array(np.ascontiguousarray(value)) for name, value in weights.items()})
+    return ArrayRecord({name: Array(np.asarray(value, order="C")) for name, value in weights.items()})
 
 
 def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
@@ -57,3 +59,14 @@ def to_update(answer: Message) -> LocalUpdate:
     extra = to_weights(arrays[EXTRA]) if EXTRA in arrays else {}
     weights, samples, loss = to_weights(arrays[ARRAYS]), metrics[SAMPLES], metrics[LOSS]
     return LocalUpdate(weights, int(samples), float(loss), extra=extra)  # type: ignore[arg-type]
+
+
+def reply_norm(message: Message, norm: float, samples: int) -> Message:
+    """Return the reply to a request for an update's norm: the norm and the number of samples, as metrics."""
+    return Message(RecordDict({METRICS: MetricRecord({NORM: norm, SAMPLES: samples})}), reply_to=message)
+
+
+def to_norm(answer: Message) -> tuple[float, int]:
+    """Return norm and number of samples in a client's reply: the inverse of `reply_norm`; raises as `to_update`."""
+    metrics = answer.content.metric_records[METRICS]
+    return float(metrics[NORM]), int(metrics[SAMPLES])  # type: ignore[arg-type]

@@ -5,18 +5,37 @@ round where one client fails.
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from flwr.app import ArrayRecord, ConfigRecord, Message, MessageType, MetricRecord, RecordDict
 from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 
-from flcav.federation.records import ARRAYS, CONFIG, EXTRA, LOSS, SAMPLES, LocalWork, to_arrays, to_update, to_weights
+from flcav.federation.encoding import decode
+from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
+from flcav.federation.records import (
+    ARRAYS,
+    ASK,
+    CONFIG,
+    EXTRA,
+    LOSS,
+    NORM,
+    SAMPLES,
+    SEND,
+    LocalWork,
+    to_arrays,
+    to_norm,
+    to_update,
+    to_weights,
+)
 from flcav.federation.rules import Rules
 from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.fedavg import average
 from flcav.federation.strategies.strategy import Exchanges, Stateful
-from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 
 OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
 
@@ -28,8 +47,10 @@ class ClientFailed(RuntimeError):
 class Rounds(FlowerStrategy):
     """Flower strategy of a federation: in each round clients train, and `strategy` combines their updates.
 
-    `work` gives the local training of a round by its number; numbers continue after the `done` rounds. `names` are the
-    clients' names by node. `state` is changed in place; `on_round` is called after each aggregation.
+    `rules` say who takes part, what is sent and what is kept private; `work` gives the local training of a round by its
+    number; numbers continue after the `done` rounds. `names` are the clients' names by node. `earlier` is the number of
+    rounds of earlier federations with the same clients, which privacy is accounted with. `state` is changed in place;
+    `on_round` is called after each aggregation.
     """
 
     def __init__(
@@ -40,11 +61,17 @@ class Rounds(FlowerStrategy):
         names: Mapping[int, str],
         state: FederationState,
         done: int,
+        earlier: int,
         on_round: OnRound,
     ) -> None:
         self._strategy, self._rules, self._work, self._names = strategy, rules, work, names
-        self._state, self._done, self._on_round = state, done, on_round
+        self._state, self._done, self._earlier, self._on_round = state, done, earlier, on_round
+        self._nodes = {name: node for node, name in names.items()}
         self._start: Weights = {}
+        self._chosen: list[str] = []  # who is to send an update in this round
+        self._failed: dict[str, str] = {}  # by client what was wrong in this round
+        self._drawn: dict[str, float] = {}  # of importance selection: probability of the clients that were drawn
+        self._shares: dict[str, float] = {}  # of importance selection: of all samples, by client
 
     def summary(self) -> None:
         """Log nothing: the stage's own records hold the settings."""
@@ -52,14 +79,31 @@ class Rounds(FlowerStrategy):
     def configure_train(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
-        """Return one training message per node: the round's weights and its local work."""
+        """Return one training message per chosen client: the round's weights and its local work.
+
+        Under importance selection all clients train and report the norm of their update, and those that are drawn are
+        asked to send it.
+        """
         self._start = to_weights(arrays)
-        records = {ARRAYS: arrays}
+        work, records = self._work(self._done + server_round), {ARRAYS: arrays}
         if isinstance(self._strategy, Exchanges) and (sent := self._strategy.send(self._state.server)):
             records[EXTRA] = to_arrays(sent)
-        content = RecordDict({**records, CONFIG: self._work(self._done + server_round).record()})
+        selection, local = self._rules.selection, work.record()
+        self._chosen = selection.choose([*self._names.values()], work.round, work.seed)
+        self._failed = {}
+        if selection.rule != "importance":
+            return self._address(self._chosen, {**records, CONFIG: local})
+        asked = self._address(self._chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
+        norms = self._receive_norms(grid.send_and_receive(asked))
+        self._drawn = selection.draw(norms, work.seed)
+        self._chosen = [*self._drawn]
+        return self._address(self._chosen, {CONFIG: local, ASK: ConfigRecord({ASK: SEND})})
+
+    def _address(self, clients: Iterable[str], records: dict[str, Any]) -> list[Message]:
+        content = RecordDict(records)
         return [
-            Message(content=content, message_type=MessageType.TRAIN, dst_node_id=node) for node in grid.get_node_ids()
+            Message(content=content, message_type=MessageType.TRAIN, dst_node_id=self._nodes[client])
+            for client in clients
         ]
 
     def aggregate_train(
@@ -71,52 +115,89 @@ class Rounds(FlowerStrategy):
         returns arrays of other names, shapes or types.
         """
         number = self._done + server_round
-        updates, failed = self._receive(replies)
-        wanted = len(self._names) if self._rules.least_clients is None else self._rules.least_clients
-        if len(updates) < wanted:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
+        updates = self._receive(replies)
+        least = self._rules.least_clients
+        wanted = len(self._chosen) if least is None else min(least, len(self._chosen))
+        if len(updates) < wanted or (self._failed and least is None):
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
             raise ClientFailed(
-                f"round {number}: {len(updates)} of {len(self._names)} clients sent an update that can be used, "
+                f"round {number}: {len(updates)} of {len(self._chosen)} clients sent an update that can be used, "
                 f"{wanted} are wanted ({reasons})"
             )
-        weights = self._combine(list(updates.values()))
+        weights = self._combine(updates, number)
         samples = [update.samples for update in updates.values()]
-        loss = float(np.average([update.loss for update in updates.values()], weights=samples))
-        self._state.records.append(RoundRecord(number, tuple(updates), failed))
+        losses = [update.loss for update in updates.values()]
+        loss = float(np.average(losses, weights=samples)) if updates else 0.0
+        epsilon = None
+        if self._rules.privacy is not None:
+            rounds, names = self._earlier + number, [*self._names.values()]
+            epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
+        self._state.records.append(RoundRecord(number, tuple(updates), self._failed, epsilon))
         self._on_round(number, weights, loss)
         return to_arrays(weights), MetricRecord({SAMPLES: sum(samples), LOSS: loss})
 
-    def _receive(self, replies: Iterable[Message]) -> tuple[dict[str, LocalUpdate], dict[str, str]]:
-        """Return the usable updates by client, in node order, and by client what is wrong with the others."""
-        updates: dict[str, LocalUpdate] = {}
-        failed: dict[str, str] = {}
+    def _receive_norms(self, replies: Iterable[Message]) -> dict[str, float]:
+        """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
+        told: dict[str, tuple[float, int]] = {}
+        for name, message in self._sort_replies(replies):
+            norm, samples = to_norm(message)
+            if np.isfinite(norm) and norm >= 0 and samples >= 0:
+                told[name] = norm, samples
+            else:
+                self._failed[name] = f"a norm of {norm} and {samples} samples"
+        total = sum(samples for _, samples in told.values())
+        self._shares = {name: samples / max(total, 1) for name, (_, samples) in told.items()}
+        return {name: norm * self._shares[name] for name, (norm, _) in told.items()}
+
+    def _sort_replies(self, replies: Iterable[Message]) -> list[tuple[str, Message]]:
+        """Return the replies with content by client, in node order, and note the failures."""
+        found = []
         for message in sorted(replies, key=lambda message: message.metadata.src_node_id):
             name = self._names[message.metadata.src_node_id]
             if message.has_error():
-                failed[name] = message.error.reason
-                continue
+                self._failed[name] = str(message.error.reason)
+            else:
+                found.append((name, message))
+        return found
+
+    def _receive(self, replies: Iterable[Message]) -> dict[str, LocalUpdate]:
+        """Return the usable updates by client, in node order, and note what is wrong with the others."""
+        updates: dict[str, LocalUpdate] = {}
+        for name, message in self._sort_replies(replies):
             try:
-                update = to_update(message)
-            except (KeyError, TypeError, ValueError) as error:
-                failed[name] = f"a message that is no update ({error!r})"
+                sent = to_update(message)
+                update = replace(sent, weights=decode(sent.weights, self._start, self._rules))
+            except (KeyError, IndexError, TypeError, ValueError) as error:
+                self._failed[name] = f"a message that is no update ({error})"
                 continue
             others = next(iter(updates.values())).extra if updates else update.extra
             fault = find_fault(update, self._start, others)
             if fault is None:
                 updates[name] = update
             else:
-                failed[name] = fault
-        return updates, failed
+                self._failed[name] = fault
+        return updates
 
-    def _combine(self, updates: list[LocalUpdate]) -> Weights:
-        """Return the weights after the round, and change the strategy's state."""
+    def _combine(self, updates: Mapping[str, LocalUpdate], number: int) -> Weights:
+        """Return the weights after round `number`, and change the strategy's state."""
+        privacy, start, each = self._rules.privacy, self._start, list(updates.values())
+        if privacy is not None and privacy.where == "central":
+            sent = self._rules.upload.exchanged(start)
+            names = [name for name in learned_names(start) if name in sent]
+            expected = expected_clients(self._rules.selection, [*self._names.values()])
+            mean = average_privately(start, each, names, privacy, expected, self._work(number).seed)
+            each = [LocalUpdate(mean, 1, 0.0)]
+        elif self._rules.selection.rule == "importance" and updates:
+            weights = {name: self._shares[name] / self._drawn[name] for name in updates}
+            each = [LocalUpdate(average_inversely(start, updates, weights), 1, 0.0)]
+        if not each:
+            return start
         if isinstance(self._strategy, Stateful):
-            state = self._state.server
-            weights, after = self._strategy.step(self._start, updates, state, len(self._names))
+            weights, after = self._strategy.step(start, each, self._state.server, len(self._names))
             self._state.server = {name: np.asarray(array) for name, array in after.items()}
         else:
-            weights = self._strategy.combine(self._start, updates)
-        if _form(weights) != _form(self._start):
+            weights = self._strategy.combine(start, each)
+        if _form(weights) != _form(start):
             name = type(self._strategy).__name__
             raise ValueError(f"{name} returned arrays of other names, shapes or types than the round started from")
         return weights
@@ -149,6 +230,20 @@ def find_fault(update: LocalUpdate, start: Weights, extra: Weights) -> str | Non
     if update.samples < 0 or not np.isfinite(update.loss):
         return f"{update.samples} samples and a loss of {update.loss}"
     return None
+
+
+def average_inversely(start: Weights, updates: Mapping[str, LocalUpdate], weights: Mapping[str, float]) -> Weights:
+    """Return start + sum_i weights_i (w_i - start) of learned arrays; of all others the mean of the updates.
+
+    With weights_i = share_i / probability_i it is the unbiased (Horvitz-Thompson) estimate of the mean of all clients.
+    """
+    names = learned_names(start)
+    moved = {name: np.zeros(start[name].shape) for name in names}
+    for client, update in updates.items():
+        for name in names:
+            moved[name] += weights[client] * (update.weights[name].astype(np.float64) - start[name])
+    mean = average([update.weights for update in updates.values()], [*weights.values()])
+    return mean | {name: (start[name] + array).astype(start[name].dtype) for name, array in moved.items()}
 
 
 def _form(weights: Weights) -> dict[str, tuple[tuple[int, ...], np.dtype]]:

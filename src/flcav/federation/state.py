@@ -1,7 +1,7 @@
 """State of a federation between rounds, as arrays for a checkpoint, and the record of each round."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -51,4 +51,4 @@ class FederationState:
             else:
                 client, kind, name = rest.split("|", 2)
                 self.clients.setdefault(client, {}).setdefault(kind, {})[name] = array
-        self.records = [RoundRecord(**(record | {"clients": tuple(record["clients"])})) for record in records]
+        self.records = [replace(RoundRecord(**record), clients=tuple(record["clients"])) for record in records]

@@ -171,7 +171,7 @@ def test_krum_chooses_whom_flower_chooses(kept: int):
             )
             for place, update in enumerate(updates)
         ]
-        chosen = [updates[int(each["metrics"]["place"])] for each in select_multikrum(contents, 2, kept)]
+        chosen = [updates[int(each.metric_records["metrics"]["place"])] for each in select_multikrum(contents, 2, kept)]
         samples = [each.samples for each in chosen]
         found = Krum(byzantine=2, kept=kept).combine(updates[0].weights, updates)
         for name in ("a", "b"):
@@ -221,7 +221,7 @@ def test_what_makes_no_sense_is_one_sentence():
         (Scaffold(), Rules(), r"Scaffold needs clients whose training takes 'shift'"),
         (Krum(byzantine=1), Rules(), r"krum: 5 clients or more are wanted for byzantine = 1 and kept = 1, .* are 3"),
         (TrimmedMean(0.2), Rules(), r"trimmed-mean: a fraction of 0\.2 of 3 clients leaves nobody out"),
-        (FEDAVG, Rules(least_clients=4), r"least_clients: 4 are wanted in a round, and there are 3"),
+        (FEDAVG, Rules(least_clients=4), r"least_clients: 4 are wanted in a round, and 3 take part"),
     ):
         with pytest.raises(InputError, match=said):
             check_federation(plain, strategy, rules)

@@ -15,12 +15,16 @@ from flwr.serverapp import Grid
 from flwr.supercore.run import Run
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.records import ARRAYS, LOSS, METRICS, SAMPLES, to_arrays, to_weights
-from flcav.federation.trainable import Weights
+from flcav.federation.encoding import encode
+from flcav.federation.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, to_arrays, to_weights
+from flcav.federation.rules import Rules
+from flcav.federation.trainable import LocalUpdate, Weights, learned_names
+from flcav.federation.upload import Upload
 from flcav.network.ledger import BudgetExceeded
 
 RUN_ID, SERVER_NODE, CLIENT_APP_RAISED = 1, 1, 2  # the last is Flower's error code of an exception in a client app
 FIRST_NODE = 2  # id of the first client
+WHOLE = Upload()  # whole updates
 
 
 def wire_bytes(content: RecordDict) -> int:
@@ -28,9 +32,17 @@ def wire_bytes(content: RecordDict) -> int:
     return recorddict_to_proto(content).ByteSize()
 
 
-def update_bytes(weights: Weights) -> int:
-    """Return the size of a client's update with these weights in Flower's serialisation [bytes]."""
-    return wire_bytes(RecordDict({ARRAYS: to_arrays(weights), METRICS: MetricRecord({SAMPLES: 0, LOSS: 0.0})}))
+def update_bytes(weights: Weights, upload: Upload = WHOLE, *, exchanging: bool = False) -> int:
+    """Return the size of a client's update with these weights in Flower's serialisation [bytes].
+
+    `exchanging`: with an array beside each that is learned, as a strategy's clients send them that `Exchanges` arrays.
+    """
+    sent, _ = encode(LocalUpdate(weights, 0, 0.0), weights, Rules(upload=upload), {}, 0)
+    records = {ARRAYS: to_arrays(sent.weights), METRICS: MetricRecord({SAMPLES: 0, LOSS: 0.0})}
+    if exchanging:
+        names = [name for name in learned_names(weights) if name in upload.exchanged(weights)]
+        records[EXTRA] = to_arrays({name: weights[name] for name in names})
+    return wire_bytes(RecordDict(records))
 
 
 @contextlib.contextmanager
@@ -74,13 +86,14 @@ class EmbeddedGrid(Grid):
     def __exit__(self, *exception: object) -> None:
         self._identity.__exit__(None, None, None)
 
-    def read_states(self) -> dict[str, dict[str, dict[str, np.ndarray]]]:
-        """Return the arrays that nodes keep between rounds, by node and record; nodes without any are left out."""
-        return {
-            self.names[node]: {key: to_weights(arrays) for key, arrays in context.state.array_records.items()}
-            for node, context in self._contexts.items()
-            if context.state.array_records
-        }
+    def read_states(self, keys: Iterable[str]) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+        """Return the arrays that nodes have under these records of their state, by node and record."""
+        found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
+        for node, context in self._contexts.items():
+            for key in keys:
+                if key in context.state.array_records:
+                    found.setdefault(self.names[node], {})[key] = to_weights(context.state.array_records[key])
+        return found
 
     def set_run(self, run: Run) -> None:
         """Set Flower's record of the run."""

@@ -33,10 +33,10 @@ def step_adaptively(
     moments: dict[str, Floats] = {}
 
     def moved(name: str, before: Floats, change: Floats) -> Floats:
-        m = beta1 * state.get(FIRST + name, np.zeros_like(before)) + (1 - beta1) * change
+        m = beta1 * np.asarray(state.get(FIRST + name, 0.0 * before), np.float64) + (1 - beta1) * change
         v = second(np.asarray(state.get(SECOND + name, np.full_like(before, tau**2)), np.float64), change**2)
         moments[FIRST + name], moments[SECOND + name] = m, v
-        return before + rate * m / (np.sqrt(v) + tau)
+        return np.asarray(before + rate * m / (np.sqrt(v) + tau))
 
     return move_mean(start, updates, moved), moments
 

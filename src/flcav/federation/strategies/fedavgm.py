@@ -49,7 +49,7 @@ class FedAvgM:
         velocity: dict[str, Floats] = {}
 
         def moved(name: str, before: Floats, change: Floats) -> Floats:
-            velocity[name] = self.momentum * state.get(name, np.zeros_like(before)) + change
+            velocity[name] = self.momentum * np.asarray(state.get(name, 0.0 * before), np.float64) + change
             return before + self.rate * velocity[name]
 
         return move_mean(start, updates, moved), velocity

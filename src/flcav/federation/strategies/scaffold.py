@@ -37,7 +37,9 @@ class Scaffold:
         """Return the weights after a round, and the server's variate c <- c + sum_i (change of c_i) / clients."""
         variate = {
             name: state.get(name, np.zeros_like(start[name]))
-            + (sum(update.extra[name].astype(np.float64) for update in updates) / clients).astype(start[name].dtype)
+            + (np.sum([update.extra[name] for update in updates], axis=0, dtype=np.float64) / clients).astype(
+                start[name].dtype
+            )
             for name in (updates[0].extra if updates else ())
         }
         return self.combine(start, updates), variate
