@@ -37,7 +37,9 @@ class Upload(Config):
         """Raise `InputError` where a pattern matches no array, or all of them together none that is learned."""
         for layer in self.layers:
             if not any(fnmatchcase(name, layer) for name in weights):
-                raise InputError(f"layers: '{layer}' matches none of {len(weights)} arrays, such as '{[*weights][0]}'")
+                raise InputError(
+                    f"layers: '{layer}' matches none of {len(weights)} arrays, such as '{next(iter(weights))}'"
+                )
         if not {*learned_names(weights)} & {*self.exchanged(weights)}:
             raise InputError(f"layers {', '.join(self.layers)}: match no array that is learned")
 
