@@ -61,10 +61,10 @@ def average_privately(
     `expected` is the number of clients that are expected in a round, whether they came or not: the noise is
     N(0, (noise clip)^2) per coordinate of the sum, and every client counts the same.
     """
-    total = {name: np.zeros(start[name].shape) for name in names}
+    total: Arrays = {name: np.zeros(start[name].shape) for name in names}
     for update in updates:
         for name, array in clip_change(subtract(update.weights, start, names), privacy.clip).items():
-            total[name] += array
+            total[name] += np.asarray(array, np.float64)
     noisy = add_noise(total, privacy.noise * privacy.clip, stream(seed, "noise"))
     return add(start, {name: array / expected for name, array in noisy.items()})
 

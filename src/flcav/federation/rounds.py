@@ -238,7 +238,7 @@ def average_inversely(start: Weights, updates: Mapping[str, LocalUpdate], weight
     With weights_i = share_i / probability_i it is the unbiased (Horvitz-Thompson) estimate of the mean of all clients.
     """
     names = learned_names(start)
-    moved = {name: np.zeros(start[name].shape) for name in names}
+    moved: dict[str, Any] = {name: np.zeros(start[name].shape) for name in names}
     for client, update in updates.items():
         for name in names:
             moved[name] += weights[client] * (update.weights[name].astype(np.float64) - start[name])

@@ -15,3 +15,10 @@ class Rules(Config):
     upload: Upload = Upload()  # form of the updates
     privacy: Privacy | None = None  # clipping and noise; default: none
     least_clients: int | None = Field(default=None, ge=1, le=10**6)  # whose updates a round needs; default: all chosen
+
+    def of_servers(self) -> "Rules":
+        """Return the rules among edge servers, which federate with the cloud, where vehicles have these.
+
+        All take part, and send in the same form; noise is the vehicles', and all that comes after it is as private.
+        """
+        return Rules(upload=self.upload)

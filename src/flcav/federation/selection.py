@@ -65,6 +65,7 @@ class Selection(Config):
             case "uniform":
                 chosen = set(rng.permutation(len(names))[:count].tolist())
             case "poisson":
+                assert self.probability is not None
                 chosen = set(np.flatnonzero(rng.random(len(names)) < self.probability).tolist())
             case "round-robin":
                 chosen = {((round_ - 1) * count + place) % len(names) for place in range(count)}

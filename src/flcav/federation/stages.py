@@ -153,6 +153,19 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
             raise InputError(f"{told} looks at each update, and central noise covers their sum alone")
 
 
+def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_rounds: int, earlier: int) -> int:
+    """Return how many of `rounds` cloud rounds, of `edge_rounds` edge rounds each, a region's privacy budget affords.
+
+    names: the region's clients, who took part in `earlier` rounds. Raises `InputError` where it affords none.
+    """
+    if rules.privacy is None or rounds == 0:
+        return rounds
+    afforded = affordable_rounds(rules.privacy, rules.selection, names, rounds * edge_rounds, earlier) // edge_rounds
+    if afforded == 0:
+        raise InputError(f"privacy: the budget does not afford the {edge_rounds} edge rounds of a cloud round")
+    return afforded
+
+
 @dataclass
 class EdgeServer:
     """A region's edge server as a client of the cloud: its local training is k edge rounds with its vehicles."""

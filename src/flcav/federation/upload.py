@@ -50,7 +50,7 @@ class Upload(Config):
         return [name for name in weights if any(fnmatchcase(name, layer) for layer in self.layers)]
 
 
-def compress(upload: Upload, change: Weights, residual: NDArray[np.float32] | None, seed: int) -> tuple[Arrays, Arrays]:
+def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | None, seed: int) -> tuple[Arrays, Arrays]:
     """Return a change of floating arrays as it is sent, and what is kept for the next round under `VALUES`.
 
     residual: (coordinates,) what was left out before, None at first. `seed` is that of the rounding. What is kept is
@@ -96,7 +96,7 @@ def decompress(upload: Upload, sent: Weights, like: Weights) -> Arrays:
             return {name: (sent[name] * scales[name]).astype(array.dtype) for name, array in like.items()}
         case "top-k":
             flat = np.zeros(sum(array.size for array in like.values()), np.float32)
-            flat[sent[INDICES]] = sent[VALUES]
+            flat[sent[INDICES].astype(np.int64, casting="safe")] = sent[VALUES]
             ends = np.cumsum([array.size for array in like.values()])[:-1]
             parts = np.split(flat, ends)
             return {

@@ -18,7 +18,7 @@ from flcav.config import InputError
 from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
@@ -160,11 +160,26 @@ def make_clients(learning: Learning, config: Any, samples: Mapping[str, Sequence
 
 
 @dataclass(frozen=True)
+class RegionStart:
+    """Where a region's edge server starts in stage III."""
+
+    clients: Mapping[str, TaskClient]  # its vehicles, by name
+    weights: Weights  # of stage II
+    earlier: int  # rounds of stage II
+
+
+@dataclass(frozen=True)
 class Strategies:
     """Strategies of stage III: of edge servers with their vehicles, and of the cloud with edge servers."""
 
     edge: Strategy
     cloud: Strategy
+
+
+def describe_federation(strategy: Strategy | Strategies, rules: Rules) -> str:
+    """Return strategies and rules, as far as they are not the defaults, in words: what a checkpoint is of."""
+    changed = rules.model_dump(mode="json", include=set(Rules.model_fields), exclude_defaults=True)
+    return f"{strategy} by {json.dumps(changed)}" if changed else str(strategy)
 
 
 class FederationCheckpoints:
@@ -252,26 +267,32 @@ def federate_edge(
     schedule: Schedule,
     strategy: Strategy,
     rules: Rules,
+    earlier: int,
     book: Ledger,
     folder: Path,
     report: Report,
 ) -> tuple[float, ...]:
-    """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss."""
+    """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
+
+    A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
+    """
     state = FederationState()
-    federating = FederationCheckpoints(learning.task, folder, book, report, {EDGE: state}, str(strategy))
+    federating = FederationCheckpoints(
+        learning.task, folder, book, report, {EDGE: state}, describe_federation(strategy, rules)
+    )
     start, done = federating.resume(to_arrays(network))
     account = Account(book, EDGE, learning.task.name, "wireless")
     keep = federating.make_saver(schedule.rounds)
-    how: Any = {"strategy": strategy, "rules": rules, "state": state}
+    how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
     federate(clients, start, schedule, account, **how, done=done, on_round=keep)
-    federating.finish(network, schedule.rounds, learning.training.average_rounds)
+    federating.finish(network, len(federating.losses), learning.training.average_rounds)
     return tuple(federating.losses)
 
 
 def federate_cloud(
     learning: Learning,
     network: Any,
-    regions: Mapping[str, tuple[Mapping[str, TaskClient], Weights]],
+    regions: Mapping[str, RegionStart],
     rounds: int,
     edge_rounds: int,
     strategies: Strategies,
@@ -280,23 +301,37 @@ def federate_cloud(
     folder: Path,
     report: Report,
 ) -> tuple[float, ...]:
-    """Run stage III from `network`; `regions`: each edge server's clients and its stage II weights.
+    """Run stage III from `network`; `regions`: where each edge server starts.
 
     An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers.
     Writes weights and ledger, returns each round's loss.
     """
     state, own_states = FederationState(), {region: FederationState() for region in regions}
     states = {CLOUD: state, **{f"{EDGE}/{region}": own for region, own in own_states.items()}}
-    federating = FederationCheckpoints(learning.task, folder, book, report, states, str(strategies))
+    for own in regions.values() if rules.privacy is not None else ():
+        rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, edge_rounds, own.earlier))
+    federating = FederationCheckpoints(
+        learning.task, folder, book, report, states, describe_federation(strategies, rules)
+    )
     start, done = federating.resume(to_arrays(network))
     wireless, wireline = (Account(book, CLOUD, learning.task.name, link) for link in ("wireless", "wireline"))
     servers: dict[str, Trainable] = {
-        region: EdgeServer(clients, edge_rounds, wireless, own, done, strategies.edge, rules, own_states[region])
-        for region, (clients, own) in regions.items()
+        region: EdgeServer(
+            own.clients,
+            edge_rounds,
+            wireless,
+            own.weights,
+            cloud_rounds_done=done,
+            strategy=strategies.edge,
+            rules=rules,
+            state=own_states[region],
+            earlier=own.earlier,
+        )
+        for region, own in regions.items()
     }
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
     keep = federating.make_saver(rounds)
-    how: Any = {"strategy": strategies.cloud, "state": state}
+    how: Any = {"strategy": strategies.cloud, "rules": rules.of_servers(), "state": state}
     federate(servers, start, schedule, wireline, **how, done=done, on_round=keep)
     federating.finish(network, rounds, learning.training.average_rounds)
     return tuple(federating.losses)

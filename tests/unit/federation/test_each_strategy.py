@@ -1,7 +1,7 @@
 """Each strategy against its paper's formula written out, or against Flower's own implementation."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -171,7 +171,10 @@ def test_krum_chooses_whom_flower_chooses(kept: int):
             )
             for place, update in enumerate(updates)
         ]
-        chosen = [updates[int(each.metric_records["metrics"]["place"])] for each in select_multikrum(contents, 2, kept)]
+        chosen = [
+            updates[int(cast(int, each.metric_records["metrics"]["place"]))]
+            for each in select_multikrum(contents, 2, kept)
+        ]
         samples = [each.samples for each in chosen]
         found = Krum(byzantine=2, kept=kept).combine(updates[0].weights, updates)
         for name in ("a", "b"):

@@ -1,7 +1,7 @@
 """Differential privacy: norms after clipping, the noise that is added, and epsilon against another accountant."""
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -123,7 +123,11 @@ def test_the_noise_is_its_own_and_resumes():
 def gaussian_epsilon(noise: float, rounds: int, delta: float) -> float:
     """Return epsilon of composed Gaussian mechanisms, exactly (Balle and Wang, ICML 2018, theorem 8)."""
     mu = math.sqrt(rounds) / noise
-    return brentq(lambda e: norm.cdf(mu / 2 - e / mu) - math.exp(e) * norm.cdf(-mu / 2 - e / mu) - delta, 0, 200)
+
+    def excess(e: float) -> Any:
+        return norm.cdf(mu / 2 - e / mu) - math.exp(e) * norm.cdf(-mu / 2 - e / mu) - delta
+
+    return cast(float, brentq(excess, 0, 200))
 
 
 @pytest.mark.parametrize("rounds", [1, 7, 30])

@@ -78,8 +78,10 @@ def test_importance_has_the_least_variance_of_all_probabilities(seed: int):
     rng = np.random.default_rng(seed)
     norms, expected = rng.lognormal(sigma=1.5, size=9), int(rng.integers(1, 9))
     p = cvxpy.Variable(9)
-    variance = cvxpy.sum(cvxpy.multiply(norms**2, cvxpy.inv_pos(p)))
-    cvxpy.Problem(cvxpy.Minimize(variance), [p <= 1, cvxpy.sum(p) <= expected]).solve(solver="CLARABEL")
+    variance: Any = cvxpy.sum(cvxpy.multiply(norms**2, cvxpy.inv_pos(p)))
+    within: Any = [p <= 1, cvxpy.sum(p) <= expected]
+    cvxpy.Problem(cvxpy.Minimize(variance), within).solve(solver="CLARABEL")
+    assert p.value is not None
     found = optimal_probabilities(norms, expected)
     assert np.sum(found) == pytest.approx(expected)
     np.testing.assert_allclose(found, p.value, atol=2e-3)
@@ -99,7 +101,8 @@ def test_the_mean_under_importance_selection_is_unbiased():
         f"cav{i}": LocalUpdate({"w": rng.normal(size=4) * 2**i, "count": np.array(i)}, i + 1, 0.0) for i in range(5)
     }
     shares = {name: update.samples / 15 for name, update in updates.items()}
-    norms = {name: shares[name] * np.linalg.norm(update.weights["w"] - start["w"]) for name, update in updates.items()}
+    lengths = {name: np.linalg.norm(update.weights["w"] - start["w"]) for name, update in updates.items()}
+    norms = {name: float(shares[name] * length) for name, length in lengths.items()}
     selection = Selection(rule="importance", clients=2)
     estimates = []
     for seed in range(4000):
@@ -137,11 +140,12 @@ def test_what_makes_no_sense_is_one_sentence():
     ):
         with pytest.raises(InputError, match=said):
             check_federation(clients, strategy, Rules(selection=Selection(**selection)))
-    for fields, said in (
+    wrong: tuple[tuple[dict[str, Any], str], ...] = (
         ({"rule": "uniform"}, "the rule uniform needs 'clients'"),
         ({"clients": 2}, "the rule all takes no 'clients'"),
         ({"rule": "poisson", "probability": 0}, "greater than 0"),
         ({"rule": "uniform", "clients": 1, "seconds": SECONDS}, "the rule uniform takes no 'seconds'"),
-    ):
+    )
+    for fields, said in wrong:
         with pytest.raises(ValidationError, match=said):
             Selection(**fields)

@@ -139,12 +139,12 @@ def test_what_top_k_sends_and_keeps_is_all_there_was(seed: int, scale: float):
 def test_int8_is_unbiased_and_within_a_step():
     change = {"a": np.linspace(-1, 1, 41, dtype=np.float32) ** 3, "b": np.zeros(4, np.float32)}
     upload = Upload(compression="int8")
-    back = []
+    back, step = [], 0.0
     for seed in range(4000):
         sent, _ = compress(upload, change, None, seed)
+        step = float(sent[SCALES][0])
         assert {sent["a"].dtype, sent["b"].dtype} == {np.dtype(np.int8)}
         back.append(decompress(upload, sent, change))
-    step = float(sent[SCALES][0])
     assert step == pytest.approx(1 / 127)
     every = np.array([each["a"] for each in back])
     assert np.abs(every - change["a"]).max() <= step * 1.0001

@@ -15,7 +15,7 @@ from flcav.federation.strategies.fedyogi import FedYogi
 from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.scaffold import Scaffold
-from flcav.federation.strategies.strategy import Corrects, Strategy
+from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.plugins import load_named
 
@@ -63,6 +63,15 @@ def strategy_named(spec: Spec) -> Strategy:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
         raise InputError(f"strategy '{name}': {field} = {shorten(first['input'])}: {first['msg']}") from None
+
+
+def exchanges_more(spec: Spec) -> bool:
+    """Return whether clients of one of `STRATEGIES` send an array beside each of the weights, as SCAFFOLD's do.
+
+    A user's own strategy is not imported to find out.
+    """
+    name = spec if isinstance(spec, str) else next(iter(spec), "")
+    return name in STRATEGIES and issubclass(STRATEGIES[name], Exchanges)
 
 
 def of_servers(strategy: Strategy) -> Strategy:
