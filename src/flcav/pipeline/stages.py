@@ -242,7 +242,9 @@ class FederationCheckpoints:
                 state |= {"by": self._identity, "records": records, "states": bool(arrays)}
             write_json(self._folder / ROUND, state)
             self._state_path(round_ - 1).unlink(missing_ok=True)
-            self._report(round_, rounds, f"loss {loss:.3f}")
+            spent = [own.records[-1].epsilon for own in self._states.values() if own.records]
+            private = [epsilon for epsilon in spent if epsilon is not None]
+            self._report(round_, rounds, f"loss {loss:.3f}" + (f", epsilon {max(private):.2f}" if private else ""))
 
         return keep
 
