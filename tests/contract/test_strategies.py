@@ -5,17 +5,22 @@ import json
 import pickle
 import random
 import sys
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load, save
 
+from flcav.federation.rounds import ClientFailed
+from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import Schedule, federate
+from flcav.federation.state import FederationState
 from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy
+from flcav.federation.strategies.strategy import Stateful
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.pipeline.graph import Graph
@@ -34,11 +39,24 @@ class Client:
     def __init__(self, samples: int) -> None:
         self.samples = samples
 
-    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+    def train(
+        self,
+        weights: Weights,
+        *,
+        steps: int,
+        learning_rate: float,
+        seed: int,
+        proximal: float = 0.0,
+        shift: Weights | None = None,
+    ) -> LocalUpdate:
         rng = np.random.default_rng(seed)
-        moved = weights["layer.weight"] + (learning_rate * self.samples * rng.normal(size=(5, 3))).astype(np.float32)
-        count = weights["norm.count"] + self.samples
-        return LocalUpdate({"layer.weight": moved, "norm.count": count}, self.samples, float(rng.uniform(0.1, 2.0)))
+        gradient = (self.samples * rng.normal(size=(5, 3))).astype(np.float32)
+        corrected = gradient + proximal * weights["layer.weight"] + (shift or {}).get("layer.weight", 0)
+        moved = {
+            "layer.weight": (weights["layer.weight"] + learning_rate * corrected).astype(np.float32),
+            "norm.count": weights["norm.count"] + self.samples,
+        }
+        return LocalUpdate(moved, self.samples, float(rng.uniform(0.1, 2.0)), {"layer.weight": gradient})
 
 
 def of_the_example() -> type[Strategy]:
@@ -117,11 +135,63 @@ def test_no_client_is_special(strategy):
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
-def test_it_keeps_nothing_between_rounds(strategy):
+def test_without_state_it_keeps_nothing_between_rounds(strategy):
+    if isinstance(strategy, Stateful):
+        pytest.skip("has a state, which is checkpointed")
     kept: list[Weights] = []
     whole = federated(strategy, on_round=lambda number, weights, loss: kept.append(weights))
     for done in (1, 2):
         assert same(federated(type(strategy)(), kept[done - 1], done=done), whole)
+
+
+def test_it_resumes_from_weights_and_state_to_the_same_bits(strategy):
+    state, kept = FederationState(), []
+
+    def keep(number: int, weights: Weights, loss: float) -> None:
+        arrays = {name: array.copy() for name, array in state.to_arrays().items()}
+        kept.append((weights, arrays, [asdict(record) for record in state.records]))
+
+    whole = federated(strategy, on_round=keep, state=state)
+    last = kept[-1]
+    assert isinstance(strategy, Stateful) == bool(state.server)
+    for done in (1, 2):
+        weights, arrays, records = kept[done - 1]
+        resumed = FederationState()
+        resumed.restore(load(save(arrays)), json.loads(json.dumps(records)))
+        assert same(federated(type(strategy)(), weights, done=done, state=resumed), whole)
+        assert save(resumed.to_arrays()) == save(last[1])
+        assert resumed.records == state.records
+
+
+def test_a_client_that_fails_is_named_and_the_others_go_on(strategy):
+    class Failing(Client):
+        def train(self, weights: Weights, **how: Any) -> LocalUpdate:
+            update = super().train(weights, **how)
+            if self.samples == 17:
+                raise OSError("no power")
+            moved = dict(update.weights)
+            moved["layer.weight"] = {8: np.full((5, 3), np.nan, np.float32), 9: np.zeros((2, 3), np.float32)}.get(
+                self.samples, moved["layer.weight"]
+            )
+            return replace(update, weights=moved)
+
+    clients = {f"cav{i}": Failing(samples) for i, samples in enumerate((3, 40, 1, 17, 8, 9, 5, 6))}
+    account, state = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless"), FederationState()
+    rules = Rules(least_clients=5)
+    result = federate(clients, START, SCHEDULE, account, strategy=strategy, rules=rules, state=state)
+    usable = {name: client for name, client in clients.items() if client.samples not in (8, 9, 17)}
+    assert [record.clients for record in state.records] == [tuple(usable)] * SCHEDULE.rounds
+    assert {name: reason.split("(")[0] for name, reason in state.records[0].failed.items()} == {
+        "cav3": "OSError",
+        "cav4": "'layer.weight' has values that are not finite",
+        "cav5": "'layer.weight' is float32 ",
+    }
+    account = replace(account, ledger=Ledger(Budget(1.0, 1.0)))
+    alone = federate(usable, START, SCHEDULE, account, strategy=strategy)
+    if type(strategy).__name__ != "Scaffold":  # whose server counts all clients
+        assert same(result.weights, alone.weights)
+    with pytest.raises(ClientFailed, match=r"round 1: 5 of 8 clients .* 6 are wanted \(cav3: OSError.*no power.*cav4"):
+        federate(clients, START, SCHEDULE, account, strategy=strategy, rules=Rules(least_clients=6))
 
 
 def test_it_travels_to_the_step_that_federates_and_is_in_its_fingerprint(strategy):

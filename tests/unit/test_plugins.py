@@ -55,7 +55,8 @@ def test_own_tasks_and_strategies_are_found_in_the_working_directory():
     assert task_named("own_parts.sky:SKY").name == "sky"
     assert dataclasses.asdict(strategy_named("own_first:SECOND")) == {"place": 1}  # type: ignore[call-overload]
     assert dataclasses.asdict(strategy_named("own_first:First")) == {"place": 0}  # type: ignore[call-overload]
-    assert [strategy_named(name) for name in STRATEGIES] == [FedAvg()]
+    assert strategy_named("fedavg") == FedAvg()
+    assert [type(strategy_named(name)) for name in STRATEGIES] == [*STRATEGIES.values()]
 
 
 @pytest.mark.parametrize(
@@ -96,7 +97,7 @@ def test_what_is_no_task_is_one_sentence(name: str, body: str, said: str, capsys
 def test_what_is_no_strategy_is_one_sentence():
     write("own_plain.py", STRATEGY + "SKY = 3\n")
     for name, said in {
-        "fedprose": "strategy 'fedprose': choose one of fedavg, or name your own",
+        "fedprose": "strategy 'fedprose': choose one of fedavg, fedprox, .*krum, or name your own",
         "own_plain:SKY": "is no strategy, it has no combine",
         "own_plain:Plain": "is no dataclass, so that its settings are not known",
     }.items():

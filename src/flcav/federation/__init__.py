@@ -5,13 +5,24 @@ from typing import TYPE_CHECKING
 from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from flcav.federation.privacy import Privacy
+    from flcav.federation.rules import Rules
     from flcav.federation.runtimes.metered import Account
+    from flcav.federation.selection import Selection
     from flcav.federation.stages import Schedule, federate
+    from flcav.federation.state import FederationState, RoundRecord
     from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy, strategy_named
     from flcav.federation.trainable import LocalUpdate, Trainable, Update
+    from flcav.federation.upload import Upload
 
 PLACES = {
     "Account": "flcav.federation.runtimes.metered",
+    "Privacy": "flcav.federation.privacy",
+    "Rules": "flcav.federation.rules",
+    "Selection": "flcav.federation.selection",
+    "Upload": "flcav.federation.upload",
+    "FederationState": "flcav.federation.state",
+    "RoundRecord": "flcav.federation.state",
     "Schedule": "flcav.federation.stages",
     "federate": "flcav.federation.stages",
     "STRATEGIES": "flcav.federation.strategies",

@@ -1,18 +1,42 @@
 """The Flower client app of both federated stages: vehicles with their edge server, edge servers with the cloud."""
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Iterable, Mapping
 
-from flwr.app import Context, Message
+import numpy as np
+from flwr.app import Context, Message, MetricRecord
 from flwr.clientapp import ClientApp
 
-from flcav.federation.records import ARRAYS, CONFIG, LocalWork, reply, to_weights
-from flcav.federation.trainable import Trainable
+from flcav.config import InputError
+from flcav.federation.encoding import encode
+from flcav.federation.privacy import change_norm
+from flcav.federation.records import (
+    ARRAYS,
+    ASK,
+    CONFIG,
+    EXTRA,
+    LOSS,
+    NORM,
+    SAMPLES,
+    SEND,
+    LocalWork,
+    reply,
+    reply_norm,
+    to_arrays,
+    to_weights,
+)
+from flcav.federation.rules import Rules
+from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
+from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Update, Weights, learned_names
+from flcav.federation.upload import Arrays, subtract
 from flcav.seeds import derive_seed
 
 CLIENT = "client"  # node config key: the client's registered name
+OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy and compression keep between rounds
+KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 
 
-def client_app(trainables: Mapping[str, Trainable]) -> ClientApp:
+def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> ClientApp:
     """Return a Flower client app that trains the one of `trainables` (by client name) that its node stands for.
 
     A node's name is the entry `CLIENT` of its node config. Its seed is derived from the round's seed and its name.
@@ -22,13 +46,72 @@ def client_app(trainables: Mapping[str, Trainable]) -> ClientApp:
     @app.train()
     def train(message: Message, context: Context) -> Message:
         name = str(context.node_config[CLIENT])
+        asked = message.content.config_records[ASK][ASK] if ASK in message.content.config_records else None
         work = LocalWork.from_record(message.content.config_records[CONFIG])
-        update = trainables[name].train(
-            to_weights(message.content.array_records[ARRAYS]),
-            steps=work.steps,
-            learning_rate=work.learning_rate,
-            seed=derive_seed(work.seed, name),
-        )
-        return reply(message, update)
+        seed = derive_seed(work.seed, name)
+        if asked == SEND:
+            start, update, extra = _recall(context)
+        else:
+            start = to_weights(message.content.array_records[ARRAYS])
+            update, extra = _train(trainables[name], message, context, start, work, seed)
+        if asked == NORM:
+            _keep(context, start, update)
+            names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
+            return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
+        sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed)
+        _record(context, RESIDUAL, left)
+        return reply(message, sent, extra)
+
+    def _train(
+        trainable: Trainable, message: Message, context: Context, start: Weights, work: LocalWork, seed: int
+    ) -> tuple[Update, Weights]:
+        """Return the result of local training, and a strategy's arrays beside it."""
+        records = message.content.array_records
+        sent, own = to_weights(records[EXTRA]) if EXTRA in records else {}, _recorded(context, OWN)
+        correction = strategy.correct(sent, own) if isinstance(strategy, Corrects) else Correction()
+        layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
+        how = {**correction.arguments(), **layers}
+        update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
+        if not isinstance(strategy, Exchanges):
+            return update, {}
+        gradient = getattr(update, "gradient", {})  # asked for by the correction
+        extra, own = strategy.report(LocalUpdate(update.weights, update.samples, update.loss, gradient), sent, own)
+        _record(context, OWN, own)
+        return update, extra
 
     return app
+
+
+def _recorded(context: Context, key: str) -> Arrays:
+    return to_weights(context.state.array_records[key]) if key in context.state.array_records else {}
+
+
+def _record(context: Context, key: str, arrays: Weights) -> None:
+    """Keep arrays for the next round; of a training that diverged nothing is kept."""
+    if arrays and all(np.isfinite(array).all() for array in arrays.values()):
+        context.state[key] = to_arrays(arrays)
+
+
+def _keep(context: Context, start: Weights, update: Update) -> None:
+    context.state[KEPT], context.state[KEPT_START] = to_arrays(update.weights), to_arrays(start)
+    context.state[f"{KEPT}-{SAMPLES}"] = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
+
+
+def _recall(context: Context) -> tuple[Weights, Update, Weights]:
+    metrics = context.state.metric_records[f"{KEPT}-{SAMPLES}"]
+    samples, loss = metrics[SAMPLES], metrics[LOSS]
+    update = LocalUpdate(_recorded(context, KEPT), int(samples), float(loss))  # type: ignore[arg-type]
+    return _recorded(context, KEPT_START), update, {}
+
+
+def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], why: str) -> None:
+    """Raise `InputError` where a client's `train` does not take the arguments `wanted`; `why` begins the sentence."""
+    for name, trainable in trainables.items():
+        known = inspect.signature(trainable.train).parameters
+        if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in known.values()):
+            continue
+        if lacking := [argument for argument in wanted if argument not in known]:
+            raise InputError(
+                f"{why} needs clients whose training takes '{lacking[0]}', and that of {name} "
+                f"({type(trainable).__name__}) does not"
+            )

@@ -8,6 +8,9 @@ from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, Re
 from flcav.federation.trainable import LocalUpdate, Update, Weights
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"  # records of a message, by key
+EXTRA = "extra"  # a strategy's arrays beside the weights, where it has any
+ASK = "ask"  # record and its entry: what is to be sent, where it is not the update after training
+NORM, SEND = "norm", "send"  # ask for the norm of the update after training; for the update whose norm was sent
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
 
 
@@ -32,7 +35,7 @@ class LocalWork:
 
 def to_arrays(weights: Weights) -> ArrayRecord:
     """Return weights as a Flower array record, in the same order."""
-    return ArrayRecord({name: Array(np.ascontiguousarray(value)) for name, value in weights.items()})
+    return ArrayRecord({name: Array(np.asarray(value, order="C")) for name, value in weights.items()})
 
 
 def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
@@ -40,14 +43,30 @@ def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
     return {name: array.numpy() for name, array in arrays.items()}
 
 
-def reply(message: Message, update: Update) -> Message:
-    """Return the reply to a training message: the weights, and the number of samples and the loss as metrics."""
+def reply(message: Message, update: Update, extra: Weights) -> Message:
+    """Return the reply to a training message: the weights, a strategy's `extra` arrays, samples and loss.
+
+    Without extra arrays there is no record of them.
+    """
+    records = {ARRAYS: to_arrays(update.weights)} | ({EXTRA: to_arrays(extra)} if extra else {})
     metrics = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
-    return Message(RecordDict({ARRAYS: to_arrays(update.weights), METRICS: metrics}), reply_to=message)
+    return Message(RecordDict({**records, METRICS: metrics}), reply_to=message)
 
 
 def to_update(answer: Message) -> LocalUpdate:
     """Return the update in a client's reply: the inverse of `reply`. Raises KeyError where a record is missing."""
+    metrics, arrays = answer.content.metric_records[METRICS], answer.content.array_records
+    extra = to_weights(arrays[EXTRA]) if EXTRA in arrays else {}
+    weights, samples, loss = to_weights(arrays[ARRAYS]), metrics[SAMPLES], metrics[LOSS]
+    return LocalUpdate(weights, int(samples), float(loss), extra=extra)  # type: ignore[arg-type]
+
+
+def reply_norm(message: Message, norm: float, samples: int) -> Message:
+    """Return the reply to a request for an update's norm: the norm and the number of samples, as metrics."""
+    return Message(RecordDict({METRICS: MetricRecord({NORM: norm, SAMPLES: samples})}), reply_to=message)
+
+
+def to_norm(answer: Message) -> tuple[float, int]:
+    """Return norm and number of samples in a client's reply: the inverse of `reply_norm`; raises as `to_update`."""
     metrics = answer.content.metric_records[METRICS]
-    weights = to_weights(answer.content.array_records[ARRAYS])
-    return LocalUpdate(weights, int(metrics[SAMPLES]), float(metrics[LOSS]))  # type: ignore[arg-type]
+    return float(metrics[NORM]), int(metrics[SAMPLES])  # type: ignore[arg-type]

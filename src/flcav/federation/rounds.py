@@ -1,37 +1,77 @@
-"""Synchronous federated rounds with full participation, as a Flower strategy.
+"""Synchronous federated rounds as a Flower strategy: who trains, whose updates count, and how they are combined.
 
-In each round every client trains, and `Strategy.combine` aggregates the updates in the order of the nodes. Flower's own
-strategies sample nodes from the global random state and multiply integer buffers by floats.
+Flower's own strategies sample nodes from the global random state, multiply integer buffers by floats, and skip a whole
+round where one client fails.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from flwr.app import ArrayRecord, ConfigRecord, Message, MessageType, MetricRecord, RecordDict
 from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 
-from flcav.federation.records import ARRAYS, CONFIG, LOSS, SAMPLES, LocalWork, to_arrays, to_update, to_weights
+from flcav.federation.encoding import decode
+from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
+from flcav.federation.records import (
+    ARRAYS,
+    ASK,
+    CONFIG,
+    EXTRA,
+    LOSS,
+    NORM,
+    SAMPLES,
+    SEND,
+    LocalWork,
+    to_arrays,
+    to_norm,
+    to_update,
+    to_weights,
+)
+from flcav.federation.rules import Rules
+from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
-from flcav.federation.trainable import Weights
+from flcav.federation.strategies.fedavg import average
+from flcav.federation.strategies.strategy import Exchanges, Stateful
+from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 
 OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
 
 
 class ClientFailed(RuntimeError):
-    """A client replied to a round with an error."""
+    """Fewer clients sent a usable update in a round than are wanted."""
 
 
 class Rounds(FlowerStrategy):
-    """Flower strategy in which every node trains in every round; `strategy` aggregates their updates.
+    """Flower strategy of a federation: in each round clients train, and `strategy` combines their updates.
 
-    `work` gives the local training of a round by its number; numbers continue after the `done` rounds. `on_round` is
-    called after each aggregation.
+    `rules` say who takes part, what is sent and what is kept private; `work` gives the local training of a round by its
+    number; numbers continue after the `done` rounds. `names` are the clients' names by node. `earlier` is the number of
+    rounds of earlier federations with the same clients, which privacy is accounted with. `state` is changed in place;
+    `on_round` is called after each aggregation.
     """
 
-    def __init__(self, strategy: Strategy, work: Callable[[int], LocalWork], done: int, on_round: OnRound) -> None:
-        self._strategy, self._work, self._done, self._on_round = strategy, work, done, on_round
+    def __init__(
+        self,
+        strategy: Strategy,
+        rules: Rules,
+        work: Callable[[int], LocalWork],
+        names: Mapping[int, str],
+        state: FederationState,
+        done: int,
+        earlier: int,
+        on_round: OnRound,
+    ) -> None:
+        self._strategy, self._rules, self._work, self._names = strategy, rules, work, names
+        self._state, self._done, self._earlier, self._on_round = state, done, earlier, on_round
+        self._nodes = {name: node for node, name in names.items()}
         self._start: Weights = {}
+        self._chosen: list[str] = []  # who is to send an update in this round
+        self._failed: dict[str, str] = {}  # by client what was wrong in this round
+        self._drawn: dict[str, float] = {}  # of importance selection: probability of the clients that were drawn
+        self._shares: dict[str, float] = {}  # of importance selection: of all samples, by client
 
     def summary(self) -> None:
         """Log nothing: the stage's own records hold the settings."""
@@ -39,11 +79,31 @@ class Rounds(FlowerStrategy):
     def configure_train(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
     ) -> Iterable[Message]:
-        """Return one training message per node: the round's weights and its local work."""
+        """Return one training message per chosen client: the round's weights and its local work.
+
+        Under importance selection all clients train and report the norm of their update, and those that are drawn are
+        asked to send it.
+        """
         self._start = to_weights(arrays)
-        content = RecordDict({ARRAYS: arrays, CONFIG: self._work(self._done + server_round).record()})
+        work, records = self._work(self._done + server_round), {ARRAYS: arrays}
+        if isinstance(self._strategy, Exchanges) and (sent := self._strategy.send(self._state.server)):
+            records[EXTRA] = to_arrays(sent)
+        selection, local = self._rules.selection, work.record()
+        self._chosen = selection.choose([*self._names.values()], work.round, work.seed)
+        self._failed = {}
+        if selection.rule != "importance":
+            return self._address(self._chosen, {**records, CONFIG: local})
+        asked = self._address(self._chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
+        norms = self._receive_norms(grid.send_and_receive(asked))
+        self._drawn = selection.draw(norms, work.seed)
+        self._chosen = [*self._drawn]
+        return self._address(self._chosen, {CONFIG: local, ASK: ConfigRecord({ASK: SEND})})
+
+    def _address(self, clients: Iterable[str], records: dict[str, Any]) -> list[Message]:
+        content = RecordDict(records)
         return [
-            Message(content=content, message_type=MessageType.TRAIN, dst_node_id=node) for node in grid.get_node_ids()
+            Message(content=content, message_type=MessageType.TRAIN, dst_node_id=self._nodes[client])
+            for client in clients
         ]
 
     def aggregate_train(
@@ -51,22 +111,96 @@ class Rounds(FlowerStrategy):
     ) -> tuple[ArrayRecord | None, MetricRecord | None]:
         """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
 
-        Raises `ClientFailed` where a reply is an error, ValueError where the strategy returns arrays of other names,
-        shapes or types.
+        Raises `ClientFailed` where fewer clients than are wanted sent a usable update, ValueError where the strategy
+        returns arrays of other names, shapes or types.
         """
-        ordered = sorted(replies, key=lambda message: message.metadata.src_node_id)
-        for message in ordered:
+        number = self._done + server_round
+        updates = self._receive(replies)
+        least = self._rules.least_clients
+        wanted = len(self._chosen) if least is None else min(least, len(self._chosen))
+        if len(updates) < wanted or (self._failed and least is None):
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
+            raise ClientFailed(
+                f"round {number}: {len(updates)} of {len(self._chosen)} clients sent an update that can be used, "
+                f"{wanted} are wanted ({reasons})"
+            )
+        weights = self._combine(updates, number)
+        samples = [update.samples for update in updates.values()]
+        losses = [update.loss for update in updates.values()]
+        loss = float(np.average(losses, weights=samples)) if updates else 0.0
+        epsilon = None
+        if self._rules.privacy is not None:
+            rounds, names = self._earlier + number, [*self._names.values()]
+            epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
+        self._state.records.append(RoundRecord(number, tuple(updates), self._failed, epsilon))
+        self._on_round(number, weights, loss)
+        return to_arrays(weights), MetricRecord({SAMPLES: sum(samples), LOSS: loss})
+
+    def _receive_norms(self, replies: Iterable[Message]) -> dict[str, float]:
+        """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
+        told: dict[str, tuple[float, int]] = {}
+        for name, message in self._sort_replies(replies):
+            norm, samples = to_norm(message)
+            if np.isfinite(norm) and norm >= 0 and samples >= 0:
+                told[name] = norm, samples
+            else:
+                self._failed[name] = f"a norm of {norm} and {samples} samples"
+        total = sum(samples for _, samples in told.values())
+        self._shares = {name: samples / max(total, 1) for name, (_, samples) in told.items()}
+        return {name: norm * self._shares[name] for name, (norm, _) in told.items()}
+
+    def _sort_replies(self, replies: Iterable[Message]) -> list[tuple[str, Message]]:
+        """Return the replies with content by client, in node order, and note the failures."""
+        found = []
+        for message in sorted(replies, key=lambda message: message.metadata.src_node_id):
+            name = self._names[message.metadata.src_node_id]
             if message.has_error():
-                raise ClientFailed(f"node {message.metadata.src_node_id}: {message.error.reason}")
-        updates = [to_update(message) for message in ordered]
-        weights = self._strategy.combine(self._start, updates)
-        if _form(weights) != _form(self._start):
+                self._failed[name] = str(message.error.reason)
+            else:
+                found.append((name, message))
+        return found
+
+    def _receive(self, replies: Iterable[Message]) -> dict[str, LocalUpdate]:
+        """Return the usable updates by client, in node order, and note what is wrong with the others."""
+        updates: dict[str, LocalUpdate] = {}
+        for name, message in self._sort_replies(replies):
+            try:
+                sent = to_update(message)
+                update = replace(sent, weights=decode(sent.weights, self._start, self._rules))
+            except (KeyError, IndexError, TypeError, ValueError) as error:
+                self._failed[name] = f"a message that is no update ({error})"
+                continue
+            others = next(iter(updates.values())).extra if updates else update.extra
+            fault = find_fault(update, self._start, others)
+            if fault is None:
+                updates[name] = update
+            else:
+                self._failed[name] = fault
+        return updates
+
+    def _combine(self, updates: Mapping[str, LocalUpdate], number: int) -> Weights:
+        """Return the weights after round `number`, and change the strategy's state."""
+        privacy, start, each = self._rules.privacy, self._start, list(updates.values())
+        if privacy is not None and privacy.where == "central":
+            sent = self._rules.upload.exchanged(start)
+            names = [name for name in learned_names(start) if name in sent]
+            expected = expected_clients(self._rules.selection, [*self._names.values()])
+            mean = average_privately(start, each, names, privacy, expected, self._work(number).seed)
+            each = [LocalUpdate(mean, 1, 0.0)]
+        elif self._rules.selection.rule == "importance" and updates:
+            weights = {name: self._shares[name] / self._drawn[name] for name in updates}
+            each = [LocalUpdate(average_inversely(start, updates, weights), 1, 0.0)]
+        if not each:
+            return start
+        if isinstance(self._strategy, Stateful):
+            weights, after = self._strategy.step(start, each, self._state.server, len(self._names))
+            self._state.server = {name: np.asarray(array) for name, array in after.items()}
+        else:
+            weights = self._strategy.combine(start, each)
+        if _form(weights) != _form(start):
             name = type(self._strategy).__name__
             raise ValueError(f"{name} returned arrays of other names, shapes or types than the round started from")
-        samples = [update.samples for update in updates]
-        loss = float(np.average([update.loss for update in updates], weights=samples))
-        self._on_round(self._done + server_round, weights, loss)
-        return to_arrays(weights), MetricRecord({SAMPLES: sum(samples), LOSS: loss})
+        return weights
 
     def configure_evaluate(
         self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
@@ -77,6 +211,39 @@ class Rounds(FlowerStrategy):
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
         """Return None: clients do not evaluate."""
         return None
+
+
+def find_fault(update: LocalUpdate, start: Weights, extra: Weights) -> str | None:
+    """Return what makes an update unusable, None for a usable one.
+
+    `start` has the names, shapes and types that the weights must have, `extra` those of the arrays beside them.
+    """
+    for arrays, like in ((update.weights, start), (update.extra, extra)):
+        if set(arrays) != set(like):
+            odd = sorted(set(arrays) ^ set(like))
+            return f"an array '{odd[0]}' that is missing or unknown"
+        for name, array in arrays.items():
+            if (array.shape, array.dtype) != (like[name].shape, like[name].dtype):
+                return f"'{name}' is {array.dtype} {array.shape} instead of {like[name].dtype} {like[name].shape}"
+            if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+                return f"'{name}' has values that are not finite"
+    if update.samples < 0 or not np.isfinite(update.loss):
+        return f"{update.samples} samples and a loss of {update.loss}"
+    return None
+
+
+def average_inversely(start: Weights, updates: Mapping[str, LocalUpdate], weights: Mapping[str, float]) -> Weights:
+    """Return start + sum_i weights_i (w_i - start) of learned arrays; of all others the mean of the updates.
+
+    With weights_i = share_i / probability_i it is the unbiased (Horvitz-Thompson) estimate of the mean of all clients.
+    """
+    names = learned_names(start)
+    moved: dict[str, Any] = {name: np.zeros(start[name].shape) for name in names}
+    for client, update in updates.items():
+        for name in names:
+            moved[name] += weights[client] * (update.weights[name].astype(np.float64) - start[name])
+    mean = average([update.weights for update in updates.values()], [*weights.values()])
+    return mean | {name: (start[name] + array).astype(start[name].dtype) for name, array in moved.items()}
 
 
 def _form(weights: Weights) -> dict[str, tuple[tuple[int, ...], np.dtype]]:

@@ -5,21 +5,26 @@ server is k rounds of federation with the vehicles of its region (Wang et al., I
 """
 
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from flwr.app import ArrayRecord
 
 from flcav.config import InputError
-from flcav.federation.client import CLIENT, client_app
+from flcav.federation.client import CLIENT, OWN, RESIDUAL, check_arguments, client_app
+from flcav.federation.privacy import affordable_rounds, expected_clients
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.rounds import OnRound, Rounds
+from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.seeds import derive_seed
 
+EVERYBODY = Rules()
 logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each round; a stage reports its own
 
 
@@ -51,20 +56,29 @@ def federate(
     account: Account,
     *,
     strategy: Strategy = FEDAVG,
+    rules: Rules = EVERYBODY,
+    state: FederationState | None = None,
     done: int = 0,
+    earlier: int = 0,
     on_round: OnRound = _ignore,
 ) -> LocalUpdate:
     """Run rounds `done + 1 .. schedule.rounds` of a federation, starting from `weights`.
 
     Returns the weights after the last round, and of that round the number of samples of all clients and their mean
     training loss, weighted by samples; without a round to run, `weights`, 0 samples and a loss of 0. In each round
-    every client trains, and `strategy` combines their updates: by default federated averaging (McMahan et al., AISTATS
-    2017, algorithm 1). `on_round` is called after each round with its number, weights and mean loss. Every message is
-    entered in the ledger of `account`. To resume, pass the same strategy, and the weights and the number of the last
-    round that `on_round` was given.
+    every client trains, unless `rules` say otherwise, and `strategy` combines their updates: by default federated
+    averaging (McMahan et al., AISTATS 2017, algorithm 1). `on_round` is called after each round with its number,
+    weights and mean loss; `state` is then that of the round, with a record of it. Every message is entered in the
+    ledger of `account`. To resume, pass the same strategy and rules, the weights and the number of the last round that
+    `on_round` was given, and the state after it.
 
-    Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where a client raised, `InputError`
-    where there are no clients, ValueError where `strategy` changes names, shapes or types of the arrays.
+    Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
+    before this one, with the same clients and rules, which count against that budget.
+
+    Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
+    no update, and fewer are left than `rules` ask for (by default all), `InputError` where there are no clients, or
+    `rules` or `strategy` ask for what they cannot do, ValueError where `strategy` changes names, shapes or types of the
+    arrays.
 
     >>> import numpy as np
     >>> from flcav import Ledger, federate
@@ -81,18 +95,75 @@ def federate(
     >>> federate(vehicles, {"w": np.zeros(2)}, schedule, Account(ledger, "edge", "toy", "wireless")).weights["w"]
     array([2.5, 2.5])
     """
+    check_federation(clients, strategy, rules)
+    rules.upload.check_layers(weights)
+    rounds, names = schedule.rounds, [*clients]
+    if rules.privacy is not None:
+        rounds = affordable_rounds(rules.privacy, rules.selection, names, rounds, earlier)
+    if rounds <= done:
+        return LocalUpdate(weights, 0, 0.0)
+    state = FederationState() if state is None else state
+    nodes = {name: {CLIENT: name} for name in clients}
+    with EmbeddedGrid(client_app(clients, strategy, rules), nodes, state.clients) as grid:
+
+        def keep(round_: int, aggregated: Weights, loss: float) -> None:
+            state.clients = grid.read_states((OWN, RESIDUAL))
+            on_round(round_, aggregated, loss)
+
+        metered = MeteredGrid(grid, account, grid.names)
+        app = Rounds(strategy, rules, schedule.work, grid.names, state, done, earlier, keep)
+        result = app.start(metered, to_arrays(weights), rounds - done)
+    arrays: ArrayRecord = result.arrays
+    metrics = result.train_metrics_clientapp[rounds - done]
+    return LocalUpdate(to_weights(arrays), int(metrics[SAMPLES]), float(metrics[LOSS]))  # type: ignore[arg-type]
+
+
+def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> None:
+    """Raise `InputError` where these clients cannot federate by this strategy and these rules."""
     if not clients:
         raise InputError("a federation of 0 clients: nobody trains")
-    if schedule.rounds <= done:
-        return LocalUpdate(weights, 0, 0.0)
-    nodes = {name: {CLIENT: name} for name in clients}
-    with EmbeddedGrid(client_app(clients), nodes) as grid:
-        metered = MeteredGrid(grid, account, grid.names)
-        rounds = Rounds(strategy, schedule.work, done, on_round)
-        result = rounds.start(metered, to_arrays(weights), schedule.rounds - done)
-    arrays: ArrayRecord = result.arrays
-    metrics = result.train_metrics_clientapp[schedule.rounds - done]
-    return LocalUpdate(to_weights(arrays), int(metrics[SAMPLES]), float(metrics[LOSS]))  # type: ignore[arg-type]
+    check_rules(strategy, rules, [*clients])
+    if isinstance(strategy, Corrects):
+        check_arguments(clients, strategy.correct({}, {}).arguments(), type(strategy).__name__)
+    if rules.upload.layers:
+        check_arguments(clients, ["layers"], f"layers {', '.join(rules.upload.layers)}:")
+
+
+def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
+    """Raise `InputError` where a strategy and rules do not go together, or not with so many clients."""
+    told, selection = type(strategy).__name__, rules.selection
+    selection.check_clients(names)
+    least, chosen = rules.least_clients, int(expected_clients(selection, names))
+    if least is not None and selection.rule not in ("poisson", "importance") and least > chosen:
+        raise InputError(f"least_clients: {least} are wanted in a round, and {chosen} take part")
+    single = isinstance(strategy, Robust | Exchanges)  # looks at each update
+    if selection.rule == "importance":
+        if single:
+            raise InputError(f"{told} looks at each update, and importance selection gives each a weight of its own")
+        if rules.privacy is not None:
+            raise InputError("privacy: importance selection reads norms of the updates, which no noise covers")
+    if isinstance(strategy, Robust):
+        if selection.rule == "poisson":
+            raise InputError(f"{told} needs a known number of clients, and poisson selection draws any")
+        strategy.check_clients(chosen)
+    if rules.privacy is not None:
+        if isinstance(strategy, Exchanges):
+            raise InputError(f"{told} sends further arrays beside the weights, which the noise does not cover")
+        if rules.privacy.where == "central" and single:
+            raise InputError(f"{told} looks at each update, and central noise covers their sum alone")
+
+
+def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_rounds: int, earlier: int) -> int:
+    """Return how many of `rounds` cloud rounds, of `edge_rounds` edge rounds each, a region's privacy budget affords.
+
+    names: the region's clients, who took part in `earlier` rounds. Raises `InputError` where it affords none.
+    """
+    if rules.privacy is None or rounds == 0:
+        return rounds
+    afforded = affordable_rounds(rules.privacy, rules.selection, names, rounds * edge_rounds, earlier) // edge_rounds
+    if afforded == 0:
+        raise InputError(f"privacy: the budget does not afford the {edge_rounds} edge rounds of a cloud round")
+    return afforded
 
 
 @dataclass
@@ -105,16 +176,31 @@ class EdgeServer:
     own: Weights  # the region's model at the end of stage II
     cloud_rounds_done: int = 0
     strategy: Strategy = FEDAVG  # of aggregation in the region
+    rules: Rules = EVERYBODY  # of the region's rounds
+    state: FederationState = field(default_factory=FederationState)  # of the region's rounds
+    earlier: int = 0  # rounds of stage II, which a privacy budget counts
 
-    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+    def train(
+        self, weights: Weights, *, steps: int, learning_rate: float, seed: int, layers: Sequence[str] = ()
+    ) -> LocalUpdate:
         """Return the update of the region after k edge rounds from the cloud's `weights`; raises as `federate` does.
 
         The first cloud round starts from the server's own stage II model instead: the cloud has not averaged yet, and
-        its model is older. Edge rounds are numbered consecutively over the cloud rounds.
+        its model is older. Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the
+        rules, which vehicles keep to.
         """
         start = weights if self.cloud_rounds_done else self.own
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
-        update = federate(self.vehicles, start, schedule, self.account, strategy=self.strategy, done=done)
-        self.cloud_rounds_done += 1
-        return update
+        self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
+        return federate(
+            self.vehicles,
+            start,
+            schedule,
+            self.account,
+            strategy=self.strategy,
+            rules=self.rules,
+            state=self.state,
+            done=done,
+            earlier=self.earlier,
+        )

@@ -4,13 +4,23 @@ A federation knows weights and numbers alone; whatever satisfies `Trainable` can
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Weights = Mapping[str, NDArray[np.number]]  # name -> array, parameters and buffers, in a fixed order
+STATISTICS = ("running_mean", "running_var", "num_batches_tracked")  # of batch normalisation, last part of a name
+
+
+def learned_names(weights: Weights) -> list[str]:
+    """Return the names of the arrays that gradients change: floating ones, without batch normalisation's statistics."""
+    return [
+        name
+        for name, array in weights.items()
+        if np.issubdtype(array.dtype, np.floating) and name.rpartition(".")[2] not in STATISTICS
+    ]
 
 
 class Update(Protocol):
@@ -39,10 +49,32 @@ class LocalUpdate:
     weights: Weights  # after local training
     samples: int  # distinct samples trained on
     loss: float  # mean over the local steps
+    gradient: Weights = field(default_factory=dict)  # mean over the local steps, uncorrected; where `shift` was given
+    extra: Weights = field(default_factory=dict)  # what else a strategy's clients send: see `Exchanges`
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A change of a client's gradients at every local step: g + proximal (w - start) + shift.
+
+    The mean of g over the steps is to be returned as the update's `gradient` where there is a `shift`.
+    """
+
+    proximal: float = 0.0  # mu
+    shift: Weights | None = None  # by name of parameter; one that is not in it is not shifted
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the further arguments of `Trainable.train`: none where nothing is corrected."""
+        found: dict[str, Any] = {"proximal": self.proximal} if self.proximal else {}
+        return found if self.shift is None else found | {"shift": self.shift}
 
 
 class Trainable(Protocol):
-    """A client: its own data and a network to train on them. The network that the vehicle drives with is another."""
+    """A client: its own data and a network to train on them. The network that the vehicle drives with is another.
+
+    Strategies that correct the clients' gradients need a `train` that takes the arguments of `Correction`, too, and
+    federations that exchange named layers alone need one that takes `layers`, patterns of the parameters to train.
+    """
 
     def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> Update:
         """Return the update after `steps` local optimiser steps from `weights`, at `learning_rate`.

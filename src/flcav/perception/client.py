@@ -1,11 +1,14 @@
 """Client of a federated task: recording settings, sources of labels, bytes of a sample, and local training."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any, Generic, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
@@ -73,6 +76,7 @@ class TrainedWeights:
     weights: dict[str, NDArray[np.number]]  # by name of parameter or buffer
     samples: int  # number of distinct samples trained on
     loss: float  # mean over the steps; 0 without steps
+    gradient: dict[str, NDArray[np.number]] = field(default_factory=dict)  # mean over the steps, with a `shift`
 
 
 class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
@@ -96,16 +100,78 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         self.batch = task.practice.batch if batch is None else batch
 
     def train(
-        self, weights: Mapping[str, NDArray[np.number]], *, steps: int, learning_rate: float, seed: int
+        self,
+        weights: Mapping[str, NDArray[np.number]],
+        *,
+        steps: int,
+        learning_rate: float,
+        seed: int,
+        proximal: float = 0.0,
+        shift: Mapping[str, NDArray[np.number]] | None = None,
+        layers: Sequence[str] = (),
     ) -> TrainedWeights:
         """Train for `steps` steps from `weights` at a constant learning rate; deterministic in its arguments.
 
-        Raises `InputError` if `weights` do not fit the network.
+        The gradient of each step is g + proximal (w - weights) + shift, by name of parameter; with a `shift` the result
+        has the mean of g. With `layers`, patterns of names, all other parameters stay as they are. Raises `InputError`
+        if `weights` do not fit the network, or no parameter is named by `layers`.
         """
         network = self.task.build(self.config)
         from_arrays(network, weights)
+        freeze_others(network, layers)
+        correction = GradientCorrection(weights, proximal, shift) if proximal or shift is not None else None
         loss = train_steps(
-            self.task, network, self.samples, steps=steps, batch=self.batch, learning_rate=learning_rate, seed=seed
+            self.task,
+            network,
+            self.samples,
+            steps=steps,
+            batch=self.batch,
+            learning_rate=learning_rate,
+            seed=seed,
+            correct=correction,
         )
         seen = min(len(self.samples), steps * min(self.batch, len(self.samples)))
-        return TrainedWeights(to_arrays(network), seen, loss)
+        gradient = correction.mean() if correction is not None and shift is not None else {}
+        return TrainedWeights(to_arrays(network), seen, loss, gradient)
+
+
+def freeze_others(network: nn.Module, layers: Sequence[str]) -> None:
+    """Leave out of training all parameters whose names match none of the patterns `layers`; () leaves out none.
+
+    Raises `InputError` where none is left.
+    """
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(not layers or any(fnmatchcase(name, layer) for layer in layers))
+    if not any(parameter.requires_grad for parameter in network.parameters()):
+        raise InputError(f"layers {', '.join(layers)}: match no parameter of the network")
+
+
+class GradientCorrection:
+    """Correction of gradients in local training, g + proximal (w - start) + shift, which sums up the g that it sees."""
+
+    def __init__(
+        self,
+        start: Mapping[str, NDArray[np.number]],
+        proximal: float,
+        shift: Mapping[str, NDArray[np.number]] | None,
+    ) -> None:
+        self._start = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in start.items()}
+        self._shift = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in (shift or {}).items()}
+        self._proximal, self._sum, self._steps = proximal, {}, 0
+
+    @torch.no_grad()
+    def __call__(self, network: nn.Module) -> None:
+        """Correct the gradients of the network's parameters, in place."""
+        self._steps += 1
+        for name, parameter in network.named_parameters():
+            if parameter.grad is None:
+                continue
+            self._sum[name] = self._sum.get(name, 0) + parameter.grad
+            if self._proximal:
+                parameter.grad += self._proximal * (parameter - self._start[name])
+            if name in self._shift:
+                parameter.grad += self._shift[name]
+
+    def mean(self) -> dict[str, NDArray[np.number]]:
+        """Return the mean of the uncorrected gradients over the steps, by name of parameter."""
+        return {name: (total / self._steps).numpy() for name, total in self._sum.items()}

@@ -97,7 +97,7 @@ def _question(each: Difference, rules: Mapping[str, str], roles: Mapping[str, st
         return f"Does federated learning help {where}?"
     if rules[each.before_arm] == "densest" and rules[MAIN] == "vrcsp":
         return "Does the placed pole beat the pole with the densest traffic?"
-    if rules[each.before_arm] == "none":
+    if rules[each.before_arm] == "none" and rules[MAIN] != "none":
         return "Does the placed pole beat no pole?"
     return f"Does the run beat its arm '{each.before_arm}'?"
 

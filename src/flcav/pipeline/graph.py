@@ -9,9 +9,10 @@ from typing import Any
 
 from flcav.config import InputError, shorten
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
+from flcav.pipeline.federations import update_forms
 from flcav.pipeline.frames import hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
-from flcav.pipeline.planning import read_history
+from flcav.pipeline.planning import UpdateForm, read_history
 from flcav.pipeline.recipe import (
     CENTRAL,
     CLOUD,
@@ -193,6 +194,8 @@ class Graph:
         asked["placement"] = {"tasks": []}  # not part of the plan; the default would depend on objects
         asked["federation"] = {"edge_rounds_per_cloud_round": recipe.federation.edge_rounds_per_cloud_round}
         planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "histories": self._histories()}
+        if (forms := update_forms(self.settings.values())) != [UpdateForm()]:
+            planned["updates"] = [form.model_dump(mode="json") for form in forms]
         plan = names.plan(arm.name)
         self._add(_step(plan, plan_step, planned, [step for steps in pools.values() for step in steps]))
         for task in recipe.tasks:

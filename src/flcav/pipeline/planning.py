@@ -4,7 +4,7 @@
 """
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,8 +12,9 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow.csv
 
-from flcav.config import InputError, parse_config
+from flcav.config import Config, InputError, parse_config
 from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.upload import Upload
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import TaskPlan as Allotted
@@ -201,9 +202,17 @@ def _planned(sizes: MessageSizes, own: Allotted, problem: Problem) -> TaskPlan:
     return TaskPlan(*counts, own.wireless_mb, own.wireline_mb, sizes.sample_mb, sizes.model_mb, predicted)
 
 
-def model_mb(task: Task, network: str | None) -> float:
-    """Return the serialised size of one model update [MB], by a dry run of the message."""
-    return update_bytes(to_arrays(build_network(task, find_configuration(task, network), 0))) / BYTES_PER_MB
+class UpdateForm(Config):
+    """What a client's update is sent as, as far as its size depends on it."""
+
+    upload: Upload = Upload()
+    exchanging: bool = False  # with an array beside each that is learned
+
+
+def model_mb(task: Task, network: str | None, forms: Sequence[UpdateForm] = (UpdateForm(),)) -> float:
+    """Return the serialised size of one model update [MB], the largest of its `forms`, by a dry run of the message."""
+    weights = to_arrays(build_network(task, find_configuration(task, network), 0))
+    return max(update_bytes(weights, form.upload, exchanging=form.exchanging) for form in forms) / BYTES_PER_MB
 
 
 def read_history(task: str, name: str, beside: Path) -> str:

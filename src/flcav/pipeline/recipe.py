@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
+from flcav.federation.rules import Rules
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.world.scenarios.scenario import Scenario
@@ -158,10 +159,16 @@ class Placement(Config):
     tasks: tuple[str, ...] = ()  # tasks whose errors are to be covered; default: objects, if the run has it
 
 
-class Federation(Config):
-    """Settings of the aggregation of clients' models."""
+StrategySpec = str | Mapping[str, Mapping[str, Any]]  # a name, or a name with settings
 
-    strategy: str = "fedavg"  # name of a strategy, or module:NAME of your own
+
+class Federation(Rules):
+    """Settings of federated learning: strategies, and the rules of the vehicles' rounds."""
+
+    strategy: StrategySpec = "fedavg"  # name, or {name: settings}; module:NAME of your own
+    cloud_strategy: StrategySpec | None = (
+        None  # of the cloud; default: `strategy`, or fedavg where that one corrects local steps
+    )
     edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)  # in every region
 
 

@@ -10,6 +10,7 @@ from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting, name_repeat
+from flcav.pipeline.federations import check_federations
 from flcav.pipeline.findings import findings, name_stage
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.labels import LABEL_SOURCES
@@ -82,6 +83,7 @@ def run(
     if (out / RESULTS).exists():
         Run.load(out, RESULTS)  # raises for results of another version
     graph, clock = Graph(recipe, Path(beside or ".")), stopwatch(out / WORK)
+    check_federations(recipe, graph.settings.values())
 
     def timed(step: str, done: int, total: int, note: str) -> None:
         if note == "done":
@@ -132,6 +134,8 @@ def run_several(
     """
     out = Path(out)
     graphs = {out / name: Graph(recipe, Path(beside or ".")) for name, recipe in recipes.items()}
+    for graph in graphs.values():
+        check_federations(graph.recipe, graph.settings.values())
     steps = {folder / WORK: graph.steps for folder, graph in graphs.items()}
     names = {folder / WORK: folder.name for folder in graphs}
     run_side_by_side(steps, jobs=jobs, notify=notify, stale=stale, engine=engine, names=names)

@@ -7,16 +7,19 @@ vehicles federate with their edge server. Stage III: edge servers federate with 
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from safetensors.numpy import load_file, save
 
+from flcav.config import InputError
 from flcav.federation.rounds import OnRound
+from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
+from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Trainable, Weights
@@ -156,22 +159,69 @@ def make_clients(learning: Learning, config: Any, samples: Mapping[str, Sequence
     }
 
 
-class FederationCheckpoints:
-    """Checkpoints of a federation: weights, loss and ledger after each round, to resume from."""
+@dataclass(frozen=True)
+class RegionStart:
+    """Where a region's edge server starts in stage III."""
 
-    def __init__(self, task: Task, folder: Path, book: Ledger, report: Report) -> None:
+    clients: Mapping[str, TaskClient]  # its vehicles, by name
+    weights: Weights  # of stage II
+    earlier: int  # rounds of stage II
+
+
+@dataclass(frozen=True)
+class Strategies:
+    """Strategies of stage III: of edge servers with their vehicles, and of the cloud with edge servers."""
+
+    edge: Strategy
+    cloud: Strategy
+
+
+def describe_federation(strategy: Strategy | Strategies, rules: Rules) -> str:
+    """Return strategies and rules, as far as they are not the defaults, in words: what a checkpoint is of."""
+    changed = rules.model_dump(mode="json", include=set(Rules.model_fields), exclude_defaults=True)
+    return f"{strategy} by {json.dumps(changed)}" if changed else str(strategy)
+
+
+class FederationCheckpoints:
+    """Checkpoints of a federation: weights, loss, ledger and states after each round, to resume from."""
+
+    def __init__(
+        self,
+        task: Task,
+        folder: Path,
+        book: Ledger,
+        report: Report,
+        states: Mapping[str, FederationState] = {},
+        identity: str = "",
+    ) -> None:
+        """Keep the checkpoints in `folder`.
+
+        states: by name what federations keep between rounds, restored in place; of stage III also the edge servers'.
+        identity: what the federation is by; a checkpoint of another one is refused.
+        """
         self._task, self._folder, self._book, self._report = task, folder, book, report
+        self._states, self._identity = states, identity
         self.losses: list[float] = []
 
     def resume(self, weights: Weights) -> tuple[Weights, int]:
-        """Return the last round's weights and number, restoring ledger and losses; without one, `weights` and 0."""
+        """Return the last round's weights and number, restoring ledger, losses and states.
+
+        Without a checkpoint, returns `weights` and 0. Raises `InputError` for the checkpoint of another strategy.
+        """
         if not (self._folder / ROUND).exists():
             return weights, 0
         state = json.loads((self._folder / ROUND).read_text())
+        if state.get("by", self._identity) != self._identity:
+            raise InputError(f"{self._folder}: a checkpoint of {state['by']}, which {self._identity} cannot go on with")
         kept = Ledger.load(self._folder / LEDGER).entries[: state["entries"]]
         for entry in kept[len(self._book.entries) :]:
             self._book.enter(entry)
         self.losses = state["losses"]
+        arrays = load_file(self._state_path(state["round"])) if state.get("states") else {}
+        for name, own in self._states.items():
+            begins = f"{name}|"
+            mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
+            own.restore(mine, state["records"][name])
         return load_file(round_path(self._folder, state["round"])), state["round"]
 
     def make_saver(self, rounds: int) -> OnRound:
@@ -180,12 +230,26 @@ class FederationCheckpoints:
         def keep(round_: int, weights: Weights, loss: float) -> None:
             self.losses.append(loss)
             write_bytes(round_path(self._folder, round_), save(dict(weights)))
+            arrays = {
+                f"{name}|{key}": array for name, own in self._states.items() for key, array in own.to_arrays().items()
+            }
+            if arrays:
+                write_bytes(self._state_path(round_), save(arrays))
             self._book.save(self._folder / LEDGER)
             state = {"round": round_, "entries": len(self._book.entries), "losses": self.losses}
+            if self._states:
+                records = {name: [asdict(record) for record in own.records] for name, own in self._states.items()}
+                state |= {"by": self._identity, "records": records, "states": bool(arrays)}
             write_json(self._folder / ROUND, state)
-            self._report(round_, rounds, f"loss {loss:.3f}")
+            self._state_path(round_ - 1).unlink(missing_ok=True)
+            spent = [own.records[-1].epsilon for own in self._states.values() if own.records]
+            private = [epsilon for epsilon in spent if epsilon is not None]
+            self._report(round_, rounds, f"loss {loss:.3f}" + (f", epsilon {max(private):.2f}" if private else ""))
 
         return keep
+
+    def _state_path(self, round_: int) -> Path:
+        return self._folder / f"state{round_}.safetensors"
 
     def finish(self, network: Any, rounds: int, averaged: int) -> None:
         """Write the final weights and the ledger: the mean of the last `averaged` rounds' weights.
@@ -204,45 +268,73 @@ def federate_edge(
     clients: Mapping[str, TaskClient],
     schedule: Schedule,
     strategy: Strategy,
+    rules: Rules,
+    earlier: int,
     book: Ledger,
     folder: Path,
     report: Report,
 ) -> tuple[float, ...]:
-    """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss."""
-    federating = FederationCheckpoints(learning.task, folder, book, report)
+    """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
+
+    A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
+    """
+    state = FederationState()
+    federating = FederationCheckpoints(
+        learning.task, folder, book, report, {EDGE: state}, describe_federation(strategy, rules)
+    )
     start, done = federating.resume(to_arrays(network))
     account = Account(book, EDGE, learning.task.name, "wireless")
     keep = federating.make_saver(schedule.rounds)
-    federate(clients, start, schedule, account, strategy=strategy, done=done, on_round=keep)
-    federating.finish(network, schedule.rounds, learning.training.average_rounds)
+    how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
+    federate(clients, start, schedule, account, **how, done=done, on_round=keep)
+    federating.finish(network, len(federating.losses), learning.training.average_rounds)
     return tuple(federating.losses)
 
 
 def federate_cloud(
     learning: Learning,
     network: Any,
-    regions: Mapping[str, tuple[Mapping[str, TaskClient], Weights]],
+    regions: Mapping[str, RegionStart],
     rounds: int,
     edge_rounds: int,
-    strategy: Strategy,
+    strategies: Strategies,
+    rules: Rules,
     book: Ledger,
     folder: Path,
     report: Report,
 ) -> tuple[float, ...]:
-    """Run stage III from `network`; `regions`: each edge server's clients and its stage II weights.
+    """Run stage III from `network`; `regions`: where each edge server starts.
 
-    An edge server runs `edge_rounds` rounds in a cloud round. Writes weights and ledger, returns each round's loss.
+    An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers.
+    Writes weights and ledger, returns each round's loss.
     """
-    federating = FederationCheckpoints(learning.task, folder, book, report)
+    state, own_states = FederationState(), {region: FederationState() for region in regions}
+    states = {CLOUD: state, **{f"{EDGE}/{region}": own for region, own in own_states.items()}}
+    for own in regions.values() if rules.privacy is not None else ():
+        rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, edge_rounds, own.earlier))
+    federating = FederationCheckpoints(
+        learning.task, folder, book, report, states, describe_federation(strategies, rules)
+    )
     start, done = federating.resume(to_arrays(network))
     wireless, wireline = (Account(book, CLOUD, learning.task.name, link) for link in ("wireless", "wireline"))
     servers: dict[str, Trainable] = {
-        region: EdgeServer(clients, edge_rounds, wireless, own, cloud_rounds_done=done, strategy=strategy)
-        for region, (clients, own) in regions.items()
+        region: EdgeServer(
+            own.clients,
+            edge_rounds,
+            wireless,
+            own.weights,
+            cloud_rounds_done=done,
+            strategy=strategies.edge,
+            rules=rules,
+            state=own_states[region],
+            earlier=own.earlier,
+        )
+        for region, own in regions.items()
     }
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
     keep = federating.make_saver(rounds)
-    federate(servers, start, schedule, wireline, strategy=strategy, done=done, on_round=keep)
+    how: Any = {"strategy": strategies.cloud, "rules": rules.of_servers(), "state": state}
+    federate(servers, start, schedule, wireline, **how, done=done, on_round=keep)
     federating.finish(network, rounds, learning.training.average_rounds)
     return tuple(federating.losses)
 

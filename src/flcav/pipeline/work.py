@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 
 from flcav.config import InputError, read_config
-from flcav.federation.strategies import strategy_named
 from flcav.files import write_json
 from flcav.intervals import Estimate
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Budget, Ledger, LedgerEntry, Link
@@ -25,6 +24,7 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule
 from flcav.pipeline.before_after import detect_before_after
+from flcav.pipeline.federations import find_strategies
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
     LABEL_SOURCES,
@@ -34,7 +34,15 @@ from flcav.pipeline.labels import (
     select_frames_near,
 )
 from flcav.pipeline.placing import find_sites, place_sensors, read_traces
-from flcav.pipeline.planning import PlanRequest, PlanSettings, make_plan, model_mb, parse_history, remake_plan
+from flcav.pipeline.planning import (
+    PlanRequest,
+    PlanSettings,
+    UpdateForm,
+    make_plan,
+    model_mb,
+    parse_history,
+    remake_plan,
+)
 from flcav.pipeline.recipe import (
     CENTRAL,
     CLOUD,
@@ -65,6 +73,8 @@ from flcav.pipeline.results import (
 )
 from flcav.pipeline.stages import (
     Learning,
+    RegionStart,
+    Strategies,
     book_uploads,
     choose_uploads,
     federate_cloud,
@@ -106,11 +116,20 @@ def deal_step(work: Work, path: str, split: SplitName, role: Role, seed: int, wh
 
 
 def plan_step(
-    work: Work, recipe: Fields, rule: PlanRule, pools: Mapping[str, Sequence[str]], histories: Mapping[str, str]
+    work: Work,
+    recipe: Fields,
+    rule: PlanRule,
+    pools: Mapping[str, Sequence[str]],
+    histories: Mapping[str, str],
+    updates: Sequence[Fields] = (),
 ) -> None:
-    """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables."""
+    """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables.
+
+    `updates` are the forms of the arms' updates, of which the largest is planned with; default: whole updates.
+    """
     asked_for = RunRecipe.model_validate(recipe)
     asked, groups, each = [], _edge_groups(asked_for), asked_for.sized_splits.edge
+    forms = tuple(UpdateForm.model_validate(update) for update in updates) or (UpdateForm(),)
     held = tuple(vehicles * each.scenes * each.spins for vehicles in groups)
     for name in asked_for.tasks:
         task, network = task_named(name), asked_for.tasks[name].network
@@ -121,7 +140,7 @@ def plan_step(
             for split in (Frames.open(work.inputs[step]),)
             for size in as_shared(task).sample_bytes(split.data, config, split.vehicles)
         ]
-        messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network))
+        messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network, forms))
         own = asked_for.tasks[name]
         history = parse_history(name, histories[name], name) if name in histories else None
         asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan, own.train_s))
@@ -271,10 +290,11 @@ def edge_step(
     start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
     clients = make_clients(learning, start.config, samples)
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region)
-    strategy = strategy_named(how.strategy)
-    losses = federate_edge(learning, start, clients, schedule, strategy, book, work.folder, work.report)
+    strategy, _ = find_strategies(how)
+    earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
+    losses = federate_edge(learning, start, clients, schedule, strategy, how, earlier, book, work.folder, work.report)
     held = sum(len(client.samples) for client in clients.values())
-    StageResult(stage, task, region, rounds, held, len(clients), poles, losses).save(work.folder)
+    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses).save(work.folder)
 
 
 def cloud_step(
@@ -300,13 +320,14 @@ def cloud_step(
     for region, steps in regions.items():
         samples, poles = _label_samples(work, learning, region, labels, steps)
         clients = make_clients(learning, start.config, samples)
-        servers[region] = clients, to_arrays(load_stage_network(learning.task, work.inputs[steps["edge"]]))
+        weights = to_arrays(load_stage_network(learning.task, work.inputs[steps["edge"]]))
+        servers[region] = RegionStart(clients, weights, StageResult.load(work.inputs[steps["edge"]]).rounds)
         held += sum(len(client.samples) for client in clients.values())
         count, helped = count + len(clients), [*helped, *poles]
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
-    strategy = strategy_named(how.strategy)
-    losses = federate_cloud(learning, start, servers, rounds, k, strategy, book, work.folder, work.report)
-    StageResult(CLOUD, task, None, rounds, held, count, tuple(helped), losses).save(work.folder)
+    federating = Strategies(*find_strategies(how))
+    losses = federate_cloud(learning, start, servers, rounds, k, federating, how, book, work.folder, work.report)
+    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses).save(work.folder)
 
 
 def central_step(

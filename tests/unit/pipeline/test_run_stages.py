@@ -10,8 +10,13 @@ import torch
 from pydantic.dataclasses import dataclass
 from safetensors.numpy import load_file, save
 
+from flcav.config import InputError
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.state import FederationState
+from flcav.federation.strategies import FEDAVG, Strategy, of_servers
+from flcav.federation.strategies.fedadam import FedAdam
+from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.files import write_bytes
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
@@ -44,37 +49,46 @@ SCHEDULE = Schedule(rounds=3, steps=4, learning_rate=0.1, final_learning_rate=0.
 class Walk:
     """A client whose weights walk at random: any other round, seed, start or rate ends elsewhere."""
 
-    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
-        stride = np.random.default_rng(seed).normal(size=3) * learning_rate * steps
+    def train(
+        self, weights: Weights, *, steps: int, learning_rate: float, seed: int, shift: Weights | None = None
+    ) -> LocalUpdate:
+        gradient = np.random.default_rng(seed).normal(size=3).astype(np.float32)
+        stride = (gradient + (shift or {}).get("w", 0)) * learning_rate * steps
         moved = (0.9 * weights["w"] + stride).astype(np.float32)
-        return LocalUpdate({"w": moved, "count": weights["count"] + np.int64(steps)}, 3, 0.5)
+        return LocalUpdate({"w": moved, "count": weights["count"] + np.int64(steps)}, 3, 0.5, {"w": gradient})
 
 
-def edge(folder: Path) -> tuple[Weights, Ledger]:
+def edge(folder: Path, strategy: Strategy = FEDAVG) -> tuple[Weights, Ledger]:
     """Federate as stage II does: the road's views are booked before the rounds."""
     book = Ledger(Budget(1.0, 0.0))
     book.enter(ROAD)
-    federating = FederationCheckpoints(OBJECTS, folder, book, lambda done, total, note="": None)
+    states = {"edge": FederationState()}
+    federating = FederationCheckpoints(OBJECTS, folder, book, lambda done, total, note="": None, states, str(strategy))
     start, done = federating.resume(START)
     clients = {f"grid/cav{i}": Walk() for i in range(2)}
     account = Account(book, "edge", "t", "wireless")
-    federate(clients, start, SCHEDULE, account, done=done, on_round=federating.make_saver(SCHEDULE.rounds))
+    keep = federating.make_saver(SCHEDULE.rounds)
+    federate(clients, start, SCHEDULE, account, strategy=strategy, state=states["edge"], done=done, on_round=keep)
+    assert [record.round for record in states["edge"].records] == [1, 2, 3]
     assert len(federating.losses) == SCHEDULE.rounds
     return load_file(round_path(folder, SCHEDULE.rounds)), book
 
 
-def cloud(folder: Path) -> tuple[Weights, Ledger]:
+def cloud(folder: Path, strategy: Strategy = FEDAVG) -> tuple[Weights, Ledger]:
     """Federate as stage III does: on top of what was spent before, edge servers nested below the cloud."""
     book = Ledger(Budget(10.0, 1.0), [STAGE_ONE, ROAD])
-    federating = FederationCheckpoints(OBJECTS, folder, book, lambda done, total, note="": None)
+    states = {name: FederationState() for name in ("cloud", "grid", "ring")}
+    federating = FederationCheckpoints(OBJECTS, folder, book, lambda done, total, note="": None, states, str(strategy))
     start, done = federating.resume(START)
     servers: dict[str, Trainable] = {}
     for town, own in (("grid", 1.0), ("ring", -1.0)):
         vehicles = {f"{town}/cav{i}": Walk() for i in range(2)}
         model = {"w": np.full(3, own, dtype=np.float32), "count": START["count"]}
-        servers[town] = EdgeServer(vehicles, 2, Account(book, "cloud", "t", "wireless"), model, cloud_rounds_done=done)
+        wireless, own_state = Account(book, "cloud", "t", "wireless"), states[town]
+        servers[town] = EdgeServer(vehicles, 2, wireless, model, done, strategy, state=own_state)
     account = Account(book, "cloud", "t", "wireline")
-    federate(servers, start, SCHEDULE, account, done=done, on_round=federating.make_saver(SCHEDULE.rounds))
+    how: Any = {"strategy": of_servers(strategy), "state": states["cloud"]}
+    federate(servers, start, SCHEDULE, account, **how, done=done, on_round=federating.make_saver(SCHEDULE.rounds))
     return load_file(round_path(folder, SCHEDULE.rounds)), book
 
 
@@ -82,15 +96,19 @@ class Killed(BaseException):
     pass
 
 
+@pytest.mark.parametrize("strategy", [FEDAVG, FedAdam(), Scaffold()], ids=["fedavg", "fedadam", "scaffold"])
 @pytest.mark.parametrize("stage", [edge, cloud])
 def test_a_federation_killed_at_any_write_ends_the_same(
-    stage: Callable[[Path], tuple[Weights, Ledger]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: Callable[[Path, Strategy], tuple[Weights, Ledger]],
+    strategy: Strategy,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def fresh(name: str) -> Path:
         (tmp_path / name).mkdir()
         return tmp_path / name
 
-    weights, book = stage(fresh("whole"))
+    weights, book = stage(fresh("whole"), strategy)
     writes, last = 0, 0
 
     def dying(write: Callable[..., None]) -> Callable[..., None]:
@@ -107,16 +125,22 @@ def test_a_federation_killed_at_any_write_ends_the_same(
         patched.setattr(stages, "write_bytes", dying(stages.write_bytes))
         patched.setattr(stages, "write_json", dying(stages.write_json))
         patched.setattr(Ledger, "save", dying(Ledger.save))
-        stage(fresh("counted"))
+        stage(fresh("counted"), strategy)
         total = writes
         for last in range(1, total + 1):
             folder, writes = fresh(str(last)), 0
             with pytest.raises(Killed):
-                stage(folder)
-            found, resumed = stage(folder)
+                stage(folder, strategy)
+            found, resumed = stage(folder, strategy)
             assert all(np.array_equal(found[name], weights[name]) for name in weights), last
             assert resumed.entries == book.entries, last
     assert total >= 3 * SCHEDULE.rounds
+
+
+def test_a_checkpoint_of_another_strategy_is_refused(tmp_path: Path) -> None:
+    edge(tmp_path)
+    with pytest.raises(InputError, match=r"a checkpoint of FedAvg\(\), which FedAdam\(.*\) cannot go on with"):
+        edge(tmp_path, FedAdam())
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ record, the id of a message, and the serialised form of a record.
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 
+import numpy as np
 from flwr.app import ConfigRecord, Context, Error, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 from flwr.common.serde import recorddict_to_proto
@@ -14,12 +15,16 @@ from flwr.serverapp import Grid
 from flwr.supercore.run import Run
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.records import ARRAYS, LOSS, METRICS, SAMPLES, to_arrays
-from flcav.federation.trainable import Weights
+from flcav.federation.encoding import encode
+from flcav.federation.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, to_arrays, to_weights
+from flcav.federation.rules import Rules
+from flcav.federation.trainable import LocalUpdate, Weights, learned_names
+from flcav.federation.upload import Upload
 from flcav.network.ledger import BudgetExceeded
 
 RUN_ID, SERVER_NODE, CLIENT_APP_RAISED = 1, 1, 2  # the last is Flower's error code of an exception in a client app
 FIRST_NODE = 2  # id of the first client
+WHOLE = Upload()  # whole updates
 
 
 def wire_bytes(content: RecordDict) -> int:
@@ -27,9 +32,17 @@ def wire_bytes(content: RecordDict) -> int:
     return recorddict_to_proto(content).ByteSize()
 
 
-def update_bytes(weights: Weights) -> int:
-    """Return the size of a client's update with these weights in Flower's serialisation [bytes]."""
-    return wire_bytes(RecordDict({ARRAYS: to_arrays(weights), METRICS: MetricRecord({SAMPLES: 0, LOSS: 0.0})}))
+def update_bytes(weights: Weights, upload: Upload = WHOLE, *, exchanging: bool = False) -> int:
+    """Return the size of a client's update with these weights in Flower's serialisation [bytes].
+
+    `exchanging`: with an array beside each that is learned, as a strategy's clients send them that `Exchanges` arrays.
+    """
+    sent, _ = encode(LocalUpdate(weights, 0, 0.0), weights, Rules(upload=upload), {}, 0)
+    records = {ARRAYS: to_arrays(sent.weights), METRICS: MetricRecord({SAMPLES: 0, LOSS: 0.0})}
+    if exchanging:
+        names = [name for name in learned_names(weights) if name in upload.exchanged(weights)]
+        records[EXTRA] = to_arrays({name: weights[name] for name in names})
+    return wire_bytes(RecordDict(records))
 
 
 @contextlib.contextmanager
@@ -48,12 +61,18 @@ def _server_identity() -> Iterator[None]:
 class EmbeddedGrid(Grid):
     """Flower grid whose nodes are in this process; a context manager."""
 
-    def __init__(self, app: ClientApp, nodes: Mapping[str, Mapping[str, str]]) -> None:
-        """Register a node for each name in `nodes`, in their order; the values are the node configs."""
+    def __init__(
+        self, app: ClientApp, nodes: Mapping[str, Mapping[str, str]], states: Mapping[str, Mapping[str, Weights]] = {}
+    ) -> None:
+        """Register a node for each name in `nodes`, in their order; the values are the node configs.
+
+        `states` are the arrays that nodes have kept from earlier rounds, by node and record.
+        """
         self._app = app
         self.names = dict(enumerate(nodes, FIRST_NODE))
         self._contexts = {
-            node: Context(RUN_ID, node, dict(nodes[name]), RecordDict(), {}) for node, name in self.names.items()
+            node: Context(RUN_ID, node, dict(nodes[name]), _node_state(states.get(name, {})), {})
+            for node, name in self.names.items()
         }
         self._replies: dict[str, Message] = {}
         self._sent = 0
@@ -66,6 +85,15 @@ class EmbeddedGrid(Grid):
 
     def __exit__(self, *exception: object) -> None:
         self._identity.__exit__(None, None, None)
+
+    def read_states(self, keys: Iterable[str]) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+        """Return the arrays that nodes have under these records of their state, by node and record."""
+        found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
+        for node, context in self._contexts.items():
+            for key in keys:
+                if key in context.state.array_records:
+                    found.setdefault(self.names[node], {})[key] = to_weights(context.state.array_records[key])
+        return found
 
     def set_run(self, run: Run) -> None:
         """Set Flower's record of the run."""
@@ -115,6 +143,10 @@ class EmbeddedGrid(Grid):
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
         """Deliver messages one after another and return their replies."""
         return [reply for message in messages for reply in self.pull_messages(self.push_messages([message]))]
+
+
+def _node_state(arrays: Mapping[str, Weights]) -> RecordDict:
+    return RecordDict({key: to_arrays(weights) for key, weights in arrays.items()})
 
 
 def _copied(record):

@@ -1,23 +1,82 @@
-"""Aggregation strategies by name: federated averaging, or a user's own."""
+"""Strategies by name: how clients' updates are combined, and how clients correct their training; or a user's own."""
 
-from dataclasses import is_dataclass
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
 
-from flcav.config import InputError
+from pydantic import TypeAdapter, ValidationError
+
+from flcav.config import InputError, shorten
+from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavg import FedAvg
-from flcav.federation.strategies.strategy import Strategy
+from flcav.federation.strategies.fedavgm import FedAvgM
+from flcav.federation.strategies.fedprox import FedProx
+from flcav.federation.strategies.fedyogi import FedYogi
+from flcav.federation.strategies.krum import Krum
+from flcav.federation.strategies.median import Median
+from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
+from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.plugins import load_named
 
-STRATEGIES: dict[str, type[Strategy]] = {"fedavg": FedAvg}
+STRATEGIES: dict[str, type[Strategy]] = {
+    "fedavg": FedAvg,
+    "fedprox": FedProx,
+    "fedavgm": FedAvgM,
+    "fedadam": FedAdam,
+    "fedyogi": FedYogi,
+    "scaffold": Scaffold,
+    "median": Median,
+    "trimmed-mean": TrimmedMean,
+    "krum": Krum,
+}
 FEDAVG = FedAvg()  # the default everywhere
 
+Spec = str | Mapping[str, Mapping[str, Any]]  # a name, or a name with settings: {fedprox: {mu: 0.1}}
 
-def strategy_named(name: str) -> Strategy:
-    """Return the strategy of that name with its default settings: one of `STRATEGIES`, or a user's own, `module:NAME`.
 
-    Raises `InputError` for an unknown name, where the user's module cannot be imported or has no strategy of that name,
-    and where the strategy is no dataclass.
+def strategy_named(spec: Spec) -> Strategy:
+    """Return a strategy by its name: one of `STRATEGIES`, or a user's own, `module:NAME`.
+
+    Settings that `spec` does not give are the strategy's defaults. Raises `InputError` for an unknown name, where the
+    user's module cannot be imported or has no strategy of that name, where the strategy is no dataclass, for a setting
+    that it does not have, and for one with an impossible value.
+
+    >>> from flcav.federation import strategy_named
+    >>> strategy_named({"fedavgm": {"momentum": 0.5}})
+    FedAvgM(rate=1.0, momentum=0.5)
     """
+    if not isinstance(spec, str) and len(spec) != 1:
+        raise InputError(f"strategy {shorten(dict(spec))}: one name is wanted, with its settings")
+    name, settings = (spec, {}) if isinstance(spec, str) else next(iter(spec.items()))
     found: Strategy = load_named("strategy", name, STRATEGIES, Strategy)
     if not is_dataclass(found):
         raise InputError(f"strategy '{name}': is no dataclass, so that its settings are not known")
-    return found
+    if not settings:
+        return found
+    known = [field.name for field in fields(found)]
+    if odd := [setting for setting in settings if setting not in known]:
+        raise InputError(f"strategy '{name}': has no setting '{odd[0]}'; it has {', '.join(known) or 'none'}")
+    try:
+        return TypeAdapter(type(found)).validate_python({**vars(found), **settings})
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"strategy '{name}': {field} = {shorten(first['input'])}: {first['msg']}") from None
+
+
+def exchanges_more(spec: Spec) -> bool:
+    """Return whether clients of one of `STRATEGIES` send an array beside each of the weights, as SCAFFOLD's do.
+
+    A user's own strategy is not imported to find out.
+    """
+    name = spec if isinstance(spec, str) else next(iter(spec), "")
+    return name in STRATEGIES and issubclass(STRATEGIES[name], Exchanges)
+
+
+def of_servers(strategy: Strategy) -> Strategy:
+    """Return the strategy among edge servers, which federate with the cloud, where vehicles have `strategy`.
+
+    It is the same one, unless it corrects the gradients of local steps: edge servers take none, and FedAvg is used.
+    """
+    return FEDAVG if isinstance(strategy, Corrects) else strategy

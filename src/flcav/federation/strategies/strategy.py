@@ -1,16 +1,17 @@
-"""The interface of an aggregation strategy."""
+"""The interfaces of a strategy: aggregation, and where it has them, state between rounds and a part on the clients."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-from flcav.federation.trainable import Update, Weights
+from flcav.federation.trainable import Correction, LocalUpdate, Update, Weights
 
 
 class Strategy(Protocol):
     """Aggregation of the clients' updates into the weights of the next round.
 
-    A strategy is a frozen dataclass: its fields are its settings, JSON values with defaults. It has no state between
-    rounds, so that a resumed federation ends as an uninterrupted one, and it draws no random numbers.
+    A strategy is a frozen dataclass: its fields are its settings, JSON values with defaults. It draws no random
+    numbers. State between rounds is handed to it and returned by it (`Stateful`), so that a resumed federation ends as
+    an uninterrupted one.
     """
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
@@ -18,4 +19,52 @@ class Strategy(Protocol):
 
         Names, shapes and types of the arrays must be those of `start`.
         """
+        ...
+
+
+@runtime_checkable
+class Stateful(Protocol):
+    """A strategy with state between rounds: arrays by name, which the server keeps and which are checkpointed."""
+
+    def step(
+        self, start: Weights, updates: Sequence[LocalUpdate], state: Weights, clients: int
+    ) -> tuple[Weights, Weights]:
+        """Return what `combine` does, and the state after the round; `state` is empty before the first one.
+
+        `clients` is the number of clients of the federation, whether they take part in the round or not.
+        """
+        ...
+
+
+@runtime_checkable
+class Corrects(Protocol):
+    """A strategy whose clients correct the gradients of their local steps."""
+
+    def correct(self, sent: Weights, own: Weights) -> Correction:
+        """Return a client's correction in a round, from what the server sent and from the client's own state.
+
+        Both are empty unless the strategy `Exchanges` arrays.
+        """
+        ...
+
+
+@runtime_checkable
+class Exchanges(Protocol):
+    """A strategy that exchanges further arrays beside the weights, and whose clients have state between rounds."""
+
+    def send(self, state: Weights) -> Weights:
+        """Return what the server sends to clients beside the weights, from its state."""
+        ...
+
+    def report(self, update: LocalUpdate, sent: Weights, own: Weights) -> tuple[Weights, Weights]:
+        """Return what a client sends beside its update, and its state after the round; `own` is empty at first."""
+        ...
+
+
+@runtime_checkable
+class Robust(Protocol):
+    """A strategy that compares the updates with each other, and so needs each of them as it was sent."""
+
+    def check_clients(self, clients: int) -> None:
+        """Raise `InputError` where the strategy cannot combine the updates of so few clients."""
         ...

@@ -23,6 +23,7 @@ from flcav.seeds import stream
 
 CLIP_NORM = 10.0  # largest norm of the gradient
 Watch = Callable[[int, Mapping[str, float]], None]  # called with the number of steps taken and scalars by name
+Correct = Callable[[nn.Module], None]  # called before each step, to change the gradients of the network's parameters
 
 
 def constant(done: float) -> float:
@@ -97,13 +98,15 @@ def train(
     validation: Validation | None = None,
     watch: Watch = _unwatched,
     progress: Report = ignore_progress,
+    correct: Correct | None = None,
 ) -> TrainingHistory:
     """Train `network` in place for `steps` optimiser steps; hyperparameters default to `task.practice`.
 
     Each epoch goes through the samples in a new random order. With the `patience` of `validation`, training may stop
     early, and the network gets the weights of the best validation. With `checkpointing`, an interrupted run is resumed
-    from its file and ends with the same weights. `watch` receives loss, learning rate and validation score. Raises
-    `InputError` without samples, for an unknown schedule, and if the checkpoint is of another run.
+    from its file and ends with the same weights. `watch` receives loss, learning rate and validation score; `correct`
+    changes the gradients before they are clipped. Raises `InputError` without samples, for an unknown schedule, and if
+    the checkpoint is of another run.
     """
     batch = task.practice.batch if batch is None else batch
     learning_rate = task.practice.learning_rate if learning_rate is None else learning_rate
@@ -130,7 +133,7 @@ def train(
             task.draw(samples, int(index), config, stream(seed, "augment", number, place))
             for place, index in enumerate(order[number])
         ]
-        done.losses.append(step(task, network, optimizer, drawn))
+        done.losses.append(step(task, network, optimizer, drawn, correct))
         watch(number + 1, {"loss": done.losses[-1], "learning rate": rate})
         if validation and (number + 1) % validation.every == 0:
             _validate(validation, network, done)
@@ -153,10 +156,11 @@ def train_steps(
     learning_rate: float,
     seed: int,
     watch: Watch = _unwatched,
+    correct: Correct | None = None,
 ) -> float:
     """Train `network` in place at a constant learning rate, as a federated client does.
 
-    Returns the mean loss, 0 for 0 steps; raises as `train` does. `watch` is that of `train`.
+    Returns the mean loss, 0 for 0 steps; raises as `train` does. `watch` and `correct` are those of `train`.
     """
     history = train(
         task,
@@ -168,6 +172,7 @@ def train_steps(
         schedule="constant",
         seed=seed,
         watch=watch,
+        correct=correct,
     )
     return float(history.losses.mean()) if steps else 0.0
 
@@ -182,11 +187,17 @@ def step(
     network: NetworkT,
     optimizer: torch.optim.Optimizer,
     samples: Sequence[SampleT],
+    correct: Correct | None = None,
 ) -> float:
-    """Take one optimiser step on a batch, with the gradient's norm clipped to `CLIP_NORM`, and return the loss."""
+    """Take one optimiser step on a batch, with the gradient's norm clipped to `CLIP_NORM`, and return the loss.
+
+    `correct` changes the gradient before it is clipped.
+    """
     loss = task.loss(network, samples)
     optimizer.zero_grad()
     loss.backward()
+    if correct is not None:
+        correct(network)
     torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)
     optimizer.step()
     return float(loss.detach())

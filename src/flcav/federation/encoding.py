@@ -1,0 +1,53 @@
+"""A client's update as the arrays of its message, and back: named layers, clipping, local noise, compression."""
+
+from flcav.federation.privacy import add_noise, clip_change
+from flcav.federation.rules import Rules
+from flcav.federation.trainable import LocalUpdate, Update, Weights, learned_names
+from flcav.federation.upload import VALUES, Arrays, add, compress, decompress, subtract
+from flcav.seeds import derive_seed, stream
+
+
+def is_changed(rules: Rules) -> bool:
+    """Return whether the arrays of a message are changes of weights; otherwise they are weights."""
+    return rules.upload.compression != "none" or _is_local(rules)
+
+
+def encode(update: Update, start: Weights, rules: Rules, residual: Weights, seed: int) -> tuple[LocalUpdate, Arrays]:
+    """Return an update as it is sent, and what the client keeps for the next round.
+
+    `start` are the weights that the round began with, `residual` is what was kept in the last one, `seed` that of noise
+    and rounding. Under local privacy the number of samples, the loss and all that is not learned stay with the client.
+    """
+    upload, weights = rules.upload, update.weights
+    names, learned = upload.exchanged(start), set(learned_names(start))
+    if not is_changed(rules):
+        return LocalUpdate({name: weights[name] for name in names}, update.samples, update.loss), {}
+    change = subtract(weights, start, [name for name in names if name in learned])
+    if rules.privacy is not None and _is_local(rules):
+        privacy = rules.privacy
+        change = add_noise(clip_change(change, privacy.clip), privacy.noise * privacy.clip, stream(seed, "noise"))
+    sent, kept = compress(upload, change, residual.get(VALUES), derive_seed(seed, "rounding"))
+    if _is_local(rules):
+        return LocalUpdate(sent, 1, 0.0), kept
+    rest = {name: weights[name] for name in names if name not in learned}
+    return LocalUpdate({**sent, **rest}, update.samples, update.loss), kept
+
+
+def decode(sent: Weights, start: Weights, rules: Rules) -> Weights:
+    """Return the weights of a client after its local training, as far as its message tells; otherwise those of `start`.
+
+    Raises KeyError, IndexError or ValueError where the arrays are not those of `encode`.
+    """
+    names, learned = rules.upload.exchanged(start), set(learned_names(start))
+    if not is_changed(rules):
+        if odd := sorted(set(sent) ^ set(names)):
+            raise ValueError(f"an array '{odd[0]}' that is missing or unknown")
+        return {name: sent.get(name, array) for name, array in start.items()}
+    like = {name: start[name] for name in names if name in learned}
+    weights = add(start, decompress(rules.upload, sent, like))
+    rest = () if _is_local(rules) else [name for name in names if name not in learned]
+    return weights | {name: sent[name] for name in rest}
+
+
+def _is_local(rules: Rules) -> bool:
+    return rules.privacy is not None and rules.privacy.where == "local"

@@ -1,0 +1,113 @@
+"""Client selection: which clients take part in a round, and with what probability.
+
+Each round draws from a stream of its own, so that a resumed federation draws as an uninterrupted one.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from flcav.config import Config, InputError
+from flcav.seeds import stream
+
+Rule = Literal["all", "uniform", "poisson", "round-robin", "importance", "deadline"]
+
+NEEDED: Mapping[Rule, str | None] = {  # the field that a rule needs, which others do not take
+    "all": None,
+    "uniform": "clients",
+    "poisson": "probability",
+    "round-robin": "clients",
+    "importance": "clients",
+    "deadline": "deadline_s",
+}
+
+
+class Selection(Config):
+    """Selection of the clients of a round.
+
+    all: every client. uniform: `clients` of them, drawn without replacement. poisson: each by itself with
+    `probability`. round-robin: `clients` of them in turn. importance: `clients` of them in the mean, each by itself
+    with a probability that grows with the norm of its update, which all train for and report (Chen et al., TMLR 2022).
+    deadline: those whose predicted round time `seconds` is at most `deadline_s` (Nishio and Yonetani, ICC 2019, with
+    the bound on the time of a client instead of their sum); clients that `seconds` does not name are in time.
+    """
+
+    rule: Rule = "all"
+    clients: int | None = Field(default=None, ge=1, le=10**6)  # per round
+    probability: float | None = Field(default=None, gt=0, le=1)  # that a client takes part in a round
+    deadline_s: float | None = Field(default=None, gt=0)
+    seconds: Mapping[str, float] = {}  # predicted time of a round, by client
+
+    @model_validator(mode="after")
+    def _fields_of_the_rule(self) -> Self:
+        needed = NEEDED[self.rule]
+        for name in ("clients", "probability", "deadline_s"):
+            if (getattr(self, name) is not None) != (name == needed):
+                raise ValueError(f"the rule {self.rule} {'needs' if name == needed else 'takes no'} '{name}'")
+        if self.seconds and self.rule != "deadline":
+            raise ValueError(f"the rule {self.rule} takes no 'seconds'")
+        return self
+
+    def check_clients(self, names: Sequence[str]) -> None:
+        """Raise `InputError` where these clients cannot be selected so."""
+        if self.clients is not None and self.clients > len(names):
+            raise InputError(f"selection: {self.clients} clients are wanted in a round, and there are {len(names)}")
+        if self.rule == "deadline" and not self.choose(names, 1, 0):
+            raise InputError(f"selection: no client is predicted to end a round within {self.deadline_s:g} s")
+
+    def choose(self, names: Sequence[str], round_: int, seed: int) -> list[str]:
+        """Return the clients of round `round_` (from 1) in their order; of importance all, as each reports its norm."""
+        count, rng = self.clients or 0, stream(seed, "selection")
+        match self.rule:
+            case "uniform":
+                chosen = set(rng.permutation(len(names))[:count].tolist())
+            case "poisson":
+                assert self.probability is not None
+                chosen = set(np.flatnonzero(rng.random(len(names)) < self.probability).tolist())
+            case "round-robin":
+                chosen = {((round_ - 1) * count + place) % len(names) for place in range(count)}
+            case "deadline":
+                assert self.deadline_s is not None
+                chosen = {i for i, name in enumerate(names) if self.seconds.get(name, 0.0) <= self.deadline_s}
+            case _:
+                chosen = set(range(len(names)))
+        return [name for i, name in enumerate(names) if i in chosen]
+
+    def draw(self, norms: Mapping[str, float], seed: int) -> dict[str, float]:
+        """Return the clients that importance selection draws, with the probability of each.
+
+        `norms` are the norms of the clients' updates times their shares of all samples.
+        """
+        assert self.clients is not None
+        probabilities = optimal_probabilities(np.array([*norms.values()]), self.clients)
+        drawn = stream(seed, "importance").random(len(norms)) < probabilities
+        return {name: float(p) for name, p, taken in zip(norms, probabilities, drawn, strict=True) if taken}
+
+
+def optimal_probabilities(norms: NDArray[np.float64], expected: int) -> NDArray[np.float64]:
+    """Return each client's probability (clients,) of taking part, for the least variance of the unbiased mean.
+
+    norms: (clients,) weighted norms of updates. They sum to at most `expected`: p_i = (m + l - n) u_i / (u_1 + ... +
+    u_l) for the l smallest norms, and 1 for the others, with the largest l for which none is above 1 (Chen, Horváth and
+    Richtárik, "Optimal Client Sampling for Federated Learning", TMLR 2022, equation 7). Where no norm is above 0, all
+    have the same probability.
+    """
+    count = len(norms)
+    if expected >= count:
+        return np.ones(count)
+    if not (norms > 0).any():
+        return np.full(count, expected / count)
+    order = np.argsort(norms, kind="stable")
+    total = np.cumsum(norms[order])
+    for small in range(count, 0, -1):
+        share = expected + small - count
+        if share > 0 and share * norms[order[small - 1]] <= total[small - 1]:
+            break
+    else:
+        raise AssertionError("the smallest norm alone is at most itself")
+    found = np.ones(count)
+    found[order[:small]] = share * norms[order[:small]] / total[small - 1] if total[small - 1] > 0 else 0.0
+    return found

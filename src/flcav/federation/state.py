@@ -1,0 +1,54 @@
+"""State of a federation between rounds, as arrays for a checkpoint, and the record of each round."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Arrays = dict[str, NDArray[np.number]]  # by name
+
+SERVER, CLIENT = "server", "client"
+
+
+@dataclass(frozen=True)
+class RoundRecord:
+    """One round: whose updates were combined, and who failed."""
+
+    round: int  # from 1
+    clients: tuple[str, ...]  # whose updates were combined, by name
+    failed: Mapping[str, str] = field(default_factory=dict)  # by client what was wrong
+    epsilon: float | None = None  # of differential privacy, of all rounds so far; None: without noise
+
+
+@dataclass
+class FederationState:
+    """State of a federation after a round: what server and clients keep for the next one, and the rounds' records.
+
+    In a simulation it is in one place, so that a checkpoint holds all of it. Clients keep theirs to themselves.
+    """
+
+    server: Arrays = field(default_factory=dict)
+    clients: dict[str, dict[str, Arrays]] = field(default_factory=dict)  # by client and kind
+    records: list[RoundRecord] = field(default_factory=list)
+
+    def to_arrays(self) -> Arrays:
+        """Return server's and clients' arrays in one mapping, for a safetensors file."""
+        found = {f"{SERVER}|{name}": array for name, array in self.server.items()}
+        for client, kinds in self.clients.items():
+            for kind, arrays in kinds.items():
+                found |= {f"{CLIENT}|{client}|{kind}|{name}": array for name, array in arrays.items()}
+        return found
+
+    def restore(self, arrays: Mapping[str, NDArray[np.number]], records: list[dict[str, Any]]) -> None:
+        """Set the state, in place, to what `to_arrays` returned and to the fields of the records."""
+        self.server, self.clients = {}, {}
+        for key, array in arrays.items():
+            owner, _, rest = key.partition("|")
+            if owner == SERVER:
+                self.server[rest] = array
+            else:
+                client, kind, name = rest.split("|", 2)
+                self.clients.setdefault(client, {}).setdefault(kind, {})[name] = array
+        self.records = [replace(RoundRecord(**record), clients=tuple(record["clients"])) for record in records]

@@ -1,0 +1,47 @@
+"""Krum and multi-Krum: the updates nearest to their neighbours (Blanchard et al., NeurIPS 2017, section 4)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.config import InputError
+from flcav.federation.strategies.fedavg import average
+from flcav.federation.trainable import Update, Weights, learned_names
+
+
+@dataclass(frozen=True)
+class Krum:
+    """Krum: of n updates the one with the least sum of squared distances to its n - byzantine - 2 nearest others.
+
+    With `kept` above 1 it is multi-Krum: the mean, by samples, of the `kept` updates with the least sums.
+    """
+
+    byzantine: Annotated[int, Field(ge=0, le=10**6)] = 1  # clients that it is to withstand
+    kept: Annotated[int, Field(ge=1, le=10**6)] = 1
+
+    def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
+        """Return the weights of the chosen update, or the mean of the chosen ones; raises as `check_clients` does."""
+        self.check_clients(len(updates))
+        names = learned_names(start)
+        flat = np.stack([_flatten(update.weights, names) for update in updates])
+        near = len(updates) - self.byzantine - 2
+        scores = [np.sort(((flat - own) ** 2).sum(axis=1))[1 : near + 1].sum() for own in flat]
+        chosen = [updates[i] for i in np.sort(np.argsort(scores, kind="stable")[: self.kept])]
+        return average([update.weights for update in chosen], [update.samples for update in chosen])
+
+    def check_clients(self, clients: int) -> None:
+        """Raise `InputError` unless clients > 2 byzantine + 2, as the paper's guarantee asks, and `kept` <= clients."""
+        least = max(2 * self.byzantine + 3, self.kept)
+        if clients < least:
+            raise InputError(
+                f"krum: {least} clients or more are wanted for byzantine = {self.byzantine} and kept = {self.kept}, "
+                f"and there are {clients}"
+            )
+
+
+def _flatten(weights: Weights, names: Sequence[str]) -> NDArray[np.float64]:
+    return np.concatenate([weights[name].astype(np.float64).ravel() for name in names])

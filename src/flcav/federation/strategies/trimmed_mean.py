@@ -1,0 +1,34 @@
+"""Coordinate-wise trimmed mean of the clients' weights (Yin et al., ICML 2018, option II)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.config import InputError
+from flcav.federation.strategies.median import combine_coordinates
+from flcav.federation.trainable import Update, Weights
+
+
+@dataclass(frozen=True)
+class TrimmedMean:
+    """Mean without the largest and the smallest values of each coordinate. Samples do not count."""
+
+    fraction: Annotated[float, Field(ge=0, lt=0.5)] = 0.2  # of the clients that is left out at either end, rounded down
+
+    def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
+        """Return the trimmed mean of the updates' weights, coordinate by coordinate."""
+        out = int(self.fraction * len(updates))
+
+        def trimmed(stacked: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.sort(stacked, axis=0)[out : len(stacked) - out].mean(axis=0)
+
+        return combine_coordinates(updates, trimmed)
+
+    def check_clients(self, clients: int) -> None:
+        """Raise `InputError` where the fraction of so few clients is less than one of them."""
+        if self.fraction and int(self.fraction * clients) == 0:
+            raise InputError(f"trimmed-mean: a fraction of {self.fraction:g} of {clients} clients leaves nobody out")

@@ -1,0 +1,120 @@
+"""What a client's update is sent as: named layers alone, and their changes in fewer bits or fewer coordinates.
+
+Nothing but arrays crosses the link, so that an update's bytes in the ledger are those of its serialised message.
+"""
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.config import Config, InputError
+from flcav.federation.trainable import Weights, learned_names
+
+Arrays = dict[str, NDArray[np.number]]  # by name
+INDICES, VALUES, SCALES = "#indices", "#values", "#scales"  # arrays of a compressed change; no parameter is called so
+LEVELS = 127  # of int8, on either side of 0
+
+
+class Upload(Config):
+    """Form of an update: `layers` named by patterns alone, and a `compression` of their change in the round.
+
+    fp16: half precision. int8: a scale per array and stochastic rounding to 8 bits (Alistarh et al., NeurIPS 2017,
+    with the largest magnitude for the norm). top-k: the `fraction` of the coordinates that changed most; what is left
+    out is added to the change of the next round (Stich et al., NeurIPS 2018; Karimireddy et al., ICML 2019). Statistics
+    of batch normalisation and integers are sent as they are.
+    """
+
+    layers: tuple[Annotated[str, Field(min_length=1)], ...] = ()  # as in `head.*`; default: all
+    compression: Literal["none", "fp16", "int8", "top-k"] = "none"
+    fraction: float = Field(default=0.01, gt=0, le=1)  # of top-k
+    error_feedback: bool = True  # of top-k: what was left out is kept for the next round
+
+    def check_layers(self, weights: Weights) -> None:
+        """Raise `InputError` where a pattern matches no array, or all of them together none that is learned."""
+        for layer in self.layers:
+            if not any(fnmatchcase(name, layer) for name in weights):
+                raise InputError(
+                    f"layers: '{layer}' matches none of {len(weights)} arrays, such as '{next(iter(weights))}'"
+                )
+        if not {*learned_names(weights)} & {*self.exchanged(weights)}:
+            raise InputError(f"layers {', '.join(self.layers)}: match no array that is learned")
+
+    def exchanged(self, weights: Weights) -> list[str]:
+        """Return the names of the arrays that are sent."""
+        if not self.layers:
+            return [*weights]
+        return [name for name in weights if any(fnmatchcase(name, layer) for layer in self.layers)]
+
+
+def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | None, seed: int) -> tuple[Arrays, Arrays]:
+    """Return a change of floating arrays as it is sent, and what is kept for the next round under `VALUES`.
+
+    residual: (coordinates,) what was left out before, None at first. `seed` is that of the rounding. What is kept is
+    empty unless something is left out.
+    """
+    match upload.compression:
+        case "fp16":
+            limit = float(np.finfo(np.float16).max)
+            return {name: np.clip(array, -limit, limit).astype(np.float16) for name, array in change.items()}, {}
+        case "int8":
+            rng, sent, scales = np.random.default_rng(seed), {}, []
+            for name, array in change.items():
+                scale = np.float32(np.abs(array).max(initial=0.0) / LEVELS)
+                levels = array / (scale or 1.0) + rng.random(array.shape)
+                sent[name] = np.clip(np.floor(levels), -LEVELS, LEVELS).astype(np.int8)
+                scales.append(scale)
+            return {**sent, SCALES: np.array(scales, np.float32)}, {}
+        case "top-k":
+            flat = np.concatenate([np.ravel(array).astype(np.float32) for array in change.values()])
+            if residual is not None:
+                flat = flat + residual
+            kept = max(1, round(upload.fraction * flat.size))
+            indices = np.sort(np.argsort(-np.abs(flat), kind="stable")[:kept])
+            sent = {INDICES: indices.astype(np.uint32), VALUES: flat[indices]}
+            flat[indices] = 0.0
+            return sent, {VALUES: flat} if upload.error_feedback else {}
+        case _:
+            return dict(change), {}
+
+
+def decompress(upload: Upload, sent: Weights, like: Weights) -> Arrays:
+    """Return the change of floating arrays that `compress` sent; `like` has their names, shapes and types.
+
+    Raises KeyError, IndexError or ValueError where `sent` is no such message.
+    """
+    if upload.compression != "top-k":
+        for name, array in like.items():
+            if sent[name].shape != array.shape:
+                raise ValueError(f"'{name}' has shape {sent[name].shape} instead of {array.shape}")
+    match upload.compression:
+        case "int8":
+            scales = dict(zip(like, sent[SCALES], strict=True))
+            return {name: (sent[name] * scales[name]).astype(array.dtype) for name, array in like.items()}
+        case "top-k":
+            flat = np.zeros(sum(array.size for array in like.values()), np.float32)
+            flat[sent[INDICES].astype(np.int64, casting="safe")] = sent[VALUES]
+            ends = np.cumsum([array.size for array in like.values()])[:-1]
+            parts = np.split(flat, ends)
+            return {
+                name: part.reshape(array.shape).astype(array.dtype)
+                for part, (name, array) in zip(parts, like.items(), strict=True)
+            }
+        case _:
+            return {name: sent[name].astype(array.dtype) for name, array in like.items()}
+
+
+def subtract(weights: Weights, start: Weights, names: Sequence[str]) -> Arrays:
+    """Return the change of the arrays `names` in a round, in their own types."""
+    return {name: (weights[name].astype(np.float64) - start[name]).astype(start[name].dtype) for name in names}
+
+
+def add(start: Weights, change: Mapping[str, NDArray[np.number]]) -> Arrays:
+    """Return the weights `start` with their `change` added to those arrays that it names."""
+    return {
+        name: (array.astype(np.float64) + change[name]).astype(array.dtype) if name in change else np.asarray(array)
+        for name, array in start.items()
+    }

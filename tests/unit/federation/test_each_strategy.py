@@ -1,0 +1,252 @@
+"""Each strategy against its paper's formula written out, or against Flower's own implementation."""
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
+from flwr.serverapp.strategy.multikrum import select_multikrum
+from regression import START, TRUTH, Regression, ledger, vehicles
+from scipy.stats import trim_mean
+
+from flcav.config import InputError
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.stages import EdgeServer, Schedule, check_federation, federate
+from flcav.federation.state import FederationState
+from flcav.federation.strategies import FEDAVG, STRATEGIES, of_servers, strategy_named
+from flcav.federation.strategies.fedadam import FedAdam
+from flcav.federation.strategies.fedavgm import FedAvgM
+from flcav.federation.strategies.fedprox import FedProx
+from flcav.federation.strategies.fedyogi import FedYogi
+from flcav.federation.strategies.krum import Krum
+from flcav.federation.strategies.median import Median
+from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.trimmed_mean import TrimmedMean
+from flcav.federation.trainable import LocalUpdate
+from flcav.seeds import derive_seed
+
+RATE, STEPS = 0.02, 5
+SCHEDULE = Schedule(rounds=4, steps=STEPS, learning_rate=RATE, final_learning_rate=RATE, seed=3)
+
+
+class Descent(Regression):
+    """Gradient descent in float64, which corrects its gradients and tells their mean."""
+
+    def train(self, weights, *, steps, learning_rate, seed, proximal=0.0, shift=None):
+        rng, w, seen = np.random.default_rng(seed), weights["w"], []
+        for _ in range(steps):
+            i = rng.integers(len(self.inputs))
+            seen.append(2 * (self.inputs[i] @ w - self.targets[i]) * self.inputs[i])
+            w = w - learning_rate * (seen[-1] + proximal * (w - weights["w"]) + (shift or {}).get("w", 0.0))
+        return LocalUpdate({"w": w, "count": weights["count"]}, len(self.inputs), 1.0, {"w": np.mean(seen, axis=0)})
+
+
+FIRST = {"w": np.array([0.3, 0.1, -0.2]), "count": START["count"]}
+CLIENTS = {name: Descent(each.inputs, each.targets) for name, each in vehicles("grid", 5).items()}
+
+
+def account() -> Account:
+    return Account(ledger(), "edge", "regression", "wireless")
+
+
+def run(strategy: Any, **how: Any) -> np.ndarray:
+    return federate(CLIENTS, FIRST, SCHEDULE, account(), strategy=strategy, **how).weights["w"]
+
+
+def plain_updates(w: np.ndarray, round_: int, proximal: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the clients' weights after local training, (clients, 3), and their numbers of samples."""
+    work, how = SCHEDULE.work(round_), {"steps": STEPS, "learning_rate": RATE}
+    ends = [
+        client.train({**FIRST, "w": w}, seed=derive_seed(work.seed, name), proximal=proximal, **how)
+        for name, client in CLIENTS.items()
+    ]
+    return np.array([end.weights["w"] for end in ends]), np.array([end.samples for end in ends])
+
+
+def mean_change(w: np.ndarray, round_: int) -> np.ndarray:
+    ends, samples = plain_updates(w, round_)
+    return samples @ ends / samples.sum() - w
+
+
+def test_fedprox_descends_the_proximal_objective():
+    w = FIRST["w"]
+    for round_ in range(1, 5):
+        ends, samples = plain_updates(w, round_, proximal=3.0)
+        w = samples @ ends / samples.sum()
+    np.testing.assert_allclose(run(FedProx(mu=3.0)), w, rtol=1e-12)
+    near, far = (np.linalg.norm(run(each) - FIRST["w"]) for each in (FedProx(mu=50.0), FedProx(mu=0.0)))
+    assert near < 0.5 * far
+    np.testing.assert_array_equal(run(FedProx(mu=0.0)), run(FEDAVG))
+
+
+def test_fedavgm_is_momentum_of_the_mean_change():
+    w, velocity = FIRST["w"], np.zeros(3)
+    for round_ in range(1, 5):
+        velocity = 0.7 * velocity + mean_change(w, round_)
+        w = w + 0.5 * velocity
+    np.testing.assert_allclose(run(FedAvgM(rate=0.5, momentum=0.7)), w, rtol=1e-12)
+    np.testing.assert_allclose(run(FedAvgM(rate=1.0, momentum=0.0)), run(FEDAVG), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [FedAdam, FedYogi])
+def test_adaptive_optimisers_are_algorithm_2_of_reddi_et_al(kind: Any):
+    rate, beta1, beta2, tau = 0.05, 0.8, 0.9, 0.02
+    w, m, v = FIRST["w"], np.zeros(3), np.full(3, tau**2)
+    for round_ in range(1, 5):
+        delta = mean_change(w, round_)
+        m = beta1 * m + (1 - beta1) * delta
+        for j in range(3):  # lines 11 and 12, coordinate by coordinate
+            if kind is FedYogi:
+                v[j] = v[j] - (1 - beta2) * delta[j] ** 2 * np.sign(v[j] - delta[j] ** 2)
+            else:
+                v[j] = beta2 * v[j] + (1 - beta2) * delta[j] ** 2
+        w = w + rate * m / (np.sqrt(v) + tau)
+    np.testing.assert_allclose(run(kind(rate, beta1, beta2, tau)), w, rtol=1e-12)
+
+
+def test_scaffold_is_algorithm_1_of_karimireddy_et_al_with_option_2():
+    x, c, own = FIRST["w"], np.zeros(3), {name: np.zeros(3) for name in CLIENTS}
+    for round_ in range(1, 5):
+        work, moves, changes = SCHEDULE.work(round_), [], []
+        for name, client in CLIENTS.items():
+            rng, y = np.random.default_rng(derive_seed(work.seed, name)), x
+            for _ in range(STEPS):
+                i = rng.integers(len(client.inputs))
+                gradient = 2 * (client.inputs[i] @ y - client.targets[i]) * client.inputs[i]
+                y = y - RATE * (gradient - own[name] + c)
+            after = own[name] - c + (x - y) / (STEPS * RATE)
+            moves.append(y - x)
+            changes.append(after - own[name])
+            own[name] = after
+        x, c = x + 1.5 * np.mean(moves, axis=0), c + np.sum(changes, axis=0) / len(CLIENTS)
+    state = FederationState()
+    np.testing.assert_allclose(run(Scaffold(rate=1.5), state=state), x, rtol=1e-9)
+    np.testing.assert_allclose(state.server["w"], c, rtol=1e-9)
+    np.testing.assert_allclose(state.clients["grid/cav3"]["own"]["w"], own["grid/cav3"], rtol=1e-9)
+
+
+def test_scaffold_sends_its_variates_beside_the_weights():
+    plain, controlled = account(), account()
+    federate(CLIENTS, FIRST, SCHEDULE, plain)
+    federate(CLIENTS, FIRST, SCHEDULE, controlled, strategy=Scaffold())
+    sizes = [[entry.bytes for entry in each.ledger.entries if entry.direction == "up"] for each in (plain, controlled)]
+    assert all(more - less > 3 * 8 for less, more in zip(*sizes, strict=True))
+
+
+def random_updates(clients: int, seed: int = 0) -> list[LocalUpdate]:
+    rng = np.random.default_rng(seed)
+    return [
+        LocalUpdate(
+            {"a": rng.normal(size=(4, 2)).astype(np.float32), "b": rng.normal(size=3), "n": np.array(i)},
+            int(rng.integers(1, 9)),
+            0.5,
+        )
+        for i in range(clients)
+    ]
+
+
+def test_median_and_trimmed_mean_go_coordinate_by_coordinate():
+    updates = random_updates(11)
+    for name in ("a", "b"):
+        stacked = np.stack([update.weights[name] for update in updates])
+        middle = np.sort(stacked, axis=0)[5]
+        np.testing.assert_array_equal(Median().combine(updates[0].weights, updates)[name], middle)
+        trimmed = TrimmedMean(0.3).combine(updates[0].weights, updates)[name]
+        np.testing.assert_allclose(trimmed, trim_mean(stacked.astype(float), 0.3, axis=0), rtol=1e-6)
+    assert Median().combine(updates[3].weights, updates)["n"] == 0
+
+
+@pytest.mark.parametrize("kept", [1, 3])
+def test_krum_chooses_whom_flower_chooses(kept: int):
+    for seed in range(20):
+        updates = random_updates(9, seed)
+        contents = [
+            RecordDict(
+                {
+                    "arrays": ArrayRecord({name: Array(update.weights[name].astype(float)) for name in ("a", "b")}),
+                    "metrics": MetricRecord({"place": place}),
+                }
+            )
+            for place, update in enumerate(updates)
+        ]
+        chosen = [
+            updates[int(cast(int, each.metric_records["metrics"]["place"]))]
+            for each in select_multikrum(contents, 2, kept)
+        ]
+        samples = [each.samples for each in chosen]
+        found = Krum(byzantine=2, kept=kept).combine(updates[0].weights, updates)
+        for name in ("a", "b"):
+            mean = np.average([each.weights[name] for each in chosen], axis=0, weights=samples)
+            np.testing.assert_allclose(found[name], mean, rtol=1e-5)
+
+
+class Byzantine(Descent):
+    """A client that lies about what it learned."""
+
+    lie = "none"
+
+    def train(self, weights, **how):
+        if self.lie == "labels":
+            return Descent(self.inputs, -self.targets).train(weights, **how)
+        update = super().train(weights, **how)
+        factor = {"sign": -4.0, "scaled": 100.0}[self.lie]
+        return replace(
+            update, weights={**update.weights, "w": weights["w"] + factor * (update.weights["w"] - weights["w"])}
+        )
+
+
+@pytest.mark.parametrize("lie", ["sign", "scaled", "labels"])
+def test_byzantine_clients_mislead_the_mean_and_not_the_robust_strategies(lie: str):
+    rng, clients = np.random.default_rng(1), {}
+    for i in range(10):
+        inputs = rng.normal(size=(30, 3))
+        clients[f"cav{i}"] = (Byzantine if i in (1, 4, 8) else Descent)(inputs, inputs @ TRUTH)
+        clients[f"cav{i}"].lie = lie
+    schedule = Schedule(rounds=15, steps=40, learning_rate=0.02, final_learning_rate=0.01, seed=1)
+
+    def error(strategy: Any) -> float:
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = federate(clients, FIRST, schedule, account(), strategy=strategy, rules=Rules(least_clients=1))
+        return float(np.linalg.norm(found.weights["w"] - TRUTH))
+
+    misled = error(FEDAVG)
+    assert misled > 0.3
+    for strategy in (Median(), TrimmedMean(0.3), Krum(byzantine=3), Krum(byzantine=3, kept=4)):
+        assert error(strategy) < 0.1 * misled, strategy
+
+
+def test_what_makes_no_sense_is_one_sentence():
+    plain = vehicles("grid", 3)
+    for strategy, rules, said in (
+        (FedProx(), Rules(), r"FedProx needs clients whose training takes 'proximal', and that of grid/cav0"),
+        (Scaffold(), Rules(), r"Scaffold needs clients whose training takes 'shift'"),
+        (Krum(byzantine=1), Rules(), r"krum: 5 clients or more are wanted for byzantine = 1 and kept = 1, .* are 3"),
+        (TrimmedMean(0.2), Rules(), r"trimmed-mean: a fraction of 0\.2 of 3 clients leaves nobody out"),
+        (FEDAVG, Rules(least_clients=4), r"least_clients: 4 are wanted in a round, and 3 take part"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check_federation(plain, strategy, rules)
+    for spec, said in (
+        ({"fedprox": {"mu": -1}}, r"strategy 'fedprox': mu = -1: Input should be greater than or equal to 0"),
+        ({"krum": {"mu": 1}}, r"strategy 'krum': has no setting 'mu'; it has byzantine, kept"),
+        ({"median": {"mu": 1}}, r"strategy 'median': has no setting 'mu'; it has none"),
+        ({"fedavg": {}, "krum": {}}, r"one name is wanted, with its settings"),
+    ):
+        with pytest.raises(InputError, match=said):
+            strategy_named(spec)
+
+
+def test_settings_are_by_name():
+    assert strategy_named({"fedadam": {"rate": 0.5}}) == FedAdam(rate=0.5)
+    assert all(strategy_named({name: {}}) == kind() for name, kind in STRATEGIES.items())
+
+
+def test_edge_servers_take_no_local_steps_to_correct():
+    assert of_servers(Scaffold()) == of_servers(FedProx()) == FEDAVG
+    assert of_servers(FedAdam()) == FedAdam()
+    server = EdgeServer(CLIENTS, 2, account(), FIRST, strategy=Scaffold())
+    after = federate({"grid": server}, FIRST, SCHEDULE, account(), strategy=of_servers(Scaffold()))
+    assert len(server.state.records) == 2 * SCHEDULE.rounds
+    assert np.linalg.norm(after.weights["w"] - TRUTH) < np.linalg.norm(FIRST["w"] - TRUTH)

@@ -1,0 +1,218 @@
+"""Differential privacy: norms after clipping, the noise that is added, and epsilon against another accountant."""
+
+import math
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from dp_accounting import GaussianDpEvent, NeighboringRelation, PoissonSampledDpEvent, pld
+from pydantic import ValidationError
+from regression import ledger
+from scipy.optimize import brentq
+from scipy.stats import norm
+
+from flcav.config import InputError
+from flcav.federation.privacy import (
+    Privacy,
+    account_epsilon,
+    affordable_rounds,
+    average_privately,
+    change_norm,
+    clip_change,
+    most_participations,
+)
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.selection import Selection
+from flcav.federation.stages import Schedule, check_federation, federate
+from flcav.federation.state import FederationState
+from flcav.federation.strategies import FEDAVG
+from flcav.federation.strategies.fedadam import FedAdam
+from flcav.federation.strategies.median import Median
+from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.trainable import LocalUpdate, Weights
+
+START = {
+    "w": np.zeros((300, 20), np.float32),
+    "b": np.ones(50, np.float32),
+    "norm.running_var": np.full(4, 2.0, np.float32),
+    "n": np.array(5),
+}
+SCHEDULE = Schedule(rounds=4, steps=1, learning_rate=0.1, final_learning_rate=0.1, seed=3)
+NAMES = [f"cav{i}" for i in range(10)]
+UNIFORM, POISSON = Selection(rule="uniform", clients=4), Selection(rule="poisson", probability=0.3)
+EVERY = Selection()
+
+
+class Stride:
+    """Always goes the same way, by a norm of its own."""
+
+    def __init__(self, length: float, samples: int = 3) -> None:
+        self.length, self.samples = length, samples
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        size = math.sqrt(START["w"].size + START["b"].size)
+        moved = {name: (weights[name] + self.length / size).astype(np.float32) for name in ("w", "b")}
+        return LocalUpdate(
+            {**moved, "norm.running_var": weights["norm.running_var"] + 1, "n": weights["n"]}, self.samples, 0.7
+        )
+
+
+def clients(length: float = 5.0) -> dict[str, Any]:
+    return {name: Stride(length, i + 1) for i, name in enumerate(NAMES)}
+
+
+def run(privacy: Privacy, selection: Selection = EVERY, **how: Any) -> tuple[Weights, FederationState]:
+    state, account = how.pop("state", FederationState()), Account(ledger(10.0), "edge", "stride", "wireless")
+    rules = Rules(privacy=privacy, selection=selection)
+    update = federate(how.pop("clients", clients()), START, SCHEDULE, account, rules=rules, state=state, **how)
+    return update.weights, state
+
+
+def test_clipping_bounds_the_norm_of_all_arrays_together():
+    rng = np.random.default_rng(0)
+    change = {"a": rng.normal(size=(30, 4)), "b": rng.normal(size=7)}
+    length = math.sqrt(sum(float((array**2).sum()) for array in change.values()))
+    assert change_norm(change) == pytest.approx(length)
+    clipped = clip_change(change, 0.5)
+    assert change_norm(clipped) == pytest.approx(0.5)
+    np.testing.assert_allclose(clipped["b"], change["b"] * 0.5 / length)
+    np.testing.assert_array_equal(clip_change(change, 2 * length)["a"], change["a"])
+    assert not clip_change({"a": np.zeros(3)}, 1.0)["a"].any()
+
+
+@pytest.mark.parametrize("where", ["central", "local"])
+def test_the_mean_has_the_noise_that_is_accounted_for(where: Any):
+    clip, noise, number = 0.2, 3.0, len(NAMES)
+    found, _ = run(Privacy(where=where, clip=clip, noise=noise))
+    rounds, size = SCHEDULE.rounds, math.sqrt(START["w"].size + START["b"].size)
+    deviation = noise * clip * (1 / number if where == "central" else 1 / math.sqrt(number)) * math.sqrt(rounds)
+    change = found["w"] - rounds * clip / size
+    assert np.std(change) == pytest.approx(deviation, rel=0.03)
+    assert np.mean(change) == pytest.approx(0, abs=4 * deviation / math.sqrt(change.size))
+    np.testing.assert_array_equal(found["norm.running_var"], START["norm.running_var"])  # no noise covers it
+    assert found["n"] == 5
+
+
+def test_one_client_moves_the_sum_by_the_norm_at_most():
+    privacy, names = Privacy(clip=0.3, noise=1.0), ["w", "b"]
+    each = [Stride(length).train(START, steps=1, learning_rate=0.1, seed=0) for length in (0.1, 4.0, 900.0)]
+    sums = [average_privately(START, updates, names, privacy, 1.0, 7) for updates in (each, each[:2], [])]
+    moved = {name: sums[0][name] - sums[1][name] for name in names}
+    assert change_norm(moved) == pytest.approx(0.3, rel=1e-3)
+    assert change_norm({name: sums[1][name] - sums[2][name] for name in names}) == pytest.approx(0.4, rel=1e-3)
+
+
+def test_the_noise_is_its_own_and_resumes():
+    privacy, kept = Privacy(clip=1.0, noise=0.5), []
+    for selection in (EVERY, POISSON):
+        kept.clear()
+        whole, state = run(privacy, selection, on_round=lambda number, weights, loss: kept.append(weights))
+        np.random.seed(1)  # noqa: NPY002 - what the noise must not be drawn from
+        assert np.array_equal(run(privacy, selection)[0]["w"], whole["w"])
+        account = Account(ledger(10.0), "edge", "stride", "wireless")
+        rules = Rules(privacy=privacy, selection=selection)
+        resumed = federate(clients(), kept[1], SCHEDULE, account, rules=rules, done=2)
+        assert np.array_equal(resumed.weights["w"], whole["w"])
+        assert [record.epsilon for record in state.records] == [
+            account_epsilon(privacy, selection, NAMES, number) for number in (1, 2, 3, 4)
+        ]
+    assert not np.array_equal(kept[0]["w"], kept[1]["w"])
+
+
+def gaussian_epsilon(noise: float, rounds: int, delta: float) -> float:
+    """Return epsilon of composed Gaussian mechanisms, exactly (Balle and Wang, ICML 2018, theorem 8)."""
+    mu = math.sqrt(rounds) / noise
+
+    def excess(e: float) -> Any:
+        return norm.cdf(mu / 2 - e / mu) - math.exp(e) * norm.cdf(-mu / 2 - e / mu) - delta
+
+    return cast(float, brentq(excess, 0, 200))
+
+
+@pytest.mark.parametrize("rounds", [1, 7, 30])
+def test_epsilon_is_just_above_what_other_accountants_say(rounds: int):
+    privacy = Privacy(clip=1.0, noise=2.5, delta=1e-5)
+    exact = gaussian_epsilon(2.5, rounds, 1e-5)
+    deadline = Selection(rule="deadline", deadline_s=1.0)
+    for selection in (EVERY, deadline):
+        assert exact <= account_epsilon(privacy, selection, NAMES, rounds) < 1.2 * exact
+    local, halved = Privacy(clip=1.0, noise=2.5, where="local"), gaussian_epsilon(1.25, rounds, 1e-5)
+    assert halved <= account_epsilon(local, POISSON, NAMES, rounds) < 1.2 * halved  # any two data sets, not amplified
+    accountant = pld.PLDAccountant(neighboring_relation=NeighboringRelation.ADD_OR_REMOVE_ONE)
+    accountant.compose(PoissonSampledDpEvent(0.3, GaussianDpEvent(2.5)), rounds)
+    found = account_epsilon(privacy, POISSON, NAMES, rounds)
+    assert accountant.get_epsilon(1e-5) * 0.999 <= found < 1.35 * accountant.get_epsilon(1e-5)
+    assert found < exact
+
+
+def test_epsilon_of_a_fixed_number_is_between_one_client_and_all():
+    privacy = Privacy(clip=1.0, noise=2.5)
+    one, four, ten = (account_epsilon(privacy, Selection(rule="uniform", clients=n), NAMES, 5) for n in (1, 4, 10))
+    assert one < four < ten
+    assert ten == pytest.approx(gaussian_epsilon(1.25, 5, 1e-5), rel=0.2)  # replaced: twice the norm
+
+
+def test_a_client_is_accounted_for_the_rounds_that_it_takes_part_in():
+    turns = Selection(rule="round-robin", clients=4)
+    counts = np.zeros(10, int)
+    for number in range(1, 14):
+        counts[[int(name[3:]) for name in turns.choose(NAMES, number, 0)]] += 1
+        assert most_participations(turns, 10, number) == counts.max()
+    privacy = Privacy(clip=1.0, noise=2.0)
+    assert account_epsilon(privacy, turns, NAMES, 5) == account_epsilon(privacy, EVERY, NAMES, 2)
+
+
+def test_rounds_stop_at_the_budget():
+    loose = Privacy(clip=1.0, noise=2.0)
+    third = account_epsilon(loose, EVERY, NAMES, 3)
+    privacy = loose.model_copy(update={"epsilon": third + 1e-9})
+    _, state = run(privacy)
+    assert [record.round for record in state.records] == [1, 2, 3]
+    assert state.records[-1].epsilon == third
+    assert affordable_rounds(privacy, EVERY, NAMES, 99, 1) == 2
+    _, state = run(privacy, earlier=2)
+    assert [record.epsilon for record in state.records] == [third]
+    with pytest.raises(
+        InputError, match=r"privacy: another round comes to epsilon = .* at delta = 1e-05, above .*budget"
+    ):
+        run(privacy, earlier=3)
+    with pytest.raises(InputError, match=r"privacy: a first round comes to epsilon"):
+        run(loose.model_copy(update={"epsilon": 1e-3}))
+
+
+def test_a_failing_client_does_not_lose_the_round_nor_its_privacy():
+    class Failing(Stride):
+        def train(self, weights: Weights, **how: Any) -> LocalUpdate:
+            raise OSError("no power")
+
+    others = clients() | {"cav3": Failing(1.0)}
+    account, state = Account(ledger(10.0), "edge", "stride", "wireless"), FederationState()
+    rules = Rules(privacy=Privacy(clip=1.0, noise=1e-6), least_clients=5)
+    found = federate(others, START, SCHEDULE, account, rules=rules, state=state).weights
+    assert [*state.records[0].failed] == ["cav3"]
+    size = math.sqrt(START["w"].size + START["b"].size)
+    np.testing.assert_allclose(found["w"], SCHEDULE.rounds * 0.9 / size, rtol=1e-3)  # nine of ten, whoever came
+
+
+def test_strategies_see_the_noisy_mean():
+    privacy = Privacy(clip=1.0, noise=1.0)
+    adaptive, plain = (run(privacy, strategy=strategy)[0]["w"] for strategy in (FedAdam(), FEDAVG))
+    assert not np.array_equal(adaptive, plain)
+    assert np.isfinite(adaptive).all()
+
+
+def test_what_makes_no_sense_is_one_sentence():
+    central, local = Privacy(clip=1.0, noise=1.0), Privacy(clip=1.0, noise=1.0, where="local")
+    importance, many = Selection(rule="importance", clients=2), clients()
+    for strategy, rules, said in (
+        (Median(), Rules(privacy=central), r"Median looks at each update, and central noise covers their sum alone"),
+        (Scaffold(), Rules(privacy=local), r"Scaffold sends further arrays beside the weights, which the noise"),
+        (FEDAVG, Rules(privacy=local, selection=importance), r"privacy: importance selection reads norms"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check_federation(many, strategy, rules)
+    check_federation(many, Median(), Rules(privacy=local))
+    for wrong in ({"epsilon": 0}, {"noise": 0}, {"clip": -1}, {"delta": 1}):
+        with pytest.raises(ValidationError, match="Input should be"):
+            Privacy(**{"clip": 1.0, "noise": 1.0, **wrong})

@@ -1,0 +1,151 @@
+"""Who takes part in a round: rules, probabilities against an optimiser, the unbiased mean, what it costs."""
+
+from typing import Any
+
+import cvxpy
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from regression import START, ledger, vehicles
+
+from flcav.config import InputError
+from flcav.federation.rounds import average_inversely
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.selection import Selection, optimal_probabilities
+from flcav.federation.stages import Schedule, check_federation, federate
+from flcav.federation.state import FederationState
+from flcav.federation.strategies import FEDAVG
+from flcav.federation.strategies.krum import Krum
+from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.trainable import LocalUpdate
+
+SCHEDULE = Schedule(rounds=6, steps=5, learning_rate=0.05, final_learning_rate=0.02, seed=3)
+NAMES = [f"grid/cav{i}" for i in range(6)]
+SECONDS = {"grid/cav1": 9.0, "grid/cav2": 3.0, "grid/cav4": 3.1}
+RULES: dict[str, Any] = {
+    "uniform": {"rule": "uniform", "clients": 2},
+    "poisson": {"rule": "poisson", "probability": 0.4},
+    "round-robin": {"rule": "round-robin", "clients": 4},
+    "importance": {"rule": "importance", "clients": 2},
+    "deadline": {"rule": "deadline", "deadline_s": 3.0, "seconds": SECONDS},
+}
+
+
+def run(selection: Selection, **how: Any) -> tuple[np.ndarray, FederationState, Account]:
+    account, state = Account(ledger(), "edge", "regression", "wireless"), how.pop("state", FederationState())
+    start = how.pop("start", START)
+    rules = Rules(selection=selection)
+    result = federate(vehicles("grid", 6), start, SCHEDULE, account, rules=rules, state=state, **how)
+    return result.weights["w"], state, account
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_selection_is_deterministic_resumes_and_books_only_who_takes_part(rule: str):
+    selection, kept = Selection(**RULES[rule]), []
+    once, state, account = run(selection, on_round=lambda round_, weights, loss: kept.append(dict(weights)))
+    np.testing.assert_array_equal(run(selection)[0], once)
+    np.testing.assert_array_equal(run(selection, start=kept[2], done=3)[0], once)
+    assert not np.array_equal(once, run(Selection())[0])
+    took_part = [(record.round, client) for record in state.records for client in record.clients]
+    update = max(entry.bytes for entry in account.ledger.entries if entry.direction == "up")
+    sent = [(e.round, e.client) for e in account.ledger.entries if e.direction == "up" and e.bytes == update]
+    assert sorted(sent) == sorted(took_part)
+    assert 0 < len(took_part) < 6 * SCHEDULE.rounds
+
+
+def test_rules_choose_as_they_say():
+    rounds = range(1, 4)
+    assert [Selection(**RULES["round-robin"]).choose(NAMES, round_, 1) for round_ in rounds] == [
+        NAMES[:4],
+        [NAMES[i] for i in (0, 1, 4, 5)],
+        NAMES[2:],
+    ]
+    assert Selection(**RULES["deadline"]).choose(NAMES, 1, 1) == [NAMES[i] for i in (0, 2, 3, 5)]
+    uniform, poisson = Selection(**RULES["uniform"]), Selection(**RULES["poisson"])
+    drawn = [uniform.choose(NAMES, 1, seed) for seed in range(3000)]
+    assert {len(each) for each in drawn} == {2}
+    share = [sum(name in each for each in drawn) / 3000 for name in NAMES]
+    np.testing.assert_allclose(share, 2 / 6, atol=0.03)
+    drawn = [poisson.choose(NAMES, 1, seed) for seed in range(3000)]
+    np.testing.assert_allclose([sum(name in each for each in drawn) / 3000 for name in NAMES], 0.4, atol=0.03)
+    both = sum({NAMES[0], NAMES[1]} <= set(each) for each in drawn) / 3000
+    assert both == pytest.approx(0.16, abs=0.02)  # each by itself
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_importance_has_the_least_variance_of_all_probabilities(seed: int):
+    rng = np.random.default_rng(seed)
+    norms, expected = rng.lognormal(sigma=1.5, size=9), int(rng.integers(1, 9))
+    p = cvxpy.Variable(9)
+    variance: Any = cvxpy.sum(cvxpy.multiply(norms**2, cvxpy.inv_pos(p)))
+    within: Any = [p <= 1, cvxpy.sum(p) <= expected]
+    cvxpy.Problem(cvxpy.Minimize(variance), within).solve(solver="CLARABEL")
+    assert p.value is not None
+    found = optimal_probabilities(norms, expected)
+    assert np.sum(found) == pytest.approx(expected)
+    np.testing.assert_allclose(found, p.value, atol=2e-3)
+    assert np.sum(norms**2 / found) <= variance.value * (1 + 1e-6)
+
+
+def test_probabilities_of_norms_that_are_0():
+    np.testing.assert_array_equal(optimal_probabilities(np.zeros(4), 1), np.full(4, 0.25))
+    np.testing.assert_array_equal(optimal_probabilities(np.array([0.0, 2.0, 0.0]), 2), [0, 1, 0])
+    np.testing.assert_array_equal(optimal_probabilities(np.array([1.0, 2.0]), 5), [1, 1])
+
+
+def test_the_mean_under_importance_selection_is_unbiased():
+    rng = np.random.default_rng(2)
+    start = {"w": rng.normal(size=4), "count": np.array(3)}
+    updates = {
+        f"cav{i}": LocalUpdate({"w": rng.normal(size=4) * 2**i, "count": np.array(i)}, i + 1, 0.0) for i in range(5)
+    }
+    shares = {name: update.samples / 15 for name, update in updates.items()}
+    lengths = {name: np.linalg.norm(update.weights["w"] - start["w"]) for name, update in updates.items()}
+    norms = {name: float(shares[name] * length) for name, length in lengths.items()}
+    selection = Selection(rule="importance", clients=2)
+    estimates = []
+    for seed in range(4000):
+        drawn = selection.draw(norms, seed)
+        mine = {name: updates[name] for name in drawn}
+        weights = {name: shares[name] / p for name, p in drawn.items()}
+        estimates.append(average_inversely(start, mine, weights)["w"] if drawn else start["w"])
+    mean = np.average([update.weights["w"] for update in updates.values()], axis=0, weights=[*shares.values()])
+    error = np.std(estimates, axis=0) / np.sqrt(len(estimates))
+    assert (np.abs(np.mean(estimates, axis=0) - mean) < 4 * error).all()
+
+
+def test_norms_are_messages_with_a_price():
+    _, state, account = run(Selection(**RULES["importance"]))
+    some = next(record for record in state.records if record.clients)
+    up = [entry for entry in account.ledger.entries if entry.direction == "up" and entry.round == some.round]
+    norms, updates = up[:6], up[6:]
+    assert [entry.client for entry in norms] == NAMES
+    assert [entry.client for entry in updates] == [*some.clients]
+    assert 0 < max(entry.bytes for entry in norms) < min(entry.bytes for entry in updates)
+
+
+def test_what_makes_no_sense_is_one_sentence():
+    clients: Any = vehicles("grid", 6)
+    for strategy, selection, said in (
+        (FEDAVG, {"rule": "uniform", "clients": 7}, r"selection: 7 clients are wanted in a round, and there are 6"),
+        (FEDAVG, {"rule": "deadline", "deadline_s": 1, "seconds": dict.fromkeys(NAMES, 2.0)}, r"no client is .* 1 s"),
+        (
+            Krum(),
+            RULES["uniform"],
+            r"krum: 5 clients or more are wanted for byzantine = 1 and kept = 1, and there are 2",
+        ),
+        (Krum(), RULES["poisson"], r"Krum needs a known number of clients"),
+        (Scaffold(), RULES["importance"], r"Scaffold looks at each update, and importance selection gives"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check_federation(clients, strategy, Rules(selection=Selection(**selection)))
+    wrong: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"rule": "uniform"}, "the rule uniform needs 'clients'"),
+        ({"clients": 2}, "the rule all takes no 'clients'"),
+        ({"rule": "poisson", "probability": 0}, "greater than 0"),
+        ({"rule": "uniform", "clients": 1, "seconds": SECONDS}, "the rule uniform takes no 'seconds'"),
+    )
+    for fields, said in wrong:
+        with pytest.raises(ValidationError, match=said):
+            Selection(**fields)
