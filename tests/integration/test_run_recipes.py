@@ -9,6 +9,7 @@ import pytest
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
+from flcav.network.ledger import Ledger
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.pipeline import results
@@ -102,6 +103,42 @@ def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) ->
     assert {"rounds_objects.png", "rounds_weather.png", "rounds_trajectory.png", "before_after.png"} <= {
         path.name for path in (folder / "pictures").iterdir()
     }
+
+
+def test_vehicles_join_the_rounds_that_they_have_time_for(tmp_path: Path) -> None:
+    points = [(s, e, c) for s in (2, 4) for e in range(4) for c in range(3)]
+    scores = [0.9 - s**-0.5 / 2 - 0.3 / (e + 1) - 0.05 / (c + 1) for s, e, c in points]
+    rows = [f"{s},{e},{c},{score:.4f}" for (s, e, c), score in zip(points, scores, strict=True)]
+    (tmp_path / "own.csv").write_text("\n".join(["samples,edge_rounds,cloud_rounds,accuracy", *rows]) + "\n")
+    few = {"scenes": 2, "spins": 1, "cavs": 2}
+    recipe = RunRecipe.model_validate(
+        {
+            "splits": dict.fromkeys(("pool", "validation", "registry", "edge", "test"), few),
+            "training": {"steps": 1, "local_steps": 1},
+            "tasks": {"weather": {"history": "own.csv", "train_s": 1.0}},
+            "regions": {"suburb": {"role": "pretrain"}, "ring": {"role": "federate", "speed": {"cav1": 0.5}}},
+            "budgets_mb": {"wireless": 90, "wireline": 90},
+            "limits": {"samples": [2, None]},
+            "horizon_s": 4.0,
+            "placement": {"rule": "none"},
+            "recording": {"warmup_s": 5.0, "weather": "clear"},
+        }
+    )
+    main = run(recipe, tmp_path / "out", beside=tmp_path).arms[MAIN]
+    plan = main.plan.tasks["weather"]
+    assert plan.joins is not None
+    rounds = plan.edge_rounds + plan.cloud_rounds
+    fast, slow = (plan.joins[f"ring/cav{number}"] for number in range(2))
+    assert set(fast) | set(slow) == set(range(1, rounds + 1))
+    assert len(fast) <= 4
+    assert 2 * len(slow) <= 4 < 2 * rounds
+    book = Ledger.load(tmp_path / "out/ledgers/main.parquet").entries
+    sent = [(e.stage, e.client, e.round) for e in book if (e.link, e.direction) == ("wireless", "up") and e.round]
+    assert sorted(sent) == sorted(
+        (EDGE, name, number) if number <= plan.edge_rounds else (CLOUD, name, number - plan.edge_rounds)
+        for name, joined in plan.joins.items()
+        for number in joined
+    )
 
 
 def test_signs_are_federated_and_their_errors_place_the_sensor(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from flcav.config import Config, InputError
 from flcav.seeds import stream
 
-Rule = Literal["all", "uniform", "poisson", "round-robin", "importance", "deadline"]
+Rule = Literal["all", "uniform", "poisson", "round-robin", "importance", "deadline", "planned"]
 
 NEEDED: Mapping[Rule, str | None] = {  # the field that a rule needs, which others do not take
     "all": None,
@@ -22,6 +22,7 @@ NEEDED: Mapping[Rule, str | None] = {  # the field that a rule needs, which othe
     "round-robin": "clients",
     "importance": "clients",
     "deadline": "deadline_s",
+    "planned": None,
 }
 
 
@@ -32,7 +33,9 @@ class Selection(Config):
     `probability`. round-robin: `clients` of them in turn. importance: `clients` of them in the mean, each by itself
     with a probability that grows with the norm of its update, which all train for and report (Chen et al., TMLR 2022).
     deadline: those whose predicted round time `seconds` is at most `deadline_s` (Nishio and Yonetani, ICC 2019, with
-    the bound on the time of a client instead of their sum); clients that `seconds` does not name are in time.
+    the bound on the time of a client instead of their sum); clients that `seconds` does not name are in time. planned:
+    those whose `joins` contain the round; clients that `joins` does not name join every round, and where none of those
+    that join is there, all do.
     """
 
     rule: Rule = "all"
@@ -40,6 +43,7 @@ class Selection(Config):
     probability: float | None = Field(default=None, gt=0, le=1)  # that a client takes part in a round
     deadline_s: float | None = Field(default=None, gt=0)
     seconds: Mapping[str, float] = {}  # predicted time of a round, by client
+    joins: Mapping[str, tuple[int, ...]] = {}  # rounds of a plan, by client
 
     @model_validator(mode="after")
     def _fields_of_the_rule(self) -> Self:
@@ -49,6 +53,8 @@ class Selection(Config):
                 raise ValueError(f"the rule {self.rule} {'needs' if name == needed else 'takes no'} '{name}'")
         if self.seconds and self.rule != "deadline":
             raise ValueError(f"the rule {self.rule} takes no 'seconds'")
+        if self.joins and self.rule != "planned":
+            raise ValueError(f"the rule {self.rule} takes no 'joins'")
         return self
 
     def check_clients(self, names: Sequence[str]) -> None:
@@ -72,6 +78,9 @@ class Selection(Config):
             case "deadline":
                 assert self.deadline_s is not None
                 chosen = {i for i, name in enumerate(names) if self.seconds.get(name, 0.0) <= self.deadline_s}
+            case "planned":
+                chosen = {i for i, name in enumerate(names) if round_ in self.joins.get(name, (round_,))}
+                chosen = chosen or set(range(len(names)))
             case _:
                 chosen = set(range(len(names)))
         return [name for i, name in enumerate(names) if i in chosen]

@@ -142,9 +142,11 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
             raise InputError(f"{told} looks at each update, and importance selection gives each a weight of its own")
         if rules.privacy is not None:
             raise InputError("privacy: importance selection reads norms of the updates, which no noise covers")
+    if rules.privacy is not None and selection.rule == "planned":
+        raise InputError("privacy: rounds of a plan have other numbers of clients, and noise is for one number")
     if isinstance(strategy, Robust):
-        if selection.rule == "poisson":
-            raise InputError(f"{told} needs a known number of clients, and poisson selection draws any")
+        if selection.rule in ("poisson", "planned"):
+            raise InputError(f"{told} needs a known number of clients, and {selection.rule} selection has any")
         strategy.check_clients(chosen)
     if rules.privacy is not None:
         if isinstance(strategy, Exchanges):

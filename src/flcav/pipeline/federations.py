@@ -3,12 +3,15 @@
 from collections.abc import Iterable
 
 from flcav.config import InputError
+from flcav.federation.rules import Rules
+from flcav.federation.selection import Selection
 from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, exchanges_more, of_servers, strategy_named
 from flcav.federation.strategies.strategy import Corrects
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.planning import UpdateForm
 from flcav.pipeline.recipe import CLOUD, Federation, RunRecipe
+from flcav.pipeline.results import TaskPlan
 
 
 def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
@@ -32,6 +35,16 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
                 check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])
         if CLOUD in setting.stages:
             check_rules(cloud, setting.federation.of_servers(), setting.regions)
+
+
+def follow_plan(how: Federation, plan: TaskPlan, done: int) -> Rules:
+    """Return the rules by which vehicles join the rounds that the plan gives them, after `done` rounds.
+
+    Another selection than that of all vehicles goes before the plan's.
+    """
+    if plan.joins is None or how.selection.rule != "all":
+        return how
+    return how.model_copy(update={"selection": Selection(rule="planned", joins=plan.joins_after(done))})
 
 
 def update_forms(settings: Iterable[Setting]) -> list[UpdateForm]:

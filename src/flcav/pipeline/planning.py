@@ -5,7 +5,7 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,9 +18,10 @@ from flcav.federation.upload import Upload
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import TaskPlan as Allotted
-from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.baselines import baseline
+from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.allocation.replanning import PlanState, Sent, TaskState, condition_problem
+from flcav.optimization.allocation.vehicles import Shares
 from flcav.optimization.curves.fitting import CurveFit, fit
 from flcav.optimization.curves.history import History, parse_histories
 from flcav.optimization.problem import Problem
@@ -70,6 +71,7 @@ class PlanSettings:
     edge_rounds_per_cloud_round: int
     group_samples: tuple[int, ...] = ()  # samples that the vehicles of each edge server hold, of each task
     horizon_s: float | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]
+    speeds: Mapping[str, float] = field(default_factory=dict)  # of every vehicle, in the order of the edge servers
 
     def stage_plan(self, samples: int, edge_rounds: int, cloud_rounds: int) -> StagePlan:
         """Return the transfers of a task with these counts."""
@@ -96,9 +98,9 @@ def make_plan(tasks: tuple[PlanRequest, ...], frame: PlanSettings, rule: PlanRul
     learned = [task for task in tasks if task.history is not None]
     problem = _problem(learned, frame, left) if learned else None
     if problem is not None:
-        allotted = allocate(problem).tasks if rule == "joint" else baseline(problem, rule).tasks
+        allotted, shares = (baseline(problem, rule).tasks, {}) if rule != "joint" else _allocate(problem)
         for task, own in zip(learned, allotted, strict=True):
-            plans[task.name] = _planned(task.sizes, own, problem)
+            plans[task.name] = _planned(task.sizes, own, problem, shares)
     return Plan(rule, {task.name: plans[task.name] for task in tasks}), problem
 
 
@@ -124,17 +126,36 @@ def remake_plan(
     rest = condition_problem(problem, PlanState(tasks=states, used_mb=sent))
     tasks = dict(plan.tasks)
     try:
-        allotted = allocate(rest).tasks
+        allotted, shares = _allocate(rest)
     except Infeasible:
-        allotted = ()
+        allotted, shares = (), {}
     for own in allotted:
         before = tasks[own.name]
-        new = _planned(MessageSizes(before.sample_mb, before.model_mb), own, rest)
+        new = _planned(MessageSizes(before.sample_mb, before.model_mb), own, rest, shares)
         assert new.predicted is not None
         assert before.predicted is not None
         past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)
-        tasks[own.name] = replace(new, predicted={**new.predicted, **{each: before.predicted[each] for each in past}})
+        joins = _continue_joins(before, new) if stage == EDGE else new.joins
+        predicted = {**new.predicted, **{each: before.predicted[each] for each in past}}
+        tasks[own.name] = replace(new, predicted=predicted, joins=joins)
     return Plan(plan.rule, tasks, stage, dict(reached))
+
+
+def _allocate(problem: Problem) -> tuple[Sequence[Allotted], Shares]:
+    """Return the best plan and, of vehicles with names, each one's share of it."""
+    plan, shares = allocate_fleet(problem)
+    return plan.tasks, shares
+
+
+def _continue_joins(before: TaskPlan, new: TaskPlan) -> Mapping[str, tuple[int, ...]] | None:
+    """Return the edge rounds that vehicles joined by the plan `before`, and the later rounds by the `new` one."""
+    if before.joins is None or new.joins is None:
+        return new.joins
+    over = before.edge_rounds
+    return {
+        name: tuple(each for each in before.joins[name] if each <= over) + tuple(each for each in joined if each > over)
+        for name, joined in new.joins.items()
+    }
 
 
 def fit_curve(history: History, group_samples: tuple[int, ...], k: int) -> CurveFit:
@@ -182,6 +203,7 @@ def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
             "cloud_rounds": cloud,
         },
         "train_s": task.train_s,
+        "vehicle_train_s": {name: task.train_s / speed for name, speed in frame.speeds.items()},
         "curve": found.curve.model_dump(),
     }
 
@@ -194,12 +216,13 @@ def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan
     return TaskPlan(*counts, cost.wireless_mb, cost.wireline_mb, task.sizes.sample_mb, task.sizes.model_mb, None)
 
 
-def _planned(sizes: MessageSizes, own: Allotted, problem: Problem) -> TaskPlan:
+def _planned(sizes: MessageSizes, own: Allotted, problem: Problem, shares: Shares) -> TaskPlan:
     curve = next(each.curve for each in problem.tasks if each.name == own.name)
     k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
     spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
     predicted = {stage: max(1 - float(curve.error(*each, k)), 0.0) for stage, each in spent.items()}
-    return TaskPlan(*counts, own.wireless_mb, own.wireline_mb, sizes.sample_mb, sizes.model_mb, predicted)
+    joins = {each.vehicle: each.rounds for each in shares[own.name]} if own.name in shares else None
+    return TaskPlan(*counts, own.wireless_mb, own.wireline_mb, sizes.sample_mb, sizes.model_mb, predicted, joins)
 
 
 class UpdateForm(Config):

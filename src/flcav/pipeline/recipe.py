@@ -117,6 +117,7 @@ class Region(Config):
         None  # recorded dataset whose scenes are divided over the splits, or one dataset per split
     )
     vehicles: int | None = Field(default=None, ge=1, le=8)  # clients of the edge server
+    speed: Mapping[str, Positive] = {}  # by vehicle (cav0, cav1, …): rounds it trains in the time of one; default: 1
     recording: Recording = Recording()  # changes to how the region is recorded
 
     @model_validator(mode="after")
@@ -127,6 +128,8 @@ class Region(Config):
             raise ValueError(f"'data' lacks {', '.join(sorted(missing))}, which a region to {self.role} needs")
         if self.vehicles is not None and (self.role != "federate" or self.data is not None):
             raise ValueError("'vehicles' belong to a town with the role federate")
+        if self.speed and (self.role != "federate" or self.data is not None):
+            raise ValueError("'speed' belongs to a town with the role federate")
         return self
 
 
@@ -257,6 +260,10 @@ class RunRecipe(Config):
                     f"tasks: '{name}' needs 'history', learning curves to plan by, or 'plan', a fixed one"
                     + ("; it has both" if task.plan else "")
                 )
+        for name in self.with_role("federate"):
+            known = [f"cav{number}" for number in range(self.vehicles(name))]
+            if odd := [each for each in self.regions[name].speed if each not in known]:
+                raise ValueError(f"regions.{name}.speed: '{odd[0]}' is none of its vehicles: {', '.join(known)}")
         if MAIN in self.arms:
             raise ValueError(f"arms: '{MAIN}' is the run itself; choose another name")
         for name, arm in self.arms.items():

@@ -54,6 +54,14 @@ class TaskPlan:
     sample_mb: float  # of one sample
     model_mb: float  # of one model update
     predicted: Mapping[str, float] | None  # score after each stage, by the learning curve; None: a fixed plan
+    joins: Annotated[Mapping[str, tuple[int, ...]] | None, LEFT_OUT] = (
+        None  # by vehicle the rounds it joins, of 1 … edge rounds + k · cloud rounds; None: every vehicle joins all
+    )
+
+    def joins_after(self, rounds: int) -> Mapping[str, tuple[int, ...]]:
+        """Return the rounds that each vehicle joins, numbered from 1 after the first `rounds`; empty: all join all."""
+        own = self.joins or {}
+        return {name: tuple(each - rounds for each in joined if each > rounds) for name, joined in own.items()}
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule
 from flcav.pipeline.before_after import detect_before_after
-from flcav.pipeline.federations import find_strategies
+from flcav.pipeline.federations import find_strategies, follow_plan
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
     LABEL_SOURCES,
@@ -146,7 +146,8 @@ def plan_step(
         asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan, own.train_s))
     budgets = Price(asked_for.budgets_mb.wireless, asked_for.budgets_mb.wireline)
     k = asked_for.federation.edge_rounds_per_cloud_round
-    frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k, held, asked_for.horizon_s)
+    speeds = list_speeds(asked_for)
+    frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k, held, asked_for.horizon_s, speeds)
     plan, problem = make_plan(tuple(asked), frame, rule)
     if problem is not None:
         write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
@@ -292,7 +293,8 @@ def edge_step(
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region)
     strategy, _ = find_strategies(how)
     earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
-    losses = federate_edge(learning, start, clients, schedule, strategy, how, earlier, book, work.folder, work.report)
+    rules = follow_plan(how, own, earlier)
+    losses = federate_edge(learning, start, clients, schedule, strategy, rules, earlier, book, work.folder, work.report)
     held = sum(len(client.samples) for client in clients.values())
     StageResult(stage, task, region, len(losses), held, len(clients), poles, losses).save(work.folder)
 
@@ -326,7 +328,8 @@ def cloud_step(
         count, helped = count + len(clients), [*helped, *poles]
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
     federating = Strategies(*find_strategies(how))
-    losses = federate_cloud(learning, start, servers, rounds, k, federating, how, book, work.folder, work.report)
+    rules = follow_plan(how, own.tasks[task], own.tasks[task].edge_rounds)
+    losses = federate_cloud(learning, start, servers, rounds, k, federating, rules, book, work.folder, work.report)
     StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses).save(work.folder)
 
 
@@ -447,6 +450,15 @@ def _select_group(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[
             f"(placement.group_range_m) of a sensor, so that none can take part"
         )
     return near
+
+
+def list_speeds(recipe: RunRecipe) -> dict[str, float]:
+    """Return the speed of every vehicle by its name in a federation; empty where no region gives any."""
+    federating = recipe.with_role("federate")
+    if not any(recipe.regions[name].speed for name in federating):
+        return {}
+    names = [(name, f"cav{number}") for name in federating for number in range(recipe.vehicles(name))]
+    return {f"{name}/{vehicle}": recipe.regions[name].speed.get(vehicle, 1.0) for name, vehicle in names}
 
 
 def _edge_groups(recipe: RunRecipe) -> tuple[int, ...]:

@@ -149,3 +149,16 @@ def test_what_makes_no_sense_is_one_sentence():
     for fields, said in wrong:
         with pytest.raises(ValidationError, match=said):
             Selection(**fields)
+
+
+def test_clients_join_the_rounds_of_a_plan() -> None:
+    planned = Selection(rule="planned", joins={"a": (1, 3), "b": (2,)})
+    assert [planned.choose(["a", "b", "c"], number, 0) for number in (1, 2, 3, 4)] == [
+        ["a", "c"],
+        ["b", "c"],
+        ["a", "c"],
+        ["c"],
+    ]
+    assert planned.choose(["a", "b"], 4, 0) == ["a", "b"]  # else nobody would train
+    with pytest.raises(ValueError, match="the rule all takes no 'joins'"):
+        Selection(joins={"a": (1,)})

@@ -165,6 +165,30 @@ def test_rounds_without_limits_are_those_that_were_measured_and_there_is_time_fo
     assert 4.0 * (timed.edge_rounds + timed.cloud_rounds) > 21.0
 
 
+def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> None:
+    speeds = {f"a/cav{number}": 1.0 for number in range(4)} | {f"b/cav{number}": 0.5 for number in range(3)}
+    settings = replace(frame(9000.0, 9000.0), limits=Limits(), horizon_s=12.0, speeds=speeds)
+    first, problem = make_plan((replace(asked(), train_s=2.0),), settings, "joint")
+    own = first.tasks["objects"]
+    assert problem is not None
+    assert own.joins is not None
+    assert all(len(own.joins[name]) * 2.0 / speed <= 12.0 for name, speed in speeds.items())
+    for group in (range(4), range(3)):
+        names = [f"{'a' if len(group) == 4 else 'b'}/cav{number}" for number in group]
+        assert {each for name in names for each in own.joins[name]} == set(
+            range(1, 1 + own.edge_rounds + own.cloud_rounds)
+        )
+    later = remake_plan(first, problem, "edge", {"objects": 0.4}, Price(own.wireless_mb / 2, own.wireline_mb / 2))
+    joins = later.tasks["objects"].joins
+    assert joins is not None
+    for name, joined in own.joins.items():  # what is over stays
+        assert [each for each in joins[name] if each <= own.edge_rounds] == [e for e in joined if e <= own.edge_rounds]
+    after = later.tasks["objects"].joins_after(own.edge_rounds)
+    assert {each for joined in after.values() for each in joined} == set(
+        range(1, 1 + later.tasks["objects"].cloud_rounds)
+    )
+
+
 def test_a_small_pool_limits_the_samples() -> None:
     assert make_plan((asked(pool=24),), frame(), "joint")[0].tasks["objects"].samples == 24
 
