@@ -145,7 +145,7 @@ class Limits(Config):
 
     samples: tuple[Count, Count | None] = (40, None)  # of pretraining; None: all that the pools hold
     edge_rounds: tuple[Count, Count | None] = (1, None)  # of edge FL; None: as many as the history has
-    cloud_rounds: tuple[Count, Count | None] = (0, None)  # of cloud FL; None: as many as the history has
+    cloud_rounds: tuple[Count, Count | None] = (1, None)  # of cloud FL; None: as many as the history has
 
 
 class Placement(Config):
