@@ -1,5 +1,7 @@
 """Markdown tables of a run's results."""
 
+import numpy as np
+
 from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
 from flcav.pipeline.findings import name_stage
@@ -8,8 +10,8 @@ from flcav.pipeline.results import Run
 
 
 def tables(run: Run) -> dict[str, str]:
-    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors."""
-    return {
+    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, spread of retraining."""
+    own = {
         "findings": format_bullets(f"*{each.question}* **{each.verdict}**. {each.sentence}" for each in run.findings),
         "tests": _tests(run),
         "differences": _differences(run),
@@ -17,6 +19,7 @@ def tables(run: Run) -> dict[str, str]:
         "budgets": _budgets(run),
         "sensors": _sensors(run),
     }
+    return own | {"spread": _spread(run)} if run.recipe.retrainings else own
 
 
 def _tests(run: Run) -> str:
@@ -36,6 +39,19 @@ def _tests(run: Run) -> str:
 def _differences(run: Run) -> str:
     rows = [[each.name, each.estimate.describe(sign=True)] for each in run.differences]
     return format_table(("region, task: after - before", "difference"), rows)
+
+
+def _spread(run: Run) -> str:
+    """Return how each measure and difference varies over the run's trainings on the same frames."""
+    found = {
+        f"{test.region}, {test.task}: {name_stage(test.arm, test.stage)}": (test.result.estimate.mean, *test.retrained)
+        for test in run.tested
+    } | {each.name: (each.over_scenes.mean, *each.retrained) for each in run.differences}
+    rows = [
+        [name, f"{np.mean(values):.3f}", f"{np.std(values, ddof=1):.4f}", f"{min(values):.3f}", f"{max(values):.3f}"]
+        for name, values in found.items()
+    ]
+    return format_table(("figure", "mean", "sd of retraining", "least", "most"), rows)
 
 
 def _plan(run: Run) -> str:
