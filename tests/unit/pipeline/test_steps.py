@@ -364,6 +364,19 @@ def test_a_killed_run_goes_on_from_its_last_finished_step(tmp_path):
     assert (tmp_path / "out" / "a" / "calls").read_text() == "x"
 
 
+def test_runs_side_by_side_take_over_what_another_has_done(tmp_path):
+    own = Step("own", count, {"start": 7}), Step("other", count, {"start": 8})
+    both = {tmp_path / name: [STEPS[0], each] for name, each in zip(("one", "two"), own, strict=True)}
+    values = run_side_by_side(both, jobs=1, notify=lambda *event: None)
+    assert [[*each.values()] for each in values.values()] == [[1, 7], [1, 8]]
+    first, second = (folder / STEPS[0].name for folder in both)
+    assert (first / "calls").read_text() == "x"  # it ran once
+    assert (first / "calls").samefile(second / "calls")
+    assert (second / "done.json").read_bytes() == (first / "done.json").read_bytes()
+    asked_otherwise = {tmp_path / "three": [Step(STEPS[0].name, count, {"start": 3})], tmp_path / "one": [STEPS[0]]}
+    assert run_side_by_side(asked_otherwise, jobs=1, notify=lambda *event: None)[tmp_path / "three"] == {"a": 3}
+
+
 def test_runs_side_by_side_keep_to_their_own_folders(tmp_path):
     seen = []
     runs = {tmp_path / "one": STEPS, tmp_path / "two": STEPS[:1]}

@@ -35,6 +35,7 @@ from flcav.pipeline.steps.step import (
     read_value,
     remove,
     reserve_sibling,
+    take_over,
 )
 
 
@@ -91,6 +92,7 @@ def run_side_by_side(
 ) -> dict[Path, dict[str, Any]]:
     """Run the steps of each folder, up to `jobs` folders in parallel; return each folder's values as `run_steps` does.
 
+    A step that is finished in another of the folders, asked in the same way and by the same code, is taken over.
     `names`: prefixes of the folders' steps in `notify` (None: the folders' own names).
     """
     sources = Sources()
@@ -104,7 +106,7 @@ def run_side_by_side(
     if waiting:
         with _open_engine(engine, jobs) as workers, ThreadPoolExecutor(jobs) as threads:
             each = max(1, jobs // len(runs))
-            started = [threads.submit(_run, plan, workers, each, named(plan.folder)) for plan in waiting]
+            started = [threads.submit(_run, plan, workers, each, named(plan.folder), [*runs]) for plan in waiting]
             try:
                 for future in wait(started, return_when=FIRST_EXCEPTION).done:
                     future.result()
@@ -143,7 +145,8 @@ def _plan_steps(steps: Sequence[Step], folder: Path, notify: Notify, stale: str,
     return _Plan(folder, records, [step for step in steps if step.name not in values], values)
 
 
-def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify) -> None:
+def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify, folders: Sequence[Path] = ()) -> None:
+    """Do the work that is left; steps that are finished in another of `folders` are taken over."""
     waiting, values = _most_waited_for_first(plan.waiting), plan.values
     with workers.hands(plan.folder, jobs) as hands:
         running: dict[Future[Any], Step] = {}
@@ -151,6 +154,11 @@ def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify) -> None:
             ready = [step for step in waiting if all(name in values for name in step.needs)]
             for step in ready[: jobs - len(running)]:
                 waiting.remove(step)
+                others = [folder / step.name for folder in folders if folder != plan.folder]
+                if take_over(plan.folder / step.name, plan.records[step.name], others):
+                    values[step.name] = read_value(plan.folder / step.name)
+                    notify(step.name, 1, 1, DONE_NOW)
+                    continue
                 running[hands.submit(step, plan.records[step.name])] = step
             finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
             _drain(hands.reports, notify)
@@ -192,7 +200,8 @@ def _settle_records(
     if outdated and stale == "refuse":
         raise make_stale_error(folder, outdated)
     for step in steps:
-        reserve_sibling(folder / step.name, "old")
+        for what in ("old", "copy"):
+            reserve_sibling(folder / step.name, what)
         if stale == "redo" and step.name in outdated:
             remove(folder / step.name)
     return records, set(outdated)
