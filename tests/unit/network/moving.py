@@ -26,7 +26,7 @@ def make_trace(
     time_s = np.asarray(times, dtype=np.float64)
     kinds = [(shapes or {}).get(name, ("car", 3)) for name in paths]
     xy = np.stack([np.broadcast_to(np.asarray(path, np.float64), (len(time_s), 2)) for path in paths.values()], axis=1)
-    present = np.isfinite(xy).all(axis=2)
+    present = np.isfinite(xy[..., 0] + xy[..., 1])
     flat = np.where(present, 0.0, np.nan)
     still = np.repeat(flat[..., None], 3, axis=2)
     sizes = [SHAPES[category][shape] for category, shape in kinds]

@@ -32,7 +32,7 @@ class Coverage:
     state: NDArray[np.int8]  # (Y, X) State.LOS or State.NLOS, to the unit that serves
 
 
-def cover_town(town: Town, units: Mapping[str, Array], radio: Radio, step_m: float = 4.0) -> Coverage:
+def cover_town(town: Town, units: Mapping[str, Array], radio: Radio, step_m: float = 2.0) -> Coverage:
     """Return the coverage of a town by `units`, name -> mount (3,) [m, world], on a grid of `step_m`.
 
     Rates are those of a vehicle alone in the band, without shadowing: medians over it. Raises `InputError` as

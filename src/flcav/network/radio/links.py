@@ -125,11 +125,10 @@ def _losses(
     shadow, blockage = np.zeros(distance.shape), np.zeros(distance.shape)  # standard normal draws
     if radio.shadowing:
         for v, u in np.ndindex(distance.shape[1:]):
-            link = (vehicles[v], units[u])
-            shadow[:, v, u] = stream(seed, "shadowing", *link).standard_normal(len(shadow))
-            for actor in np.unique(paths.blocker[:, v, u]).tolist():
-                draw = stream(seed, "blockage", *link, str(trace.actor[actor])).standard_normal()
-                blockage[paths.blocker[:, v, u] == actor, v, u] = draw
+            shadow[:, v, u] = stream(seed, "shadowing", vehicles[v], units[u]).standard_normal(len(shadow))
+            for actor in sorted({*paths.blocker[:, v, u].tolist()} - {-1}):
+                draws = stream(seed, "blockage", vehicles[v], units[u], str(trace.actor[actor]))
+                blockage[paths.blocker[:, v, u] == actor, v, u] = draws.standard_normal()
     antenna_m, unit_m = paths.antenna[:, :, None, 2], paths.site[:, 2]
     tops = trace.position[..., 2] + trace.size[:, 2]  # (T, A)
     top_m = np.take_along_axis(tops, paths.blocker.reshape(len(tops), -1) % tops.shape[1], axis=1)
