@@ -109,7 +109,7 @@ def calls() -> list[Call]:
         ),
         Call("radio data/ --pole #1 --network network.yaml --map OUT.png", (*DATASET, "network.yaml"), 1.0),
         Call(
-            "rounds data/ --pole 1 --model-mb #0.1 --step-s #0.001 --rounds #1 --network network.yaml --timeline OUT.png --json",
+            "rounds data/ --pole 1 --model-mb #0.1 --step-s #0.001 --network network.yaml --timeline OUT.png",
             (*DATASET, "network.yaml"),
             0.5,
         ),
