@@ -20,11 +20,12 @@ ROUND = RoundRecord(1, 10.0, 17.0, 0.5, 0.5, (DONE, LOST))
 
 def test_bars_are_as_long_as_the_times_and_begin_where_they_did():
     axes = timeline_of_rounds([ROUND]).axes[0]
-    bars = [(bar.get_x(), bar.get_width(), bar.get_y() + bar.get_height() / 2) for bar in axes.patches]
+    boxes = [bar.get_path().transformed(bar.get_patch_transform()).get_extents() for bar in axes.patches]
+    bars = [(box.x0, box.width, box.y0 + box.height / 2) for box in boxes]
     np.testing.assert_allclose(
         bars, [(0.5, 2, 0), (2.5, 3, 0), (5.5, 1, 0), (0.5, 4, 1), (4.5, 0.5, 1), (5, 0, 1)], atol=1e-9
     )
-    wire = [path.get_extents().intervalx.tolist() for path in axes.collections[0].get_paths()]
+    wire = [np.asarray(path.get_extents().intervalx) for path in axes.collections[0].get_paths()]
     np.testing.assert_allclose(wire, [[0, 0.5], [6.5, 7.0]], atol=1e-9)
     assert [label.get_text() for label in axes.get_yticklabels()] == ["cav0", "cav1", "wireline"]
 
@@ -49,6 +50,8 @@ def test_the_map_has_the_rates_of_the_coverage():
     coverage = cover_town(town, unit_positions(town, [2, 3]), Radio(), step_m=12.0)
     figure = coverage_map(town, coverage)
     mesh = next(each for each in figure.axes[0].collections if isinstance(each, QuadMesh))
-    np.testing.assert_allclose(np.reshape(mesh.get_array(), coverage.rate_bps.shape), coverage.rate_bps / 1e6)
+    np.testing.assert_allclose(
+        np.ma.getdata(mesh.get_array()).reshape(coverage.rate_bps.shape), coverage.rate_bps / 1e6
+    )
     assert {text.get_text() for text in figure.axes[0].texts} >= {"2", "3"}
     assert style.png(figure, dpi=60).startswith(b"\x89PNG")

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -124,10 +125,10 @@ def _losses(
     state, distance = np.maximum(paths.state, 0), np.nan_to_num(paths.distance_m, nan=1.0)
     shadow, blockage = np.zeros(distance.shape), np.zeros(distance.shape)  # standard normal draws
     if radio.shadowing:
-        for v, u in np.ndindex(distance.shape[1:]):
-            shadow[:, v, u] = stream(seed, "shadowing", vehicles[v], units[u]).standard_normal(len(shadow))
+        for (v, vehicle), (u, unit) in product(enumerate(vehicles), enumerate(units)):
+            shadow[:, v, u] = stream(seed, "shadowing", vehicle, unit).standard_normal(len(shadow))
             for actor in sorted({*paths.blocker[:, v, u].tolist()} - {-1}):
-                draws = stream(seed, "blockage", vehicles[v], units[u], str(trace.actor[actor]))
+                draws = stream(seed, "blockage", vehicle, unit, str(trace.actor[actor]))
                 blockage[paths.blocker[:, v, u] == actor, v, u] = draws.standard_normal()
     antenna_m, unit_m = paths.antenna[:, :, None, 2], paths.site[:, 2]
     tops = trace.position[..., 2] + trace.size[:, 2]  # (T, A)
