@@ -6,7 +6,8 @@ from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
     from flcav.network.clock.records import ClientTiming, RoundRecord, load_rounds, save_rounds
-    from flcav.network.clock.rounds import ClientWork, NetworkSettings, RoundRules, simulate_rounds
+    from flcav.network.clock.rounds import NetworkSettings, RoundRules, simulate_rounds
+    from flcav.network.clock.work import ClientWork, work_of_messages
     from flcav.network.ledger import Budget, BudgetExceeded, Ledger, LedgerEntry
     from flcav.network.plan import MessageSizes, Price, StagePlan, price
     from flcav.network.radio.budget import Radio
@@ -32,7 +33,8 @@ PLACES = {
     "Coverage": "flcav.network.radio.coverage",
     "cover_town": "flcav.network.radio.coverage",
     "Wireline": "flcav.network.radio.wireline",
-    "ClientWork": "flcav.network.clock.rounds",
+    "ClientWork": "flcav.network.clock.work",
+    "work_of_messages": "flcav.network.clock.work",
     "NetworkSettings": "flcav.network.clock.rounds",
     "RoundRules": "flcav.network.clock.rounds",
     "simulate_rounds": "flcav.network.clock.rounds",

@@ -10,7 +10,9 @@ from moving import made_links
 
 from flcav.config import InputError
 from flcav.network.clock.records import ClientTiming, load_rounds, rounds_table, save_rounds
-from flcav.network.clock.rounds import ClientWork, NetworkSettings, RoundRules, simulate_rounds, time_clients
+from flcav.network.clock.rounds import NetworkSettings, RoundRules, simulate_rounds, time_clients
+from flcav.network.clock.work import ClientWork, work_of_messages
+from flcav.network.ledger import LedgerEntry
 from flcav.network.radio.wireline import Wireline
 
 GOOD = 30.0  # dB: 2 bit/s/Hz, 20 Mbit/s of 10 MHz
@@ -156,7 +158,7 @@ SETTINGS = NetworkSettings(wireline=Wireline(rate_mbps=100, latency_s=0.1))
 def test_rounds_follow_one_another_and_cloud_rounds_pay_the_wireline():
     links = made_links(np.arange(0.0, 80.0), {"cav0": GOOD, "cav1": GOOD})
     works = {name: work(name) for name in links.vehicle}
-    records = simulate_rounds(links, works, 4, SETTINGS, edge_rounds_per_cloud_round=2, model_bytes=5 * MB)
+    records = simulate_rounds(links, [works] * 4, SETTINGS, edge_rounds_per_cloud_round=2, model_bytes=5 * MB)
     wire = 0.1 + 0.4
     radio = 4 + 1 + 8.0
     assert [record.wireline_down_s for record in records] == pytest.approx([wire, 0] * 2)
@@ -165,7 +167,7 @@ def test_rounds_follow_one_another_and_cloud_rounds_pay_the_wireline():
     assert [record.start_s for record in records] == pytest.approx(starts)
     assert records[0].clients[0].start_s == pytest.approx(wire)
     assert records[-1].end_s == pytest.approx(4 * (radio + wire))
-    edge = simulate_rounds(links, works, 2, SETTINGS, start_s=1.0)
+    edge = simulate_rounds(links, [works] * 2, SETTINGS, start_s=1.0)
     assert edge[-1].end_s == pytest.approx(1 + 2 * radio)
     assert edge[0].wireline_up_s == 0
 
@@ -174,7 +176,7 @@ def test_who_is_in_the_town_takes_part_and_the_last_is_the_straggler():
     times = np.arange(0.0, 60.0)
     links = made_links(times, {"cav0": GOOD, "cav1": np.where(times < 2, GOOD, NAN), "cav2": GOOD})
     works = {"cav0": work("cav0"), "cav1": work("cav1"), "cav2": work("cav2", compute=9)}
-    first, second = simulate_rounds(links, works, 2, SETTINGS)
+    first, second = simulate_rounds(links, [works] * 2, SETTINGS)
     assert [client.client for client in first.clients] == ["cav0", "cav1", "cav2"]
     assert [client.client for client in first.finished] == ["cav0", "cav2"]
     assert [client.client for client in second.clients] == ["cav0", "cav2"]
@@ -188,7 +190,7 @@ def test_who_is_in_the_town_takes_part_and_the_last_is_the_straggler():
 def test_records_come_back_from_parquet(tmp_path):
     times = np.arange(0.0, 60.0)
     links = made_links(times, {"cav0": GOOD, "cav1": np.where(times < 2, GOOD, NAN)})
-    records = simulate_rounds(links, {name: work(name) for name in links.vehicle}, 2, SETTINGS)
+    records = simulate_rounds(links, [{name: work(name) for name in links.vehicle}] * 2, SETTINGS)
     path = tmp_path / "rounds.parquet"
     save_rounds(records, path)
     table = pq.read_table(path)
@@ -207,6 +209,22 @@ def test_records_come_back_from_parquet(tmp_path):
         load_rounds(path)
 
 
+def test_the_work_of_a_round_is_what_the_ledger_has_of_it():
+    def message(direction, client, size, link="wireless", number=3):
+        return LedgerEntry("edge", "objects", link, direction, number, client, size)
+
+    sent = [message("down", "grid/cav0", 700), message("up", "grid/cav0", 90), message("up", "grid/cav0", 5)]
+    sent += [message("down", "grid/cav1", 700), message("up", "grid", 10**9, "wireline")]
+    assert work_of_messages(sent, {"cav0": 1.5, "cav1": 2.0, "cav2": 9.0}) == {
+        "cav0": ClientWork("cav0", 700, 1.5, 95),
+        "cav1": ClientWork("cav1", 700, 2.0, 0),
+    }
+    with pytest.raises(InputError, match="cav1: has no time to compute"):
+        work_of_messages(sent, {"cav0": 1.5})
+    with pytest.raises(InputError, match="messages of 2 rounds, stages, tasks or regions"):
+        work_of_messages([*sent, message("up", "grid/cav1", 1, number=4)], {"cav0": 1.5, "cav1": 2.0})
+
+
 def test_bad_input_is_one_sentence():
     links = made_links(np.arange(4.0), {"cav0": [NAN, GOOD, GOOD, GOOD]})
     with pytest.raises(InputError, match="cav0: upload_bytes = -1, at least 0 are wanted"):
@@ -222,8 +240,8 @@ def test_bad_input_is_one_sentence():
     with pytest.raises(InputError, match="'cav0' is no vehicle of the links, or named twice"):
         only(links, work("cav0"), work("cav0"), start_s=1.0)
     with pytest.raises(InputError, match="round 1: no client is in the town at 0 s"):
-        simulate_rounds(links, {"cav0": work("cav0")}, 1, SETTINGS)
+        simulate_rounds(links, [{"cav0": work("cav0")}] * 1, SETTINGS)
     with pytest.raises(InputError, match="3 edge rounds, 2 to a cloud round"):
-        simulate_rounds(links, {"cav0": work("cav0")}, 3, SETTINGS, edge_rounds_per_cloud_round=2)
+        simulate_rounds(links, [{"cav0": work("cav0")}] * 3, SETTINGS, edge_rounds_per_cloud_round=2)
     with pytest.raises(InputError, match="begins at -1 s"):
-        simulate_rounds(links, {"cav0": work("cav0")}, 1, SETTINGS, start_s=-1.0)
+        simulate_rounds(links, [{"cav0": work("cav0")}] * 1, SETTINGS, start_s=-1.0)

@@ -50,8 +50,8 @@ def test_the_map_has_the_rates_of_the_coverage():
     coverage = cover_town(town, unit_positions(town, [2, 3]), Radio(), step_m=12.0)
     figure = coverage_map(town, coverage)
     mesh = next(each for each in figure.axes[0].collections if isinstance(each, QuadMesh))
-    np.testing.assert_allclose(
-        np.ma.getdata(mesh.get_array()).reshape(coverage.rate_bps.shape), coverage.rate_bps / 1e6
-    )
+    drawn = mesh.get_array()
+    assert drawn is not None
+    np.testing.assert_allclose(drawn.reshape(coverage.rate_bps.shape), coverage.rate_bps / 1e6)
     assert {text.get_text() for text in figure.axes[0].texts} >= {"2", "3"}
     assert style.png(figure, dpi=60).startswith(b"\x89PNG")

@@ -66,7 +66,8 @@ def rounds(
     from flcav.dataset.store import Dataset
     from flcav.files import check_writable, write_bytes
     from flcav.network.clock.records import save_rounds
-    from flcav.network.clock.rounds import ClientWork, NetworkSettings, simulate_rounds
+    from flcav.network.clock.rounds import NetworkSettings, simulate_rounds
+    from flcav.network.clock.work import ClientWork
     from flcav.network.radio.recorded import link_scene
 
     for path in (out, timeline):
@@ -81,7 +82,7 @@ def rounds(
         for number, vehicle in enumerate(links.vehicle)
     }
     records = simulate_rounds(
-        links, work, count, settings, edge_rounds_per_cloud_round=edge_rounds_per_cloud_round, model_bytes=down
+        links, [work] * count, settings, edge_rounds_per_cloud_round=edge_rounds_per_cloud_round, model_bytes=down
     )
     if out is not None:
         save_rounds(records, out)

@@ -5,7 +5,6 @@ the bytes are the exact integral of the rates over time.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -14,6 +13,7 @@ from pydantic import Field
 
 from flcav.config import Config, InputError
 from flcav.network.clock.records import ClientTiming, RoundRecord
+from flcav.network.clock.work import ClientWork
 from flcav.network.radio.budget import Radio, shared_rates_bps
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.wireline import Wireline
@@ -42,22 +42,6 @@ class NetworkSettings(Config):
     radio: Radio = Radio()
     wireline: Wireline = Wireline()
     rounds: RoundRules = RoundRules()
-
-
-@dataclass(frozen=True)
-class ClientWork:
-    """What a client does in a round. Raises `InputError` for a negative number."""
-
-    client: str  # a vehicle of the links
-    download_bytes: int  # the model, from its edge server
-    compute_s: float
-    upload_bytes: int  # its update
-
-    def __post_init__(self) -> None:
-        for name in ("download_bytes", "compute_s", "upload_bytes"):
-            value = getattr(self, name)
-            if not 0 <= value < np.inf:
-                raise InputError(f"{self.client}: {name} = {value}, at least 0 are wanted")
 
 
 class Phase(IntEnum):
@@ -189,28 +173,27 @@ def time_clients(
 
 def simulate_rounds(
     links: RadioLinks,
-    work: Mapping[str, ClientWork],
-    count: int,
+    works: Sequence[Mapping[str, ClientWork]],
     settings: NetworkSettings,
     *,
     start_s: float | None = None,
     edge_rounds_per_cloud_round: int | None = None,
     model_bytes: int = 0,
 ) -> tuple[RoundRecord, ...]:
-    """Return `count` rounds, one after another from `start_s` (by default the trace's start), at all edge servers.
+    """Return the rounds of `works`, one after another from `start_s`, by default the trace's start.
 
-    Every vehicle of `work`, by name, that is in the town when a round begins takes part. With
+    Every vehicle of a round's work, by name, that is in the town when the round begins takes part. With
     `edge_rounds_per_cloud_round` = k the cloud's model of `model_bytes` reaches the edge servers before each group of k
     rounds, and theirs the cloud after it, over `settings.wireline`. Raises `InputError` as `time_clients`, and where
-    `count` is not a multiple of k.
+    there is no round, or no multiple of k.
     """
     k = edge_rounds_per_cloud_round
-    if count < 1 or (k is not None and (k < 1 or count % k)):
-        raise InputError(f"{count} edge rounds, {k} to a cloud round: at least 1, and a whole number of cloud rounds")
+    if not works or (k is not None and (k < 1 or len(works) % k)):
+        raise InputError(f"{len(works)} edge rounds, {k} to a cloud round: a whole number of cloud rounds is wanted")
     wire = 0.0 if k is None else settings.wireline.seconds(model_bytes)
     now = float(links.time_s[0]) if start_s is None else start_s
     records = []
-    for number in range(1, count + 1):
+    for number, work in enumerate(works, 1):
         down = wire if k is not None and (number - 1) % k == 0 else 0.0
         up = wire if k is not None and number % k == 0 else 0.0
         begins = now + down
