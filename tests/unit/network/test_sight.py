@@ -94,6 +94,13 @@ def test_a_drive_behind_a_truck_and_a_house():
     assert links.rate_bps[3, 0, 0] == 0
 
 
+def test_a_low_unit_behind_a_truck_is_below_it_like_the_car():
+    trace = make_trace([0.0], {"cav0": [70.0, 0.0], "van1": [80.0, 0.0]}, {"van1": ("truck", 0)})  # 3.3 m high
+    links = link_vehicles(open_town(HOUSE), trace, ["cav0"], {"low": np.array([100.0, 0.0, 2.8])}, MEDIAN)
+    clear = propagation.path_loss_db(links.distance_m, State.LOS, 5.9)
+    assert (links.loss_db - clear).item() == pytest.approx(9.0)
+
+
 def test_of_several_vehicles_in_the_path_the_tallest_counts():
     boxes = Boxes.from_array([[30, 0, 1, 5, 2, 2, 0], [40, 0, 1.5, 5, 2, 3, 0], [50, 0, 1, 5, 2, 2, 0]], "van")
     seen = find_sight(np.array([[0, 0, 1.0], [0, 9.0, 1.0]]), np.array([[90, 0, 1.2]]), None, boxes)
