@@ -127,6 +127,13 @@ def test_shadowing_is_a_stream_of_its_own_for_each_link_and_has_the_clauses_stat
     assert np.corrcoef(extra[:-1], extra[1:])[0, 1] == pytest.approx(np.exp(-5 / 10), abs=0.04)
 
 
+def test_a_vehicle_that_comes_back_has_shadowing_of_its_own():
+    trace = make_trace(np.arange(3.0), {"cav0": [[90.0, 0.0], [np.nan, np.nan], [90.0, 0.0]]})
+    loss = link_vehicles(open_town(HOUSE), trace, ["cav0"], UNIT, Radio(), seed=5).loss_db[:, 0, 0]
+    draws = stream(5, "shadowing", "cav0", "pole1").standard_normal(3)
+    assert loss[2] - loss[0] == pytest.approx(3 * (draws[2] - draws[0]))
+
+
 def test_a_blocking_vehicle_keeps_its_draw_as_long_as_it_blocks():
     radio = Radio()
     trace = make_trace(np.arange(3.0), {"cav0": [70.0, 0.0], "van1": [80.0, 0.0]}, {"van1": ("truck", 0)})
