@@ -12,7 +12,7 @@ from flcav.config import InputError
 from flcav.network.clock.records import ClientTiming, load_rounds, rounds_table, save_rounds
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, simulate_rounds, time_clients
 from flcav.network.clock.work import ClientWork, work_of_messages
-from flcav.network.ledger import LedgerEntry
+from flcav.network.ledger import Direction, LedgerEntry, Link
 from flcav.network.radio.wireline import Wireline
 
 GOOD = 30.0  # dB: 2 bit/s/Hz, 20 Mbit/s of 10 MHz
@@ -210,7 +210,7 @@ def test_records_come_back_from_parquet(tmp_path):
 
 
 def test_the_work_of_a_round_is_what_the_ledger_has_of_it():
-    def message(direction, client, size, link="wireless", number=3):
+    def message(direction: Direction, client: str, size: int, link: Link = "wireless", number: int = 3) -> LedgerEntry:
         return LedgerEntry("edge", "objects", link, direction, number, client, size)
 
     sent = [message("down", "grid/cav0", 700), message("up", "grid/cav0", 90), message("up", "grid/cav0", 5)]

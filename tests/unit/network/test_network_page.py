@@ -41,7 +41,13 @@ def test_defaults_are_those_of_the_tables():
 
 
 def test_reasons_are_those_that_clients_are_dropped_for():
-    reasons = (rounds.LEFT_TOWN, rounds.NO_COVERAGE, rounds.NEARER.format("poleN"), rounds.DEADLINE, rounds.TRACE_ENDS)
+    reasons = (
+        rounds.LEFT_TOWN,
+        rounds.NO_COVERAGE,
+        rounds.NEARER.format(unit="poleN"),
+        rounds.DEADLINE,
+        rounds.TRACE_ENDS,
+    )
     rows = re.findall(r"^\| `([\w ]+)` \| ", PAGE.partition("| `dropped` | when |")[2], re.M)
     assert {*rows[:5]} == {*reasons}
 

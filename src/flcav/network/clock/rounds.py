@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 LEFT_TOWN = "left the town"
 NO_COVERAGE = "out of coverage"
-NEARER = "nearer to {}"
+NEARER = "nearer to {unit}"
 DEADLINE = "past the deadline"
 TRACE_ENDS = "the trace ends"
 TIE = 1e-9  # [s] within which events are at the same time
@@ -112,22 +112,22 @@ class _Round:
         self.end_s[rows[self.phase[rows] == Phase.OVER]] = self.time_s
 
     def _drop(self) -> None:
-        """Drop the clients that cannot go on at this time, each with the first reason that holds."""
-        n = self.instant
-        distance = self.links.distance_m[n, self.column]
-        over = self.rules.deadline_s is not None and self.time_s + TIE >= self.start_s + self.rules.deadline_s
-        for k in np.flatnonzero(self.phase < Phase.OVER).tolist():
-            nearest = int(np.nan_to_num(distance[k], nan=np.inf).argmin())
-            reasons = {
-                LEFT_TOWN: not self.links.present[n, self.column[k]],
-                NEARER.format(self.links.unit[nearest]): distance[k, nearest] + self.rules.handover_margin_m
-                < distance[k, self.server[k]],
-                NO_COVERAGE: self.stalled_since[k] + self.rules.outage_s <= self.time_s + TIE,
-                DEADLINE: over,
-                TRACE_ENDS: n == len(self.links.time_s) - 1,
-            }
-            self.dropped[k] = next((reason for reason, holds in reasons.items() if holds), "")
-            if self.dropped[k]:
+        """Drop the clients that cannot go on at this time, each for the first reason that holds."""
+        n, rules = self.instant, self.rules
+        distance = np.nan_to_num(self.links.distance_m[n, self.column], nan=np.inf)  # (K, U)
+        nearest = distance.argmin(axis=1)
+        own = distance[np.arange(len(self.work)), self.server]
+        late = self.time_s + TIE >= self.start_s + (np.inf if rules.deadline_s is None else rules.deadline_s)
+        reasons = {
+            LEFT_TOWN: ~self.links.present[n, self.column],
+            NEARER: distance.min(axis=1) + rules.handover_margin_m < own,
+            NO_COVERAGE: self.stalled_since + rules.outage_s <= self.time_s + TIE,
+            DEADLINE: np.full(len(self.work), late),
+            TRACE_ENDS: np.full(len(self.work), n == len(self.links.time_s) - 1),
+        }
+        for reason, holds in reasons.items():
+            for k in np.flatnonzero(holds & (self.phase < Phase.OVER)).tolist():
+                self.dropped[k] = reason.format(unit=self.links.unit[nearest[k]])
                 self.phase[k], self.end_s[k] = Phase.OVER, self.time_s
 
     def _timing(self, k: int) -> ClientTiming:
