@@ -146,6 +146,13 @@ def test_the_deadline_and_the_end_of_the_trace():
     assert (ended.dropped, ended.end_s) == ("the trace ends", 9.0)
 
 
+def test_the_clock_may_count_from_1970():
+    since = 1.7e9 + np.arange(0, 20, 0.5)
+    links = made_links(since, {"cav0": GOOD, "cav1": GOOD})
+    found = only(links, work("cav0"), work("cav1", 5 * MB + 1), start_s=1.7e9)  # done a time apart that is not told
+    assert found["cav1"].end_s - 1.7e9 == pytest.approx(4 + 1 + 8, abs=1e-5)
+
+
 def test_nothing_to_do_takes_no_time():
     links = made_links(np.arange(3.0), {"cav0": -40.0})
     timing = only(links, work("cav0", 0, 0.0, 0), start_s=0.25)["cav0"]

@@ -97,13 +97,14 @@ class _Round:
         left = self.left[rows, self.phase[rows]]
         with np.errstate(divide="ignore", invalid="ignore"):
             seconds = np.where(left > 0, left / speed[rows], 0.0)
-        event_s = min(
-            float(self.links.time_s[self.instant + 1]),
-            self.time_s + float(seconds.min()),
-            float(self.stalled_since.min()) + self.rules.outage_s,
-            self.start_s + (np.inf if self.rules.deadline_s is None else self.rules.deadline_s),
+        deadline_s = np.inf if self.rules.deadline_s is None else self.rules.deadline_s
+        events = (
+            float(self.links.time_s[self.instant + 1]) - self.time_s,
+            float(seconds.min()),
+            float(self.stalled_since.min()) + self.rules.outage_s - self.time_s,
+            self.start_s + deadline_s - self.time_s,
         )
-        span = max(event_s - self.time_s, 0.0)
+        span = max(min(events), 0.0)
         done = seconds <= span + TIE
         self.left[rows, self.phase[rows]] = np.where(done, 0.0, left - speed[rows] * span)
         self.spent[rows, self.phase[rows]] += span
