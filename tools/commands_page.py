@@ -135,7 +135,7 @@ def copy_picture(path: Path, to: Path) -> None:
     with Image.open(path) as picture:
         picture.thumbnail((WIDEST, WIDEST))
         to.parent.mkdir(exist_ok=True)
-        picture.convert("RGB").quantize(64).save(to, optimize=True)
+        picture.convert("RGB").quantize(64, kmeans=3).save(to, optimize=True)
 
 
 def output_of(line: str, folder: Path) -> str:

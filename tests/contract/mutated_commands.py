@@ -107,6 +107,12 @@ def calls() -> list[Call]:
             ("errors.csv", "poles.csv", "town/*"),
             0.14,
         ),
+        Call("radio data/ --pole #1 --network network.yaml --map OUT.png", (*DATASET, "network.yaml"), 1.0),
+        Call(
+            "rounds data/ --pole 1 --model-mb #0.1 --step-s #0.001 --network network.yaml --timeline OUT.png",
+            (*DATASET, "network.yaml"),
+            0.5,
+        ),
         Call("fit history.csv --json --repeats 20 --at #500,#2,#1 --level #0.9 --seed #0", ("history.csv",), 0.09),
         Call("fit joint.csv --repeats 20 --at #500,1", ("joint.csv",), 0.2),
         Call("fit history.csv --repeats 20 --problem problem.yaml", ("history.csv", "problem.yaml"), 0.17),

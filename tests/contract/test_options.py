@@ -98,6 +98,14 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         ),
         ALWAYS,
     ),
+    "radio": dict.fromkeys(("--pole", "--scene", "--network", "--seed", "--map"), ALWAYS),
+    "rounds": dict.fromkeys(
+        (
+            *("--model-mb", "--update-mb", "--steps", "--step-s", "--rounds", "--edge-rounds-per-cloud-round"),
+            *("--pole", "--scene", "--network", "--seed", "--timeline"),
+        ),
+        ALWAYS,
+    ),
     "reproduce": {
         **dict.fromkeys(("--seeds", "--scale"), STUDIES),
         "--jobs": (*STUDIES, "sim-to-real"),

@@ -22,6 +22,7 @@ from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import save_network
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Frame, Views
+from flcav.world.trace import Trace
 
 DATA = Path(__file__).parents[1] / "data"
 TOWN = Path(flcav.world.__path__[0]) / "towns" / "suburb"
@@ -76,6 +77,11 @@ PROBLEM: dict[str, Any] = {
             },
         },
     ],
+}
+NETWORK = {
+    "radio": {"environment": "urban", "bandwidth_mhz": 20.0, "power_dbm": 23.0, "shadowing": True},
+    "wireline": {"rate_mbps": 500.0, "latency_s": 0.005},
+    "rounds": {"outage_s": 0.5, "deadline_s": 30.0},
 }
 PROGRESS = {
     "tasks": {"objects": {"samples": 60, "edge_rounds": 1, "cloud_rounds": 0, "accuracy": 0.6}},
@@ -136,6 +142,20 @@ OPTICAL = pose(0.5, 0.0, 1.5) @ BODY_FROM_OPTICAL
 class AllSensors(Drives):
     """Drives seen by every kind of sensor, so that no table of the dataset is empty."""
 
+    def trace(self, scene: str) -> Trace | None:
+        """Return the drive's traffic with the vehicle that sees it, which stands at the origin."""
+        traffic = super().trace(scene)
+        if traffic is None:
+            return None
+        twice = {
+            name: np.repeat(getattr(traffic, name), 2, axis=1)
+            for name in ("present", "position", "yaw", "velocity", "acceleration", "yaw_rate")
+        }
+        for name in ("position", "velocity"):
+            twice[name][:, 1] = 0.0
+        rows = {name: np.repeat(getattr(traffic, name), 2, axis=0) for name in ("category", "shape", "size")}
+        return replace(traffic, actor=np.array(["veh0", "cav0"]), **twice, **rows)
+
     def frame(self, scene: str, index: int) -> Frame:
         """Return the drive's frame with what the other sensors measured."""
         frame = super().frame(scene, index)
@@ -184,7 +204,10 @@ def make_inputs(folder: Path) -> None:
         task = task_named(name)
         save_network(task, build_network(task, networks[name], 1), folder / "weights" / f"{name}.safetensors")
     shutil.copytree(TOWN, folder / "town")
-    for name, values in (("recipe", RECIPE), ("problem", PROBLEM), ("graph", GRAPH), ("progress", PROGRESS)):
+    for name, values in (
+        *(("recipe", RECIPE), ("problem", PROBLEM), ("graph", GRAPH), ("progress", PROGRESS)),
+        ("network", NETWORK),
+    ):
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False))
     (folder / "graph.json").write_text(json.dumps(GRAPH))
     (folder / "elsewhere.yaml").write_text(yaml.safe_dump({**RECIPE, "town": str(folder / "town")}, sort_keys=False))

@@ -11,6 +11,7 @@ from flcav.cli import (
     run as run_command,
 )
 from flcav.cli.data import birdseye, camera, export, record, validate, view
+from flcav.cli.network import radio, rounds
 from flcav.cli.options import escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
 from flcav.cli.planning import allocate, fit, history, place
@@ -60,6 +61,8 @@ for command in (
     place,
     fit,
     history,
+    radio,
+    rounds,
     reproduce,
 ):
     command.register(app)

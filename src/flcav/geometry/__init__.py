@@ -1,6 +1,6 @@
 """Rigid transforms and oriented 3D boxes."""
 
-from flcav.geometry.boxes import Boxes, concatenate, points_in_boxes
+from flcav.geometry.boxes import Boxes, concatenate, points_in_boxes, segments_meet_boxes
 from flcav.geometry.poses import (
     heading_vectors,
     inverse,
@@ -26,6 +26,7 @@ __all__ = [
     "pose",
     "rotate",
     "rotations_about_z",
+    "segments_meet_boxes",
     "transform_points",
     "unit_vectors",
     "wrap_angle",

@@ -114,6 +114,32 @@ def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> N
     return inside
 
 
+def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> NDArray[np.bool_]:
+    """Return (S, N) whether each of S segments meets each of N boxes, by slabs (Kay and Kajiya, SIGGRAPH 1986).
+
+    `starts` and `ends` are (S, 3), x, y, z [m] in the frame of the boxes. Faces belong to the box.
+    """
+    start, end = np.asarray(starts, dtype=np.float64), np.asarray(ends, dtype=np.float64)
+    cos, sin = np.cos(boxes.yaw), np.sin(boxes.yaw)
+
+    def turn(vector: Array) -> Array:
+        """Return vectors (S, N, 3) in the axes of each box."""
+        x, y, z = np.moveaxis(vector, -1, 0)
+        return np.stack((x * cos + y * sin, y * cos - x * sin, z), axis=-1)
+
+    local = turn(start[:, None] - boxes.center)
+    along = turn(np.broadcast_to((end - start)[:, None], local.shape))
+    half = boxes.size / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (-half - local) / along, (half - local) / along
+    parallel, within = along == 0, np.abs(local) <= half
+    near = np.where(parallel, np.where(within, -np.inf, np.inf), np.minimum(first, second))
+    far = np.where(parallel, np.where(within, np.inf, -np.inf), np.maximum(first, second))
+    enters = near.max(axis=-1, initial=0.0)
+    leaves = far.min(axis=-1, initial=1.0)
+    return enters <= leaves
+
+
 def concatenate(parts: Sequence[Boxes]) -> Boxes:
     """Return the boxes of all `parts` in order, with scores and variances if every non-empty part has them."""
     parts = [part for part in parts if len(part)]

@@ -75,6 +75,11 @@ def build_town_mesh(town: Town) -> Mesh:
     return build_static_world(town).mesh
 
 
+def build_buildings_mesh(town: Town) -> Mesh:
+    """Return the mesh of a town's buildings alone, world frame; raises `ValueError` where it has none."""
+    return join_meshes([mesh for _, _, mesh in _buildings(town)])
+
+
 def list_signs_and_signals(town: Town) -> SignsAndSignals:
     """Return the signs and signal heads of a town, with their faces in `build_town_mesh`; without posts and masts."""
     world, signs, signals = build_static_world(town), town.signs, town.signals

@@ -1,0 +1,1 @@
+"""Commands about the network between vehicles, edge servers and the cloud."""

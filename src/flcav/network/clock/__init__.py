@@ -1,0 +1,1 @@
+"""Simulated clock of federated rounds: from bytes, radio links and speeds to seconds."""

@@ -1,0 +1,95 @@
+"""Records of rounds on the clock: when each client downloaded, trained and uploaded, and why one was dropped."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from flcav.config import InputError
+from flcav.files import atomic_path
+from flcav.parquet import read_parquet
+
+_TYPES: dict[Any, pa.DataType] = {str: pa.string(), int: pa.int64(), float: pa.float64()}
+
+
+@dataclass(frozen=True)
+class ClientTiming:
+    """The time of one client in one round [s], on the trace's clock."""
+
+    client: str  # e.g. "cav0"
+    server: str  # edge server at the start of the round, e.g. "pole3"
+    round: int
+    start_s: float  # when its edge server begins to send the model
+    download_s: float  # duration, as far as it came
+    compute_s: float
+    upload_s: float
+    end_s: float  # its update has arrived, or it was dropped
+    downloaded_bytes: int
+    uploaded_bytes: int
+    dropped: str  # why its update did not arrive, e.g. "left the town"; empty where it did
+
+
+@dataclass(frozen=True)
+class RoundRecord:
+    """One round on the trace's clock [s]: wireline download, then the clients, then wireline upload."""
+
+    round: int  # from 1
+    start_s: float
+    end_s: float
+    wireline_down_s: float  # cloud to edge servers; 0 where the round takes no part in that
+    wireline_up_s: float  # edge servers to cloud
+    clients: tuple[ClientTiming, ...]
+
+    @property
+    def finished(self) -> tuple[ClientTiming, ...]:
+        """Return the clients whose updates arrived."""
+        return tuple(client for client in self.clients if not client.dropped)
+
+    @property
+    def straggler(self) -> ClientTiming | None:
+        """Return the client whose update arrived last; None where none did."""
+        return max(self.finished, key=lambda client: client.end_s, default=None)
+
+
+_ROUND = tuple(field for field in fields(RoundRecord) if field.name not in ("round", "clients"))
+SCHEMA = pa.schema(
+    [(field.name, _TYPES[field.type]) for field in fields(ClientTiming)]
+    + [(f"round_{field.name}", _TYPES[field.type]) for field in _ROUND]
+)
+
+
+def rounds_table(records: Sequence[RoundRecord]) -> pa.Table:
+    """Return a table with a row per client and round; what is said of the round is in the columns `round_...`."""
+    rows = [
+        {**asdict(client), **{f"round_{field.name}": getattr(record, field.name) for field in _ROUND}}
+        for record in records
+        for client in record.clients
+    ]
+    return pa.Table.from_pylist(rows, schema=SCHEMA)
+
+
+def save_rounds(records: Sequence[RoundRecord], path: Path) -> None:
+    """Write `rounds_table` atomically to a Parquet file."""
+    with atomic_path(path) as temporary:
+        pq.write_table(rounds_table(records), temporary)
+
+
+def load_rounds(path: Path) -> tuple[RoundRecord, ...]:
+    """Return the rounds that `save_rounds` wrote; raises `InputError` where the file is missing or holds none."""
+    table = read_parquet(path)
+    if table.schema.remove_metadata() != SCHEMA:
+        raise InputError(f"{path}: not a table of rounds")
+    rows: list[dict[str, Any]] = table.to_pylist()
+    if any(value is None for row in rows for value in row.values()):
+        raise InputError(f"{path}: a table of rounds with an empty field")
+    records = []
+    for number, group in groupby(rows, key=lambda row: row["round"]):
+        own = list(group)
+        about = {field.name: own[0][f"round_{field.name}"] for field in _ROUND}
+        clients = (ClientTiming(**{field.name: row[field.name] for field in fields(ClientTiming)}) for row in own)
+        records.append(RoundRecord(round=number, clients=tuple(clients), **about))
+    return tuple(records)

@@ -1,0 +1,150 @@
+"""Radio links of the connected vehicles of a trace to roadside units, instant by instant."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.network.radio import propagation as laws
+from flcav.network.radio.budget import Radio, lone_rate_bps, received_dbm
+from flcav.network.radio.propagation import State
+from flcav.network.radio.sight import find_sight, raise_walls, vehicle_boxes
+from flcav.seeds import stream
+from flcav.world.map.town import Town
+from flcav.world.rays.embree import Assembly
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RadioLinks:
+    """Links of V vehicles to U roadside units at T instants of a trace; a state holds until the next instant."""
+
+    radio: Radio
+    time_s: Array  # (T,) ascending, the trace's clock
+    vehicle: tuple[str, ...]  # (V,) track ids
+    unit: tuple[str, ...]  # (U,) e.g. "pole3"
+    distance_m: Array  # (T, V, U) between the antennas; NaN where the vehicle is absent
+    state: NDArray[np.int8]  # (T, V, U) a State; -1 where the vehicle is absent
+    loss_db: Array  # (T, V, U) path loss, blockage and shadowing; infinite where the vehicle is absent
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """Return (T, V) whether each vehicle is in the town."""
+        return self.state[:, :, 0] >= 0
+
+    @property
+    def received_dbm(self) -> Array:
+        """Return the power (T, V, U) [dBm] that arrives."""
+        return received_dbm(self.loss_db, self.radio)
+
+    @property
+    def rate_bps(self) -> Array:
+        """Return the rates (T, V, U) [bit/s] of vehicles that have a unit's whole band, without interference."""
+        return lone_rate_bps(self.received_dbm, self.radio)
+
+
+def unit_positions(town: Town, poles: Sequence[int]) -> dict[str, Array]:
+    """Return the mounts (3,) [m, world] of a town's poles by the name of their agent; raises `InputError`."""
+    known = town.poles.id.tolist()
+    if odd := [pole for pole in poles if pole not in known]:
+        raise InputError(f"{town.name}: has no pole {odd[0]}; its poles are {', '.join(map(str, known))}")
+    return {f"pole{pole}": town.poles.position[known.index(pole)] for pole in poles}
+
+
+def check_units(town: Town, units: Mapping[str, Array], radio: Radio) -> None:
+    """Raise `InputError` where there is no unit, one stands outside the town, or an urban one has no buildings."""
+    if not units:
+        raise InputError(f"{town.name}: no roadside unit is given")
+    x_low, y_low, x_high, y_high = town.bounds
+    for name, (x, y, z) in units.items():
+        if not (x_low <= x <= x_high and y_low <= y <= y_high and 0 < z <= 1000):
+            raise InputError(f"{name}: {x:g}, {y:g}, {z:g} lies outside {town.name}")
+    if radio.environment == "urban" and not len(town.buildings):
+        raise InputError(f"{town.name}: has no buildings, which the urban model needs; the highway's does without")
+
+
+def walls_of(town: Town, radio: Radio) -> Assembly | None:
+    """Return the buildings that the radio's environment knows: none on a highway."""
+    return raise_walls(town) if radio.environment == "urban" else None
+
+
+def link_vehicles(
+    town: Town, trace: Trace, vehicles: Sequence[str], units: Mapping[str, Array], radio: Radio, seed: int = 0
+) -> RadioLinks:
+    """Return the links of `vehicles`, track ids of the trace, to `units`, name -> mount (3,) [m, world].
+
+    A vehicle's antenna is in the middle of its roof. Draws are named by seed, vehicle, unit and blocking vehicle, so
+    that another unit changes no other link; the loss by a vehicle in the path keeps its draw as long as that vehicle is
+    there. Raises `InputError` for an unknown vehicle, and as `check_units`.
+    """
+    check_units(town, units, radio)
+    actors = trace.actor.tolist()
+    if odd := [name for name in vehicles if name not in actors]:
+        raise InputError(f"the trace has no vehicle '{odd[0]}'")
+    carriers = np.array([actors.index(name) for name in vehicles], dtype=np.int64)
+    sites = np.array(list(units.values()), dtype=np.float64)
+    walls = walls_of(town, radio)
+    shape = (len(trace.time_s), len(carriers), len(sites))
+    distance, state = np.full(shape, np.nan), np.full(shape, -1, np.int8)
+    blocker = np.full(shape, -1, np.int64)  # actors
+    antenna = trace.position[:, carriers] + trace.size[carriers] * (0.0, 0.0, 1.0)  # (T, V, 3)
+    for n in range(shape[0]):
+        here = np.flatnonzero(trace.present[n, carriers])
+        boxes, actor = vehicle_boxes(trace, n)
+        row = np.full(len(trace.actor), -1, np.int64)
+        row[actor] = np.arange(len(actor))
+        sight = find_sight(antenna[n, here], sites, walls, boxes, row[carriers[here]])
+        distance[n, here] = np.linalg.norm(antenna[n, here, None] - sites, axis=-1)
+        state[n, here] = sight.state
+        blocker[n, here] = np.where(sight.blocker >= 0, np.append(actor, -1)[sight.blocker], -1)
+    passing = _Paths(distance, state, antenna, sites, blocker)
+    loss = np.where(state >= 0, _losses(passing, trace, tuple(vehicles), tuple(units), radio, seed), np.inf)
+    return RadioLinks(radio, trace.time_s, tuple(vehicles), tuple(units), distance, state, loss)
+
+
+class _Paths(NamedTuple):
+    """Geometry of the direct paths, the first two as in `RadioLinks`."""
+
+    distance_m: Array  # (T, V, U)
+    state: NDArray[np.int8]  # (T, V, U)
+    antenna: Array  # (T, V, 3) of the vehicles [m, world]
+    site: Array  # (U, 3)
+    blocker: NDArray[np.int64]  # (T, V, U) the actor in the path; -1 for none
+
+
+def _losses(
+    paths: _Paths, trace: Trace, vehicles: Sequence[str], units: Sequence[str], radio: Radio, seed: int
+) -> Array:
+    """Return the losses (T, V, U) [dB] of the paths; any number where a vehicle is absent."""
+    state, distance = np.maximum(paths.state, 0), np.nan_to_num(paths.distance_m, nan=1.0)
+    shadow, blockage = np.zeros(distance.shape), np.zeros(distance.shape)  # standard normal draws
+    if radio.shadowing:
+        for (v, vehicle), (u, unit) in product(enumerate(vehicles), enumerate(units)):
+            shadow[:, v, u] = stream(seed, "shadowing", vehicle, unit).standard_normal(len(shadow))
+            for actor in sorted({*paths.blocker[:, v, u].tolist()} - {-1}):
+                draws = stream(seed, "blockage", vehicle, unit, str(trace.actor[actor]))
+                blockage[paths.blocker[:, v, u] == actor, v, u] = draws.standard_normal()
+    antenna_m, unit_m = paths.antenna[:, :, None, 2], paths.site[:, 2]
+    tops = trace.position[..., 2] + trace.size[:, 2]  # (T, A)
+    top_m = np.take_along_axis(tops, paths.blocker.reshape(len(tops), -1) % tops.shape[1], axis=1)
+    blocked = laws.blockage_db(
+        distance,
+        np.minimum(antenna_m, unit_m),
+        np.maximum(antenna_m, unit_m),
+        top_m.reshape(distance.shape),
+        blockage,
+    )
+    moved = np.linalg.norm(np.diff(paths.antenna, axis=0, prepend=np.nan), axis=-1)
+    moved = np.nan_to_num(moved, nan=np.inf)[:, :, None]  # a path begins anew after an absence
+    correlation = laws.correlation_distance_m(state, radio.environment)
+    shadowing = laws.shadowing_sigma_db(state, radio.environment) * laws.correlate_along_path(
+        moved, correlation, shadow
+    )
+    path_loss = laws.path_loss_db(distance, state, radio.frequency_ghz, radio.environment)
+    return path_loss + np.where(paths.state == State.NLOSV, blocked, 0.0) + shadowing
