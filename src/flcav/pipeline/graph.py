@@ -26,7 +26,7 @@ from flcav.pipeline.recipe import (
     SplitName,
     find_path,
 )
-from flcav.pipeline.spread import read_spreads
+from flcav.pipeline.seeds.spread import read_spreads
 from flcav.pipeline.steps import Step
 from flcav.pipeline.work import (
     central_step,

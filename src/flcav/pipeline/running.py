@@ -35,8 +35,8 @@ from flcav.pipeline.results import (
     Watched,
     average_regions,
 )
+from flcav.pipeline.seeds.spread import difference_key, list_spreads, test_key
 from flcav.pipeline.seeds.summary import summarise
-from flcav.pipeline.spread import difference_key, list_spreads, test_key
 from flcav.pipeline.steps import Notify, Stale, run_side_by_side, run_steps, stopwatch
 from flcav.pipeline.tables import append_records
 

@@ -7,7 +7,7 @@ import pytest
 
 from flcav.config import InputError
 from flcav.intervals import Spread
-from flcav.pipeline.spread import SpreadRow, read_spreads
+from flcav.pipeline.seeds.spread import SpreadRow, read_spreads
 from flcav.pipeline.tables import append_records
 
 ROW = SpreadRow("objects", "grid", "main", "edge", "", "", sd=0.021, trainings=9, run="seed1")
