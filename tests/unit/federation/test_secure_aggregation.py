@@ -12,7 +12,7 @@ from flcav.config import InputError
 from flcav.federation.privacy import Privacy
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.metered import Account, MeteredGrid
-from flcav.federation.secure.masks import agree, draw_keys, expand, seal, to_integers, to_values, unseal
+from flcav.federation.secure.masks import add_vectors, agree, draw_keys, expand, seal, to_integers, to_values, unseal
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.secure.parties import SecureClient, unmask_sum
 from flcav.federation.secure.shamir import join_shares, split_secret
@@ -50,7 +50,7 @@ def protocol(lost_before: tuple[str, ...], lost_after: tuple[str, ...], threshol
     dropped = [name for name in peers if name in lost_after]
     shares = {name: clients[name].reveal(survivors, dropped) for name in survivors}
     held += [share for revealed in shares.values() for share in revealed.values()]
-    total = np.sum([*masked.values()], axis=0, dtype=np.uint32)
+    total = add_vectors([*masked.values()])
     return unmask_sum(total, keys, survivors, dropped, shares), held
 
 
@@ -133,9 +133,9 @@ def test_keys_are_common_to_two_for_one_purpose():
 def test_fixed_point_sums_do_not_overflow():
     rng = np.random.default_rng(3)
     values = rng.uniform(-9, 9, size=(7, 1000))
-    total = np.sum([to_integers(each, 8.0, 7) for each in values], axis=0, dtype=np.uint32)
+    total = add_vectors([to_integers(each, 8.0, 7) for each in values])
     np.testing.assert_allclose(to_values(total, 8.0, 7), np.clip(values, -8, 8).sum(axis=0), atol=7 * 8.0 * 7 / 2**31)
-    every = np.sum([to_integers(np.full(3, 8.0), 8.0, 7)] * 7, axis=0, dtype=np.uint32)
+    every = add_vectors([to_integers(np.full(3, 8.0), 8.0, 7)] * 7)
     np.testing.assert_allclose(to_values(every, 8.0, 7), 56.0)
     with pytest.raises(ValueError, match="not finite"):
         to_integers(np.array([np.nan]), 1.0, 2)

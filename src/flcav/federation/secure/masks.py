@@ -4,6 +4,7 @@ Updates are vectors of integers modulo 2^32, so that masks cancel exactly and le
 """
 
 import hashlib
+from collections.abc import Iterable
 
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
@@ -42,6 +43,11 @@ def unseal(key: bytes, sealed: bytes) -> bytes:
 def expand(seed: bytes, size: int) -> Vector:
     """Return the mask of a 32-byte seed, (size,): the output of SHAKE256, as little-endian integers."""
     return np.frombuffer(hashlib.shake_256(b"flcav mask" + seed).digest(4 * size), "<u4").astype(np.uint32)
+
+
+def add_vectors(vectors: Iterable[Vector]) -> Vector:
+    """Return the sum of vectors, modulo 2^32."""
+    return np.asarray(np.sum([*vectors], axis=0, dtype=np.uint32))
 
 
 def to_integers(values: NDArray[np.float64], largest: float, clients: int) -> Vector:

@@ -5,11 +5,10 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
 from flwr.app import ConfigRecord, Context, Message, RecordDict
 
 from flcav.federation.records import ASK
-from flcav.federation.secure.masks import Vector
+from flcav.federation.secure.masks import Vector, add_vectors
 from flcav.federation.secure.parties import PublicKeys, SecureClient, unmask_sum
 
 KEYS, SHARES, MASKED, UNMASK = "keys", "shares", "masked", "unmask"  # what the server asks for, in this order
@@ -99,8 +98,7 @@ class SecureSum:
         answers = self._exchange(dict.fromkeys(survivors, ask))
         self._check(len(answers), "helped to unmask the sum")
         shares = {name: _named(answer) for name, answer in answers.items()}
-        total = np.sum([*masked.values()], axis=0, dtype=np.uint32)
-        return unmask_sum(total, self._keys, survivors, dropped, shares)
+        return unmask_sum(add_vectors(masked.values()), self._keys, survivors, dropped, shares)
 
     def _check(self, left: int, did: str) -> None:
         if left < self._threshold:
