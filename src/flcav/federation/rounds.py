@@ -223,7 +223,9 @@ class Rounds(FlowerStrategy):
         elif privacy is not None and privacy.where == "central":
             sent = self._rules.upload.exchanged(start)
             names = [name for name in learned_names(start) if name in sent]
-            expected = expected_clients(self._rules.selection, [*self._names.values()])
+            expected = float(len(self._chosen))
+            if self._rules.selection.rule == "poisson":  # by chance more or fewer come
+                expected = expected_clients(self._rules.selection, [*self._names.values()])
             mean = average_privately(start, each, names, privacy, expected, self._work(number).seed)
             each = [LocalUpdate(mean, 1, 0.0)]
         elif self._rules.selection.rule == "importance" and updates:

@@ -15,8 +15,8 @@ class SecureAggregation(Config):
     largest: float = Field(default=8.0, gt=0, le=1e6)  # largest change of a weight in a round; more is cut off
 
     def needed(self, clients: int) -> int:
-        """Return the threshold among so many clients of a round."""
-        return clients // 2 + 1 if self.threshold is None else self.threshold
+        """Return the threshold among so many clients of a round; two at least, as the sum of one is its update."""
+        return max(clients // 2 + 1, 2) if self.threshold is None else self.threshold
 
 
 class Rules(Config):

@@ -131,6 +131,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
     assert rules.privacy is not None
     sixth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 6)
     rules = Rules.model_validate({"privacy": PRIVACY | {"epsilon": sixth + 1e-6}})
+    assert rules.privacy is not None
     noted: list[str] = []
 
     def report(done: int, total: int, note: str = "") -> None:
@@ -155,6 +156,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
         return len(federate_cloud(learning, network, starts, 9, edge_rounds, *how))
 
     assert (cloud(1), cloud(2), cloud(3)) == (4, 2, 1)
-    assert noted[-1].endswith(f"epsilon {account_epsilon(rules.privacy, rules.selection, [*clients['a']], 5):.2f}")
+    fifth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 5)
+    assert noted[-1].endswith(f"epsilon {fifth:.2f}")
     with pytest.raises(InputError, match="the budget does not afford the 5 edge rounds of a cloud round"):
         cloud(5)
