@@ -5,7 +5,7 @@ import json
 import pickle
 import random
 import sys
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from flcav.federation.rounds import ClientFailed
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import Schedule, federate
-from flcav.federation.state import FederationState
+from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy
 from flcav.federation.strategies.strategy import Stateful
 from flcav.federation.trainable import LocalUpdate, Weights
@@ -149,7 +149,7 @@ def test_it_resumes_from_weights_and_state_to_the_same_bits(strategy):
 
     def keep(number: int, weights: Weights, loss: float) -> None:
         arrays = {name: array.copy() for name, array in state.to_arrays().items()}
-        kept.append((weights, arrays, [asdict(record) for record in state.records]))
+        kept.append((weights, arrays, [record.as_json() for record in state.records]))
 
     whole = federated(strategy, on_round=keep, state=state)
     last = kept[-1]
@@ -157,7 +157,9 @@ def test_it_resumes_from_weights_and_state_to_the_same_bits(strategy):
     for done in (1, 2):
         weights, arrays, records = kept[done - 1]
         resumed = FederationState()
-        resumed.restore(load(save(arrays)), json.loads(json.dumps(records)))
+        resumed.restore(
+            load(save(arrays)), [RoundRecord.from_json(each, "") for each in json.loads(json.dumps(records))]
+        )
         assert same(federated(type(strategy)(), weights, done=done, state=resumed), whole)
         assert save(resumed.to_arrays()) == save(last[1])
         assert resumed.records == state.records

@@ -8,7 +8,7 @@ from flwr.app import Context, Message, MetricRecord
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
-from flcav.federation.encoding import encode
+from flcav.federation.encoding import encode, flatten
 from flcav.federation.privacy import change_norm
 from flcav.federation.records import (
     ARRAYS,
@@ -19,6 +19,7 @@ from flcav.federation.records import (
     NORM,
     SAMPLES,
     SEND,
+    VECTOR,
     LocalWork,
     reply,
     reply_norm,
@@ -26,6 +27,8 @@ from flcav.federation.records import (
     to_weights,
 )
 from flcav.federation.rules import Rules
+from flcav.federation.secure.masks import to_integers
+from flcav.federation.secure.messages import KEYS, MASKED, NAMES, SHARES, UNMASK, answer_secretly, mask_update
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Update, Weights, learned_names
 from flcav.federation.upload import Arrays, subtract
@@ -47,6 +50,8 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
     def train(message: Message, context: Context) -> Message:
         name = str(context.node_config[CLIENT])
         asked = message.content.config_records[ASK][ASK] if ASK in message.content.config_records else None
+        if asked in (KEYS, SHARES, UNMASK):
+            return answer_secretly(message, context, name)
         work = LocalWork.from_record(message.content.config_records[CONFIG])
         seed = derive_seed(work.seed, name)
         if asked == SEND:
@@ -58,6 +63,11 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
             _keep(context, start, update)
             names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
             return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
+        if asked == MASKED and rules.secure is not None:
+            clients = len(message.content.config_records[ASK][NAMES]) + 1  # type: ignore[arg-type]
+            integers = to_integers(flatten(update, start, rules), rules.secure.largest, clients)
+            masked = {VECTOR: mask_update(message, context, integers)}
+            return reply(message, LocalUpdate(masked, update.samples, update.loss), {})
         sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed)
         _record(context, RESIDUAL, left)
         return reply(message, sent, extra)

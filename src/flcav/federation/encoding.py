@@ -1,5 +1,8 @@
 """A client's update as the arrays of its message, and back: named layers, clipping, local noise, compression."""
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flcav.federation.privacy import add_noise, clip_change
 from flcav.federation.rules import Rules
 from flcav.federation.trainable import LocalUpdate, Update, Weights, learned_names
@@ -47,6 +50,23 @@ def decode(sent: Weights, start: Weights, rules: Rules) -> Weights:
     weights = add(start, decompress(rules.upload, sent, like))
     rest = () if _is_local(rules) else [name for name in names if name not in learned]
     return weights | {name: sent[name] for name in rest}
+
+
+def flatten(update: Update, start: Weights, rules: Rules) -> NDArray[np.float64]:
+    """Return the change of all floating arrays that are sent, one after another (coordinates,)."""
+    change = subtract(update.weights, start, _floating(start, rules))
+    return np.concatenate([np.ravel(array).astype(np.float64) for array in change.values()])
+
+
+def unflatten(change: NDArray[np.float64], start: Weights, rules: Rules) -> Weights:
+    """Return the weights `start` with a change of their floating arrays added: the inverse of `flatten`."""
+    names = _floating(start, rules)
+    parts = np.split(change, np.cumsum([start[name].size for name in names])[:-1])
+    return add(start, {name: part.reshape(start[name].shape) for name, part in zip(names, parts, strict=True)})
+
+
+def _floating(start: Weights, rules: Rules) -> list[str]:
+    return [name for name in rules.upload.exchanged(start) if np.issubdtype(start[name].dtype, np.floating)]
 
 
 def _is_local(rules: Rules) -> bool:

@@ -13,7 +13,7 @@ from flwr.app import ArrayRecord, ConfigRecord, Message, MessageType, MetricReco
 from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 
-from flcav.federation.encoding import decode
+from flcav.federation.encoding import decode, flatten, unflatten
 from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
 from flcav.federation.records import (
     ARRAYS,
@@ -24,13 +24,16 @@ from flcav.federation.records import (
     NORM,
     SAMPLES,
     SEND,
+    VECTOR,
     LocalWork,
     to_arrays,
     to_norm,
     to_update,
     to_weights,
 )
-from flcav.federation.rules import Rules
+from flcav.federation.rules import Rules, SecureAggregation
+from flcav.federation.secure.masks import to_values
+from flcav.federation.secure.messages import SecureSum
 from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
@@ -71,6 +74,7 @@ class Rounds(FlowerStrategy):
         self._chosen: list[str] = []  # who is to send an update in this round
         self._failed: dict[str, str] = {}  # by client what was wrong in this round
         self._drawn: dict[str, float] = {}  # of importance selection: probability of the clients that were drawn
+        self._secure: SecureSum | None = None  # of this round
         self._shares: dict[str, float] = {}  # of importance selection: of all samples, by client
 
     def summary(self) -> None:
@@ -91,6 +95,8 @@ class Rounds(FlowerStrategy):
         selection, local = self._rules.selection, work.record()
         self._chosen = selection.choose([*self._names.values()], work.round, work.seed)
         self._failed = {}
+        if self._rules.secure is not None:
+            return self._begin_securely(grid, {**records, CONFIG: local}, self._rules.secure)
         if selection.rule != "importance":
             return self._address(self._chosen, {**records, CONFIG: local})
         asked = self._address(self._chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
@@ -98,6 +104,19 @@ class Rounds(FlowerStrategy):
         self._drawn = selection.draw(norms, work.seed)
         self._chosen = [*self._drawn]
         return self._address(self._chosen, {CONFIG: local, ASK: ConfigRecord({ASK: SEND})})
+
+    def _begin_securely(self, grid: Grid, records: dict[str, Any], how: SecureAggregation) -> list[Message]:
+        """Exchange keys and shares among the chosen clients, and return the messages to those who are left."""
+
+        def exchange(asks: Mapping[str, ConfigRecord]) -> dict[str, ConfigRecord]:
+            asked = [each for name, ask in asks.items() for each in self._address([name], {CONFIG: local, ASK: ask})]
+            replies = self._sort_replies(grid.send_and_receive(asked))
+            return {name: message.content.config_records[ASK] for name, message in replies}
+
+        local = records[CONFIG]
+        self._secure = SecureSum(exchange, how.needed(len(self._chosen)))
+        asks = self._secure.agree(self._chosen)
+        return [each for name, ask in asks.items() for each in self._address([name], {**records, ASK: ask})]
 
     def _address(self, clients: Iterable[str], records: dict[str, Any]) -> list[Message]:
         content = RecordDict(records)
@@ -166,6 +185,9 @@ class Rounds(FlowerStrategy):
         for name, message in self._sort_replies(replies):
             try:
                 sent = to_update(message)
+                if self._secure is not None:
+                    updates[name] = self._check_masked(sent)
+                    continue
                 update = replace(sent, weights=decode(sent.weights, self._start, self._rules))
             except (KeyError, IndexError, TypeError, ValueError) as error:
                 self._failed[name] = f"a message that is no update ({error})"
@@ -178,13 +200,32 @@ class Rounds(FlowerStrategy):
                 self._failed[name] = fault
         return updates
 
+    def _check_masked(self, sent: LocalUpdate) -> LocalUpdate:
+        """Return a masked update; raises ValueError where it is none. Its values cannot be told from others."""
+        size, vector = len(flatten(LocalUpdate(self._start, 0, 0.0), self._start, self._rules)), sent.weights[VECTOR]
+        if (vector.shape, vector.dtype) != ((size,), np.dtype(np.uint32)) or not np.isfinite(sent.loss):
+            raise ValueError(f"{vector.dtype} {vector.shape} instead of uint32 ({size},), or a loss of {sent.loss}")
+        return sent
+
+    def _average_securely(self, updates: Mapping[str, LocalUpdate], how: SecureAggregation) -> Weights:
+        """Return start + (sum of the clients' changes) / their number; the sum is all that is unmasked."""
+        assert self._secure is not None
+        masked = {name: np.asarray(update.weights[VECTOR], np.uint32) for name, update in updates.items()}
+        peers = self._secure.peers
+        total = to_values(self._secure.finish(masked), how.largest, peers)
+        return unflatten(total / len(updates), self._start, self._rules)
+
     def _combine(self, updates: Mapping[str, LocalUpdate], number: int) -> Weights:
         """Return the weights after round `number`, and change the strategy's state."""
         privacy, start, each = self._rules.privacy, self._start, list(updates.values())
-        if privacy is not None and privacy.where == "central":
+        if self._rules.secure is not None:
+            each = [LocalUpdate(self._average_securely(updates, self._rules.secure), 1, 0.0)]
+        elif privacy is not None and privacy.where == "central":
             sent = self._rules.upload.exchanged(start)
             names = [name for name in learned_names(start) if name in sent]
-            expected = expected_clients(self._rules.selection, [*self._names.values()])
+            expected = float(len(self._chosen))
+            if self._rules.selection.rule == "poisson":  # by chance more or fewer come
+                expected = expected_clients(self._rules.selection, [*self._names.values()])
             mean = average_privately(start, each, names, privacy, expected, self._work(number).seed)
             each = [LocalUpdate(mean, 1, 0.0)]
         elif self._rules.selection.rule == "importance" and updates:

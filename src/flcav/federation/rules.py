@@ -8,12 +8,24 @@ from flcav.federation.selection import Selection
 from flcav.federation.upload import Upload
 
 
+class SecureAggregation(Config):
+    """Secure aggregation: the server learns the sum of the updates alone, and all clients count the same."""
+
+    threshold: int | None = Field(default=None, ge=2, le=10**6)  # clients that have to stay; default: more than half
+    largest: float = Field(default=8.0, gt=0, le=1e6)  # largest change of a weight in a round; more is cut off
+
+    def needed(self, clients: int) -> int:
+        """Return the threshold among so many clients of a round; two at least, as the sum of one is its update."""
+        return max(clients // 2 + 1, 2) if self.threshold is None else self.threshold
+
+
 class Rules(Config):
     """Rules of the rounds of a federation; by default every client sends its whole update in every round."""
 
     selection: Selection = Selection()  # of the clients of a round
     upload: Upload = Upload()  # form of the updates
     privacy: Privacy | None = None  # clipping and noise; default: none
+    secure: SecureAggregation | None = None  # default: the server sees every update
     least_clients: int | None = Field(default=None, ge=1, le=10**6)  # whose updates a round needs; default: all chosen
 
     def of_servers(self) -> "Rules":

@@ -15,7 +15,7 @@ from flcav.federation.client import CLIENT, OWN, RESIDUAL, check_arguments, clie
 from flcav.federation.privacy import affordable_rounds, expected_clients
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.rounds import OnRound, Rounds
-from flcav.federation.rules import Rules
+from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.state import FederationState
@@ -148,11 +148,29 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
         if selection.rule in ("poisson", "planned"):
             raise InputError(f"{told} needs a known number of clients, and {selection.rule} selection has any")
         strategy.check_clients(chosen)
+    if rules.secure is not None:
+        _check_secure(told, rules, rules.secure, chosen, single)
     if rules.privacy is not None:
         if isinstance(strategy, Exchanges):
             raise InputError(f"{told} sends further arrays beside the weights, which the noise does not cover")
         if rules.privacy.where == "central" and single:
             raise InputError(f"{told} looks at each update, and central noise covers their sum alone")
+
+
+def _check_secure(told: str, rules: Rules, secure: SecureAggregation, chosen: int, single: bool) -> None:
+    needed = secure.needed(chosen)
+    if single:
+        raise InputError(f"{told} looks at each update, and secure aggregation shows their sum alone")
+    if rules.selection.rule in ("poisson", "importance"):
+        raise InputError(f"secure aggregation needs a known number of clients, and {rules.selection.rule} draws any")
+    if rules.upload.compression != "none":
+        raise InputError(f"secure aggregation sums integers of 32 bits, and {rules.upload.compression} sends others")
+    if rules.privacy is not None:
+        raise InputError("secure aggregation is not to be combined with noise yet: neither clips before it masks")
+    if not max(chosen / 2, 1) < needed <= chosen:
+        raise InputError(
+            f"secure.threshold: more than half of the {chosen} clients of a round, 2 or more, and not {needed}"
+        )
 
 
 def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_rounds: int, earlier: int) -> int:

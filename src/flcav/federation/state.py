@@ -1,11 +1,12 @@
 """State of a federation between rounds, as arrays for a checkpoint, and the record of each round."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from flcav.records import Record
 
 Arrays = dict[str, NDArray[np.number]]  # by name
 
@@ -13,7 +14,7 @@ SERVER, CLIENT = "server", "client"
 
 
 @dataclass(frozen=True)
-class RoundRecord:
+class RoundRecord(Record):
     """One round: whose updates were combined, and who failed."""
 
     round: int  # from 1
@@ -41,8 +42,8 @@ class FederationState:
                 found |= {f"{CLIENT}|{client}|{kind}|{name}": array for name, array in arrays.items()}
         return found
 
-    def restore(self, arrays: Mapping[str, NDArray[np.number]], records: list[dict[str, Any]]) -> None:
-        """Set the state, in place, to what `to_arrays` returned and to the fields of the records."""
+    def restore(self, arrays: Mapping[str, NDArray[np.number]], records: Sequence[RoundRecord]) -> None:
+        """Set the state, in place, to what `to_arrays` returned and to the records."""
         self.server, self.clients = {}, {}
         for key, array in arrays.items():
             owner, _, rest = key.partition("|")
@@ -51,4 +52,4 @@ class FederationState:
             else:
                 client, kind, name = rest.split("|", 2)
                 self.clients.setdefault(client, {}).setdefault(kind, {})[name] = array
-        self.records = [replace(RoundRecord(**record), clients=tuple(record["clients"])) for record in records]
+        self.records = [*records]

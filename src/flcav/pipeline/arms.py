@@ -1,9 +1,13 @@
 """Arms of a run: their complete settings, and the names of their steps, which equal arms share."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from flcav.config import InputError
+from flcav.federation.stages import check_rules
+from flcav.federation.strategies import Strategy, of_servers, strategy_named
+from flcav.federation.strategies.strategy import Corrects
 from flcav.pipeline.recipe import (
     CENTRAL,
     CLOUD,
@@ -84,6 +88,29 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         (CENTRAL,) if arm.central else arm.stages,
         recipe.replan and arm.plan == "joint" and any(task.history for task in recipe.tasks.values()),
     )
+
+
+def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
+    """Return the strategies of edge servers and of the cloud; raises `InputError` as `strategy_named` does."""
+    edge = strategy_named(how.strategy)
+    cloud = of_servers(edge) if how.cloud_strategy is None else strategy_named(how.cloud_strategy)
+    if isinstance(cloud, Corrects):
+        raise InputError(f"cloud_strategy: {type(cloud).__name__} corrects local steps, and edge servers take none")
+    return edge, cloud
+
+
+def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
+    """Raise `InputError` where an arm's strategies and rules do not go together, or not with so many vehicles.
+
+    The vehicles of regions of recorded data are not known before their frames are dealt.
+    """
+    for setting in settings:
+        edge, cloud = find_strategies(setting.federation)
+        for region in setting.regions:
+            if recipe.regions[region].data is None:
+                check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])
+        if CLOUD in setting.stages:
+            check_rules(cloud, setting.federation.of_servers(), setting.regions)
 
 
 class Names:

@@ -9,10 +9,9 @@ from typing import Any
 
 from flcav.config import InputError, shorten
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
-from flcav.pipeline.federations import update_forms
 from flcav.pipeline.frames import hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
-from flcav.pipeline.planning import UpdateForm, read_history
+from flcav.pipeline.planning import UpdateForm, read_history, update_forms
 from flcav.pipeline.recipe import (
     CENTRAL,
     CLOUD,

@@ -4,7 +4,7 @@
 """
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +13,10 @@ import numpy as np
 import pyarrow.csv
 
 from flcav.config import Config, InputError, parse_config
+from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.selection import Selection
+from flcav.federation.strategies import exchanges_more
 from flcav.federation.upload import Upload
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
@@ -28,8 +31,8 @@ from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
+from flcav.pipeline.arms import PlanRule, Setting
+from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, Federation, FixedPlan, Limits
 from flcav.pipeline.results import Plan, TaskPlan
 from flcav.pipeline.tables import read_table
 
@@ -230,6 +233,27 @@ class UpdateForm(Config):
 
     upload: Upload = Upload()
     exchanging: bool = False  # with an array beside each that is learned
+
+
+def update_forms(settings: Iterable[Setting]) -> list[UpdateForm]:
+    """Return the different forms of the arms' updates, in the order of the arms."""
+    forms = []
+    for setting in settings:
+        how = setting.federation
+        form = UpdateForm(upload=how.upload, exchanging=exchanges_more(how.strategy))
+        if form not in forms and setting.central is None:
+            forms.append(form)
+    return forms
+
+
+def follow_plan(how: Federation, plan: TaskPlan, done: int) -> Rules:
+    """Return the rules by which vehicles join the rounds that the plan gives them, after `done` rounds.
+
+    Another selection than that of all vehicles goes before the plan's.
+    """
+    if plan.joins is None or how.selection.rule != "all":
+        return how
+    return how.model_copy(update={"selection": Selection(rule="planned", joins=plan.joins_after(done))})
 
 
 def model_mb(task: Task, network: str | None, forms: Sequence[UpdateForm] = (UpdateForm(),)) -> float:

@@ -9,8 +9,7 @@ from flcav.intervals import Estimate, measure_spread, widen, widen_share
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
-from flcav.pipeline.arms import Setting, name_repeat
-from flcav.pipeline.federations import check_federations
+from flcav.pipeline.arms import Setting, check_federations, name_repeat
 from flcav.pipeline.findings import findings, name_stage
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.labels import LABEL_SOURCES

@@ -7,7 +7,7 @@ vehicles federate with their edge server. Stage III: edge servers federate with 
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
-from flcav.federation.state import FederationState
+from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Trainable, Weights
@@ -221,7 +221,7 @@ class FederationCheckpoints:
         for name, own in self._states.items():
             begins = f"{name}|"
             mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
-            own.restore(mine, state["records"][name])
+            own.restore(mine, [RoundRecord.from_json(record, str(self._folder)) for record in state["records"][name]])
         return load_file(round_path(self._folder, state["round"])), state["round"]
 
     def make_saver(self, rounds: int) -> OnRound:
@@ -238,7 +238,7 @@ class FederationCheckpoints:
             self._book.save(self._folder / LEDGER)
             state = {"round": round_, "entries": len(self._book.entries), "losses": self.losses}
             if self._states:
-                records = {name: [asdict(record) for record in own.records] for name, own in self._states.items()}
+                records = {name: [record.as_json() for record in own.records] for name, own in self._states.items()}
                 state |= {"by": self._identity, "records": records, "states": bool(arrays)}
             write_json(self._folder / ROUND, state)
             self._state_path(round_ - 1).unlink(missing_ok=True)

@@ -22,9 +22,8 @@ from flcav.perception.outcomes import as_measurable, compute_interval, compute_m
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
-from flcav.pipeline.arms import PlanRule
+from flcav.pipeline.arms import PlanRule, find_strategies
 from flcav.pipeline.before_after import detect_before_after
-from flcav.pipeline.federations import find_strategies, follow_plan
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
     LABEL_SOURCES,
@@ -38,6 +37,7 @@ from flcav.pipeline.planning import (
     PlanRequest,
     PlanSettings,
     UpdateForm,
+    follow_plan,
     make_plan,
     model_mb,
     parse_history,

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -17,6 +16,7 @@ from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
+from flcav.files import Json
 from flcav.plugins import load_named
 
 STRATEGIES: dict[str, type[Strategy]] = {
@@ -32,7 +32,7 @@ STRATEGIES: dict[str, type[Strategy]] = {
 }
 FEDAVG = FedAvg()  # the default everywhere
 
-Spec = str | Mapping[str, Mapping[str, Any]]  # a name, or a name with settings: {fedprox: {mu: 0.1}}
+Spec = str | Mapping[str, Mapping[str, Json]]  # a name, or a name with settings: {fedprox: {mu: 0.1}}
 
 
 def strategy_named(spec: Spec) -> Strategy:

@@ -1,0 +1,67 @@
+"""Masks of secure aggregation: key agreement (X25519), expansion of seeds (SHAKE256), sealed shares, fixed point.
+
+Updates are vectors of integers modulo 2^32, so that masks cancel exactly and leave no trace in the sum.
+"""
+
+import hashlib
+from collections.abc import Iterable
+
+import numpy as np
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+from numpy.typing import NDArray
+
+LARGEST_SUM = 2**31 - 1
+NONCE = bytes(12)  # every key seals one message
+Vector = NDArray[np.uint32]
+
+
+def draw_keys() -> tuple[bytes, bytes]:
+    """Return a new X25519 key pair, private and public, of 32 bytes each, from the operating system's randomness."""
+    private = X25519PrivateKey.generate()
+    return private.private_bytes_raw(), private.public_key().public_bytes_raw()
+
+
+def agree(private: bytes, public: bytes, purpose: str) -> bytes:
+    """Return the 32-byte key that two clients have in common for a purpose (X25519, HKDF with SHA-256)."""
+    common = X25519PrivateKey.from_private_bytes(private).exchange(X25519PublicKey.from_public_bytes(public))
+    return HKDF(SHA256(), 32, salt=None, info=purpose.encode()).derive(common)
+
+
+def seal(key: bytes, data: bytes) -> bytes:
+    """Return data encrypted and authenticated (ChaCha20-Poly1305) by a key that is used once."""
+    return ChaCha20Poly1305(key).encrypt(NONCE, data, None)
+
+
+def unseal(key: bytes, sealed: bytes) -> bytes:
+    """Return what was sealed; raises cryptography's `InvalidTag` where it was changed, or by another key."""
+    return ChaCha20Poly1305(key).decrypt(NONCE, sealed, None)
+
+
+def expand(seed: bytes, size: int) -> Vector:
+    """Return the mask of a 32-byte seed, (size,): the output of SHAKE256, as little-endian integers."""
+    return np.frombuffer(hashlib.shake_256(b"flcav mask" + seed).digest(4 * size), "<u4").astype(np.uint32)
+
+
+def add_vectors(vectors: Iterable[Vector]) -> Vector:
+    """Return the sum of vectors, modulo 2^32."""
+    return np.asarray(np.sum([*vectors], axis=0, dtype=np.uint32))
+
+
+def to_integers(values: NDArray[np.float64], largest: float, clients: int) -> Vector:
+    """Return values in fixed point, modulo 2^32; beyond +-largest they are cut off.
+
+    The step is fine enough, and no finer, that the sum of `clients` vectors does not overflow. Raises ValueError for
+    values that are not finite.
+    """
+    if not np.isfinite(values).all():
+        raise ValueError("an update with values that are not finite cannot be masked")
+    limit = LARGEST_SUM // clients
+    return np.rint(np.clip(values / largest, -1.0, 1.0) * limit).astype(np.int64).astype(np.uint32)
+
+
+def to_values(total: Vector, largest: float, clients: int) -> NDArray[np.float64]:
+    """Return the sum of the values of which `total` is the sum in fixed point: the inverse of `to_integers`."""
+    return total.astype(np.int32).astype(np.float64) * (largest / (LARGEST_SUM // clients))

@@ -1,0 +1,250 @@
+"""Secure aggregation: sums come out exactly, with drop-outs too, and the server holds no client's update."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from cryptography.exceptions import InvalidTag
+from flwr.common.serde import recorddict_to_proto
+
+from flcav.config import InputError
+from flcav.federation.privacy import Privacy
+from flcav.federation.rules import Rules, SecureAggregation
+from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.secure.masks import add_vectors, agree, draw_keys, expand, seal, to_integers, to_values, unseal
+from flcav.federation.secure.messages import TooFewClients
+from flcav.federation.secure.parties import SecureClient, unmask_sum
+from flcav.federation.secure.shamir import join_shares, split_secret
+from flcav.federation.selection import Selection
+from flcav.federation.stages import Schedule, check_federation, federate
+from flcav.federation.state import FederationState
+from flcav.federation.strategies import FEDAVG
+from flcav.federation.strategies.fedadam import FedAdam
+from flcav.federation.strategies.median import Median
+from flcav.federation.trainable import LocalUpdate
+from flcav.federation.upload import Upload
+from flcav.network.ledger import Budget, Ledger
+
+NAMES = [f"grid/cav{i}" for i in (3, 0, 4, 1, 2)]
+
+
+def updates(size: int = 50) -> dict[str, Any]:
+    rng = np.random.default_rng(1)
+    return {name: to_integers(rng.normal(size=size), 8.0, len(NAMES)) for name in NAMES}
+
+
+def protocol(lost_before: tuple[str, ...], lost_after: tuple[str, ...], threshold: int = 3) -> tuple[Any, list[Any]]:
+    """Return the sum as the server computes it, and all that the server was sent."""
+    held: list[Any] = []
+    clients = {name: SecureClient.draw(name) for name in NAMES}
+    keys = {name: client.keys for name, client in clients.items()}
+    sealed = {name: client.share(keys, threshold) for name, client in clients.items()}
+    held += [share for shares in sealed.values() for share in shares.values()]
+    peers = [name for name in NAMES if name not in lost_before]
+    for_one = {name: {other: sealed[other][name] for other in peers if other != name} for name in peers}
+    survivors = [name for name in peers if name not in lost_after]
+    given = updates()
+    masked = {name: clients[name].mask(given[name], for_one[name]) for name in survivors}
+    held += [*masked.values()]
+    dropped = [name for name in peers if name in lost_after]
+    shares = {name: clients[name].reveal(survivors, dropped) for name in survivors}
+    held += [share for revealed in shares.values() for share in revealed.values()]
+    total = add_vectors([*masked.values()])
+    return unmask_sum(total, keys, survivors, dropped, shares), held
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [((), ()), ((NAMES[1],), ()), ((), (NAMES[0], NAMES[4])), ((NAMES[2],), (NAMES[3],))]
+)
+def test_the_sum_is_that_of_those_who_are_left(before: tuple[str, ...], after: tuple[str, ...]):
+    given = updates()
+    expected = sum(given[name].astype(np.int64) for name in NAMES if name not in before + after) % 2**32
+    np.testing.assert_array_equal(protocol(before, after)[0], expected)
+
+
+def test_the_server_holds_no_client_s_update():
+    for before, after in (((), ()), ((), (NAMES[0],))):
+        _, held = protocol(before, after)
+        vectors = [each for each in held if isinstance(each, np.ndarray)]
+        assert len(vectors) == len(NAMES) - len(after)
+        for vector, (_, update) in itertools.product(vectors, updates().items()):
+            assert np.mean(vector == update) < 0.05
+            for other in vectors:  # nor does a difference of two give one away
+                assert np.mean(vector - other == update) < 0.05 or np.array_equal(vector, other)
+        shares = [each for each in held if isinstance(each, bytes)]
+        seeds = [update.tobytes()[:16] for update in updates().values()]
+        assert not any(seed in share for seed, share in itertools.product(seeds, shares))
+
+
+def test_masks_look_uniform_and_differ_from_round_to_round():
+    client = {name: SecureClient.draw(name) for name in NAMES}
+    keys = {name: each.keys for name, each in client.items()}
+    sealed = {name: each.share(keys, 3) for name, each in client.items()}
+    zero = np.zeros(100_000, np.uint32)
+    name = NAMES[0]
+    masked = client[name].mask(zero, {other: sealed[other][name] for other in NAMES if other != name})
+    counts = np.bincount(masked >> 24, minlength=256)
+    assert ((counts - len(zero) / 256) ** 2).sum() / (len(zero) / 256) < 360  # chi-squared, 255 degrees: p > 1e-5
+    assert SecureClient.draw(name).keys != client[name].keys
+
+
+def test_a_client_does_not_reveal_both_masks_of_another():
+    clients = {name: SecureClient.draw(name) for name in NAMES}
+    keys = {name: client.keys for name, client in clients.items()}
+    sealed = {name: client.share(keys, 3) for name, client in clients.items()}
+    one = clients[NAMES[0]]
+    one.mask(np.zeros(4, np.uint32), {name: sealed[name][NAMES[0]] for name in NAMES[1:]})
+    for survivors, dropped in ((NAMES, NAMES[:1]), (NAMES[:2], NAMES[2:]), (NAMES[1:], ()), ([*NAMES[:3], "x"], ())):
+        with pytest.raises(ValueError, match="shares are revealed"):
+            one.reveal(survivors, dropped)
+    one.reveal(NAMES[:3], NAMES[3:])
+    with pytest.raises(ValueError, match="revealed once"):
+        one.reveal(NAMES, ())
+    for threshold in (2, 6):
+        with pytest.raises(ValueError, match="more than half of them is wanted"):
+            one.share(keys, threshold)
+    with pytest.raises(ValueError, match="2 clients are left, and 3 are needed"):
+        clients[NAMES[1]].mask(np.zeros(4, np.uint32), {NAMES[0]: b""})
+
+
+def test_any_threshold_of_the_shares_make_the_secret_and_fewer_do_not():
+    secret = bytes(range(32))
+    shares = dict(enumerate(split_secret(secret, 3, 6)))
+    for places in itertools.combinations(shares, 3):
+        assert join_shares({place: shares[place] for place in places}) == secret
+    assert join_shares(shares) == secret
+    with pytest.raises(OverflowError):  # a random element of the field, of 521 bits
+        join_shares({place: shares[place] for place in (0, 1)})
+    assert split_secret(secret, 3, 6) != [*shares.values()]
+
+
+def test_keys_are_common_to_two_for_one_purpose():
+    (private, public), (other_private, other_public) = draw_keys(), draw_keys()
+    assert agree(private, other_public, "mask") == agree(other_private, public, "mask")
+    assert agree(private, other_public, "mask") != agree(private, other_public, "shares")
+    sealed = seal(agree(private, other_public, "shares"), b"share")
+    assert unseal(agree(other_private, public, "shares"), sealed) == b"share"
+    with pytest.raises(InvalidTag):
+        unseal(agree(other_private, public, "mask"), sealed)
+    assert not np.array_equal(expand(b"a" * 32, 8), expand(b"b" * 32, 8))
+
+
+def test_fixed_point_sums_do_not_overflow():
+    rng = np.random.default_rng(3)
+    values = rng.uniform(-9, 9, size=(7, 1000))
+    total = add_vectors([to_integers(each, 8.0, 7) for each in values])
+    np.testing.assert_allclose(to_values(total, 8.0, 7), np.clip(values, -8, 8).sum(axis=0), atol=7 * 8.0 * 7 / 2**31)
+    every = add_vectors([to_integers(np.full(3, 8.0), 8.0, 7)] * 7)
+    np.testing.assert_allclose(to_values(every, 8.0, 7), 56.0)
+    with pytest.raises(ValueError, match="not finite"):
+        to_integers(np.array([np.nan]), 1.0, 2)
+
+
+class Walk:
+    def __init__(self, stride: float, fails: tuple[int, ...] = ()) -> None:
+        self.stride, self.fails, self.calls = stride, fails, 0
+
+    def train(self, weights: Any, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        self.calls += 1
+        if self.calls in self.fails:
+            raise OSError("no power")
+        noise = np.random.default_rng(seed).normal(size=(40, 5))
+        moved = (weights["w"] + self.stride + learning_rate * noise).astype(np.float32)
+        return LocalUpdate(
+            {"w": moved, "norm.running_var": weights["norm.running_var"] + 0.5, "n": weights["n"]}, 3, 0.5
+        )
+
+
+START = {"w": np.zeros((40, 5), np.float32), "norm.running_var": np.ones(4, np.float32), "n": np.array(2)}
+SCHEDULE = Schedule(rounds=3, steps=1, learning_rate=0.1, final_learning_rate=0.1, seed=3)
+SECURE = Rules(secure=SecureAggregation(), least_clients=3)
+
+
+def run(clients: dict[str, Walk], rules: Rules, **how: Any) -> tuple[Any, FederationState, Ledger]:
+    book, state = Ledger(Budget(10.0, 0.0)), FederationState()
+    account = Account(book, "edge", "walk", "wireless")
+    return federate(clients, START, SCHEDULE, account, rules=rules, state=state, **how).weights, state, book
+
+
+def walks(**fails: tuple[int, ...]) -> dict[str, Walk]:
+    return {f"cav{i}": Walk(0.1 * i, fails.get(f"cav{i}", ())) for i in range(5)}
+
+
+@pytest.mark.parametrize("strategy", [FEDAVG, FedAdam()], ids=["fedavg", "fedadam"])
+def test_a_masked_federation_ends_as_an_open_one(strategy: Any):
+    open_weights, _, open_book = run(walks(), Rules(), strategy=strategy)
+    weights, _, book = run(walks(), SECURE, strategy=strategy)
+    np.testing.assert_allclose(weights["w"], open_weights["w"], atol=2e-6)
+    np.testing.assert_allclose(weights["norm.running_var"], open_weights["norm.running_var"], atol=2e-6)
+    again = run(walks(), SECURE, strategy=strategy)[0]
+    assert all(np.array_equal(weights[name], again[name]) for name in weights)  # whatever the keys were
+    assert len([entry for entry in book.entries if entry.direction == "up"]) == 4 * 5 * 3  # four messages a round
+    assert book.used_mb("wireless") > open_book.used_mb("wireless")
+
+
+def test_a_vehicle_that_drops_out_is_named_and_the_sum_is_of_the_others():
+    weights, state, _ = run(walks(cav2=(1,)), SECURE)
+    assert state.records[0].clients == ("cav0", "cav1", "cav3", "cav4")
+    assert "no power" in state.records[0].failed["cav2"]
+    expected = run(walks(cav2=(1,)), Rules(least_clients=3))[0]
+    np.testing.assert_allclose(weights["w"], expected["w"], atol=2e-6)
+    with pytest.raises(TooFewClients, match="secure aggregation: 2 clients sent an update, and 3 are needed"):
+        run(walks(cav0=(1,), cav1=(1,), cav2=(1,)), Rules(secure=SecureAggregation(), least_clients=1))
+
+
+def test_the_server_is_sent_no_update_that_it_could_read(monkeypatch: pytest.MonkeyPatch):
+    held: list[bytes] = []
+    receive = MeteredGrid.send_and_receive
+
+    def listening(grid: Any, messages: Any, **options: Any) -> Any:
+        replies = list(receive(grid, messages, **options))
+        held.extend(recorddict_to_proto(reply.content).SerializeToString() for reply in replies)
+        return replies
+
+    trained: list[np.ndarray] = []
+    train = Walk.train
+
+    def telling(walk: Walk, weights: Any, **how: Any) -> LocalUpdate:
+        update = train(walk, weights, **how)
+        trained.append(np.concatenate([update.weights["w"].ravel() - weights["w"].ravel(), np.full(4, 0.5)]))
+        return update
+
+    monkeypatch.setattr(MeteredGrid, "send_and_receive", listening)
+    monkeypatch.setattr(Walk, "train", telling)
+    everything = {"open": Rules(), "masked": SECURE}
+    found = {}
+    for name, rules in everything.items():
+        held.clear()
+        trained.clear()
+        run(walks(), rules)
+        integers = [to_integers(change.astype(np.float64), 8.0, 5) for change in trained]
+        read = [np.frombuffer(each[at:], np.uint32, (len(each) - at) // 4) for each in held for at in range(4)]
+        near = [
+            np.isin(each >> 12, integer >> 12).mean()
+            for each, integer in itertools.product(read, integers)
+            if len(each) >= len(integer)
+        ]
+        weights = [np.float32(change[:8]).tobytes() for change in trained[:5]]  # the first round starts at 0
+        found[name] = max(near), any(weight in each for weight, each in itertools.product(weights, held))
+    assert found["open"][1]
+    assert found["masked"] == (pytest.approx(0, abs=0.05), False)
+
+
+def test_what_makes_no_sense_is_one_sentence():
+    secure, clients = SecureAggregation(), walks()
+    poisson = Selection(rule="poisson", probability=0.5)
+    for strategy, rules, said in (
+        (Median(), Rules(secure=secure), r"Median looks at each update, and secure aggregation shows their sum alone"),
+        (FEDAVG, Rules(secure=secure, selection=poisson), r"secure aggregation needs a known number of clients"),
+        (
+            FEDAVG,
+            Rules(secure=secure, upload=Upload(compression="fp16")),
+            r"integers of 32 bits, and fp16 sends others",
+        ),
+        (FEDAVG, Rules(secure=secure, privacy=Privacy(clip=1.0, noise=1.0)), r"not to be combined with noise"),
+        (FEDAVG, Rules(secure=SecureAggregation(threshold=2)), r"secure.threshold: more than half of the 5 clients"),
+        (FEDAVG, Rules(secure=SecureAggregation(threshold=6)), r"secure.threshold: .* and not 6"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check_federation(clients, strategy, rules)

@@ -1,0 +1,162 @@
+"""Federations of a recipe: refused before anything is computed, planned with what they send, ended by their budgets."""
+
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from pydantic import ValidationError
+from pydantic.dataclasses import dataclass
+
+from flcav.config import InputError
+from flcav.federation.privacy import account_epsilon
+from flcav.federation.rules import Rules
+from flcav.federation.strategies import FEDAVG
+from flcav.federation.strategies.fedadam import FedAdam
+from flcav.federation.strategies.fedavgm import FedAvgM
+from flcav.network.ledger import Budget, Ledger
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import Practice, Task
+from flcav.perception.weights import to_arrays
+from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
+from flcav.pipeline.planning import UpdateForm, model_mb, update_forms
+from flcav.pipeline.recipe import Federation, RunRecipe, Training
+from flcav.pipeline.stages import Learning, RegionStart, Strategies, federate_cloud, federate_edge, make_clients
+
+PRIVACY = {"clip": 1.0, "noise": 4.0}
+
+
+def settings(arms: dict[str, Any], **federation: Any) -> tuple[RunRecipe, Any]:
+    recipe = RunRecipe.model_validate(
+        {
+            "tasks": {"objects": {"history": "objects"}},
+            "regions": {
+                "suburb": {"role": "pretrain"},
+                "grid": {"role": "federate", "vehicles": 5},
+                "ring": {"role": "federate", "vehicles": 4},
+            },
+            "budgets_mb": {"wireless": 100, "wireline": 80},
+            "federation": federation,
+            "arms": {name: {"federation": own} for name, own in arms.items()},
+        }
+    )
+    return recipe, resolve_settings(recipe, {"objects": "ideal-road"}).values()
+
+
+@pytest.mark.parametrize(
+    ("federation", "said"),
+    [
+        ({"strategy": "fedprose"}, "strategy 'fedprose': choose one of fedavg, "),
+        ({"strategy": "krum"}, "krum: 5 clients or more are wanted .* and there are 4"),
+        ({"strategy": {"median": {}}, "cloud_strategy": "krum"}, "krum: .* and there are 2"),
+        ({"cloud_strategy": "fedprox"}, "cloud_strategy: FedProx corrects local steps, and edge servers take none"),
+        (
+            {"selection": {"rule": "uniform", "clients": 5}},
+            "selection: 5 clients are wanted in a round, and there are 4",
+        ),
+        ({"least_clients": 5}, "least_clients: 5 are wanted in a round, and 4 take part"),
+    ],
+)
+def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any, said: str) -> None:
+    for recipe, arms in (settings({}, **federation), settings({"other": federation})):
+        with pytest.raises(InputError, match=said):
+            check_federations(recipe, arms)
+
+
+@pytest.mark.parametrize(
+    ("federation", "said"),
+    [
+        ({"privacy": {**PRIVACY, "epsilon": 0}}, "privacy.epsilon"),
+        ({"selection": {"rule": "uniform"}}, "the rule uniform needs 'clients'"),
+        ({"upload": {"compression": "zip"}}, "upload.compression"),
+    ],
+)
+def test_an_arm_s_rules_are_checked_with_the_recipe(federation: Any, said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        settings({"other": federation})
+
+
+def test_strategies_are_by_name_and_settings() -> None:
+    how = Federation.model_validate({"strategy": {"fedavgm": {"momentum": 0.5}}})
+    assert find_strategies(how) == (FedAvgM(momentum=0.5), FedAvgM(momentum=0.5))
+    assert find_strategies(Federation(strategy="scaffold"))[1] == FEDAVG
+    assert find_strategies(Federation(strategy="scaffold", cloud_strategy="fedadam"))[1] == FedAdam()
+    check_federations(*settings({"masked": {"secure": {}}, "few": {"upload": {"compression": "top-k"}}}))
+
+
+def test_the_largest_update_of_the_arms_is_planned_with() -> None:
+    fp16 = {"upload": {"compression": "fp16"}}
+    assert update_forms(settings({"adam": {"strategy": "fedadam"}})[1]) == [UpdateForm()]
+    forms = update_forms(settings({"twice": {"strategy": "scaffold"}}, **fp16)[1])
+    assert forms == [UpdateForm(**cast(Any, fp16)), UpdateForm(**cast(Any, fp16), exchanging=True)]
+    whole = model_mb(OBJECTS, "tiny")
+    half, more = (model_mb(OBJECTS, "tiny", [form]) for form in forms)
+    assert half == pytest.approx(whole / 2, rel=0.05)
+    assert more == pytest.approx(1.5 * whole, rel=0.05)
+    assert model_mb(OBJECTS, "tiny", forms) == more
+
+
+@dataclass(frozen=True)
+class Slope:
+    bias: bool = True
+
+
+class Line(torch.nn.Linear):
+    def __init__(self, config: Slope) -> None:
+        super().__init__(1, 1)
+        self.config = config
+
+
+class LineTask:
+    """Fits y = 2 x to samples x."""
+
+    name, family, configurations, practice = "line", "line", {"tiny": Slope()}, Practice(2, learning_rate=0.1)
+    build = Line
+
+    def draw(self, samples, index, config, rng):
+        return samples[index]
+
+    def loss(self, network, samples):
+        x = torch.tensor(np.array(samples))[:, None]
+        return ((network(x) - 2 * x) ** 2).mean()
+
+
+def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2), 3)
+    network = learning.build_network()
+    samples = {region: {f"{region}/cav{i}": [np.float32(i), np.float32(1)] for i in range(3)} for region in ("a", "b")}
+    clients = {region: make_clients(learning, Slope(), each) for region, each in samples.items()}
+    rules = Rules.model_validate({"privacy": PRIVACY})
+    assert rules.privacy is not None
+    sixth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 6)
+    rules = Rules.model_validate({"privacy": PRIVACY | {"epsilon": sixth + 1e-6}})
+    assert rules.privacy is not None
+    noted: list[str] = []
+
+    def report(done: int, total: int, note: str = "") -> None:
+        noted.append(note)
+
+    def edge(rounds: int, earlier: int) -> int:
+        folder = tmp_path / f"{rounds}-{earlier}"
+        schedule = learning.schedule(rounds, 2, "edge", "a")
+        book = Ledger(Budget(1.0, 1.0))
+        how = (FEDAVG, rules, earlier, book, folder, report)
+        losses = federate_edge(learning, network, clients["a"], schedule, *how)
+        assert (folder / "weights.safetensors").exists()
+        return len(losses)
+
+    assert (edge(3, 0), edge(9, 0), edge(9, 4)) == (3, 6, 2)
+    assert noted[-1].endswith(f"epsilon {sixth:.2f}")
+    starts = {region: RegionStart(own, to_arrays(network), earlier=2) for region, own in clients.items()}
+
+    def cloud(edge_rounds: int) -> int:
+        book, folder = Ledger(Budget(1.0, 1.0)), tmp_path / f"cloud{edge_rounds}"
+        how = (Strategies(FEDAVG, FEDAVG), rules, book, folder, report)
+        return len(federate_cloud(learning, network, starts, 9, edge_rounds, *how))
+
+    assert (cloud(1), cloud(2), cloud(3)) == (4, 2, 1)
+    fifth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 5)
+    assert noted[-1].endswith(f"epsilon {fifth:.2f}")
+    with pytest.raises(InputError, match="the budget does not afford the 5 edge rounds of a cloud round"):
+        cloud(5)
