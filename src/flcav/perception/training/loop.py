@@ -63,7 +63,7 @@ class Checkpointing:
 class Validation:
     """Validation during a training, and the rule of early stopping."""
 
-    score: Callable[[Any], float]  # validation score of a network; more is better
+    score: Callable[[nn.Module], float]  # validation score of a network; more is better
     every: int  # steps between validations
     patience: int | None = (
         None  # validations without a new best after which training stops, with the best weights; None: it goes on
