@@ -123,8 +123,13 @@ def draw_power_curves(axes: Axes, curves: Sequence[Curve]) -> None:
 
 
 def draw_own_curves(axes: Axes, curves: Sequence[Curve], route: Route) -> None:
-    """Draw accuracy along `route` (pretrained, edge rounds, cloud rounds), a curve per sample size."""
+    """Draw accuracy along `route` (pretrained, edge rounds, cloud rounds): least, middle and most samples of `curves`.
+
+    `curves` has one for each number of samples, ascending.
+    """
     places = range(len(route))
+    if len(curves) > 3:
+        curves = [curves[0], curves[len(curves) // 2], curves[-1]]
     _draw(axes, curves, SERIES_COLOURS[1:])
     _name_ends(axes, curves, SERIES_COLOURS[1:])
     edges = [place for place, (edge, cloud) in enumerate(route) if edge and not cloud]
