@@ -19,6 +19,7 @@ from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate
+from flcav.seeds import derive_seed
 
 SCHEDULE = Schedule(rounds=6, steps=5, learning_rate=0.05, final_learning_rate=0.02, seed=3)
 NAMES = [f"grid/cav{i}" for i in range(6)]
@@ -162,3 +163,20 @@ def test_clients_join_the_rounds_of_a_plan() -> None:
     assert planned.choose(["a", "b"], 4, 0) == ["a", "b"]  # else nobody would train
     with pytest.raises(ValueError, match="the rule all takes no 'joins'"):
         Selection(joins={"a": (1,)})
+
+
+def test_a_round_by_importance_is_the_weighted_sum_of_those_drawn():
+    clients: Any = vehicles("grid", 6)
+    one = Schedule(rounds=1, steps=5, learning_rate=0.05, final_learning_rate=0.05, seed=8)
+    rules = Rules(selection=Selection(rule="importance", clients=3))
+    state, work = FederationState(), one.work(1)
+    found = federate(clients, START, one, Account(ledger(), "edge", "r", "wireless"), rules=rules, state=state)
+    how = {"steps": work.steps, "learning_rate": work.learning_rate}
+    trained = {n: client.train(START, seed=derive_seed(work.seed, n), **how) for n, client in clients.items()}
+    share = {name: update.samples / sum(each.samples for each in trained.values()) for name, update in trained.items()}
+    norms = [share[name] * np.linalg.norm(update.weights["w"].astype(float)) for name, update in trained.items()]
+    p = dict(zip(trained, optimal_probabilities(np.array(norms), 3), strict=True))
+    drawn = state.records[0].clients
+    assert 0 < len(drawn) < 6
+    expected = np.sum([share[name] / p[name] * trained[name].weights["w"] for name in drawn], axis=0)
+    np.testing.assert_allclose(found.weights["w"], expected, rtol=1e-5)
