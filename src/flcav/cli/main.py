@@ -10,7 +10,7 @@ from flcav.cli import reproduce, towns
 from flcav.cli import (
     run as run_command,
 )
-from flcav.cli.data import birdseye, camera, export, record, validate, view
+from flcav.cli.data import birdseye, camera, export, import_, record, validate, view
 from flcav.cli.network import radio, rounds
 from flcav.cli.options import escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
@@ -53,6 +53,7 @@ for command in (
     camera,
     view,
     export,
+    import_,
     train,
     evaluate,
     infer,

@@ -47,6 +47,15 @@ class Format(StrEnum):
     mcap = "mcap"
 
 
+class ImportFormat(StrEnum):
+    """Format of an import, see `flcav.dataset.formats.importing`."""
+
+    kitti = "kitti"
+    nuscenes = "nuscenes"
+    argoverse2 = "argoverse2"
+    opv2v = "opv2v"
+
+
 class Engine(StrEnum):
     """Execution engine, see `flcav.dataset.recording.recorder` and `flcav.pipeline.steps`."""
 

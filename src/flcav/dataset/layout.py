@@ -54,6 +54,18 @@ class Manifest(StrictModel):
     scenes: list[str]
     tables: dict[str, TableFile]
 
+    @property
+    def imported(self) -> str | None:
+        """Return the format that the dataset was imported from, None if flcav recorded it."""
+        name = self.recipe.get("imported")
+        return name if isinstance(name, str) else None
+
+    @property
+    def labels(self) -> Sequence[Json]:
+        """Return what is labelled: "objects" and "signs" of a recording, of an imported dataset what its files say."""
+        labels = self.recipe.get("labels") if self.imported else ("objects", "signs")
+        return labels if isinstance(labels, list | tuple) else ()
+
 
 @dataclass(frozen=True)
 class FrameKey:

@@ -5,7 +5,7 @@ time, see `benchmarks/bench_recording.py`.
 """
 
 import io
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from flcav.sensors.frame import Frame
 DEPTH_BITS = 14  # bits kept of a depth's mantissa: rounds by up to 3 mm at 100 m
 _DROPPED = 23 - DEPTH_BITS
 PLANES = {"rgb": "webp", "depth_m": "depth.zst", "semantic": "semantic.png", "instance": "instance.png"}
+PICTURES = ("webp", "png", "jpg", "jpeg")  # of colour images: recorded ones are WebP, imported ones as they were
 POINTS, TIMES, RADAR, INFRARED = "bin", "times.bin", "radar.bin", "infrared.png"
 COLUMNS = {POINTS: 4, TIMES: 1, RADAR: 5}  # of little-endian float32 in row-major order
 
@@ -32,15 +33,21 @@ class Payload(NamedTuple):
     data: bytes | memoryview
 
 
-def encode_payloads(frame: Frame) -> Iterator[Payload]:
-    """Yield the encoded measurement files of a frame: of its LiDARs, cameras, infrared cameras and radars."""
+def encode_payloads(frame: Frame, left_out: Collection[str] = ()) -> Iterator[Payload]:
+    """Yield the encoded measurement files of a frame: of its LiDARs, cameras, infrared cameras and radars.
+
+    Files of the points or the colour image of the sensors `left_out` are not among them.
+    """
     for name, points in frame.lidar.items():
-        yield Payload(payload_path(name, frame.key, POINTS), encode_rows(points))
+        if name not in left_out:
+            yield Payload(payload_path(name, frame.key, POINTS), encode_rows(points))
     for name, times in frame.point_times.items():
         yield Payload(payload_path(name, frame.key, TIMES), encode_rows(times))
-    for name, image in frame.images.items():
-        for plane, suffix in PLANES.items():
-            yield Payload(payload_path(name, frame.key, suffix), encode_plane(plane, getattr(image, plane)))
+    for name in frame.images:
+        if name not in left_out:
+            for plane, suffix in PLANES.items():
+                if (pixels := getattr(frame.images[name], plane)) is not None:
+                    yield Payload(payload_path(name, frame.key, suffix), encode_plane(plane, pixels))
     for name, image in frame.infrared.items():
         yield Payload(payload_path(name, frame.key, INFRARED), encode_png(image))
     for name, detections in frame.radar.items():
@@ -105,12 +112,12 @@ def read_plane(path: Path, plane: str) -> NDArray:
 
 
 def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArray:
-    """Return the pixels of a PNG or WebP file as `dtype`, (H, W), or (H, W, channels) for more than one channel.
+    """Return the pixels of a PNG, WebP or JPEG file as `dtype`, (H, W), or (H, W, channels) for more than one channel.
 
     Raises `InputError` where the file is missing, not such an image, or has another number of channels.
     """
     try:
-        with Image.open(path, formats=("PNG", "WEBP")) as image:
+        with Image.open(path, formats=("PNG", "WEBP", "JPEG")) as image:
             found = len(image.getbands())
             pixels = np.asarray(image)
     except (FileNotFoundError, IsADirectoryError):

@@ -29,7 +29,7 @@ from flcav.dataset.layout import (
     town_path,
     trace_path,
 )
-from flcav.dataset.payloads import INFRARED, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
+from flcav.dataset.payloads import INFRARED, PICTURES, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, read_table
 from flcav.sensors.frame import LONGEST_NAME, CameraImage, Frame, format_key
 from flcav.world.map.town import Town, load_town
@@ -151,10 +151,11 @@ class Dataset:
             agent_at_trigger=dict(zip(poses["triggered"], then)),
         )
         if self._checked:
-            _raise_first(self.folder, check_values(frame))
+            imported = self.manifest.imported is not None
+            _raise_first(self.folder, check_values(frame, imported=imported))
             _raise_first(self.folder, check_measurements(frame))
             for camera, views in frame.annotations.views.items():
-                _raise_first(self.folder, check_views(frame.key, camera, views))
+                _raise_first(self.folder, check_views(frame.key, camera, views, imported=imported))
                 _raise_first(self.folder, check_signs(frame.key, camera, frame.annotations.signs[camera]))
         return frame
 
@@ -167,7 +168,9 @@ class Dataset:
 
     def plane_path(self, i: int, camera: str, plane: str) -> Path:
         """Return the path of the file of one plane of an image of frame `i`."""
-        return self.folder / payload_path(camera, self._name[i], PLANES[plane])
+        suffixes = PICTURES if plane == "rgb" and self.manifest.imported else (PLANES[plane],)
+        paths = [payload_path(camera, self._name[i], suffix) for suffix in suffixes]
+        return self.folder / next((path for path in paths if path in self._files), paths[0])
 
     def trace(self, scene: str) -> Trace | None:
         """Return the traffic of a scene, None if it was not recorded; raises `InputError` if its file is damaged."""
@@ -186,6 +189,11 @@ class Dataset:
     def payload_bytes(self, i: int) -> int:
         """Return the size of frame `i` as a labelled sample [bytes]: its point clouds and annotation rows."""
         return sum(self._lidar[i].values()) * POINT_BYTES + self._rows("annotations", i).drop(NOT_IN_SAMPLE).nbytes
+
+    def check_labelled(self, what: str) -> None:
+        """Raise `InputError` where `what`, "objects" or "signs", is not labelled in an imported dataset."""
+        if what not in self.manifest.labels:
+            raise InputError(f"{self.folder}: imported from {self.manifest.imported} without labels of {what}")
 
     def select(
         self,
@@ -241,18 +249,18 @@ class Dataset:
         timed = {
             sensor: count
             for sensor, count in self._lidar[i].items()
-            if payload_path(sensor, self._name[i], TIMES) in self._files_of_times
+            if payload_path(sensor, self._name[i], TIMES) in self._files
         }
         return {sensor: times[:, 0] for sensor, times in self._rows_of(i, timed, TIMES).items()}
 
     @cached_property
-    def _files_of_times(self) -> frozenset[str]:
-        """Return the relative paths of the recorded files of points' times."""
-        paths: list[str] = read_table(self.folder / table_path(FILES), FILES)["path"].to_pylist()
-        return frozenset(path for path in paths if path.endswith(f".{TIMES}"))
+    def _files(self) -> frozenset[str]:
+        """Return the relative paths of all files but the manifest and the tables."""
+        return frozenset(read_table(self.folder / table_path(FILES), FILES)["path"].to_pylist())
 
     def _image(self, i: int, camera: str) -> CameraImage:
-        image = CameraImage(**{plane: self.plane(i, camera, plane) for plane in PLANES})
+        planes = ("rgb",) if self.manifest.imported else PLANES
+        image = CameraImage(**{plane: self.plane(i, camera, plane) for plane in planes})
         if self._checked:
             actors = int(np.diff(self._first["annotations"])[i])
             _raise_first(self.folder, check_planes(self._name[i], camera, image, actors))

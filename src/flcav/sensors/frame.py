@@ -5,6 +5,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from flcav.world.weather import Weather
 
 Array = NDArray[np.float64]
 
+UNKNOWN_PIXELS = -1  # in `Views.pixels`
 LONGEST_NAME = 100  # characters of a frame's key, and of the names in it: parts of file names
 
 # Numbers and names of CARLA's semantic tags (0.9.15)
@@ -61,12 +63,13 @@ class Calibration:
 
 @dataclass(frozen=True)
 class CameraImage:
-    """A colour image, with depth, semantic and instance ground truth of each of its (H, W) pixels."""
+    """A colour image, with depth, semantic and instance ground truth of each of its (H, W) pixels; None: unknown."""
 
     rgb: NDArray[np.uint8]  # (H, W, 3) sRGB
-    depth_m: NDArray[np.float32]  # (H, W) z in the optical frame; inf for the sky
-    semantic: NDArray[np.uint8]  # (H, W) class: one of SEMANTICS
-    instance: NDArray[np.uint16]  # (H, W) 1 + row of the frame's annotations, 0 where there is no annotated actor
+    depth_m: NDArray[np.float32] | None = None  # (H, W) z in the optical frame; inf for the sky
+    semantic: NDArray[np.uint8] | None = None  # (H, W) class: one of SEMANTICS
+    instance: NDArray[np.uint16] | None = None
+    # (H, W) 1 + row of the frame's annotations, 0 where there is no annotated actor
 
 
 @dataclass(frozen=True)
@@ -75,9 +78,10 @@ class Views:
 
     amodal_box: Array  # (M, 4) x1 y1 x2 y2 of the whole actor, not clipped to the image; NaN where it does not touch it
     visible_box: Array  # (M, 4) around its visible pixels, to their outer edges; NaN where there are none
-    pixels: NDArray[np.int64]  # (M,) number of visible pixels
+    pixels: NDArray[np.int64]  # (M,) number of visible pixels; UNKNOWN_PIXELS where an imported dataset does not say
     truncation: Array  # (M,) share of the amodal box that lies outside the image, 0 to 1
-    occlusion: Array  # (M,) 1 - visible pixels / pixels in a world without other objects; 1 where none is visible
+    occlusion: Array
+    # (M,) 1 - visible pixels / pixels in a world without other objects; 1 where none is visible, NaN where unknown
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,8 @@ class SignViews:
 class Annotations:
     """Ground truth of one frame: every actor but the agent itself that is within range or shows in a camera.
 
-    The range is that of the LiDARs; an actor within it is annotated even if it is hidden.
+    The range is that of the LiDARs; an actor within it is annotated even if it is hidden. Of imported datasets it is
+    what their format labels; velocity, acceleration and occlusion are NaN where it does not say.
     """
 
     track: NDArray[np.str_]  # (M,) track ids, the same in all frames of a scene
@@ -173,3 +178,10 @@ class Frame:
         Raises `KeyError` for an unknown sensor.
         """
         return self.agent_at_trigger.get(name, self.world_from_agent) @ self.assumed.agent_from_sensor[name]
+
+
+@dataclass(frozen=True)
+class LinkedFrame(Frame):
+    """A frame some of whose measurements are files in an encoding that datasets have: a recording links to them."""
+
+    files: Mapping[str, Path] = field(default_factory=dict)  # LiDAR or camera -> file of its points or its picture

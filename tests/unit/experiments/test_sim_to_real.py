@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flcav.dataset.formats.kitti.read import Calibration, KittiFrame, Objects
+from flcav.dataset.formats.kitti.files import Calibration, KittiFrame, Objects
 from flcav.experiments.sim_to_real import run as sim_to_real
 from flcav.experiments.sim_to_real.clouds import summarise_clouds
 from flcav.geometry import Boxes

@@ -27,8 +27,11 @@ FARTHEST = 1e9  # [m], [m/s]: beyond, squares of numbers say nothing
 EXACT = 1e-6  # tolerance between values that are stored twice [s], [m], [rad], [m/s]
 
 
-def check_values(frame: Frame) -> Iterator[str]:
-    """Check that numbers are finite and in range, the pose is rigid, classes are known and tracks unique."""
+def check_values(frame: Frame, *, imported: bool = False) -> Iterator[str]:
+    """Check that numbers are finite and in range, the pose is rigid, classes are known and tracks unique.
+
+    In an imported dataset velocities and occlusions may be NaN, which is unknown, and classes are any.
+    """
     truth = frame.annotations
     for name, points in frame.lidar.items():
         if not np.isfinite(points).all():
@@ -40,14 +43,15 @@ def check_values(frame: Frame) -> Iterator[str]:
             yield f"{frame.key}: '{name}' has a point that was measured in no spin around the frame's time"
     if not is_rigid(frame.world_from_agent):
         yield f"{frame.key}: the pose of {frame.agent} is not a rigid transform"
-    for category in sorted(set(truth.boxes.label.tolist()) - set(CATEGORIES)):
+    for category in () if imported else sorted(set(truth.boxes.label.tolist()) - set(CATEGORIES)):
         yield f"{frame.key}: unknown class '{category}'; known: {', '.join(CATEGORIES)}"
     tracks, times = np.unique(truth.track, return_counts=True)
     for track in tracks[times > 1]:
         yield f"{frame.key}: '{track}' is annotated more than once"
     if frame.agent in tracks:
         yield f"{frame.key}: {frame.agent} is annotated in its own frame"
-    numbers = np.column_stack((truth.boxes.array(), truth.velocity, truth.occlusion))
+    unsure = np.column_stack((truth.velocity, truth.occlusion))
+    numbers = np.column_stack((truth.boxes.array(), np.where(np.isnan(unsure), 0.0, unsure) if imported else unsure))
     for track in truth.track[~np.isfinite(numbers).all(axis=1)]:
         yield f"{frame.key}: the annotation of '{track}' has a number that is not finite"
     with np.errstate(invalid="ignore"):

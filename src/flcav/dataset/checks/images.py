@@ -18,12 +18,15 @@ JUDGED = 40  # pixels sampled of each actor; actors with fewer are skipped
 SIGN_STATES = {"", "off", *STATES.values()}
 
 
-def check_images(frame: Frame) -> Iterator[str]:
-    """Check every image of a frame and its annotations of actors, signs and lights."""
+def check_images(frame: Frame, *, imported: bool = False) -> Iterator[str]:
+    """Check every image of a frame and its annotations of actors, signs and lights.
+
+    Images of an imported dataset have no depths, classes and instances to be checked against.
+    """
     for name in (*frame.images, *frame.infrared):
-        yield from check_views(frame.key, name, frame.annotations.views[name])
+        yield from check_views(frame.key, name, frame.annotations.views[name], imported=imported)
         yield from check_signs(frame.key, name, frame.annotations.signs[name])
-    for name, image in frame.images.items():
+    for name, image in () if imported else frame.images.items():
         yield from check_planes(frame.key, name, image, len(frame.annotations))
         if not _fit(image):
             continue
@@ -33,12 +36,14 @@ def check_images(frame: Frame) -> Iterator[str]:
         yield from check_placed_signs(frame.key, name, frame.annotations.signs[name], lens)
 
 
-def check_views(key: str, name: str, views: Views) -> Iterator[str]:
+def check_views(key: str, name: str, views: Views, *, imported: bool = False) -> Iterator[str]:
     """Check that truncation and occlusion are in [0, 1] and that boxes have an area.
 
-    `key` names the frame and `name` the camera, here and below.
+    `key` names the frame and `name` the camera, here and below. In an imported dataset an occlusion may be NaN, which
+    is unknown.
     """
-    shares = np.column_stack((views.truncation, views.occlusion))
+    occlusion = np.where(np.isnan(views.occlusion), 0.0, views.occlusion) if imported else views.occlusion
+    shares = np.column_stack((views.truncation, occlusion))
     if not ((shares >= 0) & (shares <= 1)).all():
         yield f"{key}: '{name}' has a truncation or an occlusion outside 0 to 1"
     for kind, box in (("amodal", views.amodal_box), ("visible", views.visible_box)):
@@ -52,9 +57,9 @@ def check_planes(key: str, name: str, image: CameraImage, actors: int) -> Iterat
     if not _fit(image):
         yield f"{key}: the planes of '{name}' differ in shape"
         return
-    if np.isnan(image.depth_m).any() or (image.depth_m <= 0).any():
+    if image.depth_m is not None and (np.isnan(image.depth_m).any() or (image.depth_m <= 0).any()):
         yield f"{key}: '{name}' has a depth that is not above 0"
-    if image.instance.max(initial=0) > actors:
+    if image.instance is not None and image.instance.max(initial=0) > actors:
         yield f"{key}: '{name}' shows actor {image.instance.max()} of {actors}"
 
 
@@ -62,12 +67,13 @@ def _fit(image: CameraImage) -> bool:
     """Return whether the planes of an image have one height and width."""
     shape = image.rgb.shape[:2]
     others = (image.depth_m, image.semantic, image.instance)
-    return image.rgb.shape[2:] == (3,) and all(plane.shape == shape for plane in others)
+    return image.rgb.shape[2:] == (3,) and all(plane is None or plane.shape == shape for plane in others)
 
 
 def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[str]:
     """Check that the pixel counts and visible boxes of actors agree with the instance image."""
     truth, views = frame.annotations, frame.annotations.views[name]
+    assert image.instance is not None
     found = find_actor_regions(image.instance.astype(np.int32), max(len(truth), int(image.instance.max(initial=0))))
     for i in np.flatnonzero(views.pixels != found.pixels[: len(truth)]):
         yield f"{frame.key}: '{name}' shows {found.pixels[i]} pixels of '{truth.track[i]}', not {views.pixels[i]}"
@@ -81,6 +87,7 @@ def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[st
 def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) -> Iterator[str]:
     """Check that each actor's pixels, back-projected by their depth, lie in its 3D box, and in its amodal box."""
     truth, views = frame.annotations, frame.annotations.views[name]
+    assert image.instance is not None and image.depth_m is not None
     boxes = _boxes_then(frame, frame.calibration.offset_ms.get(name, 0.0) / 1e3)
     rays = compute_pixel_rays(lens).astype(np.float64).reshape(*image.instance.shape, 3)
     for i in np.flatnonzero(views.pixels >= JUDGED):

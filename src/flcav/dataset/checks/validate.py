@@ -59,7 +59,7 @@ def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[st
             problems += check_motion(key.scene, trace) if trace is not None else ()
         try:
             frame = dataset.frame(i)
-            problems += _frame_problems(frame, traces[key.scene])
+            problems += _frame_problems(frame, traces[key.scene], imported=manifest.imported is not None)
             sight.add(frame)
         except InputError as error:  # a file that cannot be read
             if not any(str(error).startswith(str(folder / name)) for name in damaged):
@@ -68,12 +68,13 @@ def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[st
     return [*problems, *sight.problems()]
 
 
-def _frame_problems(frame: Frame, trace: Trace | None) -> Iterator[str]:
-    yield from check_values(frame)
-    yield from check_sweeps(frame)
+def _frame_problems(frame: Frame, trace: Trace | None, *, imported: bool) -> Iterator[str]:
+    yield from check_values(frame, imported=imported)
+    if not imported:  # KITTI has the camera's view alone of each spin
+        yield from check_sweeps(frame)
     yield from check_points(frame, trace)
     yield from check_measurements(frame)
-    yield from check_images(frame)
+    yield from check_images(frame, imported=imported)
     if trace is not None:
         yield from check_traffic(frame, trace)
 
@@ -157,5 +158,5 @@ def _shared(one: tuple[str, Manifest], other: tuple[str, Manifest]) -> Iterator[
     scenes = sorted(set(manifest.scenes) & set(other_manifest.scenes))
     if scenes:
         yield f"{where}: leakage, they share {len(scenes)} scenes, the first is '{scenes[0]}'"
-    elif (recipe.get("town"), recipe.get("seed")) == (other_recipe.get("town"), other_recipe.get("seed")):
+    elif "seed" in recipe and (recipe.get("town"), recipe["seed"]) == (other_recipe.get("town"), other_recipe.get("seed")):
         yield f"{where}: leakage, they share the traffic seed {recipe.get('seed')} in '{recipe.get('town')}'"

@@ -12,7 +12,7 @@ from flcav.dataset.formats.exporter import Exported, Exporter, ExportOptions
 from flcav.dataset.formats.kitti.write import export_kitti
 from flcav.dataset.formats.mcap import export_mcap
 from flcav.dataset.formats.nuscenes import export_nuscenes
-from flcav.dataset.formats.opv2v import export_opv2v
+from flcav.dataset.formats.opv2v.write import export_opv2v
 from flcav.dataset.formats.yolo import export_yolo
 from flcav.dataset.store import Dataset
 from flcav.progress import Report, ignore_progress

@@ -17,12 +17,12 @@ from typing import NamedTuple, Protocol
 import pyarrow as pa
 
 from flcav.dataset.calibration import encode_calibration
-from flcav.dataset.layout import CALIBRATION, FILES, TRACES, table_path
+from flcav.dataset.layout import CALIBRATION, FILES, TRACES, payload_path, table_path
 from flcav.dataset.payloads import encode_payloads
 from flcav.dataset.rows import build_table, encode_frame
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
-from flcav.files import write_bytes, write_in_pieces
-from flcav.sensors.frame import LONGEST_NAME, Frame
+from flcav.files import sha256, write_bytes, write_in_pieces
+from flcav.sensors.frame import LONGEST_NAME, Frame, LinkedFrame
 from flcav.sources.source import Replayable, Source
 from flcav.world.trace import Trace
 
@@ -100,7 +100,13 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
         if frame.key in written:
             raise ValueError(f"{frame.key}: the source yields this frame twice")
         written.add(frame.key)
-        for payload in encode_payloads(frame):
+        links = frame.files if isinstance(frame, LinkedFrame) else {}
+        for sensor, target in links.items():
+            name = payload_path(sensor, frame.key, target.suffix[1:].lower())
+            (part / PAYLOADS / name).parent.mkdir(parents=True, exist_ok=True)
+            (part / PAYLOADS / name).symlink_to(target.resolve())
+            files.append((name, target.stat().st_size, sha256(target)))
+        for payload in encode_payloads(frame, links):
             path = part / PAYLOADS / payload.path
             path.parent.mkdir(parents=True, exist_ok=True)
             write_in_pieces(path, payload.data)

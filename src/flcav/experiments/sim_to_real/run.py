@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flcav.dataset.formats.kitti.read import KittiFolder, KittiFrame
+from flcav.dataset.formats.kitti.files import KittiFolder, KittiFrame
 from flcav.dataset.store import Dataset
 from flcav.experiments.sim_to_real.clouds import CloudNumbers, Labelled, summarise_clouds
 from flcav.experiments.splits import open_split, record_split

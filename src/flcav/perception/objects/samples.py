@@ -48,10 +48,11 @@ def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = No
 class RecordedSweeps(Sequence[Sample]):
     """Frames of a dataset as a sequence of samples with ground truth as labels, each read on access.
 
-    Raises `InputError` where one of the frames has no LiDAR.
+    Raises `InputError` where one of the frames has no LiDAR, or the dataset no labels of objects.
     """
 
     def __init__(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> None:
+        data.check_labelled("objects")
         if blind := [data.name(number) for number in frames if not data.lidars(number)]:
             raise InputError(f"{data.folder}: no LiDAR in {len(blind)} of {len(frames)} frames, as in {blind[0]}")
         self._data, self._config, self._frames = data, config, frames

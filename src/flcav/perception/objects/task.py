@@ -99,6 +99,7 @@ class ObjectsTask(ObjectsOutcomes):
         frames: their numbers (None: all). asked: the network's configuration with a smaller range, see `narrow_range`
         in `flcav.perception.objects.truth`. Raises `InputError` where there are no frames, or one has no LiDAR.
         """
+        data.check_labelled("objects")
         numbers, classes = data.numbers(frames), network.config.classes
         found, truths = detect_frames(network, map(data.frame, numbers), asked, total=len(numbers), progress=progress)
         return ObjectsEvaluation(
@@ -112,6 +113,7 @@ class ObjectsTask(ObjectsOutcomes):
 
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the Platt scaling of the network's scores, fitted on frames (None: all) it was not trained on."""
+        data.check_labelled("objects")
         calibrate(network, map(data.frame, data.numbers(frames)))
 
     def sample_bytes(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> list[int]:
@@ -136,6 +138,7 @@ class ObjectsTask(ObjectsOutcomes):
 
         threshold: lowest score of a detection. See `flcav.perception.objects.errors`.
         """
+        data.check_labelled("objects")
         numbers = data.numbers(frames)
 
         def found() -> Iterator[Boxes]:

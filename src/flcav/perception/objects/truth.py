@@ -136,7 +136,8 @@ def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
     truth = ground_truth(frame, config)
     neutral = (truth.known & ~truth.target) | truth.lookalike
     weather = None if frame.weather is None else classify_weather(frame.weather)
-    occlusion = frame.annotations.occlusion[truth.target].astype(float)
+    hidden = frame.annotations.occlusion[truth.target].astype(float)
+    occlusion = None if np.isnan(hidden).any() else hidden
     boxes = truth.boxes
     return FrameTruth(frame.scene, boxes[truth.target], boxes[neutral], boxes[truth.hidden], occlusion, weather)
 

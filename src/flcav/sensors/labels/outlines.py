@@ -50,7 +50,7 @@ def compute_amodal_boxes(
         actor = actors[row]
         model = hull(str(scene.trace.category[actor]), int(scene.trace.shape[actor]))
         points = transform_points(camera_from_world @ scene.world_from_actor(int(actor)), model.vertices)
-        points = points if points[:, 2].min() >= near_m else _in_front(points, model.edges, near_m)
+        points = points if points[:, 2].min() >= near_m else clip_in_front(points, model.edges, near_m)
         if len(points):
             outlines[row] = points
     if outlines:
@@ -99,7 +99,7 @@ def _border(lens: Lens) -> Array:
     return np.concatenate((*across, *(np.column_stack((np.full(9, edge), v)) for edge in (0, lens.width - 1))))
 
 
-def _in_front(points: Array, edges: NDArray[np.int64], near_m: float) -> Array:
+def clip_in_front(points: Array, edges: NDArray[np.int64], near_m: float) -> Array:
     """Return the vertices (V, 3) of a hull clipped to z >= `near_m`: those beyond, and edges' cuts with the plane."""
     ahead = points[:, 2] >= near_m
     one, other = (points[end] for end in edges[ahead[edges[:, 0]] != ahead[edges[:, 1]]].T)

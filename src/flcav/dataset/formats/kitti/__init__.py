@@ -1,9 +1,9 @@
-"""KITTI's 3D object detection benchmark: its files read (`read`) and written (`write`).
+"""KITTI's 3D object detection benchmark: its files (`files`), read as a source of frames (`read`) and written (`write`).
 
 Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the benchmark's development kit.
 """
 
-from flcav.dataset.formats.kitti.read import (
+from flcav.dataset.formats.kitti.files import (
     Calibration,
     KittiFolder,
     KittiFrame,

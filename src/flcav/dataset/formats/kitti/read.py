@@ -1,217 +1,191 @@
-"""Strict reading of KITTI's object detection files: point clouds, calibrations, labels, and whole folders.
+"""Reading of KITTI's object detection benchmark as a source of frames.
 
-KITTI labels boxes in its rectified camera frame (x right, y down, z ahead): the location is the centre of a box's
-bottom face, and the rotation about y is zero along x. Records of this module are in KITTI's LiDAR frame (x ahead,
-y left, z up).
+Its frames are of no sequence: each is a scene of its own, at time 0 and at the world's origin. Only an export of flcav's
+says more, in `frames.csv`. The LiDAR stands where KITTI's does, HEIGHT_M above the ground (Geiger et al., IJRR 32(11),
+2013, fig. 3); a label's rectangle is of the whole object as far as it lies in the image.
 """
 
-from dataclasses import dataclass
+import csv
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
 from flcav.config import InputError
-from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
+from flcav.dataset.formats.kitti.files import (
+    Objects,
+    check_objects,
+    read_calibration,
+    read_objects,
+    read_points,
+    read_split,
+)
+from flcav.dataset.formats.kitti.write import FRAMES
+from flcav.dataset.formats.reading import (
+    AgentNames,
+    annotate,
+    choose_split,
+    measure_picture,
+    name_splits,
+    read_pictures,
+    unseen_views,
+)
+from flcav.files import Json
+from flcav.geometry import Boxes, inverse, pose
+from flcav.sensors.frame import Calibration, LinkedFrame
 
-POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
-LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
-MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
-CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
-SUFFIXES = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}
-MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """Extrinsics and projection of the left colour camera (camera 2)."""
-
-    camera_from_lidar: NDArray[np.float64]  # (4, 4), rectified camera frame
-    image_from_camera: NDArray[np.float64]  # (3, 4) projection to pixels
-
-
-def read_points(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x, y, z [m] and reflectance [0, 1] of a point cloud, LiDAR frame.
-
-    Raises `InputError` where the file is missing, empty, truncated within a point, or holds a number that is not
-    finite.
-    """
-    try:
-        data = path.read_bytes()
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
-    if not data:
-        raise InputError(f"{path}: empty; a point cloud holds {POINT_BYTES} bytes for each point")
-    if len(data) % POINT_BYTES:
-        raise InputError(
-            f"{path}: truncated; {len(data)} bytes are not a multiple of {POINT_BYTES}, the size of a point"
-        )
-    points = np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4)
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: point {int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])} is not finite")
-    return points
+CATEGORIES = {  # KITTI's other classes (Person_sitting, Tram, Misc) keep their names
+    "Car": "car",
+    "Van": "van",
+    "Truck": "truck",
+    "Pedestrian": "pedestrian",
+    "Cyclist": "bicycle",
+}
+OCCLUSION = np.array([0.0, 0.3, 0.75, np.nan])  # share that stands for the levels 0 fully visible, 1, 2, 3 unknown
+HEIGHT_M = 1.73
+LIDAR, CAMERA = "velodyne", "image_2"
+FOLDERS = ("training", "testing")
+LISTS = ("train", "val", "test")
 
 
-def read_calibration(path: Path) -> Calibration:
-    """Return the calibration of a frame from its file; raises `InputError` for a missing, malformed or singular matrix.
+class Shot(NamedTuple):
+    """A frame of the benchmark, and where it belongs in a dataset."""
 
-    Needs the matrices in MATRICES.
-    """
-    rows = dict(line.split(":", 1) for line in _lines(path) if ":" in line)
-    matrices = {}
-    for name, (height, width) in MATRICES.items():
-        try:
-            matrices[name] = np.array(rows[name].split(), dtype=np.float64).reshape(height, width)
-        except (KeyError, ValueError):
-            raise InputError(f"{path}: needs {height * width} numbers after '{name}:'") from None
-        if not np.isfinite(matrices[name]).all() or np.linalg.matrix_rank(matrices[name][:, :3]) < 3:
-            raise InputError(f"{path}: the numbers after '{name}:' are no projection and no pose")
-    rectified, camera = np.eye(4), np.eye(4)
-    rectified[:3, :3] = matrices["R0_rect"]
-    camera[:3] = matrices["Tr_velo_to_cam"]
-    return Calibration(camera_from_lidar=rectified @ camera, image_from_camera=matrices["P2"])
+    folder: Path  # "training" or "testing"
+    number: str  # "000008"
+    split: str | None
+    scene: str
+    index: int
+    vehicle: str
+    time_s: float
 
 
-@dataclass(frozen=True)
-class Objects:
-    """The N labelled objects of a frame, without DontCare regions."""
+class KittiSource:
+    """The frames of a KITTI folder, `training` and `testing`."""
 
-    boxes: Boxes  # (N,) LiDAR frame, KITTI's class names
-    truncation: NDArray[np.float64]  # (N,) share outside the image
-    occlusion: NDArray[np.int64]  # (N,) 0 fully visible, 1 partly and 2 largely occluded, 3 unknown
-    alpha: NDArray[np.float64]  # (N,) observation angle [rad]
-    rectangle: NDArray[np.float64]  # (N, 4) left, top, right, bottom [px]
+    def __init__(self, folder: Path, split: str | None = None) -> None:
+        """Raises `InputError` where `folder` has no frames, none of `split`, or a calibration or point cloud is missing."""
+        self._folder, self._split = folder, split
+        shots = _find_shots(folder)
+        split_of = {shot.scene: shot.split for shot in shots}
+        chosen = set(choose_split(folder, split_of, split))
+        self._split_of = {scene: own for scene, own in split_of.items() if scene in chosen}
+        self._shots: dict[str, list[Shot]] = defaultdict(list)
+        self._agent: dict[str, str] = {}
+        names = AgentNames()
+        for shot in shots:
+            if shot.scene in chosen:
+                calibration = _path(shot, "calib")
+                read_calibration(calibration)
+                self._shots[shot.scene].append(shot)
+                self._agent[shot.number] = names.of(shot.vehicle, calibration.read_text())
+        every = [shot for own in self._shots.values() for shot in own]
+        bare = sum(not _path(shot, "label_2").is_file() for shot in every)
+        self._labelled = not bare
+        self.notes = (f"no label_2 of {bare} of {len(every)} frames, so no boxes there",) if bare else ()
+
+    def describe(self) -> Mapping[str, Json]:
+        """Return folder, splits and what is labelled."""
+        return {
+            "imported": "kitti",
+            "from": str(self._folder.resolve()),
+            "split": self._split or "",
+            "labels": ["objects"] if self._labelled else [],
+            "splits": name_splits(self._split_of),
+        }
+
+    def scenes(self) -> list[str]:
+        """Return a name for each frame, or of an export the scenes that it was made of."""
+        return list(self._shots)
+
+    def frame_count(self, scene: str) -> int:
+        """Return the number of frames of a scene."""
+        return len(self._shots[scene])
+
+    def trace(self, scene: str) -> None:
+        """Return None: nothing is known between frames."""
+        return
+
+    def frames(self, scene: str) -> Iterator[LinkedFrame]:
+        """Yield the frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""
+        for shot in sorted(self._shots[scene], key=lambda shot: (shot.index, shot.vehicle)):
+            yield _read_frame(shot, self._agent[shot.number])
 
 
-def read_objects(path: Path, calibration: Calibration) -> Objects:
-    """Return the labelled objects of a frame from its label file.
-
-    Boxes are upright in the LiDAR frame: the tilt of about a degree between camera and LiDAR is neglected in their
-    orientation, but not in their position. Scores are kept where every row has one. Raises `InputError` where the file
-    is missing or a line is not a label.
-    """
-    label, rows = [], []
-    for number, line in enumerate(_lines(path), 1):
-        kind, *fields = line.split()
-        try:
-            values = [float(field) for field in fields]
-        except ValueError:
-            values = []
-        if len(values) + 1 not in (LABEL_FIELDS, LABEL_FIELDS + 1) or not np.isfinite(values).all():
-            raise InputError(f"{path}: line {number} is no KITTI label: a class and {LABEL_FIELDS - 1} numbers or 15")
-        if kind != "DontCare":
-            label.append(kind)
-            rows.append(values)
-    scores = np.array([row[14] for row in rows]) if rows and all(len(row) == LABEL_FIELDS for row in rows) else None
-    numbers = np.array([row[:14] for row in rows]).reshape(-1, 14)
-    height, width, length, x, y, z, rotation = numbers[:, 7:].T
-    lidar_from_camera = inverse(calibration.camera_from_lidar)
-    center = transform_points(lidar_from_camera, np.stack((x, y - height / 2, z), axis=1))
-    cos, sin = heading_vectors(rotation).T
-    ahead = np.stack((cos, np.zeros_like(rotation), -sin), axis=1)  # camera frame
-    ahead = ahead @ lidar_from_camera[:3, :3].T
-    yaw = wrap_angle(np.arctan2(ahead[:, 1], ahead[:, 0]))
-    size = np.stack((length, width, height), axis=1)
-    return Objects(
-        Boxes(center, size, yaw, np.array(label, dtype=np.str_), scores),
-        truncation=numbers[:, 0],
-        occlusion=numbers[:, 1].astype(np.int64),
-        alpha=numbers[:, 2],
-        rectangle=numbers[:, 3:7],
+def _read_frame(shot: Shot, agent: str) -> LinkedFrame:
+    files = {LIDAR: _path(shot, "velodyne"), CAMERA: _path(shot, "image_2")}
+    points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))
+    size = measure_picture(files[CAMERA])
+    label = _path(shot, "label_2")
+    objects = read_objects(label, calibrated) if label.is_file() else Objects.none()
+    check_objects(objects, *size, label)
+    agent_from_lidar = pose(0.0, 0.0, HEIGHT_M)
+    projection = calibrated.image_from_camera
+    shifted = np.eye(4)  # the projection's fourth column as a translation
+    shifted[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
+    calibration = Calibration(
+        {LIDAR: agent_from_lidar, CAMERA: agent_from_lidar @ inverse(shifted @ calibrated.camera_from_lidar)},
+        intrinsics={CAMERA: projection[:, :3]},
+        distortion={CAMERA: np.zeros(5)},
+    )
+    labels = [CATEGORIES.get(name, name) for name in objects.boxes.label.tolist()]
+    boxes = objects.boxes.transform(agent_from_lidar)
+    return LinkedFrame(
+        scene=shot.scene,
+        index=shot.index,
+        time_s=shot.time_s,
+        agent=agent,
+        world_from_agent=np.eye(4),
+        calibration=calibration,
+        assumed=calibration,
+        lidar={LIDAR: points},
+        annotations=annotate(
+            [f"{shot.number}-{row}" for row in range(len(boxes))],  # no track is followed
+            Boxes(boxes.center, boxes.size, boxes.yaw, np.array(labels, np.str_)),
+            {LIDAR: (points, agent_from_lidar)},
+            {CAMERA: unseen_views(objects.rectangle, objects.truncation, OCCLUSION[objects.occlusion])},
+        ),
+        images=read_pictures({CAMERA: files[CAMERA]}),
+        files=files,
     )
 
 
-def _lines(path: Path) -> list[str]:
+def _find_shots(folder: Path) -> list[Shot]:
+    """Return the frames of `training` and `testing` in the order of their numbers."""
+    listed = {}
+    for name in LISTS:
+        path = folder / "ImageSets" / f"{name}.txt"
+        for number in read_split(path) if path.is_file() else ():
+            listed["testing" if name == "test" else "training", number] = name
+    origin = _read_origins(folder / FRAMES)
+    shots = []
+    for part in FOLDERS:
+        for path in sorted((folder / part / "velodyne").glob("*.bin")):
+            split = listed.get((part, path.stem), "test" if part == "testing" else None)
+            scene, index, vehicle, time_s = origin.get(path.stem, (f"kitti-{part}-{path.stem}", 0, "ego", 0.0))
+            shots.append(Shot(folder / part, path.stem, split, scene, index, vehicle, time_s))
+    if not shots:
+        raise InputError(f"{folder}: no KITTI folder; it holds no 'training/velodyne' with point clouds")
+    return shots
+
+
+def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
+    """Return number -> scene, spin, agent and time [s] from the list of an export, empty where there is none."""
+    if not path.is_file():
+        return {}
+    found = {}
     try:
-        return [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file") from None
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                scene, index, _ = row["frame"].removesuffix(row["agent"]).rsplit("_", 2)
+                found[row["number"]] = scene, int(index), row["agent"], float(row["time_s"])
+    except (KeyError, ValueError, TypeError, AttributeError):
+        raise InputError(f"{path}: not the list of frames of an export; without it the folder can be read, too") from None
+    return found
 
 
-@dataclass(frozen=True)
-class KittiFrame:
-    """One frame of the benchmark."""
-
-    name: str  # "000008"
-    points: NDArray[np.float32]  # (N, 4) x, y, z [m], reflectance; LiDAR frame
-    calibration: Calibration
-    objects: Objects
-    image: NDArray[np.uint8]  # (H, W, 3) red, green, blue
-
-
-class KittiFolder:
-    """A KITTI folder: the frames of a split, or all frames with a point cloud."""
-
-    def __init__(self, folder: Path, names: list[str]) -> None:
-        self.folder = folder
-        self.names = names
-
-    @classmethod
-    def open(cls, path: Path | str, split: str | None = None) -> "KittiFolder":
-        """Return the frames of the KITTI folder `path` that `ImageSets/<split>.txt` lists, or all of `training`.
-
-        The split "test" is read from `testing`, any other from `training`. Raises `InputError` where the folder, the
-        list or a file of a frame is missing.
-        """
-        root, part_of = Path(path), "testing" if split == "test" else "training"
-        folder = root / part_of
-        if not folder.is_dir():
-            raise InputError(f"{root}: no KITTI folder; it holds no '{part_of}'")
-        if split is None:
-            names = sorted(file.stem for file in (folder / "velodyne").glob("*.bin"))
-        else:
-            names = _split(root / "ImageSets" / f"{split}.txt")
-        for name in names:
-            for part, suffix in SUFFIXES.items():
-                if not (folder / part / f"{name}.{suffix}").is_file():
-                    raise InputError(f"{folder / part / f'{name}.{suffix}'}: missing; every frame needs one")
-        return cls(folder, names)
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def frame(self, i: int) -> KittiFrame:
-        """Return frame `i`; raises `InputError` for a malformed file, or a label that does not fit the image."""
-        paths = {part: self.folder / part / f"{self.names[i]}.{suffix}" for part, suffix in SUFFIXES.items()}
-        calibration = read_calibration(paths["calib"])
-        image = _read_image(paths["image_2"])
-        objects = read_objects(paths["label_2"], calibration)
-        _check(objects, image.shape[1], image.shape[0], paths["label_2"])
-        return KittiFrame(self.names[i], read_points(paths["velodyne"]), calibration, objects, image)
-
-
-def _check(objects: Objects, width: int, height: int, path: Path) -> None:
-    if unknown := sorted(set(objects.boxes.label.tolist()) - CLASSES):
-        raise InputError(f"{path}: unknown class '{unknown[0]}'; KITTI has {', '.join(sorted(CLASSES))}, DontCare")
-    left, top, right, bottom = objects.rectangle.T
-    inside = (left >= -MARGIN_PX) & (top >= -MARGIN_PX) & (right < width + MARGIN_PX) & (bottom < height + MARGIN_PX)
-    checks = {
-        "a size that is not positive": (objects.boxes.size > 0).all(axis=1),
-        f"a rectangle that is not within the image of {width} x {height}": inside & (left < right) & (top < bottom),
-        "a truncation outside 0 to 1": (objects.truncation >= 0) & (objects.truncation <= 1),
-        "an occlusion that is none of 0, 1, 2, 3": np.isin(objects.occlusion, range(4)),
-    }
-    for what, good in checks.items():
-        if not good.all():
-            raise InputError(f"{path}: object {int(np.argmin(good)) + 1} has {what}")
-
-
-def _split(path: Path) -> list[str]:
-    try:
-        names = path.read_text(encoding="utf-8").split()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such list of frames") from None
-    if len(set(names)) != len(names):
-        raise InputError(f"{path}: names a frame twice")
-    return names
-
-
-def _read_image(path: Path) -> NDArray[np.uint8]:
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        raise InputError(f"{path}: not an image") from None
+def _path(shot: Shot, part: str) -> Path:
+    suffix = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}[part]
+    return shot.folder / part / f"{shot.number}.{suffix}"

@@ -1,0 +1,37 @@
+"""`flcav import`: a dataset of another format as one of flcav's."""
+
+from pathlib import Path
+
+import typer
+
+from flcav.cli.options import ImportFormat, join_choices
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("import")(import_)
+
+
+def import_(
+    format: ImportFormat = typer.Argument(metavar="FORMAT", help=f"What to read: {join_choices(ImportFormat)}."),
+    folder: Path = typer.Argument(metavar="DIR", help="A folder of that format, as it is distributed."),
+    out: Path = typer.Option(..., "--out", help="New or empty folder for the dataset."),
+    split: str | None = typer.Option(None, "--split", help="One split of it alone, such as val; by default all."),
+) -> None:
+    """Make a dataset of recordings in another format: docs/formats.md says what of it is kept.
+
+    Files that need no conversion are linked to, so they have to stay where they are.
+    """
+    from flcav import progress
+    from flcav.dataset.formats.importing import import_dataset
+    from flcav.dataset.layout import read_manifest
+
+    with progress.show_progress(f"import {out}") as report:
+        notes = import_dataset(format, folder, out, split=split, progress=report)
+    counts = read_manifest(out).counts
+    typer.echo(
+        f"{out}: imported {counts.scenes} scenes, {counts.frames} frames, {counts.annotations} objects, "
+        f"{counts.points} points, {counts.images} images"
+    )
+    for note in notes:
+        typer.echo(f"{folder}: {note}")

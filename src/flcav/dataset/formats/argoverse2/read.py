@@ -1,0 +1,282 @@
+"""Reading of Argoverse 2's sensor dataset: logs in Feather files, as av2-api reads them.
+
+Frames: `egovehicle` is at the centre of the rear axle, x ahead, y left, z up; `city` is the world; cameras are optical.
+A sweep's points are of both stacked LiDARs, in the ego frame at the sweep's time, their motion compensated. Images have
+no distortion: av2-api's camera model has none, the coefficients in `intrinsics.feather` are of the raw images.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather as feather
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from flcav.config import InputError
+from flcav.dataset.formats.reading import (
+    AgentNames,
+    Picture,
+    annotate,
+    choose_split,
+    difference_tracks,
+    name_splits,
+    pinhole,
+    read_pictures,
+    view_boxes,
+)
+from flcav.files import Json
+from flcav.geometry import Boxes, pose, transform_points, wrap_angle, yaw_of
+from flcav.sensors.camera.lens import Lens
+from flcav.sensors.frame import Calibration, LinkedFrame
+
+Array = NDArray[np.float64]
+
+CATEGORIES = {  # a bicycle of flcav's has a rider; Argoverse 2's without one keeps its name, as do all other classes
+    "REGULAR_VEHICLE": "car",
+    "LARGE_VEHICLE": "truck",
+    "BOX_TRUCK": "truck",
+    "TRUCK": "truck",
+    "TRUCK_CAB": "truck",
+    "VEHICULAR_TRAILER": "truck",
+    "BUS": "bus",
+    "SCHOOL_BUS": "bus",
+    "ARTICULATED_BUS": "bus",
+    "PEDESTRIAN": "pedestrian",
+    "OFFICIAL_SIGNALER": "pedestrian",
+    "BICYCLIST": "bicycle",
+    "MOTORCYCLIST": "motorcycle",
+}
+SPLITS = ("train", "val", "test")  # folders of logs
+AXLE_M = 0.33  # height of the rear axle above the ground, which in the log 7fab2350 lies 0.33 to 0.37 m below it
+LIDAR, MOUNT = "lidar", "up_lidar"  # our name of both LiDARs, where they are taken to be
+LATE_NS = 50_000_000  # most time between a sweep and the picture of a camera that goes with it: it runs at 20 Hz
+PLACED = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+EGO_FROM_AGENT = pose(0.0, 0.0, -AXLE_M)
+
+
+class Log(NamedTuple):
+    """A log: its folder, split and agent, and the times of its sweeps."""
+
+    folder: Path
+    split: str | None
+    agent: str
+    sweeps: tuple[int, ...]  # [ns]
+    labelled: bool
+
+
+class Labels(NamedTuple):
+    """The A annotations of a log."""
+
+    sweep: NDArray[np.int64]  # (A,) time [ns]
+    track: NDArray[np.str_]  # (A,)
+    boxes: Boxes  # (A,) city frame
+    velocity: Array  # (A, 3) city frame [m/s]
+
+
+class Argoverse2Source:
+    """The logs of a folder of Argoverse 2's sensor dataset: one log, a folder of logs, or folders of SPLITS of them."""
+
+    def __init__(self, folder: Path, split: str | None = None) -> None:
+        """Raises `InputError` where there is no log in `folder`, none of `split`, or a file of a log is missing."""
+        self._folder, self._split = folder, split
+        found = _find_logs(folder)
+        names = AgentNames()
+        self._logs = {
+            scene: _open_log(found[scene], names)
+            for scene in choose_split(folder, {scene: _split_of(path) for scene, path in found.items()}, split)
+        }
+        bare = [log.folder.name for log in self._logs.values() if not log.labelled]
+        self.notes = (f"no annotations.feather in {len(bare)} of {len(self._logs)} logs, so no boxes",) if bare else ()
+        self._labelled = not bare
+
+    def describe(self) -> Mapping[str, Json]:
+        """Return folder, splits and what is labelled."""
+        return {
+            "imported": "argoverse2",
+            "from": str(self._folder.resolve()),
+            "split": self._split or "",
+            "labels": ["objects"] if self._labelled else [],
+            "splits": name_splits({scene: log.split for scene, log in self._logs.items()}),
+        }
+
+    def scenes(self) -> list[str]:
+        """Return the logs' ids."""
+        return list(self._logs)
+
+    def frame_count(self, scene: str) -> int:
+        """Return the number of sweeps of a log."""
+        return len(self._logs[scene].sweeps)
+
+    def trace(self, scene: str) -> None:
+        """Return None: the traffic between the sweeps is not known."""
+        return
+
+    def frames(self, scene: str) -> Iterator[LinkedFrame]:
+        """Yield a frame for each sweep of a log; raises `InputError` where a file is missing or truncated."""
+        log = self._logs[scene]
+        poses = Poses(log.folder / "city_SE3_egovehicle.feather")
+        mounts, lenses = _read_mounts(log.folder), _read_lenses(log.folder)
+        labels = _read_labels(log.folder, poses) if log.labelled else None
+        cameras = {name: _list_times(log.folder / "sensors" / "cameras" / name, "jpg") for name in lenses}
+        agent_from_ego = np.linalg.inv(EGO_FROM_AGENT)
+        seen = [name for name in lenses if len(cameras[name])]
+        at = {LIDAR: pose(*mounts[MOUNT][:3, 3])} | {name: mounts[name] for name in lenses}
+        calibration = Calibration(
+            {name: agent_from_ego @ ego_from_sensor for name, ego_from_sensor in at.items()},
+            intrinsics={name: lens.intrinsics() for name, lens in lenses.items()},
+            distortion={name: np.zeros(5) for name in lenses},
+        )
+        for index, sweep in enumerate(log.sweeps):
+            taken = {name: t for name in seen if (t := _nearest(cameras[name], sweep)) is not None}
+            then = {name: poses.at(t) for name, t in taken.items()}
+            pictures = {
+                name: Picture(
+                    log.folder / "sensors" / "cameras" / name / f"{t}.jpg", lenses[name], then[name] @ mounts[name]
+                )
+                for name, t in taken.items()
+            }
+            points = _read_sweep(log.folder / "sensors" / "lidar" / f"{sweep}.feather", mounts[MOUNT][:3, 3])
+            own = np.flatnonzero(labels.sweep == sweep) if labels else np.zeros(0, np.int64)
+            boxes = labels.boxes[own] if labels else Boxes.empty()
+            city_from_ego = poses.at(sweep)
+            files = {name: picture.path for name, picture in pictures.items()}
+            yield LinkedFrame(
+                scene=scene,
+                index=index,
+                time_s=sweep / 1e9,
+                agent=log.agent,
+                world_from_agent=city_from_ego @ EGO_FROM_AGENT,
+                calibration=calibration,
+                assumed=calibration,
+                lidar={LIDAR: points},
+                annotations=annotate(
+                    labels.track[own].tolist() if labels else (),
+                    boxes,
+                    {LIDAR: (points, city_from_ego @ at[LIDAR])},
+                    {name: view_boxes(boxes, picture) for name, picture in pictures.items()},
+                    velocity=labels.velocity[own] if labels else None,
+                ),
+                images=read_pictures(files),
+                agent_at_trigger={name: city_from_then @ EGO_FROM_AGENT for name, city_from_then in then.items()},
+                files=files,
+            )
+
+
+class Poses:
+    """The ego vehicle's poses in the city, by time."""
+
+    def __init__(self, path: Path) -> None:
+        table = _read_feather(path, ("timestamp_ns", *PLACED))
+        self._path, self._transforms = path, _transforms(table)
+        self._row = {time: row for row, time in enumerate(table["timestamp_ns"].to_pylist())}
+
+    def at(self, time_ns: int) -> Array:
+        """Return the (4, 4) pose at a time [ns] of the table; raises `InputError` at any other."""
+        if time_ns not in self._row:
+            raise InputError(f"{self._path}: no pose at {time_ns}, when a measurement was made")
+        return self._transforms[self._row[time_ns]]
+
+
+def _find_logs(folder: Path) -> dict[str, Path]:
+    """Return log id -> folder of the logs in `folder`, which is itself one, or holds them, or splits of them."""
+    depths = (folder,), folder.glob("*"), (path for split in SPLITS for path in (folder / split).glob("*"))
+    for paths in depths:
+        if logs := sorted(path for path in paths if (path / "sensors" / "lidar").is_dir()):
+            return {path.resolve().name: path for path in logs}
+    raise InputError(f"{folder}: no log of Argoverse 2; neither it nor a folder in it holds 'sensors/lidar'")
+
+
+def _split_of(log: Path) -> str | None:
+    name = log.resolve().parent.name
+    return name if name in SPLITS else None
+
+
+def _open_log(folder: Path, names: AgentNames) -> Log:
+    mounts, lenses = _read_mounts(folder), _read_lenses(folder)
+    if MOUNT not in mounts:
+        raise InputError(f"{folder / 'calibration' / 'egovehicle_SE3_sensor.feather'}: no mount of '{MOUNT}'")
+    if lost := sorted(lenses.keys() - mounts.keys()):
+        raise InputError(f"{folder / 'calibration' / 'egovehicle_SE3_sensor.feather'}: no mount of '{lost[0]}'")
+    calibration = (*((name, mounts[name].tobytes()) for name in sorted(mounts)), *map(str, lenses.items()))
+    sweeps = _list_times(folder / "sensors" / "lidar", "feather")
+    if not len(sweeps):
+        raise InputError(f"{folder / 'sensors' / 'lidar'}: no sweeps in it")
+    labelled = (folder / "annotations.feather").is_file()
+    return Log(folder, _split_of(folder), names.of("ego", calibration), tuple(sweeps.tolist()), labelled)
+
+
+def _list_times(folder: Path, suffix: str) -> NDArray[np.int64]:
+    """Return the times [ns] that name the files of a folder, in order; none where there is no such folder."""
+    return np.array(sorted(int(path.stem) for path in folder.glob(f"*.{suffix}") if path.stem.isdigit()), np.int64)
+
+
+def _nearest(times: NDArray[np.int64], sweep: int) -> int | None:
+    nearest = int(times[np.abs(times - sweep).argmin()])
+    return nearest if abs(nearest - sweep) <= LATE_NS else None
+
+
+def _read_sweep(path: Path, origin: Array) -> NDArray[np.float32]:
+    """Return (N, 4) x, y, z [m] from `origin` in the ego frame, and intensity [0, 1]."""
+    table = _read_feather(path, ("x", "y", "z", "intensity"))
+    x, y, z, intensity = (table[name].to_numpy().astype(np.float32) for name in ("x", "y", "z", "intensity"))
+    return np.column_stack((np.column_stack((x, y, z)) - origin.astype(np.float32), intensity / np.float32(255)))
+
+
+def _read_mounts(folder: Path) -> dict[str, Array]:
+    """Return sensor -> (4, 4) pose in the ego frame."""
+    table = _read_feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", ("sensor_name", *PLACED))
+    return dict(zip(table["sensor_name"].to_pylist(), _transforms(table)))
+
+
+def _read_lenses(folder: Path) -> dict[str, Lens]:
+    names = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+    table = _read_feather(folder / "calibration" / "intrinsics.feather", ("sensor_name", *names))
+    lenses = {}
+    for row in table.to_pylist():
+        matrix = np.array([[row["fx_px"], 0, row["cx_px"]], [0, row["fy_px"], row["cy_px"]], [0, 0, 1.0]])
+        lenses[row["sensor_name"]] = pinhole(matrix, row["width_px"], row["height_px"])
+    return lenses
+
+
+def _read_labels(folder: Path, poses: Poses) -> Labels:
+    """Return the annotations of a log, of its sweeps that are not here, too: velocities are differences of them."""
+    size = ("length_m", "width_m", "height_m")
+    table = _read_feather(
+        folder / "annotations.feather", ("timestamp_ns", "track_uuid", "category", *size, *PLACED)
+    )
+    sweep, track = table["timestamp_ns"].to_numpy(), np.array(table["track_uuid"].to_pylist(), np.str_)
+    in_ego = _transforms(table)
+    center, yaw = np.zeros((len(table), 3)), np.zeros(len(table))
+    for time in np.unique(sweep).tolist():
+        city_from_ego, own = poses.at(time), np.flatnonzero(sweep == time)
+        center[own] = transform_points(city_from_ego, in_ego[own, :3, 3])
+        yaw[own] = [yaw_of(city_from_ego @ in_ego[row]) for row in own]
+    label = np.array([CATEGORIES.get(name, name) for name in table["category"].to_pylist()], np.str_)
+    boxes = Boxes(center, np.column_stack([table[name].to_numpy() for name in size]), wrap_angle(yaw), label)
+    return Labels(sweep, track, boxes, difference_tracks(track, (sweep - sweep.min(initial=sweep[0])) / 1e9, center))
+
+
+def _transforms(table: pa.Table) -> Array:
+    """Return (N, 4, 4) transforms of the quaternions and translations in PLACED."""
+    w, x, y, z, *translation = (table[name].to_numpy() for name in PLACED)
+    transforms = np.tile(np.eye(4), (len(table), 1, 1))
+    if len(table):
+        transforms[:, :3, :3] = Rotation.from_quat(np.column_stack((x, y, z, w))).as_matrix()
+        transforms[:, :3, 3] = np.column_stack(translation)
+    return transforms
+
+
+def _read_feather(path: Path, columns: tuple[str, ...]) -> pa.Table:
+    """Return columns of a Feather file; raises `InputError` where it is missing, truncated, or lacks one of them."""
+    try:
+        table = feather.read_table(path, memory_map=False)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; a log of Argoverse 2 has one") from None
+    except (OSError, pa.ArrowException, ValueError):
+        raise InputError(f"{path}: not a Feather file, or a truncated one") from None
+    if lost := [name for name in columns if name not in table.column_names]:
+        raise InputError(f"{path}: no column '{lost[0]}'")
+    return table.select(list(columns)).combine_chunks()

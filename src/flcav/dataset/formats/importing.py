@@ -1,0 +1,50 @@
+"""Import of datasets of other formats, by reading them as a source of frames and recording that."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from flcav.config import InputError
+from flcav.dataset.formats.argoverse2.read import Argoverse2Source
+from flcav.dataset.formats.kitti.read import KittiSource
+from flcav.dataset.formats.reading import LogSource
+from flcav.dataset.recording.recorder import record
+from flcav.progress import Report, ignore_progress
+
+
+class Readable(NamedTuple):
+    """A format that can be imported: how to open a folder of it, and the files that tell it from others."""
+
+    read: Callable[[Path, str | None], LogSource]  # folder, split (None: all)
+    signs: tuple[str, ...]  # patterns of paths, of which a folder of this format has one
+
+
+READABLE: Mapping[str, Readable] = {
+    "kitti": Readable(KittiSource, ("training/velodyne", "testing/velodyne")),
+    "argoverse2": Readable(Argoverse2Source, ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar")),
+}
+
+
+def import_dataset(
+    name: str, folder: Path, out: Path, *, split: str | None = None, progress: Report = ignore_progress
+) -> tuple[str, ...]:
+    """Record the dataset of the format `name`, one of READABLE, in `folder` as one of flcav's in `out`.
+
+    Points and pictures that are in an encoding of flcav's are linked to, others are rewritten. Only the scenes of
+    `split` are taken, all for None. Returns sentences on what the files do not have. Raises `InputError` where `folder`
+    is missing, of another format or damaged, and as `record` does.
+    """
+    if name not in READABLE:
+        raise InputError(f"format '{name}': cannot be imported; known formats: {', '.join(READABLE)}")
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    if others := [other for other in READABLE if _shows(folder, other)]:
+        if name not in others:
+            raise InputError(f"{folder}: is no folder of '{name}' but of '{others[0]}'")
+    source = READABLE[name].read(folder, split)
+    record(source, out, progress=progress)
+    return source.notes
+
+
+def _shows(folder: Path, name: str) -> bool:
+    return any(next(folder.glob(sign), None) is not None for sign in READABLE[name].signs)

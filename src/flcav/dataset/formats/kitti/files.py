@@ -1,0 +1,224 @@
+"""Strict reading of KITTI's object detection files: point clouds, calibrations, labels, and whole folders.
+
+KITTI labels boxes in its rectified camera frame (x right, y down, z ahead): the location is the centre of a box's
+bottom face, and the rotation about y is zero along x. Records of this module are in KITTI's LiDAR frame (x ahead,
+y left, z up).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from flcav.config import InputError
+from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
+
+POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
+LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
+MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
+CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
+SUFFIXES = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}
+MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Extrinsics and projection of the left colour camera (camera 2)."""
+
+    camera_from_lidar: NDArray[np.float64]  # (4, 4), rectified camera frame
+    image_from_camera: NDArray[np.float64]  # (3, 4) projection to pixels
+
+
+def read_points(path: Path) -> NDArray[np.float32]:
+    """Return (N, 4) x, y, z [m] and reflectance [0, 1] of a point cloud, LiDAR frame.
+
+    Raises `InputError` where the file is missing, empty, truncated within a point, or holds a number that is not
+    finite.
+    """
+    try:
+        data = path.read_bytes()
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: no such file") from None
+    if not data:
+        raise InputError(f"{path}: empty; a point cloud holds {POINT_BYTES} bytes for each point")
+    if len(data) % POINT_BYTES:
+        raise InputError(
+            f"{path}: truncated; {len(data)} bytes are not a multiple of {POINT_BYTES}, the size of a point"
+        )
+    points = np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4)
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: point {int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])} is not finite")
+    return points
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Return the calibration of a frame from its file; raises `InputError` for a missing, malformed or singular matrix.
+
+    Needs the matrices in MATRICES.
+    """
+    rows = dict(line.split(":", 1) for line in _lines(path) if ":" in line)
+    matrices = {}
+    for name, (height, width) in MATRICES.items():
+        try:
+            matrices[name] = np.array(rows[name].split(), dtype=np.float64).reshape(height, width)
+        except (KeyError, ValueError):
+            raise InputError(f"{path}: needs {height * width} numbers after '{name}:'") from None
+        if not np.isfinite(matrices[name]).all() or np.linalg.matrix_rank(matrices[name][:, :3]) < 3:
+            raise InputError(f"{path}: the numbers after '{name}:' are no projection and no pose")
+    rectified, camera = np.eye(4), np.eye(4)
+    rectified[:3, :3] = matrices["R0_rect"]
+    camera[:3] = matrices["Tr_velo_to_cam"]
+    return Calibration(camera_from_lidar=rectified @ camera, image_from_camera=matrices["P2"])
+
+
+@dataclass(frozen=True)
+class Objects:
+    """The N labelled objects of a frame, without DontCare regions."""
+
+    boxes: Boxes  # (N,) LiDAR frame, KITTI's class names
+    truncation: NDArray[np.float64]  # (N,) share outside the image
+    occlusion: NDArray[np.int64]  # (N,) 0 fully visible, 1 partly and 2 largely occluded, 3 unknown
+    alpha: NDArray[np.float64]  # (N,) observation angle [rad]
+    rectangle: NDArray[np.float64]  # (N, 4) left, top, right, bottom [px]
+
+    @classmethod
+    def none(cls) -> "Objects":
+        """Return a record of no objects."""
+        return cls(Boxes.empty(), np.zeros(0), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 4)))
+
+
+def read_objects(path: Path, calibration: Calibration) -> Objects:
+    """Return the labelled objects of a frame from its label file.
+
+    Boxes are upright in the LiDAR frame: the tilt of about a degree between camera and LiDAR is neglected in their
+    orientation, but not in their position. Scores are kept where every row has one. Raises `InputError` where the file
+    is missing or a line is not a label.
+    """
+    label, rows = [], []
+    for number, line in enumerate(_lines(path), 1):
+        kind, *fields = line.split()
+        try:
+            values = [float(field) for field in fields]
+        except ValueError:
+            values = []
+        if len(values) + 1 not in (LABEL_FIELDS, LABEL_FIELDS + 1) or not np.isfinite(values).all():
+            raise InputError(f"{path}: line {number} is no KITTI label: a class and {LABEL_FIELDS - 1} numbers or 15")
+        if kind != "DontCare":
+            label.append(kind)
+            rows.append(values)
+    scores = np.array([row[14] for row in rows]) if rows and all(len(row) == LABEL_FIELDS for row in rows) else None
+    numbers = np.array([row[:14] for row in rows]).reshape(-1, 14)
+    height, width, length, x, y, z, rotation = numbers[:, 7:].T
+    lidar_from_camera = inverse(calibration.camera_from_lidar)
+    center = transform_points(lidar_from_camera, np.stack((x, y - height / 2, z), axis=1))
+    cos, sin = heading_vectors(rotation).T
+    ahead = np.stack((cos, np.zeros_like(rotation), -sin), axis=1)  # camera frame
+    ahead = ahead @ lidar_from_camera[:3, :3].T
+    yaw = wrap_angle(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    size = np.stack((length, width, height), axis=1)
+    return Objects(
+        Boxes(center, size, yaw, np.array(label, dtype=np.str_), scores),
+        truncation=numbers[:, 0],
+        occlusion=numbers[:, 1].astype(np.int64),
+        alpha=numbers[:, 2],
+        rectangle=numbers[:, 3:7],
+    )
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: no such file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file") from None
+
+
+@dataclass(frozen=True)
+class KittiFrame:
+    """One frame of the benchmark."""
+
+    name: str  # "000008"
+    points: NDArray[np.float32]  # (N, 4) x, y, z [m], reflectance; LiDAR frame
+    calibration: Calibration
+    objects: Objects
+    image: NDArray[np.uint8]  # (H, W, 3) red, green, blue
+
+
+class KittiFolder:
+    """A KITTI folder: the frames of a split, or all frames with a point cloud."""
+
+    def __init__(self, folder: Path, names: list[str]) -> None:
+        self.folder = folder
+        self.names = names
+
+    @classmethod
+    def open(cls, path: Path | str, split: str | None = None) -> "KittiFolder":
+        """Return the frames of the KITTI folder `path` that `ImageSets/<split>.txt` lists, or all of `training`.
+
+        The split "test" is read from `testing`, any other from `training`. Raises `InputError` where the folder, the
+        list or a file of a frame is missing.
+        """
+        root, part_of = Path(path), "testing" if split == "test" else "training"
+        folder = root / part_of
+        if not folder.is_dir():
+            raise InputError(f"{root}: no KITTI folder; it holds no '{part_of}'")
+        if split is None:
+            names = sorted(file.stem for file in (folder / "velodyne").glob("*.bin"))
+        else:
+            names = read_split(root / "ImageSets" / f"{split}.txt")
+        for name in names:
+            for part, suffix in SUFFIXES.items():
+                if not (folder / part / f"{name}.{suffix}").is_file():
+                    raise InputError(f"{folder / part / f'{name}.{suffix}'}: missing; every frame needs one")
+        return cls(folder, names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def frame(self, i: int) -> KittiFrame:
+        """Return frame `i`; raises `InputError` for a malformed file, or a label that does not fit the image."""
+        paths = {part: self.folder / part / f"{self.names[i]}.{suffix}" for part, suffix in SUFFIXES.items()}
+        calibration = read_calibration(paths["calib"])
+        image = _read_image(paths["image_2"])
+        objects = read_objects(paths["label_2"], calibration)
+        check_objects(objects, image.shape[1], image.shape[0], paths["label_2"])
+        return KittiFrame(self.names[i], read_points(paths["velodyne"]), calibration, objects, image)
+
+
+def check_objects(objects: Objects, width: int, height: int, path: Path) -> None:
+    """Raise `InputError` where a label of the file `path` is impossible in an image of `width` x `height` pixels."""
+    if unknown := sorted(set(objects.boxes.label.tolist()) - CLASSES):
+        raise InputError(f"{path}: unknown class '{unknown[0]}'; KITTI has {', '.join(sorted(CLASSES))}, DontCare")
+    left, top, right, bottom = objects.rectangle.T
+    inside = (left >= -MARGIN_PX) & (top >= -MARGIN_PX) & (right < width + MARGIN_PX) & (bottom < height + MARGIN_PX)
+    checks = {
+        "a size that is not positive": (objects.boxes.size > 0).all(axis=1),
+        f"a rectangle that is not within the image of {width} x {height}": inside & (left < right) & (top < bottom),
+        "a truncation outside 0 to 1": (objects.truncation >= 0) & (objects.truncation <= 1),
+        "an occlusion that is none of 0, 1, 2, 3": np.isin(objects.occlusion, range(4)),
+    }
+    for what, good in checks.items():
+        if not good.all():
+            raise InputError(f"{path}: object {int(np.argmin(good)) + 1} has {what}")
+
+
+def read_split(path: Path) -> list[str]:
+    """Return the names of the frames that a file of `ImageSets` lists; raises `InputError` where one is there twice."""
+    try:
+        names = path.read_text(encoding="utf-8").split()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such list of frames") from None
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: names a frame twice")
+    return names
+
+
+def _read_image(path: Path) -> NDArray[np.uint8]:
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        raise InputError(f"{path}: not an image") from None

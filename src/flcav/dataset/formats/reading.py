@@ -1,0 +1,185 @@
+"""What readers of other formats share: annotations from boxes, what can be computed of them, and names of agents.
+
+What a format does not say is NaN, or UNKNOWN_PIXELS. Computed are returns (the points in an object's box), velocities
+from tracks, and the rectangles that boxes fill in images.
+"""
+
+from collections.abc import Hashable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from flcav.config import InputError
+from flcav.dataset.payloads import read_image
+from flcav.dataset.store import LazyMapping
+from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
+from flcav.sensors.camera.lens import Lens, project
+from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, SignViews, Views
+from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncation
+from flcav.sources.source import Source
+
+Array = NDArray[np.float64]
+
+LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose difference is a velocity, as nuscenes-devkit's
+EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
+
+
+class LogSource(Source, Protocol):
+    """A source that reads recorded logs."""
+
+    notes: tuple[str, ...]  # sentences on what is not in the files, for whoever imports them
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A camera's image file with what projects into it."""
+
+    path: Path
+    lens: Lens
+    world_from_camera: Array  # (4, 4), optical frame
+
+
+def annotate(
+    track: Iterable[str],
+    boxes: Boxes,
+    clouds: Mapping[str, tuple[NDArray[np.float32], Array]],
+    views: Mapping[str, Views],
+    *,
+    velocity: Array | None = None,
+    occlusion: Array | None = None,
+) -> Annotations:
+    """Return annotations of M objects from their `boxes`, world frame.
+
+    `clouds` maps each LiDAR to its (N, 4) points and its (4, 4) pose in the world; the points in an object's box are
+    its returns. `velocity` (M, 3) and `occlusion` (M,) are NaN where they are None.
+    """
+    count = len(boxes)
+    points = {
+        name: points_in_boxes(transform_points(world_from_lidar, cloud[:, :3].astype(np.float64)), boxes).sum(axis=1)
+        for name, (cloud, world_from_lidar) in clouds.items()
+    }
+    return Annotations(
+        track=np.array(list(track), np.str_).reshape(count),
+        boxes=boxes,
+        velocity=np.full((count, 3), np.nan) if velocity is None else velocity,
+        acceleration=np.full((count, 3), np.nan),
+        returns=np.sum(list(points.values()), axis=0, dtype=np.int64) if points else np.zeros(count, np.int64),
+        occlusion=np.full(count, np.nan) if occlusion is None else occlusion,
+        points=points,
+        views=views,
+        signs={name: _no_signs() for name in views},
+    )
+
+
+def _no_signs() -> SignViews:
+    none, number = np.zeros(0, np.str_), np.zeros(0, np.int64)
+    return SignViews(none, none, np.zeros((0, 4)), number, np.zeros(0), number)
+
+
+def difference_tracks(track: NDArray[np.str_], time_s: Array, center: Array) -> Array:
+    """Return (R, 3) velocities [m/s] of R annotations of tracks, by the difference of their neighbours' centres (R, 3).
+
+    A track's first and last annotation have one neighbour. NaN where neighbours are LONGEST_STEP_S away or more, and
+    where a track has one annotation: nuscenes-devkit's `box_velocity`.
+    """
+    order = np.lexsort((time_s, track))
+    same = track[order][1:] == track[order][:-1]
+    before, after = order.copy(), order.copy()
+    before[1:][same], after[:-1][same] = order[:-1][same], order[1:][same]
+    step = time_s[after] - time_s[before]
+    sides = (before != order).astype(int) + (after != order)
+    known = (step > 0) & (step <= LONGEST_STEP_S * sides)
+    velocity = np.full((len(track), 3), np.nan)
+    velocity[order[known]] = ((center[after] - center[before]) / np.where(known, step, 1.0)[:, None])[known]
+    return velocity
+
+
+def view_boxes(boxes: Boxes, picture: Picture) -> Views:
+    """Return the rectangles that `boxes` (world frame) fill in an image, with the share outside it.
+
+    They are those of the boxes and not of what is in them, so somewhat larger than of a simulated actor. Which pixels
+    show is unknown.
+    """
+    amodal = np.full((len(boxes), 4), np.nan)
+    camera_from_world = inverse(picture.world_from_camera)
+    for row, corners in enumerate(boxes.corners()):
+        seen = clip_in_front(transform_points(camera_from_world, corners), EDGES, NEAR_M)
+        if len(seen):
+            pixels = project(picture.lens, seen)
+            amodal[row] = *pixels.min(axis=0), *pixels.max(axis=0)
+    truncation = compute_truncation(amodal, picture.lens)
+    amodal[truncation == 1] = np.nan
+    return unseen_views(amodal, truncation)
+
+
+def unseen_views(amodal: Array, truncation: Array, occlusion: Array | None = None) -> Views:
+    """Return views of M objects with (M, 4) amodal boxes of whose visible pixels nothing is known."""
+    count = len(amodal)
+    return Views(
+        amodal_box=amodal,
+        visible_box=np.full((count, 4), np.nan),
+        pixels=np.full(count, UNKNOWN_PIXELS, np.int64),
+        truncation=truncation,
+        occlusion=np.full(count, np.nan) if occlusion is None else occlusion,
+    )
+
+
+def pinhole(intrinsics: Array, width: int, height: int) -> Lens:
+    """Return the lens of a (3, 3) camera matrix."""
+    fx, fy, cx, cy = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return Lens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def measure_picture(path: Path) -> tuple[int, int]:
+    """Return width and height of an image file [px]; raises `InputError` where it is missing or no image."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        raise InputError(f"{path}: not an image, or a truncated one") from None
+
+
+def read_pictures(paths: Mapping[str, Path]) -> Mapping[str, CameraImage]:
+    """Return camera -> image, each read on first access."""
+    return LazyMapping(list(paths), lambda name: CameraImage(read_image(paths[name], np.uint8, channels=3)))
+
+
+class AgentNames:
+    """Names of agents: a dataset has one calibration for each, so that another calibration makes another agent.
+
+    >>> names = AgentNames()
+    >>> names.of("ego", "calibration of Monday"), names.of("ego", "of Tuesday"), names.of("ego", "of Tuesday")
+    ('ego', 'ego-2', 'ego-2')
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[str, dict[Hashable, str]] = {}
+
+    def of(self, vehicle: str, calibration: Hashable) -> str:
+        """Return the name of the agent of a `vehicle` with this `calibration`."""
+        known = self._known.setdefault(vehicle, {})
+        return known.setdefault(calibration, vehicle if not known else f"{vehicle}-{len(known) + 1}")
+
+
+def name_splits(split_of: Mapping[str, str | None]) -> dict[str, list[str]]:
+    """Return split -> scenes from scene -> split, without those of no split."""
+    found: dict[str, list[str]] = {}
+    for scene, split in split_of.items():
+        if split is not None:
+            found.setdefault(split, []).append(scene)
+    return found
+
+
+def choose_split(folder: Path, split_of: Mapping[str, str | None], split: str | None) -> list[str]:
+    """Return the scenes of `split`, all for None; raises `InputError` where there are none."""
+    chosen = [scene for scene, own in split_of.items() if split is None or own == split]
+    if not chosen:
+        known = sorted({own for own in split_of.values() if own is not None})
+        raise InputError(f"{folder}: no split '{split}'; it has {', '.join(known) or 'none'}")
+    return chosen
