@@ -37,14 +37,15 @@ def birdseye(
     seen = dataset.frame(0 if frame is None else dataset.number(frame))
     agent_from_world = inverse(seen.world_from_agent)
     points = [transform_points(seen.agent_from_sensor[name], cloud[:, :3]) for name, cloud in seen.lidar.items()]
-    ground_m = -seen.world_from_agent[2, 3]
+    pole = seen.agent.startswith("pole")  # whose origin is at its sensors, that of a vehicle is on the ground
+    ground_m = -seen.world_from_agent[2, 3] if pole else 0.0
     view = View(
         points=np.concatenate(points) - (0.0, 0.0, ground_m),
         truth=seen.annotations.boxes.transform(agent_from_world),
         returns=seen.annotations.returns,
         title=f"{seen.key} · {seen.time_s:.1f} s",
         range_m=range_m,
-        agent_size=(sedan.length, sedan.width) if seen.agent.startswith("cav") else None,
+        agent_size=None if pole else (sedan.length, sedan.width),
     )
     write_bytes(out, style.png(birdseye(view)))
     typer.echo(f"{out}: {seen.key}, {sum(map(len, points))} points, {len(seen.annotations)} annotated actors")

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -76,10 +76,13 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
 
     A dataset whose recipe says validation or test belongs to that split entirely; raises `InputError` where a share of
     validation scenes is requested nevertheless. Of any other dataset, the last scenes are the validation split: the
-    requested share of them, rounded up, but never all.
+    requested share of them, rounded up, but never all. An imported dataset keeps its splits unless a share is requested.
     """
     scenes = list(dict.fromkeys(key.scene for key in dataset.keys))
     recorded_for = str(dataset.manifest.recipe.get("split", ""))
+    if dataset.manifest.imported and not recorded_for and "validation" not in options.model_fields_set:
+        if len(known := _imported_splits(dataset)) == len(scenes):
+            return {scene: known[scene] for scene in scenes}
     for split in ("val", "test"):
         if recorded_for.startswith(split):
             if "validation" in options.model_fields_set:
@@ -90,6 +93,17 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
     held_out = min(math.ceil(options.validation * len(scenes)), len(scenes) - 1)
     first = len(scenes) - held_out
     return {scene: "val" if i >= first else "train" for i, scene in enumerate(scenes)}
+
+
+def _imported_splits(dataset: Dataset) -> dict[str, str]:
+    """Return scene -> split of an imported dataset as its files have it, without the scenes that are in none."""
+    splits = dataset.manifest.recipe.get("splits")
+    return {
+        str(scene): name
+        for name, scenes in (splits.items() if isinstance(splits, Mapping) else ())
+        if name in SPLITS and isinstance(scenes, Sequence)
+        for scene in scenes
+    }
 
 
 def split_with_validation(dataset: Dataset, options: ExportOptions, name: str) -> Mapping[str, str]:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 from flcav.config import InputError
 from flcav.dataset.formats.argoverse2.read import Argoverse2Source
 from flcav.dataset.formats.kitti.read import KittiSource
+from flcav.dataset.formats.nuscenes.read import NuscenesSource
+from flcav.dataset.formats.opv2v.read import Opv2vSource
 from flcav.dataset.formats.reading import LogSource
 from flcav.dataset.recording.recorder import record
 from flcav.progress import Report, ignore_progress
@@ -21,6 +23,8 @@ class Readable(NamedTuple):
 
 READABLE: Mapping[str, Readable] = {
     "kitti": Readable(KittiSource, ("training/velodyne", "testing/velodyne")),
+    "nuscenes": Readable(NuscenesSource, ("v1.0-*/sample.json", "sample.json", "samples/LIDAR_TOP")),
+    "opv2v": Readable(Opv2vSource, ("data_protocol.yaml", "*/data_protocol.yaml", "*/*/data_protocol.yaml")),
     "argoverse2": Readable(Argoverse2Source, ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar")),
 }
 

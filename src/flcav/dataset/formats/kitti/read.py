@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flcav.config import InputError
+from flcav.dataset.formats.kitti.files import Calibration as KittiCalibration
 from flcav.dataset.formats.kitti.files import (
     Objects,
     check_objects,
@@ -60,6 +61,7 @@ class Shot(NamedTuple):
     index: int
     vehicle: str
     time_s: float
+    exported: bool  # by flcav, whose camera may have moved on since the spin: an agent keeps its first calibration
 
 
 class KittiSource:
@@ -74,13 +76,16 @@ class KittiSource:
         self._split_of = {scene: own for scene, own in split_of.items() if scene in chosen}
         self._shots: dict[str, list[Shot]] = defaultdict(list)
         self._agent: dict[str, str] = {}
+        self._calibration: dict[str, Calibration] = {}
         names = AgentNames()
         for shot in shots:
             if shot.scene in chosen:
                 calibration = _path(shot, "calib")
-                read_calibration(calibration)
+                mounted = _calibrate(read_calibration(calibration))
                 self._shots[shot.scene].append(shot)
-                self._agent[shot.number] = names.of(shot.vehicle, calibration.read_text())
+                text = "" if shot.exported else calibration.read_text()
+                agent = self._agent[shot.number] = names.of(shot.vehicle, text)
+                self._calibration.setdefault(agent, mounted)
         every = [shot for own in self._shots.values() for shot in own]
         bare = sum(not _path(shot, "label_2").is_file() for shot in every)
         self._labelled = not bare
@@ -111,25 +116,30 @@ class KittiSource:
     def frames(self, scene: str) -> Iterator[LinkedFrame]:
         """Yield the frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""
         for shot in sorted(self._shots[scene], key=lambda shot: (shot.index, shot.vehicle)):
-            yield _read_frame(shot, self._agent[shot.number])
+            agent = self._agent[shot.number]
+            yield _read_frame(shot, agent, self._calibration[agent])
 
 
-def _read_frame(shot: Shot, agent: str) -> LinkedFrame:
+def _calibrate(calibrated: KittiCalibration) -> Calibration:
+    agent_from_lidar, projection = pose(0.0, 0.0, HEIGHT_M), calibrated.image_from_camera
+    shifted = np.eye(4)  # the projection's fourth column as a translation
+    shifted[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
+    return Calibration(
+        {LIDAR: agent_from_lidar, CAMERA: agent_from_lidar @ inverse(shifted @ calibrated.camera_from_lidar)},
+        intrinsics={CAMERA: projection[:, :3]},
+        distortion={CAMERA: np.zeros(5)},
+    )
+
+
+def _read_frame(shot: Shot, agent: str, calibration: Calibration) -> LinkedFrame:
     files = {LIDAR: _path(shot, "velodyne"), CAMERA: _path(shot, "image_2")}
     points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))
     size = measure_picture(files[CAMERA])
     label = _path(shot, "label_2")
     objects = read_objects(label, calibrated) if label.is_file() else Objects.none()
     check_objects(objects, *size, label)
-    agent_from_lidar = pose(0.0, 0.0, HEIGHT_M)
-    projection = calibrated.image_from_camera
-    shifted = np.eye(4)  # the projection's fourth column as a translation
-    shifted[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
-    calibration = Calibration(
-        {LIDAR: agent_from_lidar, CAMERA: agent_from_lidar @ inverse(shifted @ calibrated.camera_from_lidar)},
-        intrinsics={CAMERA: projection[:, :3]},
-        distortion={CAMERA: np.zeros(5)},
-    )
+    agent_from_lidar, mount = calibration.agent_from_sensor[LIDAR], calibration.agent_from_sensor[CAMERA]
+    then = _calibrate(calibrated).agent_from_sensor[CAMERA] @ inverse(mount)
     labels = [CATEGORIES.get(name, name) for name in objects.boxes.label.tolist()]
     boxes = objects.boxes.transform(agent_from_lidar)
     return LinkedFrame(
@@ -148,6 +158,7 @@ def _read_frame(shot: Shot, agent: str) -> LinkedFrame:
             {CAMERA: unseen_views(objects.rectangle, objects.truncation, OCCLUSION[objects.occlusion])},
         ),
         images=read_pictures({CAMERA: files[CAMERA]}),
+        agent_at_trigger={} if np.allclose(then, np.eye(4), atol=1e-9) else {CAMERA: then},
         files=files,
     )
 
@@ -164,8 +175,8 @@ def _find_shots(folder: Path) -> list[Shot]:
     for part in FOLDERS:
         for path in sorted((folder / part / "velodyne").glob("*.bin")):
             split = listed.get((part, path.stem), "test" if part == "testing" else None)
-            scene, index, vehicle, time_s = origin.get(path.stem, (f"kitti-{part}-{path.stem}", 0, "ego", 0.0))
-            shots.append(Shot(folder / part, path.stem, split, scene, index, vehicle, time_s))
+            where = origin.get(path.stem, (f"kitti-{part}-{path.stem}", 0, "ego", 0.0))
+            shots.append(Shot(folder / part, path.stem, split, *where, path.stem in origin))
     if not shots:
         raise InputError(f"{folder}: no KITTI folder; it holds no 'training/velodyne' with point clouds")
     return shots

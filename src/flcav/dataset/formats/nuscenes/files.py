@@ -76,6 +76,19 @@ def encode_radar(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> 
     return "\n".join(header).encode() + rows.tobytes() + b"\n"  # the devkit wants a byte after the last point
 
 
+def decode_radar(rows: NDArray[np.void]) -> NDArray[np.float32]:
+    """Return (N, 5) range [m], azimuth, elevation [rad], Doppler [m/s], RCS [dBsm] of the points of a radar's PCD file.
+
+    Those that the devkit leaves out by default, as invalid or ambiguous, are left out.
+    """
+    kept = (rows["invalid_state"] == 0) & (rows["ambig_state"] == UNAMBIGUOUS) & np.isfinite(rows["x"])
+    x, y, z, vx, vy, rcs = (rows[name][kept].astype(np.float64) for name in ("x", "y", "z", "vx", "vy", "rcs"))
+    level = np.hypot(x, y)
+    distance = np.hypot(level, z)
+    doppler = (vx * x + vy * y) * distance / level**2  # the inverse of `encode_radar`: vx is Doppler times x / distance
+    return np.column_stack((distance, np.arctan2(y, x), np.arctan2(z, level), doppler, rcs)).astype(np.float32)
+
+
 def map_mask(town: Town) -> NDArray[np.uint8]:
     """Return the (H, W) mask of a town at RESOLUTION_M, north up: 255 on roads and sidewalks, else 0.
 

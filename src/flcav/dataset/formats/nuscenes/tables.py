@@ -8,6 +8,8 @@ from flcav.files import Json
 
 Row = dict[str, Json]
 
+VERSION = "v1.0-flcav"
+
 TABLES = (
     "attribute",
     "calibrated_sensor",

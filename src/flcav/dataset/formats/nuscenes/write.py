@@ -16,7 +16,7 @@ from flcav.dataset.formats.exporter import Exported, ExportOptions, missing_data
 from flcav.dataset.formats.mounts import agent_velocities
 from flcav.dataset.formats.nuscenes.drive import Drive
 from flcav.dataset.formats.nuscenes.files import RESOLUTION_M, map_mask
-from flcav.dataset.formats.nuscenes.tables import constant_rows, token
+from flcav.dataset.formats.nuscenes.tables import VERSION, constant_rows, token
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
@@ -25,7 +25,6 @@ from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 
 Array = NDArray[np.float64]
 
-VERSION = "v1.0-flcav"
 MAP = "maps/map.png"
 UNKNOWN_MARGIN_M = 120.0  # margin of the map around the agents where the town is unknown
 

@@ -5,6 +5,7 @@ vehicles are numbered in one list. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `tran
 """
 
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -125,6 +126,24 @@ def carla_pose(world_from_body: Array) -> list[float]:
     roll = np.arctan2(-matrix[2, 1], matrix[2, 2])
     pitch = np.arcsin(np.clip(matrix[2, 0], -1, 1))
     return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw_of(matrix), pitch)).tolist()]
+
+
+def from_carla(values: Sequence[float]) -> Array:
+    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`.
+
+    OpenCOOD's `x_to_world`, mirrored.
+    """
+    x, y, z, *angles = values
+    (cr, cy, cp), (sr, sy, sp) = np.cos(np.radians(angles)), np.sin(np.radians(angles))
+    matrix = np.array(
+        [
+            [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr, x],
+            [sy * cp, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr, y],
+            [sp, -cp * sr, cp * cr, z],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+    return MIRROR @ matrix @ MIRROR
 
 
 def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed_m_s: float) -> None:

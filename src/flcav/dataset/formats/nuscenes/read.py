@@ -1,0 +1,293 @@
+"""Reading of nuScenes' tables and files, as nuscenes-devkit reads them: the key frames, which are those with boxes.
+
+The ego vehicle's frame is on the ground below the rear axle, the world is nuScenes' global frame. Splits of nuScenes are
+in its devkit's code and not in its files; an export of flcav's has them, and its logs name scene and agent.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from flcav.config import InputError, read_json
+from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar
+from flcav.dataset.formats.nuscenes.tables import VERSION
+from flcav.dataset.formats.pcd import read_pcd
+from flcav.dataset.formats.reading import (
+    AgentNames,
+    Picture,
+    annotate,
+    choose_split,
+    difference_tracks,
+    name_splits,
+    pinhole,
+    read_pictures,
+    view_boxes,
+)
+from flcav.files import Json
+from flcav.geometry import Boxes, inverse, yaw_of
+from flcav.sensors.frame import Calibration, LinkedFrame
+
+Array = NDArray[np.float64]
+Row = Mapping[str, Any]  # of a table of nuScenes
+
+CATEGORIES = {  # other classes keep their names, and so do cycles without a rider
+    "vehicle.car": "car",
+    "vehicle.emergency.police": "car",
+    "vehicle.truck": "truck",
+    "vehicle.trailer": "truck",
+    "vehicle.construction": "truck",
+    "vehicle.emergency.ambulance": "truck",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.bus.bendy": "bus",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+}
+RIDDEN = {"vehicle.bicycle": "bicycle", "vehicle.motorcycle": "motorcycle"}
+RIDER = "cycle.with_rider"
+OCCLUSION = {"1": 0.8, "2": 0.5, "3": 0.3, "4": 0.1}  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
+TOP = "LIDAR_TOP"
+POINT = 5  # float32 of a point: x, y, z, intensity 0 to 255, ring
+COLUMNS = {  # what is read of each table
+    "scene": ("name", "log_token", "first_sample_token"),
+    "log": ("logfile", "vehicle"),
+    "sample": ("timestamp", "scene_token"),
+    "sample_data": ("sample_token", "ego_pose_token", "calibrated_sensor_token", "is_key_frame", "filename"),
+    "ego_pose": ("translation", "rotation"),
+    "calibrated_sensor": ("sensor_token", "translation", "rotation", "camera_intrinsic"),
+    "sensor": ("channel", "modality"),
+    "category": ("name",),
+    "attribute": ("name",),
+    "instance": ("category_token",),
+    "sample_annotation": ("sample_token", "instance_token", "translation", "size", "rotation"),
+}
+
+
+class Spin(NamedTuple):
+    """A key frame: its sample, and where it belongs in a dataset."""
+
+    sample: str  # token
+    agent: str
+    index: int
+    time_s: float
+
+
+class NuscenesSource:
+    """The key frames of a nuScenes folder, or of a folder of tables in it, such as `v1.0-mini`."""
+
+    def __init__(self, folder: Path, split: str | None = None) -> None:
+        """Raises `InputError` where tables are missing or malformed, or there is nothing of `split`."""
+        self._folder, self._split = folder, split
+        self._tables = _find_tables(folder)
+        self._root = self._tables.parent
+        table = {name: _read_table(self._tables / f"{name}.json", name) for name in COLUMNS}
+        self._data: dict[str, dict[str, Row]] = defaultdict(dict)  # sample -> channel -> row of sample_data
+        self._mounted, self._channel = table["calibrated_sensor"], table["sensor"]
+        for row in table["sample_data"].values():
+            if row["is_key_frame"]:
+                mounted = self._at(self._mounted, row["calibrated_sensor_token"])
+                self._data[row["sample_token"]][self._at(self._channel, mounted["sensor_token"])["channel"]] = row
+        used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
+        self._pose = {token: row for token, row in table["ego_pose"].items() if token in used}
+        self._spins, split_of = self._order(table["scene"], table["log"], table["sample"])
+        self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
+        self._read_notes(table)
+        self._labelled = bool(table["sample_annotation"])
+        self.notes = () if self._labelled else ("no annotations in its tables, so no boxes",)
+
+    def _at(self, table: Mapping[str, Row], token: str) -> Row:
+        if token not in table:
+            raise InputError(f"{self._tables}: its tables do not fit together, nothing has the token '{token}'")
+        return table[token]
+
+    def _order(
+        self, scenes: Mapping[str, Row], logs: Mapping[str, Row], samples: Mapping[str, Row]
+    ) -> tuple[dict[str, list[Spin]], dict[str, str | None]]:
+        """Return scene -> its spins in order of time and agent, and scene -> split."""
+        ours, names = self._tables.name == VERSION, AgentNames()
+        splits = self._tables / "splits.json"
+        listed = read_json(splits) if splits.is_file() else {}
+        split_by_name = {
+            name: split.removeprefix("flcav_")
+            for split, own in (listed.items() if isinstance(listed, dict) else ())
+            for name in own
+        }
+        of_scene: dict[str, list[str]] = defaultdict(list)
+        for token, row in samples.items():
+            of_scene[row["scene_token"]].append(token)
+        times: dict[str, list[tuple[float, str, str]]] = defaultdict(list)
+        split_of = {}
+        for token, scene in scenes.items():
+            log, name = self._at(logs, scene["log_token"]), scene["name"]
+            for sample in of_scene[token]:
+                if TOP not in self._data[sample]:
+                    raise InputError(f"{self._tables / 'sample_data.json'}: no {TOP} of the sample '{sample}'")
+            own = log["logfile"] if ours else name
+            first = self._data[of_scene[token][0]] if of_scene[token] else {}
+            mounted = {c: self._at(self._mounted, row["calibrated_sensor_token"]) for c, row in sorted(first.items())}
+            about = [(c, *(str(row[name]) for name in COLUMNS["calibrated_sensor"])) for c, row in mounted.items()]
+            agent = names.of(log["vehicle"] or "ego", tuple(about))
+            late = int(name.rpartition("-")[2]) if ours else 0  # see `Drive._micros`
+            times[own] += [((samples[s]["timestamp"] - late) / 1e6, agent, s) for s in of_scene[token]]
+            split_of[own] = split_by_name.get(name, "test" if self._tables.name.endswith("-test") else None)
+        spins = {}
+        for scene, found in times.items():
+            rank = {time: index for index, time in enumerate(sorted({time for time, _, _ in found}))}
+            spins[scene] = [Spin(sample, agent, rank[time], time) for time, agent, sample in sorted(found)]
+        return spins, split_of
+
+    def _read_notes(self, table: Mapping[str, Mapping[str, Row]]) -> None:
+        """Keep the annotations: boxes in the global frame by sample, with velocities by their instances."""
+        rows = list(table["sample_annotation"].values())
+        category = {
+            token: self._at(table["category"], row["category_token"])["name"] for token, row in table["instance"].items()
+        }
+        attribute = {token: row["name"] for token, row in table["attribute"].items()}
+        track = np.array([row["instance_token"] for row in rows], np.str_)
+        time_s = np.array([self._at(table["sample"], row["sample_token"])["timestamp"] / 1e6 for row in rows])
+        center = np.array([row["translation"] for row in rows], np.float64).reshape(-1, 3)
+        width, length, height = np.array([row["size"] for row in rows], np.float64).reshape(-1, 3).T
+        yaw = np.array([yaw_of(_placed(row)) for row in rows])
+        label = []
+        for row in rows:
+            name = category.get(row["instance_token"], "")
+            ridden = RIDER in (attribute.get(token) for token in row.get("attribute_tokens", ()))
+            label.append(RIDDEN.get(name, name) if ridden else CATEGORIES.get(name, name))
+        self._track, self._velocity = track, difference_tracks(track, time_s, center)
+        self._boxes = Boxes(center, np.column_stack((length, width, height)), yaw, np.array(label, np.str_))
+        self._occlusion = np.array([OCCLUSION.get(row.get("visibility_token", ""), np.nan) for row in rows])
+        self._notes: dict[str, list[int]] = defaultdict(list)
+        for number, row in enumerate(rows):
+            self._notes[row["sample_token"]].append(number)
+
+    def describe(self) -> Mapping[str, Json]:
+        """Return folder, splits and what is labelled."""
+        return {
+            "imported": "nuscenes",
+            "from": str(self._tables.resolve()),
+            "split": self._split or "",
+            "labels": ["objects"] if self._labelled else [],
+            "splits": name_splits(self._split_of),
+        }
+
+    def scenes(self) -> list[str]:
+        """Return the scenes' names."""
+        return list(self._split_of)
+
+    def frame_count(self, scene: str) -> int:
+        """Return the number of key frames of a scene."""
+        return len(self._spins[scene])
+
+    def trace(self, scene: str) -> None:
+        """Return None: the traffic between key frames is not known."""
+        return
+
+    def frames(self, scene: str) -> Iterator[LinkedFrame]:
+        """Yield the key frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""
+        for spin in self._spins[scene]:
+            yield self._frame(scene, spin)
+
+    def _frame(self, scene: str, spin: Spin) -> LinkedFrame:
+        data = self._data[spin.sample]
+        mounted = {name: self._at(self._mounted, row["calibrated_sensor_token"]) for name, row in data.items()}
+        kind = {name: self._at(self._channel, row["sensor_token"])["modality"] for name, row in mounted.items()}
+        poses = {name: _placed(self._at(self._pose, row["ego_pose_token"])) for name, row in data.items()}
+        ours = inverse(OURS_FROM_LIDAR)
+        mounts = {name: _placed(row) @ (ours if kind[name] == "lidar" else np.eye(4)) for name, row in mounted.items()}
+        cameras = [name for name in data if kind[name] == "camera"]
+        calibration = Calibration(
+            mounts,
+            intrinsics={name: np.array(mounted[name]["camera_intrinsic"], np.float64) for name in cameras},
+            distortion={name: np.zeros(5) for name in cameras},
+        )
+        path = {name: self._root / row["filename"] for name, row in data.items()}
+        ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
+        clouds = {name: read_cloud(path[name]) for name in ranging}
+        radar = {name: decode_radar(read_pcd(path[name])) for name in data if kind[name] == "radar"}
+        own = self._notes[spin.sample]
+        boxes = self._boxes[own]
+        pictures = {
+            name: Picture(
+                path[name],
+                pinhole(calibration.intrinsics[name], data[name]["width"], data[name]["height"]),
+                poses[name] @ mounts[name],
+            )
+            for name in cameras
+        }
+        files = {name: path[name] for name in cameras}
+        for file in files.values():
+            if not file.is_file():
+                raise InputError(f"{file}: no such file")
+        return LinkedFrame(
+            scene=scene,
+            index=spin.index,
+            time_s=spin.time_s,
+            agent=spin.agent,
+            world_from_agent=poses[TOP],
+            calibration=calibration,
+            assumed=calibration,
+            lidar=clouds,
+            annotations=annotate(
+                self._track[own].tolist(),
+                boxes,
+                {name: (cloud, poses[name] @ mounts[name]) for name, cloud in clouds.items()},
+                {name: view_boxes(boxes, picture) for name, picture in pictures.items()},
+                velocity=self._velocity[own],
+                occlusion=self._occlusion[own],
+            ),
+            images=read_pictures(files),
+            radar=radar,
+            agent_at_trigger={name: then for name, then in poses.items() if not np.array_equal(then, poses[TOP])},
+            files=files,
+        )
+
+
+def read_cloud(path: Path) -> NDArray[np.float32]:
+    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a LiDAR's file; raises `InputError` as it is missing."""
+    try:
+        data = np.fromfile(path, "<f4")
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: no such file") from None
+    if len(data) % POINT or path.stat().st_size % 4 or not len(data):
+        raise InputError(f"{path}: truncated; {path.stat().st_size} bytes are no whole points of {4 * POINT} bytes")
+    right, ahead, up, intensity, _ = data.reshape(-1, POINT).T
+    return np.stack((ahead, -right, up, intensity / np.float32(255)), axis=1)
+
+
+def _find_tables(folder: Path) -> Path:
+    if (folder / "sample.json").is_file():
+        return folder
+    found = sorted(path.parent for path in folder.glob("v1.0-*/sample.json"))
+    if not found:
+        raise InputError(f"{folder}: no nuScenes tables; it holds no folder such as 'v1.0-mini' with a 'sample.json'")
+    if len(found) > 1:
+        raise InputError(f"{folder}: several folders of tables, {', '.join(path.name for path in found)}: name one of them")
+    return found[0]
+
+
+def _read_table(path: Path, name: str) -> dict[str, Row]:
+    """Return token -> row of a table; raises `InputError` where a row lacks one of COLUMNS."""
+    rows = read_json(path)
+    wanted = {"token", *COLUMNS[name]}
+    if not isinstance(rows, list):
+        raise InputError(f"{path}: not a table of nuScenes; a list of rows is wanted")
+    for row in rows:
+        if not isinstance(row, dict) or not wanted <= row.keys():
+            lost = sorted(wanted - row.keys())[0] if isinstance(row, dict) else "token"
+            raise InputError(f"{path}: a row has no '{lost}'")
+    return {row["token"]: row for row in rows}  # type: ignore[index, misc]
+
+
+def _placed(row: Row) -> Array:
+    """Return the (4, 4) transform of a row's rotation, w x y z, and translation."""
+    w, x, y, z = row["rotation"]
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat((x, y, z, w)).as_matrix()
+    matrix[:3, 3] = row["translation"]
+    return matrix

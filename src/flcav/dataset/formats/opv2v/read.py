@@ -1,0 +1,244 @@
+"""Reading of OPV2V, as OpenCOOD reads it: scenarios of several agents in CARLA's left-handed frames.
+
+OPV2V has one class, vehicle, which is read as car; no times, but spins at 10 Hz; of a velocity the speed, along the
+heading. Its sensors' poses are those in the world: mounts are those of the agent's first frame.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.formats.opv2v.write import CAMERAS, FOLDERS, KMH, MIRROR, from_carla
+from flcav.dataset.formats.pcd import read_pcd
+from flcav.dataset.formats.reading import (
+    AgentNames,
+    Picture,
+    annotate,
+    choose_split,
+    measure_picture,
+    name_splits,
+    pinhole,
+    read_pictures,
+    view_boxes,
+)
+from flcav.files import Json
+from flcav.geometry import Boxes, heading_vectors, inverse, yaw_of
+from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
+from flcav.sensors.frame import Calibration, LinkedFrame
+
+Array = NDArray[np.float64]
+About = Mapping[str, Any]  # OPV2V's file of a frame
+
+PERIOD_S = 0.1
+LIDAR, CATEGORY = "lidar", "car"
+DIGITS = 9  # of mounts, which are computed of poses
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+PROTOCOL = "data_protocol.yaml"
+
+
+class Shot(NamedTuple):
+    """A frame of an agent: the files without their ending, and where it belongs in a dataset."""
+
+    stem: Path
+    agent: str
+    index: int
+    time_s: float
+
+
+class Opv2vSource:
+    """The scenarios of a folder: one of a split, a split of scenarios, or the folder of splits."""
+
+    def __init__(self, folder: Path, split: str | None = None) -> None:
+        """Raises `InputError` where there is no scenario, none of `split`, or an agent's first frame is malformed."""
+        self._folder, self._split = folder, split
+        found = _find_scenarios(folder)
+        split_of = {scene: _split_of(path) for scene, path in found.items()}
+        self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
+        self._calibration: dict[str, Calibration] = {}
+        self._track: dict[str, dict[str, str]] = {}
+        names = AgentNames()
+        self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
+        self.notes = ()
+
+    def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Shot]:
+        known = self._track[scene] = _read_names(folder / PROTOCOL)
+        stamps = {
+            path: sorted(file.stem for file in path.glob("*.yaml") if file.stem.isdigit())
+            for path in sorted(folder.iterdir())
+            if path.is_dir()
+        }
+        rank = {stamp: number for number, stamp in enumerate(sorted({s for own in stamps.values() for s in own}))}
+        shots = []
+        for path, own in stamps.items():
+            if own:
+                kind = "pole" if path.name.startswith("-") else "cav"
+                vehicle = known.get(path.name, f"{kind}{path.name.lstrip('-')}")
+                calibration = _calibrate(path / own[0])
+                lidar, cameras = calibration.agent_from_sensor[LIDAR], calibration.intrinsics
+                agent = names.of(vehicle, (lidar.tobytes(), *((name, cameras[name].tobytes()) for name in cameras)))
+                self._calibration.setdefault(agent, calibration)
+                shots += [Shot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
+        return sorted(shots, key=lambda shot: (shot.index, shot.agent))
+
+    def describe(self) -> Mapping[str, Json]:
+        """Return folder, splits and what is labelled."""
+        return {
+            "imported": "opv2v",
+            "from": str(self._folder.resolve()),
+            "split": self._split or "",
+            "labels": ["objects"],
+            "splits": name_splits(self._split_of),
+        }
+
+    def scenes(self) -> list[str]:
+        """Return the scenarios' names."""
+        return list(self._shots)
+
+    def frame_count(self, scene: str) -> int:
+        """Return the number of frames of a scenario, of all agents."""
+        return len(self._shots[scene])
+
+    def trace(self, scene: str) -> None:
+        """Return None: only what agents see is known of the traffic."""
+        return
+
+    def frames(self, scene: str) -> Iterator[LinkedFrame]:
+        """Yield the frames of a scenario; raises `InputError` where a file is missing, truncated or malformed."""
+        for shot in self._shots[scene]:
+            yield self._frame(scene, shot)
+
+    def _frame(self, scene: str, shot: Shot) -> LinkedFrame:
+        calibration, about = self._calibration[shot.agent], _read_about(shot.stem)
+        mounts = calibration.agent_from_sensor
+        world_from_lidar = from_carla(about["lidar_pose"])
+        world_from_agent = world_from_lidar @ inverse(mounts[LIDAR])
+        boxes, velocity = _read_vehicles(about)
+        points = read_cloud(shot.stem.with_suffix(".pcd"))
+        files = {name: file for name in mounts if (file := _picture(shot.stem, name)).is_file() and name in about}
+        placed = {name: from_carla(about[name]["cords"]) @ BODY_FROM_OPTICAL for name in files}
+        pictures = {
+            name: Picture(file, pinhole(calibration.intrinsics[name], *measure_picture(file)), placed[name])
+            for name, file in files.items()
+        }
+        names = self._track[scene]
+        return LinkedFrame(
+            scene=scene,
+            index=shot.index,
+            time_s=shot.time_s,
+            agent=shot.agent,
+            world_from_agent=world_from_agent,
+            calibration=calibration,
+            assumed=calibration,
+            lidar={LIDAR: points},
+            annotations=annotate(
+                [names.get(str(number), str(number)) for number in about["vehicles"]],
+                boxes,
+                {LIDAR: (points, world_from_lidar)},
+                {name: view_boxes(boxes, picture) for name, picture in pictures.items()},
+                velocity=velocity,
+            ),
+            images=read_pictures(files),
+            agent_at_trigger={name: world @ inverse(mounts[name]) for name, world in placed.items()},
+            files=files,
+        )
+
+
+def read_cloud(path: Path) -> NDArray[np.float32]:
+    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a PCD file, whose red channel the intensity is."""
+    rows = read_pcd(path)
+    try:
+        x, y, z, colour = (rows[name] for name in ("x", "y", "z", "rgb"))
+    except ValueError:
+        raise InputError(f"{path}: not a point cloud of OPV2V, which has the fields x, y, z, rgb") from None
+    red = (np.ascontiguousarray(colour).view("<u4") >> 16) & 255
+    return np.stack((x, -y, z, red / np.float32(255)), axis=1).astype(np.float32)
+
+
+def _calibrate(stem: Path) -> Calibration:
+    """Return the calibration of an agent by its first frame: poses of sensors in its frame."""
+    about = _read_about(stem)
+    agent_from_world = inverse(from_carla(about["true_ego_pos"]))
+    cameras = [name for name in CAMERAS if name in about]
+    mounts = {LIDAR: agent_from_world @ from_carla(about["lidar_pose"])}
+    mounts |= {name: agent_from_world @ from_carla(about[name]["cords"]) @ BODY_FROM_OPTICAL for name in cameras}
+    return Calibration(
+        {name: np.round(mount, DIGITS) for name, mount in mounts.items()},
+        intrinsics={name: np.array(about[name]["intrinsic"], np.float64).reshape(3, 3) for name in cameras},
+        distortion={name: np.zeros(5) for name in cameras},
+    )
+
+
+def _read_vehicles(about: About) -> tuple[Boxes, Array]:
+    """Return the boxes of a frame's vehicles, world frame, and their (M, 3) velocities."""
+    rows = list(about["vehicles"].values())
+    placed = [from_carla([*np.add(row["location"], row["center"]), *row["angle"]]) for row in rows]
+    yaw = np.array([yaw_of(matrix) for matrix in placed])
+    center = np.array([matrix[:3, 3] for matrix in placed]).reshape(-1, 3)
+    size = 2 * np.array([row["extent"] for row in rows], np.float64).reshape(-1, 3)
+    speed = np.array([row.get("speed", np.nan) for row in rows]) / KMH
+    velocity = np.column_stack((heading_vectors(yaw) * speed[:, None], np.where(np.isnan(speed), np.nan, 0.0)))
+    return Boxes(center, size, yaw, np.full(len(rows), CATEGORY)), velocity
+
+
+def _read_about(stem: Path) -> About:
+    """Return the content of a frame's YAML file; raises `InputError` where it is missing, truncated or lacks a field."""
+    path = stem.with_suffix(".yaml")
+    try:
+        about = yaml.load(path.read_text(encoding="utf-8"), LOADER)  # noqa: S506 - a safe loader
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (yaml.YAMLError, UnicodeDecodeError):
+        raise InputError(f"{path}: not a YAML file, or a truncated one") from None
+    try:
+        about["vehicles"].values()
+        for row in about["vehicles"].values():
+            _check_numbers(row["location"], 3), _check_numbers(row["center"], 3)
+            _check_numbers(row["extent"], 3), _check_numbers(row["angle"], 3)
+        _check_numbers(about["lidar_pose"], 6), _check_numbers(about["true_ego_pos"], 6)
+        for name in CAMERAS:
+            if name in about:
+                _check_numbers(about[name]["cords"], 6), _check_numbers(np.ravel(about[name]["intrinsic"]), 9)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: not a frame of OPV2V ({type(error).__name__}: {error})") from None
+    return about
+
+
+def _check_numbers(values: Any, count: int) -> None:
+    numbers = np.array(values, np.float64)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise ValueError(f"{count} numbers are wanted")
+
+
+def _read_names(path: Path) -> dict[str, str]:
+    """Return number -> name of agents and tracks by an export's `data_protocol.yaml`; empty of any other."""
+    if not path.is_file():
+        return {}
+    try:
+        protocol = yaml.load(path.read_text(encoding="utf-8"), LOADER)  # noqa: S506 - a safe loader
+    except (yaml.YAMLError, UnicodeDecodeError):
+        raise InputError(f"{path}: not a YAML file, or a truncated one") from None
+    numbers = protocol.get("numbers") if isinstance(protocol, dict) else None
+    return {str(number): str(name) for name, number in numbers.items()} if isinstance(numbers, dict) else {}
+
+
+def _picture(stem: Path, camera: str) -> Path:
+    return stem.with_name(f"{stem.name}_{camera}.png")
+
+
+def _find_scenarios(folder: Path) -> dict[str, Path]:
+    """Return name -> folder of the scenarios in `folder`: folders of agents, which hold a YAML file for each frame."""
+    for depth in ("*/*.yaml", "*/*/*.yaml", "*/*/*/*.yaml"):
+        if frames := [path for path in folder.glob(depth) if path.stem.isdigit()]:
+            found = sorted({path.parent.parent for path in frames})
+            return {path.resolve().name: path for path in found}
+    raise InputError(f"{folder}: no scenario of OPV2V; agents' folders with a YAML file for each frame are wanted")
+
+
+def _split_of(scenario: Path) -> str | None:
+    name = scenario.resolve().parent.name
+    return {own: split for split, own in FOLDERS.items()}.get(name, "test" if name.startswith("test") else None)

@@ -1,0 +1,257 @@
+"""Every format that is exported and imported keeps what both know; each damaged folder is one sentence."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from painted_source import CATEGORIES, IN_BOX, PaintedSource
+
+from flcav.config import InputError
+from flcav.dataset.checks.validate import find_leaks, validate
+from flcav.dataset.formats.export import FORMATS, export
+from flcav.dataset.formats.exporter import ExportOptions, split_scenes
+from flcav.dataset.formats.importing import READABLE, import_dataset
+from flcav.dataset.recording.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.geometry import inverse, wrap_angle
+from flcav.sensors.frame import Frame
+
+SCENES = 2
+ROUND = [name for name in READABLE if name in FORMATS]
+SENSORS = {  # of cav0: name in the format -> name in the source
+    "kitti": {"velodyne": "lidar", "image_2": "front"},
+    "nuscenes": {"LIDAR_TOP": "lidar", "CAM_FRONT": "front", "CAM_BACK": "back", "RADAR_FRONT": "radar"},
+    "opv2v": {"lidar": "lidar", "camera0": "front", "camera3": "back"},
+}
+METRES = {"kitti": 2e-4, "nuscenes": 1e-6, "opv2v": 1e-6}
+INTENSITY = {"kitti": 0, "nuscenes": 1e-6, "opv2v": 0.5 / 255 + 1e-6}
+CLASSES = {  # of those with another name than in the source
+    "kitti": {"bus": "truck", "motorcycle": "bicycle"},
+    "nuscenes": {"van": "car"},
+    "opv2v": {"van": "car", "truck": "car", "bus": "car"},
+}
+TRACKS, VISIBILITY, LEVELS, SPEED = ("opv2v",), ("nuscenes",), ("kitti",), ("opv2v",)  # formats that have them
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("painted") / "dataset"
+    record(PaintedSource(SCENES), folder)
+    return Dataset.open(folder)
+
+
+@pytest.fixture(scope="module")
+def exported(source: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("exports")
+    for name in ROUND:
+        export(source, name, root / name, ExportOptions(validation=0.5))
+    return {name: root / name for name in ROUND}
+
+
+@pytest.fixture(scope="module")
+def imported(exported: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Dataset]:
+    root = tmp_path_factory.mktemp("imports")
+    for name, folder in exported.items():
+        import_dataset(name, folder, root / name)
+    return {name: Dataset.open(root / name) for name in exported}
+
+
+def _pairs(name: str, source: Dataset, imported: Dataset) -> list[tuple[Frame, Frame]]:
+    expected = [i for i in range(len(source)) if name != "kitti" or source.keys[i].agent == "cav0"]
+    assert [imported.name(i) for i in range(len(imported))] == [source.name(i) for i in expected]
+    return [(source.frame(i), imported.frame(number)) for number, i in enumerate(expected)]
+
+
+@pytest.mark.parametrize("name", ROUND)
+def test_an_export_is_imported_as_it_was(name: str, source: Dataset, imported: dict[str, Dataset]):
+    dataset = imported[name]
+    assert validate(dataset.folder) == []
+    assert split_scenes(dataset, ExportOptions()) == {"painted-0-000": "train", "painted-0-001": "val"}
+    for old, new in _pairs(name, source, dataset):
+        sensors = {own: was for own, was in SENSORS[name].items() if was in old.calibration.agent_from_sensor}
+        assert {*new.lidar, *new.images, *new.radar} == sensors.keys()
+        lidar = next(iter(new.lidar))
+        np.testing.assert_allclose(new.lidar[lidar][:, :3], old.lidar["lidar"][:, :3], atol=1e-5)
+        np.testing.assert_allclose(new.lidar[lidar][:, 3], old.lidar["lidar"][:, 3], atol=INTENSITY[name] + 1e-9)
+        for own in new.radar:
+            np.testing.assert_allclose(new.radar[own], old.radar[sensors[own]], atol=1e-4)
+        lidar_from_world, lidar_from_past = (
+            inverse(new.world_from_sensor(lidar)),
+            inverse(old.world_from_sensor("lidar")),
+        )
+        for own in new.images:
+            np.testing.assert_array_equal(new.images[own].rgb, old.images[sensors[own]].rgb)
+            assert new.images[own].depth_m is None
+            np.testing.assert_allclose(new.calibration.intrinsics[own], old.calibration.intrinsics[sensors[own]])
+            pose, past = lidar_from_world @ new.world_from_sensor(own), old.world_from_sensor(sensors[own])
+            np.testing.assert_allclose(pose, lidar_from_past @ past, atol=1e-6)
+        if name == "nuscenes":  # whose global frame is the world, shifted
+            between = new.world_from_agent @ inverse(old.world_from_agent)
+            np.testing.assert_allclose(between[:3, :3], np.eye(3), atol=1e-9)
+            np.testing.assert_allclose(new.agent_from_sensor[lidar], old.agent_from_sensor["lidar"], atol=1e-9)
+        if name == "opv2v":
+            np.testing.assert_allclose(new.world_from_sensor(lidar), old.world_from_sensor("lidar"), atol=1e-6)
+            np.testing.assert_allclose(new.agent_from_sensor[lidar], old.agent_from_sensor["lidar"], atol=1e-6)
+        else:
+            assert new.time_s == pytest.approx(old.time_s, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ROUND)
+def test_objects_of_an_export_are_imported_as_they_were(name: str, source: Dataset, imported: dict[str, Dataset]):
+    for old, new in _pairs(name, source, imported[name]):
+        truth, found = old.annotations, new.annotations
+        boxes = found.boxes.transform(inverse(new.world_from_sensor(next(iter(new.lidar)))))
+        was = truth.boxes.transform(inverse(old.world_from_sensor("lidar")))
+        away = np.linalg.norm(boxes.center[:, None] - was.center[None], axis=2)
+        row = away.argmin(axis=1)
+        assert len(set(row)) == len(row) > 0
+        np.testing.assert_allclose(boxes.center, was.center[row], atol=METRES[name])
+        np.testing.assert_allclose(boxes.size, was.size[row], atol=METRES[name])
+        np.testing.assert_allclose(wrap_angle(boxes.yaw - was.yaw[row]), 0, atol=METRES[name])
+        other = CLASSES[name]
+        assert found.boxes.label.tolist() == [other.get(CATEGORIES[i], CATEGORIES[i]) for i in row]
+        np.testing.assert_array_equal(found.returns, IN_BOX[row])
+        assert np.isnan(found.acceleration).all()
+        if name in TRACKS:
+            assert found.track.tolist() == truth.track[row].tolist()
+        if name in VISIBILITY:
+            assert (np.digitize(found.occlusion, (0.2, 0.4, 0.6)) == np.digitize(truth.occlusion[row], (0.2, 0.4, 0.6 + 1e-9))).all()
+        else:
+            assert np.isnan(found.occlusion).all()
+        if name in SPEED:
+            speed = np.linalg.norm(truth.velocity[row], axis=1)
+            np.testing.assert_allclose(np.linalg.norm(found.velocity, axis=1), speed, atol=1e-6)
+        if name in LEVELS:
+            views, past = found.views["image_2"], truth.views["front"]
+            np.testing.assert_allclose(views.truncation, past.truncation[row], atol=1e-4)
+            level = np.where(past.pixels[row] > 0, np.digitize(past.occlusion[row], (0.1, 0.5)), 3)
+            np.testing.assert_array_equal(np.nan_to_num(np.digitize(views.occlusion, (0.1, 0.5))), np.minimum(level, 2))
+            assert (np.isnan(views.occlusion) == (level == 3)).all()
+        for camera in () if name in LEVELS else new.images:
+            """Rectangles are computed of boxes, and so are those of the painted pictures."""
+            rectangle, past = found.views[camera].amodal_box, truth.views[SENSORS[name][camera]]
+            whole = past.truncation[row] < 1
+            np.testing.assert_allclose(rectangle[whole], past.amodal_box[row][whole], atol=1e-2)
+
+
+@pytest.mark.parametrize("name", ROUND)
+def test_what_is_imported_is_exported_as_it_came(
+    name: str, exported: dict[str, Path], imported: dict[str, Dataset], tmp_path: Path
+):
+    """But for points' intensity by half a step, and what is not known: speeds of the agents, and attributes by them."""
+    export(imported[name], name, tmp_path / "again")
+    again = {path.relative_to(tmp_path / "again") for path in (tmp_path / "again").rglob("*") if path.is_file()}
+    assert again == {path.relative_to(exported[name]) for path in exported[name].rglob("*") if path.is_file()}
+    if name == "kitti":
+        for path in sorted((tmp_path / "again" / "training" / "label_2").iterdir()):
+            lines = (exported[name] / "training" / "label_2" / path.name).read_text().splitlines()
+            known = [line.split() for line in lines if not line.startswith("DontCare")]
+            for was, now in zip(known, (line.split() for line in path.read_text().splitlines()), strict=True):
+                assert (was[0], was[2]) == (now[0], now[2])
+                np.testing.assert_allclose(np.float64(now[3:]), np.float64(was[3:]), atol=5e-4)
+
+
+def test_links_are_made_where_nothing_is_to_be_converted(imported: dict[str, Dataset], exported: dict[str, Path]):
+    folder = imported["kitti"].folder
+    cloud = folder / "velodyne" / f"{imported['kitti'].name(0)}.bin"
+    assert cloud.is_symlink()
+    assert cloud.resolve() == (exported["kitti"] / "training" / "velodyne" / "000000.bin").resolve()
+    assert imported["nuscenes"].plane_path(0, "CAM_FRONT", "rgb").is_symlink()
+
+
+def test_a_split_alone_is_imported(exported: dict[str, Path], tmp_path: Path):
+    for name, folder in exported.items():
+        import_dataset(name, folder, tmp_path / name, split="val")
+        data = Dataset.open(tmp_path / name)
+        assert {key.scene for key in data.keys} == {"painted-0-001"}
+        assert set(split_scenes(data, ExportOptions()).values()) == {"val"}
+        with pytest.raises(InputError, match="no split 'holiday'; it has train, val"):
+            import_dataset(name, folder, tmp_path / "none", split="holiday")
+    import_dataset("kitti", exported["kitti"], tmp_path / "train", split="train")
+    manifests = {part: Dataset.open(tmp_path / part).manifest for part in ("kitti", "train")}
+    assert find_leaks(manifests) == []
+
+
+def _first(folder: Path, pattern: str) -> Path:
+    return sorted(folder.glob(pattern))[0]
+
+
+DAMAGES = {  # format -> pattern of a file, and the sentence where it is missing, and where it is cut in half
+    "kitti": [
+        ("training/velodyne/*.bin", None, "truncated"),
+        ("training/calib/*.txt", "no such file", "needs 12 numbers|no such file|needs 9 numbers"),
+        ("training/image_2/*.png", "no such file", None),
+        ("training/label_2/*.txt", None, "is no KITTI label"),
+    ],
+    "nuscenes": [
+        ("v1.0-flcav/ego_pose.json", "no such file", "not JSON"),
+        ("samples/LIDAR_TOP/*.bin", "no such file", "truncated"),
+        ("samples/RADAR_FRONT/*.pcd", "no such file", "truncated|not a binary PCD file"),
+        ("samples/CAM_FRONT/*.png", "no such file", None),
+    ],
+    "opv2v": [
+        ("train/*/*/*.pcd", "no such file", "truncated"),
+        ("train/*/*/000000.yaml", None, "not a YAML file|not a frame of OPV2V"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern", "how", "sentence"),
+    [
+        (name, pattern, how, sentence)
+        for name, damages in DAMAGES.items()
+        for pattern, *sentences in damages
+        for how, sentence in zip(("missing", "half"), sentences)
+        if sentence is not None
+    ],
+)
+def test_a_missing_or_truncated_file_names_itself(
+    name: str, pattern: str, how: str, sentence: str, exported: dict[str, Path], tmp_path: Path
+):
+    folder = tmp_path / "folder"
+    shutil.copytree(exported[name], folder)
+    path = _first(folder, pattern)
+    if how == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 - 1])
+    with pytest.raises(InputError, match=sentence) as error:
+        import_dataset(name, folder, tmp_path / "out")
+    assert str(path) in str(error.value)
+    assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+@pytest.mark.parametrize("name", READABLE)
+def test_a_folder_of_another_format_is_one_sentence(name: str, exported: dict[str, Path], tmp_path: Path):
+    other = "nuscenes" if name == "kitti" else "kitti"
+    with pytest.raises(InputError, match=f"is no folder of '{name}' but of '{other}'"):
+        import_dataset(name, exported[other], tmp_path / "out")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="empty: no "):
+        import_dataset(name, tmp_path / "empty", tmp_path / "out")
+    with pytest.raises(InputError, match="nowhere: no such folder"):
+        import_dataset(name, tmp_path / "nowhere", tmp_path / "out")
+
+
+def test_nuscenes_without_tables_or_boxes(exported: dict[str, Path], tmp_path: Path):
+    shutil.copytree(exported["nuscenes"], tmp_path / "bare")
+    for table in ("sample_annotation", "instance"):
+        (tmp_path / "bare" / "v1.0-flcav" / f"{table}.json").write_text("[]")
+    assert import_dataset("nuscenes", tmp_path / "bare", tmp_path / "out") == ("no annotations in its tables, so no boxes",)
+    with pytest.raises(InputError, match="imported from nuscenes without labels of objects"):
+        Dataset.open(tmp_path / "out").check_labelled("objects")
+    shutil.rmtree(tmp_path / "bare" / "v1.0-flcav")
+    with pytest.raises(InputError, match="no nuScenes tables"):
+        import_dataset("nuscenes", tmp_path / "bare", tmp_path / "out2")
+
+
+def test_a_row_that_refers_to_nothing(exported: dict[str, Path], tmp_path: Path):
+    shutil.copytree(exported["nuscenes"], tmp_path / "odd")
+    path = tmp_path / "odd" / "v1.0-flcav" / "instance.json"
+    rows = json.loads(path.read_text())
+    path.write_text(json.dumps([{**row, "category_token": "?"} for row in rows]))
+    with pytest.raises(InputError, match=r"its tables do not fit together, nothing has the token '\?'"):
+        import_dataset("nuscenes", tmp_path / "odd", tmp_path / "out")
