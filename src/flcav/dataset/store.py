@@ -159,6 +159,10 @@ class Dataset:
                 _raise_first(self.folder, check_signs(frame.key, camera, frame.annotations.signs[camera]))
         return frame
 
+    def world_from_agent(self, i: int) -> NDArray[np.float64]:
+        """Return the (4, 4) pose of the agent in frame `i`, as `frame(i)` has it, without reading measurements."""
+        return np.array(self._tables["poses"]["world_from_agent"][i].as_py()).reshape(4, 4)
+
     def plane(self, i: int, camera: str, plane: str) -> NDArray:
         """Return one plane ("rgb", "depth_m", "semantic" or "instance") of an image of frame `i`: see `CameraImage`.
 

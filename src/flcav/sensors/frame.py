@@ -83,6 +83,11 @@ class Views:
     occlusion: Array
     # (M,) 1 - visible pixels / pixels in a world without other objects; 1 where none is visible, NaN where unknown
 
+    @property
+    def shown_box(self) -> Array:
+        """Return (M, 4) the visible boxes; of actors with UNKNOWN_PIXELS the amodal ones."""
+        return np.where((self.pixels == UNKNOWN_PIXELS)[:, None], self.amodal_box, self.visible_box)
+
 
 @dataclass(frozen=True)
 class SignViews:

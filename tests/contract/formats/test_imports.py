@@ -117,7 +117,10 @@ def test_objects_of_an_export_are_imported_as_they_were(name: str, source: Datas
         if name in TRACKS:
             assert found.track.tolist() == truth.track[row].tolist()
         if name in VISIBILITY:
-            assert (np.digitize(found.occlusion, (0.2, 0.4, 0.6)) == np.digitize(truth.occlusion[row], (0.2, 0.4, 0.6 + 1e-9))).all()
+            assert (
+                np.digitize(found.occlusion, (0.2, 0.4, 0.6))
+                == np.digitize(truth.occlusion[row], (0.2, 0.4, 0.6 + 1e-9))
+            ).all()
         else:
             assert np.isnan(found.occlusion).all()
         if name in SPEED:
@@ -240,7 +243,9 @@ def test_nuscenes_without_tables_or_boxes(exported: dict[str, Path], tmp_path: P
     shutil.copytree(exported["nuscenes"], tmp_path / "bare")
     for table in ("sample_annotation", "instance"):
         (tmp_path / "bare" / "v1.0-flcav" / f"{table}.json").write_text("[]")
-    assert import_dataset("nuscenes", tmp_path / "bare", tmp_path / "out") == ("no annotations in its tables, so no boxes",)
+    assert import_dataset("nuscenes", tmp_path / "bare", tmp_path / "out") == (
+        "no annotations in its tables, so no boxes",
+    )
     with pytest.raises(InputError, match="imported from nuscenes without labels of objects"):
         Dataset.open(tmp_path / "out").check_labelled("objects")
     shutil.rmtree(tmp_path / "bare" / "v1.0-flcav")

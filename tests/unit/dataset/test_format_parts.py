@@ -15,7 +15,7 @@ from flcav.cli.main import run
 from flcav.dataset.formats.coco import encode_run_lengths
 from flcav.dataset.formats.mounts import assign_channels, find_front_camera, quaternion
 from flcav.dataset.formats.nuscenes.files import RADAR, RESOLUTION_M, encode_lidar, encode_radar, map_mask
-from flcav.dataset.formats.nuscenes.tables import CAMERAS, Row, attribute, link_rows, token, visibility
+from flcav.dataset.formats.nuscenes.tables import CAMERAS, Row, attributes, link_rows, token, visibility
 from flcav.dataset.formats.opv2v.write import agent_numbers, carla_pose, encode_pcd
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
@@ -169,7 +169,7 @@ def test_nuscenes_levels_and_attributes():
         ("bicycle", "veh2", 3.0): "cycle.with_rider",
     }
     for (category, track, speed), name in names.items():
-        assert attribute(category, track, speed) == token("attribute", name)
+        assert attributes(category, track, speed) == [token("attribute", name)]
     rows: list[Row] = [{"token": name} for name in "abc"]
     link_rows(rows)
     assert [(row["prev"], row["next"]) for row in rows] == [("", "b"), ("a", "c"), ("b", "")]

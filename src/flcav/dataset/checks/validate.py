@@ -158,5 +158,8 @@ def _shared(one: tuple[str, Manifest], other: tuple[str, Manifest]) -> Iterator[
     scenes = sorted(set(manifest.scenes) & set(other_manifest.scenes))
     if scenes:
         yield f"{where}: leakage, they share {len(scenes)} scenes, the first is '{scenes[0]}'"
-    elif "seed" in recipe and (recipe.get("town"), recipe["seed"]) == (other_recipe.get("town"), other_recipe.get("seed")):
+    elif "seed" in recipe and (recipe.get("town"), recipe["seed"]) == (
+        other_recipe.get("town"),
+        other_recipe.get("seed"),
+    ):
         yield f"{where}: leakage, they share the traffic seed {recipe.get('seed')} in '{recipe.get('town')}'"

@@ -24,6 +24,8 @@ from flcav.sensors.frame import Frame
 
 def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
     """Write every image of `dataset` with its bounding boxes and masks: see `Exporter`."""
+    if dataset.manifest.imported:
+        raise missing_data_error(dataset, "COCO", "the visible pixels of objects")
     split_of = split_scenes(dataset, options)
     tables = {(labels, split): _empty(labels) for labels in CLASSES for split in split_of.values()}
     counts: Counter[str] = Counter(images=0, signs=0, actors=0)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
+from flcav.dataset.formats.reading import difference_tracks
 from flcav.dataset.store import Dataset
 from flcav.geometry import wrap_angle
 
@@ -56,8 +57,18 @@ def quaternion(matrix: NDArray[np.float64]) -> list[float]:
 
 
 def agent_velocities(dataset: Dataset, scene: str) -> dict[tuple[str, int], NDArray[np.float64]]:
-    """Return (agent, spin) -> (3,) velocity, world frame [m/s]; zero for an agent outside the traffic, as a pole."""
-    keys = [dataset.keys[i] for i in dataset.select(scenes=[scene])]
+    """Return (agent, spin) -> (3,) velocity, world frame [m/s]; zero for an agent outside the traffic, as a pole.
+
+    In an imported dataset velocities are differences of an agent's poses, zero where there are none to be compared.
+    """
+    frames = dataset.select(scenes=[scene])
+    keys = [dataset.keys[i] for i in frames]
+    if dataset.manifest.imported:
+        places = np.array([dataset.world_from_agent(i)[:3, 3] for i in frames])
+        moved = difference_tracks(
+            np.array([key.agent for key in keys]), np.array([key.time_s for key in keys]) - keys[0].time_s, places
+        )
+        return {(key.agent, key.index): each for key, each in zip(keys, np.nan_to_num(moved))}
     velocities = {(key.agent, key.index): np.zeros(3) for key in keys}
     trace = dataset.trace(scene)
     if trace is None:

@@ -18,6 +18,8 @@ from flcav.progress import Report
 
 def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
     """Write every image of `dataset` with its signs and lights, or its actors: see `Exporter`."""
+    if dataset.manifest.imported:
+        raise missing_data_error(dataset, "YOLO", "the visible pixels of objects")
     split_of = split_with_validation(dataset, options, "YOLO")
     counts: Counter[str] = Counter(images=0, objects=0)
     for i, key in enumerate(dataset.keys):

@@ -34,6 +34,7 @@ class RecordedPictures(Sequence[Sample]):
     """
 
     def __init__(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> None:
+        data.check_labelled("signs")
         self._data, self._config = data, config
         self._of = [(number, camera) for number in data.numbers(frames) for camera in data.frame(number).images]
         if not self._of:

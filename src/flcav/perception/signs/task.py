@@ -98,6 +98,7 @@ class SignsTask(SignsOutcomes):
         progress: Report = ignore_progress,
     ) -> Registry:
         """Return the missed signs and the false positives, see `flcav.perception.signs.errors.register_errors`."""
+        data.check_labelled("signs")
         return register_errors(network, data, data.numbers(frames), threshold, progress)
 
 

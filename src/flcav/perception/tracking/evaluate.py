@@ -172,5 +172,6 @@ def _moment(
         nearest = apart.argmin(0)
         for number in np.flatnonzero(apart.min(0) <= 1.0):
             true = annotations.velocity[objects[nearest[number]]][:2]
-            errors.append(float(np.linalg.norm(true - tracked.velocity[own[number]])))
+            if np.isfinite(true).all():  # unknown in an imported dataset
+                errors.append(float(np.linalg.norm(true - tracked.velocity[own[number]])))
     return moment, errors

@@ -89,13 +89,13 @@ class Shot:
 def make_shot(frame: Frame, camera: str) -> Shot:
     """Return the picture and the visible annotations of a frame's camera, by its true calibration.
 
-    Boxes are moved from the LiDAR spin to the time of the picture. A thermal image becomes grey, warm is bright.
+    Boxes are moved from the LiDAR spin to the time of the picture where their velocity is known. A thermal image becomes grey, warm is bright.
     """
     picture = frame.images[camera].rgb if camera in frame.images else thermal_grey(frame.infrared[camera])
     calibration, seen = frame.calibration, frame.annotations
     late_s = calibration.offset_ms.get(camera, 0.0) / 1000  # after the LiDAR spin, which boxes are of
-    boxes = replace(seen.boxes, center=seen.boxes.center + late_s * seen.velocity)
-    camera_from_world, shows = inverse(frame.world_from_sensor(camera)), seen.views[camera].pixels > 0
+    boxes = replace(seen.boxes, center=seen.boxes.center + late_s * np.nan_to_num(seen.velocity))
+    camera_from_world, shows = inverse(frame.world_from_sensor(camera)), seen.views[camera].pixels != 0
     return Shot(
         name=camera,
         view=CameraView(picture, camera_from_world, calibration.intrinsics[camera], calibration.distortion[camera]),

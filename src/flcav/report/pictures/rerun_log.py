@@ -153,7 +153,7 @@ def _log_rectangles(recording: rr.RecordingStream, path: str, frame: Frame, came
     if views is not None:
         shown = np.flatnonzero(views.pixels)
         colours = [COLOURS.get(label, OTHER) for label in truth.boxes.label[shown].tolist()]
-        _log_boxes(recording, f"{path}/image/actors", views.visible_box[shown], truth.track[shown].tolist(), colours)
+        _log_boxes(recording, f"{path}/image/actors", views.shown_box[shown], truth.track[shown].tolist(), colours)
     if signs is not None:
         names = [f"{kind} {state}".strip() for kind, state in zip(signs.kind, signs.state)]
         _log_boxes(recording, f"{path}/image/signs", signs.box, names, [SIGN] * len(signs))

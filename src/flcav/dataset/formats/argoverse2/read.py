@@ -244,9 +244,7 @@ def _read_lenses(folder: Path) -> dict[str, Lens]:
 def _read_labels(folder: Path, poses: Poses) -> Labels:
     """Return the annotations of a log, of its sweeps that are not here, too: velocities are differences of them."""
     size = ("length_m", "width_m", "height_m")
-    table = _read_feather(
-        folder / "annotations.feather", ("timestamp_ns", "track_uuid", "category", *size, *PLACED)
-    )
+    table = _read_feather(folder / "annotations.feather", ("timestamp_ns", "track_uuid", "category", *size, *PLACED))
     sweep, track = table["timestamp_ns"].to_numpy(), np.array(table["track_uuid"].to_pylist(), np.str_)
     in_ego = _transforms(table)
     center, yaw = np.zeros((len(table), 3)), np.zeros(len(table))

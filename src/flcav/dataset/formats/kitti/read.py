@@ -193,7 +193,9 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
                 scene, index, _ = row["frame"].removesuffix(row["agent"]).rsplit("_", 2)
                 found[row["number"]] = scene, int(index), row["agent"], float(row["time_s"])
     except (KeyError, ValueError, TypeError, AttributeError):
-        raise InputError(f"{path}: not the list of frames of an export; without it the folder can be read, too") from None
+        raise InputError(
+            f"{path}: not the list of frames of an export; without it the folder can be read, too"
+        ) from None
     return found
 
 

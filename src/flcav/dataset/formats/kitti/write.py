@@ -21,6 +21,7 @@ from flcav.dataset.formats.exporter import (
     read_frame,
     split_scenes,
 )
+from flcav.dataset.formats.kitti.files import CLASSES as KITTI_CLASSES
 from flcav.dataset.formats.mounts import find_front_camera
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
@@ -115,13 +116,14 @@ def format_label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -
     alpha = wrap_angle(rotation - np.arctan2(bottom[:, 0], bottom[:, 2]))
     level = occlusion_levels(views.occlusion, views.pixels)
     points, shows = count_points_in_boxes(frame, lidar, frame.lidar[lidar]), views.pixels > 0
-    labelled = within & (bottom[:, 2] > 0) & (points >= min_points) & (shows | (points > 0))
+    known = np.isin(boxes.label, [*CLASSES, *KITTI_CLASSES])
+    labelled = known & within & (bottom[:, 2] > 0) & (points >= min_points) & (shows | (points > 0))
     lines = []
     for i in np.flatnonzero(labelled):
         length, breadth, tall = boxes.size[i]
         numbers = (*rectangle[i], tall, breadth, length, *bottom[i], rotation[i])
         lines.append(
-            f"{CLASSES[str(boxes.label[i])]} {views.truncation[i]:.4f} {level[i]} {alpha[i]:.4f} "
+            f"{CLASSES.get(str(boxes.label[i]), boxes.label[i])} {views.truncation[i]:.4f} {level[i]} {alpha[i]:.4f} "
             + " ".join(f"{number:.4f}" for number in numbers)
         )
     regions = [dont_care(np.clip(views.visible_box[i], 0, edge)) for i in np.flatnonzero(shows & ~labelled)]
@@ -137,10 +139,10 @@ def dont_care(rectangle: NDArray[np.float64]) -> str:
 def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return (M,) KITTI's occlusion levels: 0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown.
 
-    `occlusion` is (M,) in [0, 1], `pixels` (M,) the visible ones.
+    `occlusion` is (M,) in [0, 1] or NaN, `pixels` (M,) the visible ones.
     """
     level = np.digitize(occlusion, (PARTLY, LARGELY))
-    return np.where(pixels > 0, level, UNKNOWN)
+    return np.where((pixels != 0) & ~np.isnan(occlusion), level, UNKNOWN)
 
 
 def format_calibration(

@@ -87,7 +87,7 @@ def image_annotations(frame: Frame, camera: str, stamp: Timestamp) -> ImageAnnot
                 "truncation": f"{views.truncation[i]:.3f}",
                 "occlusion": f"{views.occlusion[i]:.3f}",
             }
-            rectangles.append(_rectangle(views.visible_box[i], COLOURS.get(label, OTHER), about, stamp))
+            rectangles.append(_rectangle(views.shown_box[i], COLOURS.get(label, OTHER), about, stamp))
     if camera in truth.signs:
         signs = truth.signs[camera]
         for kind, state, box, distance_m in zip(signs.kind, signs.state, signs.box, signs.distance_m):

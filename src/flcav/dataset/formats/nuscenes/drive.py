@@ -16,7 +16,7 @@ from flcav.dataset.formats.nuscenes.tables import (
     CATEGORIES,
     RADARS,
     Row,
-    attribute,
+    attributes,
     link_rows,
     token,
     visibility,
@@ -133,6 +133,8 @@ class Drive:
             radar += count_points_in_boxes(frame, name, echoes[:, :1] * compute_echo_directions(echoes))
         center = transform_points(self.global_from_world, boxes.center)
         for i, (track, category) in enumerate(zip(truth.track.tolist(), boxes.label.tolist())):
+            if category not in CATEGORIES:  # of an imported dataset
+                continue
             length, width, height = boxes.size[i].tolist()
             speed = float(np.linalg.norm(truth.velocity[i]))
             self.category[track] = category
@@ -142,7 +144,7 @@ class Drive:
                     "sample_token": self.samples[-1]["token"],
                     "instance_token": token(self.name, "instance", track),
                     "visibility_token": visibility(truth.occlusion[i]),
-                    "attribute_tokens": [attribute(category, track, speed)],
+                    "attribute_tokens": attributes(category, track, speed),
                     "translation": center[i].tolist(),
                     "size": [width, length, height],
                     "rotation": quaternion(pose(0, 0, yaw=boxes.yaw[i])),

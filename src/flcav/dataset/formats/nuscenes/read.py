@@ -51,14 +51,26 @@ CATEGORIES = {  # other classes keep their names, and so do cycles without a rid
 }
 RIDDEN = {"vehicle.bicycle": "bicycle", "vehicle.motorcycle": "motorcycle"}
 RIDER = "cycle.with_rider"
-OCCLUSION = {"1": 0.8, "2": 0.5, "3": 0.3, "4": 0.1}  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
+OCCLUSION = {
+    "1": 0.8,
+    "2": 0.5,
+    "3": 0.3,
+    "4": 0.1,
+}  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
 TOP = "LIDAR_TOP"
 POINT = 5  # float32 of a point: x, y, z, intensity 0 to 255, ring
 COLUMNS = {  # what is read of each table
     "scene": ("name", "log_token", "first_sample_token"),
     "log": ("logfile", "vehicle"),
     "sample": ("timestamp", "scene_token"),
-    "sample_data": ("sample_token", "ego_pose_token", "calibrated_sensor_token", "is_key_frame", "filename"),
+    "sample_data": (
+        "sample_token",
+        "ego_pose_token",
+        "calibrated_sensor_token",
+        "is_key_frame",
+        "filename",
+        "timestamp",
+    ),
     "ego_pose": ("translation", "rotation"),
     "calibrated_sensor": ("sensor_token", "translation", "rotation", "camera_intrinsic"),
     "sensor": ("channel", "modality"),
@@ -95,6 +107,7 @@ class NuscenesSource:
                 self._data[row["sample_token"]][self._at(self._channel, mounted["sensor_token"])["channel"]] = row
         used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
         self._pose = {token: row for token, row in table["ego_pose"].items() if token in used}
+        self._calibration: dict[str, Calibration] = {}  # by agent
         self._spins, split_of = self._order(table["scene"], table["log"], table["sample"])
         self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._read_notes(table)
@@ -105,6 +118,29 @@ class NuscenesSource:
         if token not in table:
             raise InputError(f"{self._tables}: its tables do not fit together, nothing has the token '{token}'")
         return table[token]
+
+    def _kind(self, row: Row) -> str:
+        """Return the modality of a row of sample_data: "lidar", "camera" or "radar"."""
+        return self._at(self._channel, self._at(self._mounted, row["calibrated_sensor_token"])["sensor_token"])[
+            "modality"
+        ]
+
+    def _fingerprint(self, data: Mapping[str, Row]) -> tuple[str, ...]:
+        mounted = {channel: self._at(self._mounted, row["calibrated_sensor_token"]) for channel, row in data.items()}
+        names = ("translation", "rotation", "camera_intrinsic")
+        return tuple(f"{channel} {[mounted[channel][name] for name in names]}" for channel in sorted(mounted))
+
+    def _calibrate(self, data: Mapping[str, Row], spin: int) -> Calibration:
+        """Return the calibration of an agent from its first row for each channel; trigger times are those of `spin`."""
+        mounted = {channel: self._at(self._mounted, row["calibrated_sensor_token"]) for channel, row in data.items()}
+        ours = {channel: inverse(OURS_FROM_LIDAR) for channel, row in data.items() if self._kind(row) == "lidar"}
+        cameras = [channel for channel, row in data.items() if self._kind(row) == "camera"]
+        return Calibration(
+            {channel: _placed(row) @ ours.get(channel, np.eye(4)) for channel, row in mounted.items()},
+            intrinsics={name: np.array(mounted[name]["camera_intrinsic"], np.float64) for name in cameras},
+            distortion={name: np.zeros(5) for name in cameras},
+            offset_ms={channel: (row["timestamp"] - spin) / 1e3 for channel, row in data.items()},
+        )
 
     def _order(
         self, scenes: Mapping[str, Row], logs: Mapping[str, Row], samples: Mapping[str, Row]
@@ -129,10 +165,13 @@ class NuscenesSource:
                 if TOP not in self._data[sample]:
                     raise InputError(f"{self._tables / 'sample_data.json'}: no {TOP} of the sample '{sample}'")
             own = log["logfile"] if ours else name
-            first = self._data[of_scene[token][0]] if of_scene[token] else {}
-            mounted = {c: self._at(self._mounted, row["calibrated_sensor_token"]) for c, row in sorted(first.items())}
-            about = [(c, *(str(row[name]) for name in COLUMNS["calibrated_sensor"])) for c, row in mounted.items()]
-            agent = names.of(log["vehicle"] or "ego", tuple(about))
+            first: dict[str, Row] = {}  # channel -> its first row in the scene
+            for sample in of_scene[token]:
+                first = {**self._data[sample], **first}
+            agent = names.of(log["vehicle"] or "ego", self._fingerprint(first))
+            if first and agent not in self._calibration:
+                spin = self._data[of_scene[token][0]][TOP]["timestamp"]
+                self._calibration[agent] = self._calibrate(first, spin)
             late = int(name.rpartition("-")[2]) if ours else 0  # see `Drive._micros`
             times[own] += [((samples[s]["timestamp"] - late) / 1e6, agent, s) for s in of_scene[token]]
             split_of[own] = split_by_name.get(name, "test" if self._tables.name.endswith("-test") else None)
@@ -146,7 +185,8 @@ class NuscenesSource:
         """Keep the annotations: boxes in the global frame by sample, with velocities by their instances."""
         rows = list(table["sample_annotation"].values())
         category = {
-            token: self._at(table["category"], row["category_token"])["name"] for token, row in table["instance"].items()
+            token: self._at(table["category"], row["category_token"])["name"]
+            for token, row in table["instance"].items()
         }
         attribute = {token: row["name"] for token, row in table["attribute"].items()}
         track = np.array([row["instance_token"] for row in rows], np.str_)
@@ -195,17 +235,10 @@ class NuscenesSource:
 
     def _frame(self, scene: str, spin: Spin) -> LinkedFrame:
         data = self._data[spin.sample]
-        mounted = {name: self._at(self._mounted, row["calibrated_sensor_token"]) for name, row in data.items()}
-        kind = {name: self._at(self._channel, row["sensor_token"])["modality"] for name, row in mounted.items()}
+        calibration = self._calibration[spin.agent]
+        mounts, kind = calibration.agent_from_sensor, {name: self._kind(row) for name, row in data.items()}
         poses = {name: _placed(self._at(self._pose, row["ego_pose_token"])) for name, row in data.items()}
-        ours = inverse(OURS_FROM_LIDAR)
-        mounts = {name: _placed(row) @ (ours if kind[name] == "lidar" else np.eye(4)) for name, row in mounted.items()}
         cameras = [name for name in data if kind[name] == "camera"]
-        calibration = Calibration(
-            mounts,
-            intrinsics={name: np.array(mounted[name]["camera_intrinsic"], np.float64) for name in cameras},
-            distortion={name: np.zeros(5) for name in cameras},
-        )
         path = {name: self._root / row["filename"] for name, row in data.items()}
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
         clouds = {name: read_cloud(path[name]) for name in ranging}
@@ -267,7 +300,9 @@ def _find_tables(folder: Path) -> Path:
     if not found:
         raise InputError(f"{folder}: no nuScenes tables; it holds no folder such as 'v1.0-mini' with a 'sample.json'")
     if len(found) > 1:
-        raise InputError(f"{folder}: several folders of tables, {', '.join(path.name for path in found)}: name one of them")
+        raise InputError(
+            f"{folder}: several folders of tables, {', '.join(path.name for path in found)}: name one of them"
+        )
     return found[0]
 
 

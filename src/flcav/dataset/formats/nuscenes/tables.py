@@ -83,15 +83,19 @@ def constant_rows() -> dict[str, list[Row]]:
 
 
 def visibility(occlusion: float) -> str:
-    """Return the token of the visibility level of an object, from its `occlusion` in [0, 1]."""
+    """Return the token of the visibility level of an object, from its `occlusion` in [0, 1]; "" for NaN, unknown."""
+    if np.isnan(occlusion):
+        return ""
     return str(int(np.digitize(1 - occlusion, VISIBILITY)) + 1)
 
 
-def attribute(category: str, track: str, speed_m_s: float) -> str:
-    """Return the token of an actor's attribute, e.g. "vehicle.moving".
+def attributes(category: str, track: str, speed_m_s: float) -> list[str]:
+    """Return the token of an actor's attribute, e.g. "vehicle.moving"; none where it needs a speed that is NaN.
 
     It follows from the actor's class, its track id, which says whether it is parked, and its speed.
     """
+    if np.isnan(speed_m_s) and category not in ("bicycle", "motorcycle"):
+        return []
     moves = speed_m_s > MOVING_M_S
     if category == "pedestrian":
         name = "pedestrian.moving" if moves else "pedestrian.standing"
@@ -101,7 +105,7 @@ def attribute(category: str, track: str, speed_m_s: float) -> str:
         name = "vehicle.parked"
     else:
         name = "vehicle.moving" if moves else "vehicle.stopped"
-    return token("attribute", name)
+    return [token("attribute", name)]
 
 
 def link_rows(rows: list[Row]) -> None:

@@ -91,7 +91,7 @@ def _write_map(dataset: Dataset, path: Path) -> Array:
     path.parent.mkdir(parents=True)
     town = dataset.town()
     if town is None:
-        positions = np.array([dataset.frame(i).world_from_agent[:2, 3] for i in range(len(dataset))])
+        positions = np.array([dataset.world_from_agent(i)[:2, 3] for i in range(len(dataset))])
         low, high = positions.min(axis=0) - UNKNOWN_MARGIN_M, positions.max(axis=0) + UNKNOWN_MARGIN_M
         height, width = np.ceil((high - low)[::-1] / RESOLUTION_M).astype(int)
         mask = np.zeros((height, width), np.uint8)

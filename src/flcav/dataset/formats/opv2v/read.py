@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.formats.opv2v.write import CAMERAS, FOLDERS, KMH, MIRROR, from_carla
+from flcav.dataset.formats.opv2v.write import CAMERAS, FOLDERS, KMH, from_carla
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
     AgentNames,
@@ -189,7 +189,7 @@ def _read_about(stem: Path) -> About:
     """Return the content of a frame's YAML file; raises `InputError` where it is missing, truncated or lacks a field."""
     path = stem.with_suffix(".yaml")
     try:
-        about = yaml.load(path.read_text(encoding="utf-8"), LOADER)  # noqa: S506 - a safe loader
+        about = yaml.load(path.read_text(encoding="utf-8"), LOADER)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (yaml.YAMLError, UnicodeDecodeError):
@@ -219,7 +219,7 @@ def _read_names(path: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     try:
-        protocol = yaml.load(path.read_text(encoding="utf-8"), LOADER)  # noqa: S506 - a safe loader
+        protocol = yaml.load(path.read_text(encoding="utf-8"), LOADER)
     except (yaml.YAMLError, UnicodeDecodeError):
         raise InputError(f"{path}: not a YAML file, or a truncated one") from None
     numbers = protocol.get("numbers") if isinstance(protocol, dict) else None
