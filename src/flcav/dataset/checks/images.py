@@ -87,7 +87,8 @@ def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[st
 def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) -> Iterator[str]:
     """Check that each actor's pixels, back-projected by their depth, lie in its 3D box, and in its amodal box."""
     truth, views = frame.annotations, frame.annotations.views[name]
-    assert image.instance is not None and image.depth_m is not None
+    assert image.instance is not None
+    assert image.depth_m is not None
     boxes = _boxes_then(frame, frame.calibration.offset_ms.get(name, 0.0) / 1e3)
     rays = compute_pixel_rays(lens).astype(np.float64).reshape(*image.instance.shape, 3)
     for i in np.flatnonzero(views.pixels >= JUDGED):

@@ -76,13 +76,14 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
 
     A dataset whose recipe says validation or test belongs to that split entirely; raises `InputError` where a share of
     validation scenes is requested nevertheless. Of any other dataset, the last scenes are the validation split: the
-    requested share of them, rounded up, but never all. An imported dataset keeps its splits unless a share is requested.
+    requested share of them, rounded up, but never all. An imported dataset keeps its splits, if it has them of all
+    scenes and no share is requested.
     """
     scenes = list(dict.fromkeys(key.scene for key in dataset.keys))
     recorded_for = str(dataset.manifest.recipe.get("split", ""))
-    if dataset.manifest.imported and not recorded_for and "validation" not in options.model_fields_set:
-        if len(known := _imported_splits(dataset)) == len(scenes):
-            return {scene: known[scene] for scene in scenes}
+    known = {} if recorded_for or "validation" in options.model_fields_set else _imported_splits(dataset)
+    if known.keys() >= set(scenes):
+        return {scene: known[scene] for scene in scenes}
     for split in ("val", "test"):
         if recorded_for.startswith(split):
             if "validation" in options.model_fields_set:
@@ -96,7 +97,7 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
 
 
 def _imported_splits(dataset: Dataset) -> dict[str, str]:
-    """Return scene -> split of an imported dataset as its files have it, without the scenes that are in none."""
+    """Return scene -> split of an imported dataset as its files have it; scenes of no split are not among them."""
     splits = dataset.manifest.recipe.get("splits")
     return {
         str(scene): name

@@ -42,9 +42,9 @@ def import_dataset(
         raise InputError(f"format '{name}': cannot be imported; known formats: {', '.join(READABLE)}")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    if others := [other for other in READABLE if _shows(folder, other)]:
-        if name not in others:
-            raise InputError(f"{folder}: is no folder of '{name}' but of '{others[0]}'")
+    shown = [each for each in READABLE if _shows(folder, each)]
+    if shown and name not in shown:
+        raise InputError(f"{folder}: is no folder of '{name}' but of '{shown[0]}'")
     source = READABLE[name].read(folder, split)
     record(source, out, progress=progress)
     return source.notes

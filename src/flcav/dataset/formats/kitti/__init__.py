@@ -1,4 +1,4 @@
-"""KITTI's 3D object detection benchmark: its files (`files`), read as a source of frames (`read`) and written (`write`).
+"""KITTI's 3D object detection benchmark: its `files`, a source of frames (`read`), the export (`write`).
 
 Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the benchmark's development kit.
 """

@@ -1,7 +1,7 @@
 """Reading of KITTI's object detection benchmark as a source of frames.
 
-Its frames are of no sequence: each is a scene of its own, at time 0 and at the world's origin. Only an export of flcav's
-says more, in `frames.csv`. The LiDAR stands where KITTI's does, HEIGHT_M above the ground (Geiger et al., IJRR 32(11),
+Its frames are of no sequence: each is a scene of its own, at time 0 and at the world's origin. Only an export of
+flcav's says more, in `frames.csv`. The LiDAR stands where KITTI's does, HEIGHT_M above the ground (Geiger et al., IJRR 32(11),
 2013, fig. 3); a label's rectangle is of the whole object as far as it lies in the image.
 """
 
@@ -68,7 +68,7 @@ class KittiSource:
     """The frames of a KITTI folder, `training` and `testing`."""
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """Raises `InputError` where `folder` has no frames, none of `split`, or a calibration or point cloud is missing."""
+        """Raises `InputError` where `folder` has no frames, none of `split`, or a frame no calibration."""
         self._folder, self._split = folder, split
         shots = _find_shots(folder)
         split_of = {shot.scene: shot.split for shot in shots}

@@ -1,7 +1,7 @@
 """Reading of nuScenes' tables and files, as nuscenes-devkit reads them: the key frames, which are those with boxes.
 
-The ego vehicle's frame is on the ground below the rear axle, the world is nuScenes' global frame. Splits of nuScenes are
-in its devkit's code and not in its files; an export of flcav's has them, and its logs name scene and agent.
+The ego vehicle's frame is on the ground below the rear axle, the world is nuScenes' global frame. Splits of nuScenes
+are in its devkit's code and not in its files; an export of flcav's has them, and its logs name scene and agent.
 """
 
 from collections import defaultdict
@@ -282,7 +282,7 @@ class NuscenesSource:
 
 
 def read_cloud(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a LiDAR's file; raises `InputError` as it is missing."""
+    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1]; raises `InputError` for a missing or truncated file."""
     try:
         data = np.fromfile(path, "<f4")
     except (FileNotFoundError, IsADirectoryError):

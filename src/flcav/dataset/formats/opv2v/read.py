@@ -186,7 +186,7 @@ def _read_vehicles(about: About) -> tuple[Boxes, Array]:
 
 
 def _read_about(stem: Path) -> About:
-    """Return the content of a frame's YAML file; raises `InputError` where it is missing, truncated or lacks a field."""
+    """Return the content of a frame's YAML file; raises `InputError` where it is missing, truncated or no frame."""
     path = stem.with_suffix(".yaml")
     try:
         about = yaml.load(path.read_text(encoding="utf-8"), LOADER)
