@@ -13,6 +13,7 @@ from flcav.cli.main import app, run
 from flcav.cli.reproduce import TARGETS
 from flcav.config import InputError
 from flcav.dataset.formats.export import FORMATS
+from flcav.dataset.formats.importing import READABLE
 from flcav.perception.errors import RegistersErrors
 from flcav.perception.task import Scores
 from flcav.perception.tasks import TASKS, task_named
@@ -23,6 +24,7 @@ STUDIES = tuple(target for target in TARGETS if target not in ("fig1b", "fig3a",
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
     "export": {name: f"{name} none --out out" for name in FORMATS},
+    "import": {name: f"{name} none --out out" for name in READABLE},
     "train": {
         **{task: f"{task} --data none --validation none --out out" for task in TASKS},
         "unvalidated": "weather --data none --out out",
@@ -56,6 +58,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--min-points": ALWAYS,
         "--calibration": ALWAYS,
     },
+    "import": {"--split": ALWAYS},
     "train": {
         "--data": ALWAYS,
         "--validation": ALWAYS,

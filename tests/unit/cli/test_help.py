@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.options import Device, Engine, Format, Method
+from flcav.cli.options import Device, Engine, Format, ImportFormat, Method
 from flcav.dataset.formats.export import FORMATS
 from flcav.dataset.recording.recorder import ENGINES
 from flcav.perception.device import select_device
@@ -109,6 +109,7 @@ def test_tasks_and_networks_are_named(shown):
         (("infer", "weather", "d", "--device", "steam"), "'--device'", Device),
         (("place", "--method", "steam"), "'--method'", Method),
         (("export",), "'FORMAT'", Format),
+        (("import", "poetry", "d", "--out", "o"), "'FORMAT'", ImportFormat),
     ],
 )
 def test_a_wrong_choice_is_one_sentence(arguments, wrong, choices: Collection[str], capsys):

@@ -67,7 +67,7 @@ def annotate(
         boxes=boxes,
         velocity=np.full((count, 3), np.nan) if velocity is None else velocity,
         acceleration=np.full((count, 3), np.nan),
-        returns=np.sum(list(points.values()), axis=0, dtype=np.int64) if points else np.zeros(count, np.int64),
+        returns=sum(points.values(), np.zeros(count, np.int64)),
         occlusion=np.full(count, np.nan) if occlusion is None else occlusion,
         points=points,
         views=views,

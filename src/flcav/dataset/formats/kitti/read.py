@@ -58,7 +58,7 @@ class Shot(NamedTuple):
     number: str  # "000008"
     split: str | None
     scene: str
-    index: int
+    spin: int
     vehicle: str
     time_s: float
     exported: bool  # by flcav, whose camera may have moved on since the spin: an agent keeps its first calibration
@@ -115,7 +115,7 @@ class KittiSource:
 
     def frames(self, scene: str) -> Iterator[LinkedFrame]:
         """Yield the frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""
-        for shot in sorted(self._shots[scene], key=lambda shot: (shot.index, shot.vehicle)):
+        for shot in sorted(self._shots[scene], key=lambda shot: (shot.spin, shot.vehicle)):
             agent = self._agent[shot.number]
             yield _read_frame(shot, agent, self._calibration[agent])
 
@@ -144,7 +144,7 @@ def _read_frame(shot: Shot, agent: str, calibration: Calibration) -> LinkedFrame
     boxes = objects.boxes.transform(agent_from_lidar)
     return LinkedFrame(
         scene=shot.scene,
-        index=shot.index,
+        index=shot.spin,
         time_s=shot.time_s,
         agent=agent,
         world_from_agent=np.eye(4),

@@ -86,7 +86,7 @@ class Spin(NamedTuple):
 
     sample: str  # token
     agent: str
-    index: int
+    number: int
     time_s: float
 
 
@@ -259,7 +259,7 @@ class NuscenesSource:
                 raise InputError(f"{file}: no such file")
         return LinkedFrame(
             scene=scene,
-            index=spin.index,
+            index=spin.number,
             time_s=spin.time_s,
             agent=spin.agent,
             world_from_agent=poses[TOP],

@@ -46,7 +46,7 @@ class Shot(NamedTuple):
 
     stem: Path
     agent: str
-    index: int
+    spin: int
     time_s: float
 
 
@@ -83,7 +83,7 @@ class Opv2vSource:
                 agent = names.of(vehicle, (lidar.tobytes(), *((name, cameras[name].tobytes()) for name in cameras)))
                 self._calibration.setdefault(agent, calibration)
                 shots += [Shot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
-        return sorted(shots, key=lambda shot: (shot.index, shot.agent))
+        return sorted(shots, key=lambda shot: (shot.spin, shot.agent))
 
     def describe(self) -> Mapping[str, Json]:
         """Return folder, splits and what is labelled."""
@@ -128,7 +128,7 @@ class Opv2vSource:
         names = self._track[scene]
         return LinkedFrame(
             scene=scene,
-            index=shot.index,
+            index=shot.spin,
             time_s=shot.time_s,
             agent=shot.agent,
             world_from_agent=world_from_agent,
