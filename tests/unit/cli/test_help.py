@@ -12,6 +12,7 @@ import typer
 from flcav.cli.main import app, run
 from flcav.cli.options import Device, Engine, Format, ImportFormat, Method
 from flcav.dataset.formats.export import FORMATS
+from flcav.dataset.formats.importing import READABLE
 from flcav.dataset.recording.recorder import ENGINES
 from flcav.perception.device import select_device
 from flcav.perception.tasks import TASKS, task_named
@@ -81,7 +82,7 @@ def test_what_can_be_chosen_is_listed(path, shown):
 
 
 def test_choices_are_those_that_there_are():
-    for listed, known in ((Format, FORMATS), (Engine, ENGINES)):
+    for listed, known in ((Format, FORMATS), (ImportFormat, READABLE), (Engine, ENGINES)):
         assert [*listed] == [*known]
     for device in Device:
         if device != Device.cuda:

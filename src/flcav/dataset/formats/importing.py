@@ -24,8 +24,8 @@ class Readable(NamedTuple):
 READABLE: Mapping[str, Readable] = {
     "kitti": Readable(KittiSource, ("training/velodyne", "testing/velodyne")),
     "nuscenes": Readable(NuscenesSource, ("v1.0-*/sample.json", "sample.json", "samples/LIDAR_TOP")),
-    "opv2v": Readable(Opv2vSource, ("data_protocol.yaml", "*/data_protocol.yaml", "*/*/data_protocol.yaml")),
     "argoverse2": Readable(Argoverse2Source, ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar")),
+    "opv2v": Readable(Opv2vSource, ("data_protocol.yaml", "*/data_protocol.yaml", "*/*/data_protocol.yaml")),
 }
 
 
@@ -45,8 +45,13 @@ def import_dataset(
     shown = [each for each in READABLE if _shows(folder, each)]
     if shown and name not in shown:
         raise InputError(f"{folder}: is no folder of '{name}' but of '{shown[0]}'")
-    source = READABLE[name].read(folder, split)
-    record(source, out, progress=progress)
+    try:
+        source = READABLE[name].read(folder, split)
+        record(source, out, progress=progress)
+    except InputError:
+        raise
+    except ValueError as error:  # of names that a dataset cannot hold, or numbers that no measurement has
+        raise InputError(f"{folder}: cannot be imported ({error})") from None
     return source.notes
 
 

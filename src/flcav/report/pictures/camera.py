@@ -89,8 +89,8 @@ class Shot:
 def make_shot(frame: Frame, camera: str) -> Shot:
     """Return the picture and the visible annotations of a frame's camera, by its true calibration.
 
-    Boxes are moved from the LiDAR spin to the time of the picture where their velocity is known. A thermal image becomes
-    grey, warm is bright.
+    Boxes are moved from the LiDAR spin to the time of the picture where their velocity is known. A thermal image
+    becomes grey, warm is bright.
     """
     picture = frame.images[camera].rgb if camera in frame.images else thermal_grey(frame.infrared[camera])
     calibration, seen = frame.calibration, frame.annotations

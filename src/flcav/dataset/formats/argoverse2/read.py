@@ -53,6 +53,7 @@ SPLITS = ("train", "val", "test")  # folders of logs
 AXLE_M = 0.33  # height of the rear axle above the ground, which in the log 7fab2350 lies 0.33 to 0.37 m below it
 LIDAR, MOUNT = "lidar", "up_lidar"  # our name of both LiDARs, where they are taken to be
 LATE_NS = 50_000_000  # most time between a sweep and the picture of a camera that goes with it: it runs at 20 Hz
+TEXT = ("sensor_name", "track_uuid", "category")  # columns, of which all others are numbers
 PLACED = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 EGO_FROM_AGENT = pose(0.0, 0.0, -AXLE_M)
 
@@ -277,4 +278,13 @@ def _read_feather(path: Path, columns: tuple[str, ...]) -> pa.Table:
         raise InputError(f"{path}: not a Feather file, or a truncated one") from None
     if lost := [name for name in columns if name not in table.column_names]:
         raise InputError(f"{path}: no column '{lost[0]}'")
+    for name in columns:
+        kind = table[name].type
+        text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+        if table[name].null_count or text != (name in TEXT) or not (text or _is_number(kind)):
+            raise InputError(f"{path}: the column '{name}' is not of {'texts' if name in TEXT else 'numbers'}")
     return table.select(list(columns)).combine_chunks()
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return pa.types.is_integer(kind) or pa.types.is_floating(kind)

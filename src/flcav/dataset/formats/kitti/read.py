@@ -1,8 +1,8 @@
 """Reading of KITTI's object detection benchmark as a source of frames.
 
 Its frames are of no sequence: each is a scene of its own, at time 0 and at the world's origin. Only an export of
-flcav's says more, in `frames.csv`. The LiDAR stands where KITTI's does, HEIGHT_M above the ground (Geiger et al., IJRR 32(11),
-2013, fig. 3); a label's rectangle is of the whole object as far as it lies in the image.
+flcav's says more, in `frames.csv`. The LiDAR stands where KITTI's does, HEIGHT_M above the ground (Geiger et al., IJRR
+32(11), 2013, fig. 3); a label's rectangle is of the whole object as far as it lies in the image.
 """
 
 import csv

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flcav.config import InputError, read_json
+from flcav.config import InputError, read_json, shorten
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar
 from flcav.dataset.formats.nuscenes.tables import VERSION
 from flcav.dataset.formats.pcd import read_pcd
@@ -58,6 +58,8 @@ OCCLUSION = {
     "4": 0.1,
 }  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
 TOP = "LIDAR_TOP"
+NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of so many numbers
+FARTHEST = 1e9
 POINT = 5  # float32 of a point: x, y, z, intensity 0 to 255, ring
 COLUMNS = {  # what is read of each table
     "scene": ("name", "log_token", "first_sample_token"),
@@ -312,11 +314,32 @@ def _read_table(path: Path, name: str) -> dict[str, Row]:
     wanted = {"token", *COLUMNS[name]}
     if not isinstance(rows, list):
         raise InputError(f"{path}: not a table of nuScenes; a list of rows is wanted")
-    for row in rows:
+    for number, row in enumerate(rows):
         if not isinstance(row, dict) or not wanted <= row.keys():
             lost = sorted(wanted - row.keys())[0] if isinstance(row, dict) else "token"
-            raise InputError(f"{path}: a row has no '{lost}'")
+            raise InputError(f"{path}: row {number} has no '{lost}'")
+        if odd := [column for column in sorted(wanted) if not _fits(column, row[column])]:
+            raise InputError(f"{path}: row {number} has a '{odd[0]}' that is none: {shorten(row[odd[0]])}")
     return {row["token"]: row for row in rows}  # type: ignore[index, misc]
+
+
+def _fits(column: str, value: object) -> bool:
+    """Return whether a value can be one of a column of COLUMNS."""
+    if column in NUMBERS:
+        return _are_numbers(value, NUMBERS[column]) and (column != "rotation" or any(value))  # type: ignore[arg-type]
+    if column == "camera_intrinsic":
+        return value == [] or (isinstance(value, list) and len(value) == 3 and all(_are_numbers(r, 3) for r in value))
+    if column == "timestamp":
+        return isinstance(value, int)
+    return isinstance(value, bool if column == "is_key_frame" else str)
+
+
+def _are_numbers(values: object, count: int) -> bool:
+    return (
+        isinstance(values, list)
+        and len(values) == count
+        and all(isinstance(value, int | float) and abs(value) < FARTHEST for value in values)
+    )
 
 
 def _placed(row: Row) -> Array:
