@@ -16,6 +16,7 @@ from flcav.dataset.formats.importing import READABLE, import_dataset
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, wrap_angle
+from flcav.pipeline.frames import group_frames
 from flcav.sensors.frame import Frame
 
 SCENES = 2
@@ -162,6 +163,13 @@ def test_links_are_made_where_nothing_is_to_be_converted(imported: dict[str, Dat
     assert cloud.is_symlink()
     assert cloud.resolve() == (exported["kitti"] / "training" / "velodyne" / "000000.bin").resolve()
     assert imported["nuscenes"].plane_path(0, "CAM_FRONT", "rgb").is_symlink()
+
+
+def test_vehicles_of_an_import_are_clients_of_a_region(imported: dict[str, Dataset]):
+    data = imported["opv2v"]
+    grouped = group_frames(data, "imported")
+    assert {data.keys[i].agent for i in grouped.vehicles} == {"cav0"}
+    assert grouped.poles.keys() == {3}
 
 
 def test_a_split_alone_is_imported(exported: dict[str, Path], tmp_path: Path):
