@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from flcav.config import InputError
+from flcav.dataset.checks.validate import validate
+from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.formats.kitti import (
     Calibration,
     KittiFolder,
@@ -17,7 +19,8 @@ from flcav.dataset.formats.kitti import (
     read_objects,
     read_points,
 )
-from flcav.geometry import points_in_boxes
+from flcav.dataset.store import Dataset
+from flcav.geometry import inverse, points_in_boxes, transform_points
 
 CALIBRATION = """P2: 700 0 600 45 0 700 180 0.2 0 0 1 0.003
 R0_rect: 1 0 0 0 1 0 0 0 1
@@ -223,3 +226,24 @@ def test_the_real_frame_is_a_whole_folder_and_its_points_project_onto_their_obje
         u, v = projected[:, 0] / projected[:, 2], projected[:, 1] / projected[:, 2]
         within = (u > left - 5) & (u < right + 5) & (v > top - 5) & (v < bottom + 5)
         assert within.mean() > 0.95
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"the real KITTI frame is not at {REAL}; set FLCAV_REAL_DATA")
+def test_the_real_frame_is_imported_with_its_boxes_in_the_picture(tmp_path: Path):
+    import_dataset("kitti", REAL, tmp_path / "out")
+    assert validate(tmp_path / "out") == []
+    data = Dataset.open(tmp_path / "out")
+    frame = data.frame(0)
+    truth = frame.annotations
+    assert truth.boxes.label.tolist() == ["car"] * 6
+    assert (truth.returns > 20).all()
+    assert (data.folder / "velodyne" / f"{frame.key}.bin").resolve().name == "000008.bin"
+    center = transform_points(inverse(frame.world_from_sensor("image_2")), truth.boxes.center)
+    pixels = center @ frame.calibration.intrinsics["image_2"].T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    rectangle = truth.views["image_2"].amodal_box
+    whole = truth.views["image_2"].truncation == 0
+    assert whole.sum() == 4
+    assert (np.abs(pixels - (rectangle[:, :2] + rectangle[:, 2:]) / 2)[whole] < 12).all()
+    assert np.isnan(truth.velocity).all()
+    assert np.isnan(truth.views["image_2"].occlusion).tolist() == [True, False, True, False, False, False]
