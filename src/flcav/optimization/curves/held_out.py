@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import rankdata
 
 from flcav.config import InputError
 from flcav.optimization.curves.fitting import CurveFit
@@ -37,5 +37,5 @@ def hold_out_runs(history: History, fit: Callable[[History], CurveFit], k: int =
         held = names == run
         curve = fit(history.select(~held)).curve
         predicted[held] = 1 - curve.error(*history.resources[held].T, k=k)
-    agreement = spearmanr(predicted, history.accuracy).statistic
+    agreement = np.corrcoef(rankdata(predicted), rankdata(history.accuracy))[0, 1]
     return HeldOut(len(runs), len(names), float(np.abs(predicted - history.accuracy).mean()), float(agreement))
