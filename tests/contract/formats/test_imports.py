@@ -154,7 +154,7 @@ def test_what_is_imported_is_exported_as_it_came(
             known = [line.split() for line in lines if not line.startswith("DontCare")]
             for was, now in zip(known, (line.split() for line in path.read_text().splitlines()), strict=True):
                 assert (was[0], was[2]) == (now[0], now[2])
-                np.testing.assert_allclose(np.float64(now[3:]), np.float64(was[3:]), atol=5e-4)
+                np.testing.assert_allclose([*map(float, now[3:])], [*map(float, was[3:])], atol=5e-4)
 
 
 def test_links_are_made_where_nothing_is_to_be_converted(imported: dict[str, Dataset], exported: dict[str, Path]):

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -24,12 +25,12 @@ NORTH = Rotation.from_euler("z", 90, degrees=True)
 UP_LIDAR = (1.35, 0.0, 1.64)
 
 
-def _write(path: Path, **columns: list) -> None:
+def _write(path: Path, **columns: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     feather.write_feather(pa.table(columns), path)
 
 
-def _placed(rotation: Rotation, places: np.ndarray) -> dict[str, list]:
+def _placed(rotation: Rotation, places: np.ndarray) -> dict[str, Any]:
     x, y, z, w = np.broadcast_to(rotation.as_quat(), (len(places), 4)).T.tolist()
     return dict(zip(("qw", "qx", "qy", "qz"), (w, x, y, z))) | dict(zip(("tx_m", "ty_m", "tz_m"), places.T.tolist()))
 

@@ -114,7 +114,7 @@ class NuscenesSource:
         self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._read_notes(table)
         self._labelled = bool(table["sample_annotation"])
-        self.notes = () if self._labelled else ("no annotations in its tables, so no boxes",)
+        self.notes: tuple[str, ...] = () if self._labelled else ("no annotations in its tables, so no boxes",)
 
     def _at(self, table: Mapping[str, Row], token: str) -> Row:
         if token not in table:
@@ -154,7 +154,7 @@ class NuscenesSource:
         split_by_name = {
             name: split.removeprefix("flcav_")
             for split, own in (listed.items() if isinstance(listed, dict) else ())
-            for name in own
+            for name in (own if isinstance(own, list) else ())
         }
         of_scene: dict[str, list[str]] = defaultdict(list)
         for token, row in samples.items():
@@ -292,7 +292,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     if len(data) % POINT or path.stat().st_size % 4 or not len(data):
         raise InputError(f"{path}: truncated; {path.stat().st_size} bytes are no whole points of {4 * POINT} bytes")
     right, ahead, up, intensity, _ = data.reshape(-1, POINT).T
-    return np.stack((ahead, -right, up, intensity / np.float32(255)), axis=1)
+    return np.stack((ahead, -right, up, intensity / np.float32(255)), axis=1).astype(np.float32, copy=False)
 
 
 def _find_tables(folder: Path) -> Path:

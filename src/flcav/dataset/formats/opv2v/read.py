@@ -63,7 +63,7 @@ class Opv2vSource:
         self._track: dict[str, dict[str, str]] = {}
         names = AgentNames()
         self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
-        self.notes = ()
+        self.notes: tuple[str, ...] = ()
 
     def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Shot]:
         known = self._track[scene] = _read_names(folder / PROTOCOL)
@@ -197,12 +197,14 @@ def _read_about(stem: Path) -> About:
     try:
         about["vehicles"].values()
         for row in about["vehicles"].values():
-            _check_numbers(row["location"], 3), _check_numbers(row["center"], 3)
-            _check_numbers(row["extent"], 3), _check_numbers(row["angle"], 3)
-        _check_numbers(about["lidar_pose"], 6), _check_numbers(about["true_ego_pos"], 6)
+            for name in ("location", "center", "extent", "angle"):
+                _check_numbers(row[name], 3)
+        for name in ("lidar_pose", "true_ego_pos"):
+            _check_numbers(about[name], 6)
         for name in CAMERAS:
             if name in about:
-                _check_numbers(about[name]["cords"], 6), _check_numbers(np.ravel(about[name]["intrinsic"]), 9)
+                _check_numbers(about[name]["cords"], 6)
+                _check_numbers(np.ravel(about[name]["intrinsic"]), 9)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: not a frame of OPV2V ({type(error).__name__}: {error})") from None
     return about
