@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
-from flcav.optimization.placement import coverage, place
+from flcav.optimization.placement.solve import coverage, place
 
 
 def drawn(seed: int):
