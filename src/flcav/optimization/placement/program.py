@@ -31,7 +31,7 @@ def minimise_cost(instance: Instance, target: float, *, limited: bool = False) -
 
     `limited` as in `maximise_coverage`.
     """
-    objective, rows, limits = _program(instance, np.inf)
+    _, rows, limits = _program(instance, np.inf)
     candidates = len(instance.cost)
     share = csr_array(np.r_[np.zeros(candidates), -instance.weight][None] / target)
     rows, limits = csr_array(vstack((rows, share))), np.r_[limits, -1.0]

@@ -39,7 +39,7 @@ class Placement:
     upper_bound: float  # proven: no choice of as many poles, or within the budget, covers more weight
     optimal: bool  # whether `covered_weight` equals the bound; of `cover_share`, `cost` its own bound
     sensors: tuple[int, ...] = ()  # index into the sensors of each chosen pole
-    cost: float | None = None  # of the chosen; None where costs play no part
+    cost: float = 0.0  # of the chosen
     marginal_gain: tuple[float, ...] = ()  # weight that each of the chosen alone covers: lost if it were left out
 
 
@@ -82,7 +82,7 @@ class Candidates:
     covers: csr_array  # (P * S, E) 1.0 where a candidate covers an error
     weight: Array  # (E,) of the errors
     cost: Array  # (P * S,)
-    order: NDArray[np.int64]  # (S,) the sensors as they were given, by range
+    order: NDArray[np.int64]  # (S,) numbers of the sensors as they were given, by range
 
     @property
     def sensors(self) -> int:
