@@ -107,7 +107,7 @@ def size(request, monkeypatch):
 
 
 @pytest.mark.usefixtures("size")
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_budget_buys_the_best_of_all_choices(seed):
     candidates, within, cost = priced(seed)
     choices = every_choice(candidates, within, cost)
@@ -131,7 +131,7 @@ def test_a_budget_buys_the_best_of_all_choices(seed):
 
 
 @pytest.mark.usefixtures("size")
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_share_is_covered_by_the_cheapest_of_all_choices(seed):
     candidates, within, cost = priced(seed)
     choices = every_choice(candidates, within, cost)

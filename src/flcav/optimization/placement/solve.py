@@ -98,11 +98,11 @@ class Candidates:
         """Return the same candidates, each of which costs 1."""
         return replace(self, cost=np.ones(len(self.cost)))
 
-    def instance(self, *, merged: bool = True) -> Instance:
-        """Return the instance to solve, by default with errors merged that the same candidates cover."""
-        if merged:
-            return merge_errors(self.covers, self.weight, self.cost, self.sensors)
-        return Instance(self.covers, self.weight, self.cost, self.sensors)
+    def instance(self, method: Method = "exact") -> Instance:
+        """Return the instance with errors merged that the same candidates cover; greedy, not where it takes longest."""
+        if method == "greedy" and self.covers.nnz > SEARCHED:
+            return Instance(self.covers, self.weight, self.cost, self.sensors)
+        return merge_errors(self.covers, self.weight, self.cost, self.sensors)
 
 
 def find_candidates(
@@ -150,7 +150,7 @@ def place_count(candidates: Candidates, count: int, *, method: Method = "exact")
     _check_method(method)
     if not 1 <= count <= candidates.poles:
         raise InputError(f"count = {count}: must be from 1 to the number of poles, {candidates.poles}")
-    instance = candidates.at_unit_cost().instance(merged=method == "exact")
+    instance = candidates.at_unit_cost().instance(method)
     chosen, bound = maximise(instance, float(count), method)
     kinds = candidates.sensors
     used = {candidate // kinds for candidate in chosen}
@@ -169,7 +169,7 @@ def place_budget(candidates: Candidates, budget: float, *, method: Method = "exa
         raise InputError(f"budget = {budget:g}: the cheapest sensor on a pole costs {candidates.cost.min():g}")
     if not np.isfinite(budget):
         raise InputError(f"budget = {budget}: must be a finite number")
-    chosen, bound = maximise(candidates.instance(merged=method == "exact"), budget, method)
+    chosen, bound = maximise(candidates.instance(method), budget, method)
     return describe(candidates, chosen, bound)
 
 
@@ -177,14 +177,14 @@ def maximise(instance: Instance, budget: float, method: Method) -> tuple[list[in
     """Return the candidates, ascending, that cover most weight within `budget`, and a proven bound on that weight."""
     chosen = choose_greedily(instance, budget)
     value = instance.value(chosen)
-    if method == "greedy":
-        return chosen, bound_of_choice(instance, budget, chosen).bound
     if instance.covers.nnz <= WHOLE:
         bound = bound_by_highs(instance, budget)
-        if bound <= value * (1 + TIE):
+        if method == "greedy" or bound <= value * (1 + TIE):
             return chosen, bound
         best, bound = maximise_coverage(instance, budget)
         return (chosen if best is None else best), bound
+    if method == "greedy":
+        return chosen, bound_of_choice(instance, budget, chosen).bound
     relaxed = relax(instance, budget, value)
     chosen = improve(instance, budget, chosen, relaxed)
     value = instance.value(chosen)
