@@ -1,4 +1,4 @@
-"""Placement of sensors against HiGHS on the same instance, in one run and one thread; and large instances with their gap.
+"""Placement of sensors against HiGHS on the same instance, in one run and one thread; large instances with their gap.
 
 Errors cluster along the streets of a city of 1.2 km, poles stand along them; three sensors, at most one a pole. The
 reference is the mixed-integer program of the merged instance, solved by HiGHS alone to the same proven optimum.
@@ -17,7 +17,7 @@ from flcav.optimization.placement.program import maximise_coverage
 from flcav.optimization.placement.solve import Candidates, Placement, find_candidates, place_budget, place_count
 
 RANGES_M, SENSOR_COST = (35.0, 60.0, 95.0), (1.0, 2.2, 4.6)
-REFERENCED = (4_000, 250, 20.0)  # errors, poles, budget
+REFERENCED = (3_000, 200, 15.0)  # errors, poles, budget
 LARGE = (100_000, 1_000)
 
 

@@ -124,7 +124,8 @@ def calls() -> list[Call]:
             0.05,
         ),
         Call(
-            "place --errors errors.csv --poles poles.csv --range 40 --count 1 --data data/ --town town/ --line-of-sight",
+            "place --errors errors.csv --poles poles.csv --range 40 --count 1 --data data/ --town town/ "
+            "--line-of-sight",
             ("errors.csv", "poles.csv", "town/*"),
             0.2,
         ),
