@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flcav.optimization.placement import place
+from flcav.optimization.placement.solve import place
 
 
 def main() -> None:

@@ -113,6 +113,22 @@ def calls() -> list[Call]:
             (*DATASET, "network.yaml"),
             0.5,
         ),
+        Call(
+            "place --errors errors.csv --poles poles.csv --sensors sensors.csv --budget #6 --json",
+            ("errors.csv", "poles.csv", "sensors.csv"),
+            0.05,
+        ),
+        Call(
+            "place --errors errors.csv --poles poles.csv --sensors sensors.csv --cover #0.3",
+            ("errors.csv", "poles.csv", "sensors.csv"),
+            0.05,
+        ),
+        Call(
+            "place --errors errors.csv --poles poles.csv --range 40 --count 1 --data data/ --town town/ "
+            "--line-of-sight",
+            ("errors.csv", "poles.csv", "town/*"),
+            0.2,
+        ),
         Call("fit history.csv --json --repeats 20 --at #500,#2,#1 --level #0.9 --seed #0", ("history.csv",), 0.09),
         Call("fit joint.csv --repeats 20 --at #500,1", ("joint.csv",), 0.2),
         Call("fit history.csv --repeats 20 --problem problem.yaml", ("history.csv", "problem.yaml"), 0.17),

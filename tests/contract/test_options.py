@@ -84,6 +84,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--poles": ALWAYS,
         "--range": ALWAYS,
         "--count": ALWAYS,
+        **dict.fromkeys(("--sensors", "--budget", "--cover", "--data", "--line-of-sight", "--class-weight"), ALWAYS),
         "--method": ALWAYS,
         "--town": ALWAYS,
         "--map": ALWAYS,

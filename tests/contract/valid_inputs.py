@@ -218,6 +218,7 @@ def make_inputs(folder: Path) -> None:
     rows = [",".join(f"{number:.3f}" for number in row) for row in errors]
     (folder / "errors.csv").write_text("\n".join(["x,y,z,weight", *rows]) + "\n")
     (folder / "poles.csv").write_text(POLES)
+    (folder / "sensors.csv").write_text("name,range_m,cost\nshort,20,1\nlong,45,2.5\n")
     for name in ("history", "errors", "poles"):
         pq.write_table(pyarrow.csv.read_csv(folder / f"{name}.csv"), folder / f"{name}.parquet")
     shutil.copy(DATA / "cross.xodr", folder / "map.xodr")

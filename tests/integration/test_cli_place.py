@@ -19,6 +19,11 @@ def called(*arguments: object) -> int:
     return int(stopped.value.code or 0)
 
 
+def at_random() -> dict[str, float]:
+    """What one of the two poles covers on average: 2 errors of the weight 1, or one of 5; about half of the draws."""
+    return {"covered": pytest.approx(1.5, abs=0.1), "covered_weight": pytest.approx(3.5, abs=0.3)}
+
+
 @pytest.fixture
 def files(tmp_path) -> tuple[Path, Path]:
     (tmp_path / "errors.csv").write_text(ERRORS)
@@ -39,7 +44,9 @@ def test_place_chooses_by_weight(files, method, parquet, capsys):
         files = (files[0].with_suffix(".parquet"), files[1].with_suffix(".parquet"))
     assert asked(files, "--method", method, "--json") == 0
     assert json.loads(capsys.readouterr().out) == {
-        "chosen": [{"pole": 8}], "covered": 1, "covered_weight": 5.0, "upper_bound": 5.0, "optimal": True,
+        "chosen": [{"pole": 8, "sensor": None}], "covered": 1, "covered_weight": 5.0, "upper_bound": 5.0,
+        "optimal": True, "cost": None, "cost_lower_bound": None, "marginal_gain": [5.0],
+        "baselines": {"visible-objects": None, "traffic-density": None, "random": at_random()},
     }  # fmt: skip
     assert asked(files) == 0
     assert "poles 8" in capsys.readouterr().out
@@ -52,12 +59,74 @@ def test_place_chooses_by_weight(files, method, parquet, capsys):
         ("x,y,z\n0,nan,0\n", {}, "row 1: y ="),
         ("x,y,z\n", {}, "no rows"),
         (ERRORS, {"reach": -1}, "range = -1"),
+        (ERRORS, {"reach": 0}, "range = 0"),
+        (ERRORS.replace("weight", "gravity"), {}, "unknown column 'gravity'"),
         (ERRORS, {"count": 3}, "count = 3"),
     ],
 )
 def test_bad_input_is_one_sentence(errors, change, named, files, capsys):
     files[0].write_text(errors)
     assert asked(files, **change) == 2
+    err = capsys.readouterr().err
+    assert named in err
+    assert err.count("\n") == 1
+
+
+SENSORS = "name,range_m,cost\nlong,100,9\nshort,10,2\n"
+
+
+def priced(files: tuple[Path, Path], *more: object, poles: str = POLES, sensors: str = SENSORS) -> int:
+    files[1].write_text(poles)
+    files[1].with_name("sensors.csv").write_text(sensors)
+    place = ("place", "--errors", files[0], "--poles", files[1], "--sensors", files[1].with_name("sensors.csv"))
+    return called(*place, *more)
+
+
+def test_sensors_and_poles_have_costs(files, capsys):
+    poles = "id,x,y,z,cost\na,0,0,3,1\nb,50,0,3,1.5\n"
+    for limit, chosen, cost in (
+        (("--budget", 3), [("a", "short")], 3.0),
+        (("--budget", 4), [("b", "short")], 3.5),
+        (("--budget", 6.5), [("a", "short"), ("b", "short")], 6.5),
+        (("--count", 1), [("a", "long")], 10.0),
+        (("--cover", 0.5), [("b", "short")], 3.5),
+        (("--cover", 0.2), [("a", "short")], 3.0),
+    ):
+        assert priced(files, *limit, "--json", poles=poles) == 0
+        said = json.loads(capsys.readouterr().out)
+        assert [(each["pole"], each["sensor"]) for each in said["chosen"]] == chosen
+        assert (said["cost"], said["optimal"]) == (cost, True)
+        assert said["cost_lower_bound"] == (cost if "--cover" in limit else None)
+    assert priced(files, "--cover", 1, poles=poles) == 0
+    assert "poles a (short), b (short)" in capsys.readouterr().out
+
+
+def test_weights_are_multiplied_by_severity_exposure_and_class(files, capsys):
+    files[0].write_text("x,y,z,severity,exposure,class\n0,0,0,3,.5,Car\n50,0,0,1,1,Pedestrian\n")
+    for more, pole, weight in (((), 3, 1.5), (("--class-weight", "Pedestrian=4"), 8, 4.0)):
+        assert asked(files, *more, "--json") == 0
+        said = json.loads(capsys.readouterr().out)
+        assert (said["chosen"][0]["pole"], said["covered_weight"]) == (pole, weight)
+
+
+@pytest.mark.parametrize(
+    ("more", "change", "named"),
+    [
+        (("--budget", 1), {}, "budget = 1"),
+        (("--budget", 5, "--count", 1), {}, "one of the three"),
+        (("--budget", 5, "--range", 9), {}, "one of the two"),
+        (("--cover", 1.5), {}, "cover = 1.5"),
+        (("--budget", 5), {"poles": "id,x,y,z\n3,0,0,3\n3,50,0,3\n"}, "two poles of the id 3"),
+        (("--budget", 5), {"poles": "id,x,y,z,cost\n3,0,0,3,-1\n"}, "every cost"),
+        (("--budget", 5), {"sensors": "name,range_m,cost\nlong,0,9\n"}, "range = 0"),
+        (("--budget", 5), {"sensors": "name,range_m,cost\nlong,nan,9\n"}, "range_m = nan"),
+        (("--budget", 5, "--line-of-sight"), {}, "--line-of-sight: needs"),
+        (("--budget", 5, "--town", "suburb"), {"poles": "id,x,y,z\n3,900,0,3\n"}, "outside suburb"),
+        (("--budget", 5, "--class-weight", "Car"), {}, "CLASS=FACTOR"),
+    ],
+)
+def test_a_wrong_price_or_limit_is_one_sentence(more, change, named, files, capsys):
+    assert priced(files, *more, **change) == 2
     err = capsys.readouterr().err
     assert named in err
     assert err.count("\n") == 1

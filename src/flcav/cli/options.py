@@ -72,7 +72,7 @@ class Stale(StrEnum):
 
 
 class Method(StrEnum):
-    """Method of placement, see `flcav.optimization.placement`."""
+    """Method of placement, see `flcav.optimization.placement.solve`."""
 
     exact = "exact"
     greedy = "greedy"

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from flcav.optimization.curves.fitting import Fit, fit
     from flcav.optimization.curves.history import History, article_histories
     from flcav.optimization.graph import load_problem
-    from flcav.optimization.placement import Placement, place
+    from flcav.optimization.placement.solve import Placement, place
     from flcav.optimization.problem import AllocationTask, Budgets, Limits, Problem
 
 PLACES = {
@@ -20,8 +20,8 @@ PLACES = {
     "article_histories": "flcav.optimization.curves.history",
     "Fit": "flcav.optimization.curves.fitting",
     "fit": "flcav.optimization.curves.fitting",
-    "Placement": "flcav.optimization.placement",
-    "place": "flcav.optimization.placement",
+    "Placement": "flcav.optimization.placement.solve",
+    "place": "flcav.optimization.placement.solve",
     "Budgets": "flcav.optimization.problem",
     "Limits": "flcav.optimization.problem",
     "Problem": "flcav.optimization.problem",

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
-from flcav.optimization.placement import coverage, place
+from flcav.optimization.placement.solve import coverage, place
 from flcav.perception.errors import PerceptionError
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import Placement

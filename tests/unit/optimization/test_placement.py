@@ -1,12 +1,16 @@
 """Placement against every subset of the poles."""
 
-from itertools import combinations
+from itertools import combinations, product
+from math import comb
 
 import numpy as np
 import pytest
 
 from flcav.config import InputError
-from flcav.optimization.placement import coverage, place
+from flcav.optimization.placement import cheapest, solve
+from flcav.optimization.placement.baselines import place_at_random, place_by_score
+from flcav.optimization.placement.cheapest import cover_share
+from flcav.optimization.placement.solve import Candidates, coverage, find_candidates, place, place_budget, place_count
 
 
 def drawn(seed: int):
@@ -68,3 +72,110 @@ def test_bad_input_is_one_sentence(change, named):
     arguments = {"errors": np.zeros((1, 3)), "poles": np.zeros((3, 3)), "range_m": 5.0, "count": 1} | change
     with pytest.raises(InputError, match=named):
         place(**arguments)
+
+
+RANGES = np.array([45.0, 18.0, 30.0])  # not in their order
+SENSOR_COST = np.array([4.0, 1.0, 2.1])
+
+
+def priced(seed: int, poles: int = 5) -> tuple[Candidates, np.ndarray, np.ndarray]:
+    """Return candidates, whether each error is within each sensor's range of each pole (P, S, E), and costs (P, S)."""
+    rng = np.random.default_rng(seed)
+    errors, sites = rng.uniform(0, 100, (60, 3)) * [1, 1, 0.1], rng.uniform(0, 100, (poles, 3)) * [1, 1, 0.1]
+    weight, of_pole = rng.uniform(0.1, 2, 60), rng.uniform(0.5, 1.5, poles)
+    within = np.linalg.norm(errors[None] - sites[:, None], axis=2)[:, None] <= RANGES[:, None]
+    candidates = find_candidates(errors, sites, RANGES, weight=weight, pole_cost=of_pole, sensor_cost=SENSOR_COST)
+    return candidates, within, of_pole[:, None] + SENSOR_COST
+
+
+def every_choice(candidates: Candidates, within: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    """Return cost and covered weight (C, 2) of every choice of no or one sensor on each pole."""
+    found = []
+    for kinds in product(range(-1, 3), repeat=len(cost)):
+        on = [(pole, kind) for pole, kind in enumerate(kinds) if kind >= 0]
+        reached = np.any([within[each] for each in on], axis=0) if on else np.zeros(within.shape[2], bool)
+        found.append((sum(cost[each] for each in on), candidates.weight[reached].sum()))
+    return np.array(found)
+
+
+@pytest.fixture(params=["small", "large"])
+def size(request, monkeypatch):
+    """Solved as a small instance is, or as a large one: by its dual, fixing, and the program of what remains."""
+    if request.param == "large":
+        monkeypatch.setattr(solve, "WHOLE", 0)
+        monkeypatch.setattr(cheapest, "WHOLE", 0)
+
+
+@pytest.mark.usefixtures("size")
+@pytest.mark.parametrize("seed", range(2))
+def test_a_budget_buys_the_best_of_all_choices(seed):
+    candidates, within, cost = priced(seed)
+    choices = every_choice(candidates, within, cost)
+    for budget in (2.7, 6.0, 11.0):
+        best = choices[choices[:, 0] <= budget, 1].max()
+        exact = place_budget(candidates, budget)
+        greedy = place_budget(candidates, budget, method="greedy")
+        assert exact.optimal
+        assert exact.covered_weight == pytest.approx(best, rel=1e-9)
+        assert (1 - 1 / np.e) / 2 * best <= greedy.covered_weight <= best + 1e-9
+        assert greedy.upper_bound >= best - 1e-9
+        for found in (exact, greedy):
+            on = list(zip(found.chosen, found.sensors, strict=True))
+            assert len({pole for pole, _ in on}) == len(on)
+            assert found.cost == pytest.approx(sum(cost[each] for each in on))
+            assert found.cost <= budget + 1e-9
+            seen = np.sum([within[each] for each in on], axis=0)
+            assert found.covered_weight == pytest.approx(candidates.weight[seen > 0].sum())
+            alone = [candidates.weight[within[each] & (seen == 1)].sum() for each in on]
+            assert found.marginal_gain == pytest.approx(alone)
+
+
+@pytest.mark.usefixtures("size")
+@pytest.mark.parametrize("seed", range(2))
+def test_a_share_is_covered_by_the_cheapest_of_all_choices(seed):
+    candidates, within, cost = priced(seed)
+    choices = every_choice(candidates, within, cost)
+    for share in (0.2, 0.5, 0.65):
+        enough = choices[:, 1] >= share * candidates.weight.sum()
+        if not enough.any():
+            with pytest.raises(InputError, match="together cover only"):
+                cover_share(candidates, share)
+            continue
+        least = choices[enough, 0].min()
+        found, bound = cover_share(candidates, share)
+        assert found.optimal
+        assert found.cost == pytest.approx(least)
+        assert bound == pytest.approx(least)
+        assert found.covered_weight >= share * candidates.weight.sum() * (1 - 1e-8)
+        assert found.upper_bound >= choices[choices[:, 0] <= found.cost + 1e-9, 1].max() - 1e-9
+        greedy, below = cover_share(candidates, share, method="greedy")
+        assert below - 1e-9 <= least <= greedy.cost + 1e-9
+
+
+@pytest.mark.usefixtures("size")
+def test_a_count_takes_the_best_sensors_whatever_they_cost():
+    candidates, within, _ = priced(7)
+    best = max(candidates.weight[within[list(poles)].any(axis=(0, 1))].sum() for poles in combinations(range(5), 2))
+    found = place_count(candidates, 2)
+    assert (found.covered_weight, found.optimal) == (pytest.approx(best), True)
+
+
+def test_random_placements_cover_what_their_expectation_says():
+    errors, poles, weight = drawn(1)
+    candidates = find_candidates(errors, poles, [30.0], weight=weight).at_unit_cost()
+    times = coverage(errors, poles, 30).sum(axis=0)
+    chance = 1 - np.array([comb(9 - int(near), 3) for near in times]) / comb(9, 3)
+    found = place_at_random(candidates, 3.0, draws=2000)
+    assert found.covered == pytest.approx(chance.sum(), rel=0.02)
+    assert found.covered_weight == pytest.approx(chance @ weight, rel=0.02)
+
+
+def test_conventional_placement_takes_the_best_scores_that_fit():
+    candidates, within, cost = priced(3)
+    score = np.zeros((5, 3))
+    score[1, 2], score[1, 1], score[4, 0] = 9.0, 8.0, 1.0  # (pole, sensor by range)
+    by_count = place_by_score(candidates.at_unit_cost(), score.ravel(), 2.0)
+    assert (by_count.chosen, by_count.sensors) == ((1, 4), (0, 1))
+    by_cost = place_by_score(candidates, score.ravel(), cost[1, 2] + cost[4, 1])
+    assert (by_cost.chosen, by_cost.sensors) == ((1, 4), (2, 1))
+    assert by_cost.covered == (within[1, 2] | within[4, 1]).sum()

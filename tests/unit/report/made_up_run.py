@@ -135,7 +135,7 @@ def error_map(town: str = "grid", errors: int = 61) -> ErrorMap:
     xy = road[rng.integers(len(road), size=errors)] + rng.normal(0, 4, (errors, 2))
     kind = np.where(rng.random(errors) < 0.7, "miss", "false_positive")
     xyz = np.c_[xy, np.full(errors, 0.8)]
-    return ErrorMap(place, xyz, kind, poles_of(place), chosen=("2",), densest="8", range_m=40.0)
+    return ErrorMap(place, xyz, kind, poles_of(place), chosen={"2": 40.0}, densest=("8",))
 
 
 def sweep() -> Sweep:

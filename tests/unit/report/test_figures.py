@@ -54,14 +54,14 @@ def test_the_map_shows_every_error_once_and_the_reach_of_the_chosen_pole() -> No
     rim = next(patch for patch in axes.patches if isinstance(patch, Circle) and not patch.get_fill())
     x, y, z = scene.town.poles.position[list(scene.town.poles.id).index(2)]
     assert rim.get_center() == pytest.approx((x, y))
-    assert rim.get_radius() == pytest.approx(np.sqrt(scene.range_m**2 - z**2))
+    assert rim.get_radius() == pytest.approx(np.sqrt(scene.chosen["2"] ** 2 - z**2))
     words = {text.get_text() for text in axes.texts}
     assert {str(number) for number in scene.town.poles.id} <= words
     assert {"placed", "densest traffic"} <= words
 
 
 def test_a_chosen_pole_that_is_also_the_densest_says_both() -> None:
-    axes = figures.town_map(replace(made_up_run.error_map(), densest="2")).axes[0]
+    axes = figures.town_map(replace(made_up_run.error_map(), densest=("2",))).axes[0]
     assert "placed and densest traffic" in {text.get_text() for text in axes.texts}
 
 

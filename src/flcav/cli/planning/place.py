@@ -5,16 +5,15 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import Method
+from flcav.cli.options import Method, check_finite
 from flcav.cli.terminal import print_json
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from flcav.cli.planning.place_inputs import Given
+    from flcav.files import Json
+    from flcav.optimization.placement.solve import Candidates, Placement
     from flcav.world.map.town import Town
-
-FAR = 10  # times the size of a town: what lies beyond is on no map of it
+    from flcav.world.trace import Trace
 
 
 def register(app: typer.Typer) -> None:
@@ -23,13 +22,32 @@ def register(app: typer.Typer) -> None:
 
 
 def place(
-    errors: Path = typer.Option(..., help="CSV or Parquet of errors: x, y, z [m], optionally weight."),
-    poles: Path = typer.Option(..., help="CSV or Parquet of candidate poles: id, x, y, z [m]."),
-    range_m: float = typer.Option(..., "--range", help="How far a sensor covers errors [m]."),
-    count: int = typer.Option(..., help="How many sensors to place."),
-    method: Method = typer.Option(Method.exact, help="exact proves that no poles cover more; greedy is faster."),
-    town: str | None = typer.Option(None, "--town", help="With --map: a town's name, or its folder."),
-    map_: Path | None = typer.Option(None, "--map", help="With --town: PNG file of errors, poles and what they cover."),
+    errors: Path = typer.Option(
+        ..., help="CSV or Parquet of errors: x, y, z [m], optionally weight, severity, exposure, class, kind."
+    ),
+    poles: Path = typer.Option(..., help="CSV or Parquet of candidate poles: id, x, y, z [m], optionally cost."),
+    sensors: Path | None = typer.Option(None, help="CSV or Parquet of sensors: name, range_m, cost; one a pole."),
+    range_m: float | None = typer.Option(None, "--range", help="How far a sensor covers errors [m]."),
+    count: int | None = typer.Option(None, help="How many sensors to place."),
+    budget: float | None = typer.Option(None, help="What sensors and poles may cost together.", callback=check_finite),
+    cover: float | None = typer.Option(
+        None, help="Share of the errors' weight, 0 to 1: the cheapest sensors for it.", callback=check_finite
+    ),
+    method: Method = typer.Option(Method.exact, help="exact proves how much could be covered; greedy is faster."),
+    data: Path | None = typer.Option(None, "--data", help="Dataset folder: its traffic, and its town."),
+    town: str | None = typer.Option(None, "--town", help="A town's name, or its folder; by default the dataset's."),
+    line_of_sight: bool = typer.Option(
+        False,
+        "--line-of-sight",
+        help="Cover only what a pole sees past the town's buildings, and the dataset's traffic.",
+    ),
+    class_weight: list[str] = typer.Option(
+        [],
+        "--class-weight",
+        metavar="CLASS=FACTOR",
+        help="Factor on the weight of a class; may be given several times.",
+    ),
+    map_: Path | None = typer.Option(None, "--map", help="PNG file of errors, poles and what they cover, in the town."),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
 ) -> None:
     """Choose the poles whose sensors cover most of the errors.
@@ -38,63 +56,126 @@ def place(
     """
     import numpy as np
 
-    from flcav.cli.tables import numbers, read_table
+    from flcav.cli.planning import place_inputs
     from flcav.config import InputError
-    from flcav.files import check_writable, write_bytes
-    from flcav.optimization import placement
-    from flcav.report import style
-    from flcav.report.charts.figures import town_map
-    from flcav.report.pictures.maps import ErrorMap
-    from flcav.world.map.town import load_town
+    from flcav.files import check_writable
+    from flcav.optimization.placement import solve
+    from flcav.optimization.placement.baselines import place_at_random
+    from flcav.optimization.placement.cheapest import cover_share
 
-    if (town is None) != (map_ is None):
-        raise InputError("--town and --map: each needs the other; the map is of the town")
+    if (sensors is None) == (range_m is None):
+        raise InputError("--sensors and --range: one of the two says how far sensors cover errors")
+    if sum(limit is not None for limit in (count, budget, cover)) != 1:
+        raise InputError("--count, --budget and --cover: one of the three says how much to place")
     if map_ is not None:
         check_writable(map_.parent)
-    here = None if town is None else load_town(town)
-    axes = ("x", "y", "z")
-    mistakes, sites = read_table(errors, axes), read_table(poles, ("id", *axes))
-    weight = numbers(mistakes, ("weight",), errors)[:, 0] if "weight" in mistakes.column_names else None
-    where, mounts = numbers(mistakes, axes, errors), numbers(sites, axes, poles)
+    here, traces = place_inputs.read_world(data, town)
+    for option, wanted in (("--map", map_ is not None), ("--line-of-sight", line_of_sight)):
+        if wanted and here is None:
+            raise InputError(f"{option}: needs --town, or --data whose town is known")
+    given = place_inputs.read_given(errors, poles, sensors, range_m, class_weight)
     if here is not None:
-        _check_near(here, where, errors)
-        _check_near(here, mounts, poles)
-    result = placement.place(where, mounts, range_m, count, weight=weight, method=method.value)
-    ids = sites["id"].to_pylist()
-    chosen = [ids[pole] for pole in result.chosen]
-    if here is not None and map_ is not None:
-        kind = mistakes["kind"].to_pylist() if "kind" in mistakes.column_names else ["error"] * mistakes.num_rows
-        candidates = {str(pole): at for pole, at in zip(ids, mounts, strict=True)}
-        placed = [str(pole) for pole in chosen]
-        scene = ErrorMap(here, where, np.array(kind, dtype=np.str_), candidates, placed, range_m=range_m)
-        write_bytes(map_, style.png(town_map(scene)))
+        place_inputs.check_inside(here, given, errors, poles)
+    if budget is not None and not given.priced:
+        raise InputError(f"--budget: nothing has a cost; give {poles} a column 'cost', or give --sensors")
+    candidates = place_inputs.build_candidates(given, here if line_of_sight else None, traces)
+    if count is not None or not given.priced:
+        candidates = candidates.at_unit_cost()
+    least: float | None = None
+    if count is not None:
+        result = solve.place_count(candidates, count, method=method.value)
+    elif budget is not None:
+        result = solve.place_budget(candidates, budget, method=method.value)
+    else:
+        result, least = cover_share(candidates, cover or 0.0, method=method.value)
+    limit = budget if budget is not None else float(count or result.cost)
+    conventional = _place_conventionally(candidates, given, limit, here, traces)
+    if map_ is not None and here is not None:
+        _draw(map_, here, given, result, conventional["traffic-density"])
+    cost = given.cost_of(result)
     if as_json:
+        random = place_at_random(candidates, limit)
         print_json(
             {
-                "chosen": [{"pole": pole} for pole in chosen],
+                "chosen": _name(given, result),
                 "covered": result.covered,
                 "covered_weight": result.covered_weight,
                 "upper_bound": result.upper_bound,
                 "optimal": result.optimal,
+                "cost": cost,
+                "cost_lower_bound": least,
+                "marginal_gain": result.marginal_gain,
+                "baselines": {
+                    **{name: _tell(given, placed) for name, placed in conventional.items()},
+                    "random": {"covered": random.covered, "covered_weight": random.covered_weight},
+                },
             }
         )
         return
+    chosen = [f"{each['pole']}" + (f" ({each['sensor']})" if sensors else "") for each in _name(given, result)]
+    typer.echo(f"poles {', '.join(chosen)}")
+    if not sensors:
+        near = np.diff(candidates.covers.indptr).tolist()
+        for number, (pole, errors_near) in enumerate(zip(given.ids, near, strict=True)):
+            placed = ", placed" if number in result.chosen else ""
+            typer.echo(f"    pole {pole}: {errors_near} errors within {range_m:g} m{placed}")
     proof = "optimal" if result.optimal else f"at most {result.upper_bound:.6g} can be covered"
-    typer.echo(f"poles {', '.join(map(str, chosen))}")
-    for pole, near in zip(ids, placement.coverage(where, mounts, range_m).sum(axis=1).tolist(), strict=True):
-        typer.echo(f"    pole {pole}: {near} errors within {range_m:g} m{', placed' if pole in chosen else ''}")
-    typer.echo(f"cover {result.covered} of {mistakes.num_rows} errors, weight {result.covered_weight:.6g} ({proof})")
+    if least is not None and not result.optimal:
+        proof = f"at least {least:.6g} has to be spent for that"
+    told = "" if cost is None else f", cost {cost:.6g}"
+    typer.echo(
+        f"cover {result.covered} of {len(given.errors)} errors, weight {result.covered_weight:.6g}{told} ({proof})"
+    )
+    for name, placed in conventional.items():
+        if placed is not None:
+            typer.echo(f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.6g}")
 
 
-def _check_near(town: "Town", places: "NDArray[np.float64]", file: Path) -> None:
-    """Raise `InputError` naming the first of `places` (N, 3) [m] of `file` that no map of the town can show."""
+def _place_conventionally(
+    candidates: "Candidates", given: "Given", limit: float, town: "Town | None", traces: "list[Trace]"
+) -> "dict[str, Placement | None]":
+    """Return the placements by visible objects and by traffic density; None where town or traffic is not given."""
     import numpy as np
 
-    from flcav.config import InputError
+    from flcav.optimization.placement.baselines import place_by_score
+    from flcav.world.line_of_sight import count_visible_actors
+    from flcav.world.map.census import measure_traffic_density
 
-    low_x, low_y, high_x, high_y = town.bounds
-    middle, reach_m = np.array([low_x + high_x, low_y + high_y]) / 2, FAR * max(high_x - low_x, high_y - low_y)
-    far = np.flatnonzero((np.abs(places[:, :2] - middle) > reach_m).any(axis=1))
-    if len(far):
-        x, y = places[far[0], :2]
-        raise InputError(f"{file}: row {far[0] + 1} lies at {x:g}, {y:g}, far from {town.name}")
+    ranges = given.ranges_m[candidates.order].tolist()
+    density = visible = None
+    if traces:
+        near = [measure_traffic_density(given.poles, traces, range_m) for range_m in ranges]
+        density = place_by_score(candidates, np.stack(near, axis=1).ravel(), limit)
+        if town is not None:
+            seen = count_visible_actors(town, traces, given.poles, ranges)
+            visible = place_by_score(candidates, seen.ravel(), limit)
+    return {"visible-objects": visible, "traffic-density": density}
+
+
+def _name(given: "Given", placed: "Placement") -> "list[dict[str, Json]]":
+    return [
+        {"pole": given.ids[pole], "sensor": given.names[sensor]}
+        for pole, sensor in zip(placed.chosen, placed.sensors, strict=True)
+    ]
+
+
+def _tell(given: "Given", placed: "Placement | None") -> "Json":
+    if placed is None:
+        return None
+    return {"chosen": _name(given, placed), "covered": placed.covered, "covered_weight": placed.covered_weight}
+
+
+def _draw(path: Path, town: "Town", given: "Given", placed: "Placement", densest: "Placement | None") -> None:
+    """Write the map of the errors, the poles, and the placement beside the conventional one."""
+    from flcav.files import write_bytes
+    from flcav.report import style
+    from flcav.report.charts.figures import town_map
+    from flcav.report.pictures.maps import ErrorMap
+
+    names = [str(pole) for pole in given.ids]
+    ranges = {names[pole]: float(given.ranges_m[sensor]) for pole, sensor in zip(placed.chosen, placed.sensors)}
+    conventional = () if densest is None else tuple(names[pole] for pole in densest.chosen)
+    scene = ErrorMap(
+        town, given.errors, given.kind, dict(zip(names, given.poles, strict=True)), ranges, conventional, heat=True
+    )
+    write_bytes(path, style.png(town_map(scene)))

@@ -18,7 +18,8 @@ EXTENT: clouds.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of 
 def town_map(scene: maps.ErrorMap) -> Figure:
     """Return the map of a town with candidate poles, registered errors, and the range of the chosen poles."""
     x_low, y_low, x_high, y_high = scene.town.bounds
-    figure = style.canvas(WIDTH, WIDTH * (y_high - y_low) / (x_high - x_low) + 0.3)
+    bar = 0.9 if scene.heat else 0.0  # [inch] beside the map
+    figure = style.canvas(WIDTH + bar, WIDTH * (y_high - y_low) / (x_high - x_low) + 0.3)
     axes = figure.add_subplot()
     maps.draw_errors(axes, scene)
     style.key(figure, axes.get_legend_handles_labels()[0])

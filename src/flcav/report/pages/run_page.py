@@ -128,9 +128,8 @@ def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
         np.array([(error.x, error.y, error.z) for error in errors]).reshape(-1, 3),
         np.array([error.kind for error in errors], dtype=np.str_),
         {number: at for number, at in maps.poles_of(town).items() if int(number) in {p.pole for p in placed.poles}},
-        tuple(str(pole) for pole in placed.chosen),
-        str(placed.densest),
-        placed.range_m,
+        {str(pole): placed.range_m for pole in placed.chosen},
+        (str(placed.densest),),
     )
 
 

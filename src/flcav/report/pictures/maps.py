@@ -1,15 +1,18 @@
 """The map of a town with registered errors, candidate poles and the chosen ones."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection, PolyCollection
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from flcav.geometry import Boxes
 from flcav.report import style
@@ -34,6 +37,9 @@ KINDS = {
 }
 NOTE_M = 15.0  # approximate distance of a note from its pole
 WIDE = 3.0  # width of a note, divided by its height
+CELL_M = 2.0  # of the map of the errors' density
+BLUR_M = 12.0  # standard deviation of its smoothing: half of a crossing
+HEAT = LinearSegmentedColormap.from_list("heat", ["#fff3e0", "#f6b26b", "#c0392b"])
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
@@ -45,9 +51,9 @@ class ErrorMap:
     errors: Array  # (E, 3) world [m]
     kind: NDArray[np.str_]  # (E,) a key of KINDS, or a kind of a user's own
     poles: Mapping[str, Array]  # candidate sites by id: (3,) world [m]
-    chosen: Collection[str] = ()  # ids of the poles that were placed
-    densest: str | None = None  # id of the pole with most actors within range
-    range_m: float = 0.0  # of the sensors that were placed
+    chosen: Mapping[str, float] = field(default_factory=dict)  # poles with a sensor: its range [m] by the pole's id
+    densest: Collection[str] = ()  # ids of the poles with most actors within range
+    heat: bool = False  # whether to show the density of the errors
 
 
 def poles_of(town: Town) -> dict[str, Array]:
@@ -74,11 +80,13 @@ def draw_town(axes: Axes, town: Town) -> None:
 def draw_errors(axes: Axes, scene: ErrorMap) -> None:
     """Draw the town, its registered errors and its poles: the chosen ones with their range, the densest as a square."""
     draw_town(axes, scene.town)
-    for number in scene.chosen:
+    if scene.heat and len(scene.errors):
+        draw_density(axes, scene)
+    for number, range_m in scene.chosen.items():
         at = scene.poles[number]
-        reach = np.sqrt(max(scene.range_m**2 - at[2] ** 2, 0.0))  # of the sphere, at ground level
-        axes.add_patch(Circle(tuple(at[:2]), reach, facecolor=style.BLUE, alpha=0.10, linewidth=0))
-        axes.add_patch(Circle(tuple(at[:2]), reach, fill=False, edgecolor=style.BLUE, linewidth=1.2))
+        reach = np.sqrt(max(range_m**2 - at[2] ** 2, 0.0))  # of the sphere, at ground level
+        axes.add_patch(Circle(tuple(at[:2]), reach, facecolor=style.BLUE, alpha=0.10, linewidth=0, zorder=1.5))
+        axes.add_patch(Circle(tuple(at[:2]), reach, fill=False, edgecolor=style.BLUE, linewidth=1.2, zorder=1.5))
     for kind in dict.fromkeys([*KINDS, *scene.kind.tolist()]):
         label, look = KINDS.get(kind, (kind, OTHER))
         xyz = scene.errors[scene.kind == kind]
@@ -87,13 +95,29 @@ def draw_errors(axes: Axes, scene: ErrorMap) -> None:
         axes.plot(*xyz[:, :2].T, linestyle="none", label=f"{label} ({len(xyz)})", **look)
     notes: list[Array] = []  # their positions (2,)
     for number, (x, y, _) in scene.poles.items():
-        chosen, densest = number in scene.chosen, number == scene.densest
+        chosen, densest = number in scene.chosen, number in scene.densest
         face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)
         axes.plot(x, y, "s" if densest else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
         axes.text(x, y, number, ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
         if note := " and ".join(word for word, said in (("placed", chosen), ("densest traffic", densest)) if said):
             others = [xyz[:2] for other, xyz in scene.poles.items() if other != number]
             notes.append(_write_beside(axes, note, np.array([x, y]), np.array([*others, *notes]).reshape(-1, 2)))
+
+
+def draw_density(axes: Axes, scene: ErrorMap) -> None:
+    """Draw the errors per hectare, smoothed by a Gaussian of BLUR_M, with a colour bar."""
+    x_low, y_low, x_high, y_high = scene.town.bounds
+    columns, rows = (max(round(size / CELL_M), 1) for size in (x_high - x_low, y_high - y_low))
+    counts = np.histogram2d(
+        scene.errors[:, 1], scene.errors[:, 0], (rows, columns), ((y_low, y_high), (x_low, x_high))
+    )[0]
+    per_hectare = gaussian_filter(counts, BLUR_M / CELL_M, mode="constant") * 1e4 / CELL_M**2
+    x, y = (low + CELL_M / 2 + CELL_M * np.arange(n) for low, n in ((x_low, columns), (y_low, rows)))
+    levels = MaxNLocator(6).tick_values(0.0, float(per_hectare.max()))[1:]  # the least dense zone is left blank
+    zones = axes.contourf(x, y, per_hectare, levels, cmap=HEAT, alpha=0.8, zorder=1.2, extend="neither")
+    bar = axes.figure.colorbar(zones, ax=axes, shrink=0.6, pad=0.02, aspect=25)
+    bar.set_label("errors per hectare", color=style.MUTED)
+    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
 
 
 def _write_beside(axes: Axes, note: str, at: Array, others: Array) -> Array:

@@ -1,0 +1,172 @@
+"""The inputs of `flcav place`: tables of errors, poles and sensors, and the world in which they stand."""
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from flcav.cli.tables import numbers, read_table
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.optimization.placement.instance import find_covered
+from flcav.optimization.placement.solve import Candidates, Placement, find_candidates
+from flcav.perception.errors import CLASS
+from flcav.world.line_of_sight import find_visible
+from flcav.world.map.town import Town, load_town
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+
+AXES = ("x", "y", "z")
+FACTORS = ("weight", "severity", "exposure")  # columns of errors whose product is an error's weight
+ERRORS = (*AXES, *FACTORS, CLASS, "kind", "returns", "occlusion", "scene", "track")
+POLES = ("id", *AXES, "cost", "yaw_deg", "kind")
+SENSORS = ("name", "range_m", "cost")
+FAR = 10  # times the size of a town: errors beyond are on no map of it
+
+
+@dataclass(frozen=True)
+class Given:
+    """Errors, poles and sensors as the user gave them."""
+
+    errors: Array  # (E, 3) world [m]
+    weight: Array  # (E,)
+    kind: NDArray[np.str_]  # (E,)
+    ids: tuple[int | str, ...]  # (P,) of the poles
+    poles: Array  # (P, 3) world [m]
+    pole_cost: Array  # (P,)
+    names: tuple[str | None, ...]  # (S,) of the sensors; None: of --range
+    ranges_m: Array  # (S,)
+    sensor_cost: Array  # (S,)
+    priced: bool  # whether anything has a cost
+
+    def cost_of(self, placed: Placement) -> float | None:
+        """Return what a placement costs; None where nothing has a cost."""
+        if not self.priced:
+            return None
+        return float(self.pole_cost[list(placed.chosen)].sum() + self.sensor_cost[list(placed.sensors)].sum())
+
+
+def read_given(
+    errors: Path, poles: Path, sensors: Path | None, range_m: float | None, class_weights: Sequence[str]
+) -> Given:
+    """Return the tables; raises `InputError` for files, columns, numbers, ids and factors that are wrong."""
+    mistakes, sites = _read(errors, AXES, ERRORS), _read(poles, ("id", *AXES), POLES)
+    ids = tuple(sites["id"].to_pylist())
+    _check_unique(ids, poles, "poles", "id")
+    pole_cost = _costs(sites, poles)
+    names, ranges, sensor_cost = (None,), np.array([range_m], np.float64), np.zeros(1)
+    if sensors is not None:
+        kinds = _read(sensors, SENSORS, SENSORS)
+        names, sensor_cost = tuple(map(str, kinds["name"].to_pylist())), _costs(kinds, sensors)
+        _check_unique(names, sensors, "sensors", "name")
+        ranges = numbers(kinds, ("range_m",), sensors)[:, 0]
+    kind = mistakes["kind"].to_pylist() if "kind" in mistakes.column_names else ["error"] * mistakes.num_rows
+    return Given(
+        errors=numbers(mistakes, AXES, errors),
+        weight=_weigh(mistakes, errors, class_weights),
+        kind=np.array(kind, dtype=np.str_),
+        ids=ids,
+        poles=numbers(sites, AXES, poles),
+        pole_cost=pole_cost,
+        names=names,
+        ranges_m=ranges,
+        sensor_cost=sensor_cost,
+        priced=sensors is not None or "cost" in sites.column_names,
+    )
+
+
+def read_world(data: Path | None, town: str | None) -> tuple[Town | None, list[Trace]]:
+    """Return the town that is named, or else the dataset's, and the traffic of the dataset's scenes."""
+    if data is None:
+        return (None if town is None else load_town(town)), []
+    dataset = Dataset.open(data)
+    scenes = sorted({key.scene for key in dataset.keys})
+    traces = [trace for scene in scenes if (trace := dataset.trace(scene)) is not None]
+    return (dataset.town() if town is None else load_town(town)), traces
+
+
+def check_inside(town: Town, given: Given, errors: Path, poles: Path) -> None:
+    """Raise `InputError` for a pole outside the town, or an error that no map of it can show."""
+    low, high = np.array(town.bounds).reshape(2, 2)
+    reach_m = FAR * float((high - low).max())
+    far = np.flatnonzero((np.abs(given.errors[:, :2] - (low + high) / 2) > reach_m).any(axis=1))
+    out = np.flatnonzero(((given.poles[:, :2] < low) | (given.poles[:, :2] > high)).any(axis=1))
+    for file, rows, places, where in (
+        (errors, far, given.errors, "far from"),
+        (poles, out, given.poles, "outside"),
+    ):
+        if len(rows):
+            x, y = places[rows[0], :2]
+            raise InputError(f"{file}: row {rows[0] + 1} lies at {x:g}, {y:g}, {where} {town.name}")
+
+
+def build_candidates(given: Given, town: Town | None, traces: Sequence[Trace]) -> Candidates:
+    """Return every sensor on every pole; with a `town` each covers only what it sees there, past the traffic."""
+    visible = None
+    if town is not None:
+        visible = find_covered(given.errors, given.poles, [given.ranges_m.max()])
+        pole, error = np.repeat(np.arange(len(given.ids)), np.diff(visible.indptr)), visible.indices.astype(np.int64)
+        seen = find_visible(town, traces, given.poles, given.errors, (pole, error))
+        visible = csr_array((seen.astype(np.float64), visible.indices, visible.indptr), shape=visible.shape)
+    return find_candidates(
+        given.errors,
+        given.poles,
+        given.ranges_m,
+        weight=given.weight,
+        pole_cost=given.pole_cost,
+        sensor_cost=given.sensor_cost,
+        visible=visible,
+    )
+
+
+def _read(path: Path, needed: Sequence[str], known: Sequence[str]) -> pa.Table:
+    table = read_table(path, needed)
+    if unknown := [name for name in table.column_names if name not in known]:
+        raise InputError(f"{path}: unknown column '{unknown[0]}'; known are {', '.join(known)}")
+    return table
+
+
+def _check_unique(names: Sequence[Hashable], path: Path, what: str, column: str) -> None:
+    first: dict[Hashable, int] = {}
+    for row, name in enumerate(names):
+        if name in first:
+            raise InputError(f"{path}: rows {first[name] + 1} and {row + 1} are two {what} of the {column} {name!r}")
+        first[name] = row
+
+
+def _costs(table: pa.Table, path: Path) -> Array:
+    return numbers(table, ("cost",), path)[:, 0] if "cost" in table.column_names else np.zeros(table.num_rows)
+
+
+def _weigh(mistakes: pa.Table, path: Path, class_weights: Sequence[str]) -> Array:
+    """Return the weights of errors (E,): the product of their FACTORS and the factor of their class."""
+    given = [name for name in FACTORS if name in mistakes.column_names]
+    weight = numbers(mistakes, given, path).prod(axis=1)
+    factors = _parse_factors(class_weights)
+    if not factors:
+        return weight
+    if CLASS not in mistakes.column_names:
+        raise InputError(f"--class-weight: {path} has no column '{CLASS}'")
+    labels = [str(label) for label in mistakes[CLASS].to_pylist()]
+    if unknown := [name for name in factors if name not in labels]:
+        raise InputError(f"--class-weight: no error in {path} is of the class {unknown[0]!r}")
+    return weight * np.array([factors.get(label, 1.0) for label in labels])
+
+
+def _parse_factors(class_weights: Sequence[str]) -> Mapping[str, float]:
+    factors: dict[str, float] = {}
+    for said in class_weights:
+        name, sign, number = said.rpartition("=")
+        try:
+            factor = float(number) if sign and name else np.nan
+        except ValueError:
+            factor = np.nan
+        if not (0 <= factor < np.inf) or name in factors:
+            raise InputError(f"--class-weight {said}: write CLASS=FACTOR, a number from 0 on, and each class once")
+        factors[name] = factor
+    return factors

@@ -1,0 +1,55 @@
+"""Conventional placements: by a score of each candidate, such as its traffic, and at random."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.optimization.placement.instance import TIE, Array
+from flcav.optimization.placement.solve import Candidates, Placement, describe
+from flcav.seeds import stream
+
+DRAWS = 200
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What random placements cover on average."""
+
+    covered: float  # errors
+    covered_weight: float
+
+
+def place_by_score(candidates: Candidates, score: Array, budget: float) -> Placement:
+    """Return the placement of the candidates of greatest `score` (P * S,) over cost that fit into `budget`.
+
+    Overlap plays no part; among equals the earlier candidate. Candidates of the cost 1 make it a number of sensors.
+    `upper_bound` is the covered weight: nothing is proven.
+    """
+    order = np.argsort(-score / np.maximum(candidates.cost, TIE), kind="stable")
+    chosen = _fill(candidates, order, budget)
+    return describe(candidates, chosen, bound=0.0, optimal=False)
+
+
+def place_at_random(candidates: Candidates, budget: float, draws: int = DRAWS, seed: int = 0) -> Expected:
+    """Return the mean coverage of `draws` random placements: candidates in random order, as long as they fit."""
+    random = stream(seed, "random-placements")
+    errors, weight = np.zeros(draws), np.zeros(draws)
+    for draw in range(draws):
+        chosen = _fill(candidates, random.permutation(len(candidates.cost)), budget)
+        covered = np.bincount(candidates.covers[chosen].indices, minlength=len(candidates.weight)) > 0
+        errors[draw], weight[draw] = covered.sum(), candidates.weight[covered].sum()
+    return Expected(float(errors.mean()), float(weight.mean()))
+
+
+def _fill(candidates: Candidates, order: NDArray[np.int64], budget: float) -> list[int]:
+    """Return the candidates of `order` that still fit when it is their turn, one a pole, ascending."""
+    cheapest, spent, taken = float(candidates.cost.min()), 0.0, {}
+    for candidate in order.tolist():
+        if spent + cheapest > budget * (1 + TIE):
+            break
+        pole = candidate // candidates.sensors
+        if pole not in taken and spent + candidates.cost[candidate] <= budget * (1 + TIE):
+            taken[pole] = candidate
+            spent += float(candidates.cost[candidate])
+    return sorted(taken.values())

@@ -1,0 +1,88 @@
+"""The cheapest roadside sensors that cover a share of the errors: the converse of budgeted maximum coverage.
+
+Small instances are mixed-integer programs. Of large ones a choice is grown greedily, and reduced; the dual of the
+relaxation bounds the cost from below: covered weight <= spare + price * cost, so that cost >= (target - spare) / price.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.optimization.placement.greedy import extend_greedily
+from flcav.optimization.placement.instance import TIE, Instance
+from flcav.optimization.placement.program import bound_by_highs, minimise_cost
+from flcav.optimization.placement.relaxation import relax
+from flcav.optimization.placement.solve import (
+    SEARCHED,
+    WHOLE,
+    Candidates,
+    Method,
+    Placement,
+    describe,
+    improve,
+    keep_candidates,
+)
+
+CUTS = 40  # times that a choice is tried to be made at less cost
+
+
+def cover_share(candidates: Candidates, share: float, *, method: Method = "exact") -> tuple[Placement, float]:
+    """Return the cheapest placement that covers `share` of the errors' weight, and a proven lower bound on its cost.
+
+    `upper_bound` of the placement is the most weight that its cost can cover; `optimal` is whether its cost is proven
+    least. Raises `InputError` where the share is not in (0, 1], or all candidates together cover less.
+    """
+    if not 0 < share <= 1:
+        raise InputError(f"cover = {share}: must be a share of the errors, more than 0 and at most 1")
+    instance, total = candidates.instance(), float(candidates.weight.sum())
+    most = float(instance.weight.sum())
+    if most < share * total * (1 - TIE) or not most:
+        part = most / total if total else 0.0
+        raise InputError(f"cover = {share:g}: sensors on all poles together cover only {part:.4g} of the errors")
+    target = min(share * total, most) * (1 - TIE)
+    chosen, least = minimise(instance, target, method)
+    cost = float(instance.cost[chosen].sum())
+    least = min(least, cost)
+    whole = instance.covers.nnz <= WHOLE
+    bound = bound_by_highs(instance, cost) if whole else relax(instance, cost).bound
+    return describe(candidates, chosen, bound, optimal=cost <= least * (1 + TIE) + TIE), least
+
+
+def minimise(instance: Instance, target: float, method: Method) -> tuple[list[int], float]:
+    """Return the cheapest candidates, ascending, that cover `target` of the weight, and a lower bound on their cost."""
+    chosen = _drop(instance, target, extend_greedily(instance, np.inf, (), target))
+    if method == "exact" and instance.covers.nnz <= WHOLE:
+        best, least = minimise_cost(instance, target)
+        return (chosen if best is None else best), least
+    cost = float(instance.cost[chosen].sum())
+    relaxed = relax(instance, cost)
+    if method == "exact":
+        for _ in range(CUTS):
+            tried = improve(instance, cost * (1 - 1e-3), chosen[:0], relaxed)
+            if instance.value(tried) < target:
+                break
+            chosen = _drop(instance, target, tried)
+            cost = float(instance.cost[chosen].sum())
+        relaxed = relax(instance, cost)
+    price = max(relaxed.price, 1e-300)
+    least = max((target - relaxed.spare) / price, 0.0)
+    if method == "greedy" or cost <= least * (1 + TIE):
+        return chosen, least
+    rest = keep_candidates(instance, least + relaxed.loss / price < cost * (1 - TIE))
+    if rest.covers.nnz > SEARCHED or rest.weight.sum() < target:
+        return chosen, cost if rest.weight.sum() < target else least
+    best, bound = minimise_cost(rest, target, limited=True)
+    if best is not None and instance.cost[best].sum() < cost:
+        chosen, cost = best, float(instance.cost[best].sum())
+    return chosen, max(least, min(bound, cost))
+
+
+def _drop(instance: Instance, target: float, chosen: Sequence[int]) -> list[int]:
+    """Return the choice without those, the dearest first, that `target` does not need."""
+    kept = list(chosen)
+    for candidate in sorted(chosen, key=lambda each: -instance.cost[each]):
+        others = [other for other in kept if other != candidate]
+        if instance.value(others) >= target:
+            kept = others
+    return kept

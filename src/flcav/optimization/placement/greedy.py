@@ -1,0 +1,110 @@
+"""The lazy greedy algorithm of budgeted maximum coverage, and exchanges of the chosen.
+
+A candidate's gain only falls as others are chosen, so that one whose old gain is too small need not be computed anew
+(Minoux 1978). With unit costs the greedy choice covers at least 1 - 1/e of the optimum (Nemhauser, Wolsey and Fisher
+1978; here Euler's number); by gain over cost, or the best single candidate if that covers more, at least (1 - 1/e) / 2
+(Khuller, Moss and Naor 1999). One sensor a pole costs no part of this: ranges are nested, so that a longer one
+replaces a shorter one on its pole, for the difference in cost.
+"""
+
+import heapq
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from flcav.optimization.placement.instance import TIE, Instance, reach
+
+NOTHING = 1e-12  # the least cost that a gain is divided by
+TRIALS = 1000  # exchanges tried at most
+
+
+def choose_greedily(instance: Instance, budget: float) -> list[int]:
+    """Return the candidates of greatest gain over cost within `budget`, or the best single one and what fits beside.
+
+    Ascending; among equals the earliest candidate.
+    """
+    chosen = extend_greedily(instance, budget, ())
+    single = np.where(instance.cost <= budget * (1 + TIE), instance.covers @ instance.weight, 0.0)
+    best = int(np.argmax(single))
+    if single[best] > instance.value(chosen) * (1 + TIE):
+        return extend_greedily(instance, budget, (best,))
+    return chosen
+
+
+def extend_greedily(instance: Instance, budget: float, chosen: Iterable[int], target: float = np.inf) -> list[int]:
+    """Return `chosen` with candidates of greatest gain over cost added while they fit into `budget`, ascending.
+
+    Ends where nothing gains, or where `target` of the weight is covered.
+    """
+    kinds, cost = instance.sensors, instance.cost
+    on = {candidate // kinds: candidate for candidate in chosen}
+    left = np.where(reach(instance.covers, [*on.values()]), 0.0, instance.weight)
+    missing = target - (instance.weight.sum() - left.sum())
+    held = np.zeros(len(cost) // kinds)  # cost of what each pole carries: taken down, it is saved
+    held[[*on]] = cost[[*on.values()]]
+    spent = float(held.sum())
+
+    def price(candidate: int) -> float:
+        return float(cost[candidate] - held[candidate // kinds])
+
+    def fits(candidate: int) -> bool:
+        return spent + price(candidate) <= budget * (1 + TIE)
+
+    def rate(candidate: int) -> float:
+        gain = float(left[instance.covered_by(candidate)].sum())
+        return gain / max(price(candidate), NOTHING)
+
+    gains, prices = instance.covers @ left, cost - np.repeat(held, kinds)
+    rates = gains / np.maximum(prices, NOTHING)
+    useful = np.flatnonzero((gains > 0) & (spent + prices <= budget * (1 + TIE)))
+    heap = list(zip((-rates[useful]).tolist(), useful.tolist(), strict=True))
+    heapq.heapify(heap)
+    while missing > 0:
+        met: list[tuple[float, int]] = []
+        top = 0.0
+        while heap and -heap[0][0] >= top * (1 - TIE):
+            candidate = heapq.heappop(heap)[1]
+            now = rate(candidate) if fits(candidate) else 0.0
+            if now > 0:
+                met.append((now, candidate))
+                top = max(top, now)
+        if not met:
+            break
+        best = min(candidate for now, candidate in met if now >= top * (1 - TIE))
+        for now, candidate in met:
+            if candidate != best:
+                heapq.heappush(heap, (-now, candidate))
+        spent += price(best)
+        on[best // kinds], held[best // kinds] = best, cost[best]
+        groups = instance.covered_by(best)
+        missing -= float(left[groups].sum())
+        left[groups] = 0.0
+        for longer in range(best + 1, (best // kinds + 1) * kinds):  # cheaper now: the shorter one is taken down
+            heapq.heappush(heap, (-rate(longer), longer))
+    return sorted(on.values())
+
+
+def exchange(instance: Instance, budget: float, chosen: Sequence[int]) -> list[int]:
+    """Return `chosen` improved: one or two are taken out and the rest extended, while more weight is covered."""
+    best, value, trials = list(chosen), instance.value(chosen), 0
+    improves = True
+    while improves:
+        improves = False
+        for kept in _without(best):
+            trials += 1
+            if trials > TRIALS:
+                return best
+            tried = extend_greedily(instance, budget, kept)
+            covered = instance.value(tried)
+            if covered > value * (1 + TIE):
+                best, value, improves = tried, covered, True
+                break
+    return best
+
+
+def _without(chosen: Sequence[int]) -> Iterator[list[int]]:
+    """Yield `chosen` without each one, and without each two."""
+    for number in (1, 2):
+        for out in combinations(chosen, number):
+            yield [candidate for candidate in chosen if candidate not in out]

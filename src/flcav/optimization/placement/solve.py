@@ -1,0 +1,276 @@
+"""Budgeted maximum coverage by roadside sensors, with a proven bound on what any other choice covers.
+
+Small instances are mixed-integer programs, solved by HiGHS to the optimum. Of large ones the linear relaxation is
+bounded by its dual (`relaxation.py`), its fractional choice is rounded and improved by exchanges, and candidates
+with which the bound falls below the best choice found are left out (fixing by reduced costs); the program of those that
+remain is small. The relaxation without variables for errors is that of Cordeau, Furini and Ljubic, "Benders
+decomposition for very large scale partial set covering and maximal covering location problems" (EJOR 275, 2019).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array, diags_array
+
+from flcav.config import InputError
+from flcav.optimization.placement.greedy import choose_greedily, exchange, extend_greedily
+from flcav.optimization.placement.instance import TIE, Array, Instance, find_covered, merge_errors, reach
+from flcav.optimization.placement.program import bound_by_highs, maximise_coverage
+from flcav.optimization.placement.relaxation import Relaxation, bound_by, relax
+
+Method = Literal["exact", "greedy"]
+
+FARTHEST_M = 1e9  # largest coordinate and range
+WHOLE = 6000  # covered pairs up to which HiGHS solves the whole program
+SEARCHED = 60_000  # covered pairs up to which it searches what remains of a large one
+SURE = 0.05  # fractional choice from which a candidate is rounded up
+
+
+@dataclass(frozen=True)
+class Placement:
+    """The chosen poles and their sensors, the errors they cover, and a certificate of optimality."""
+
+    chosen: tuple[int, ...]  # indices into the poles, ascending
+    covered: int  # errors within range of a chosen pole
+    covered_weight: float
+    upper_bound: float  # proven: no choice of as many poles, or within the budget, covers more weight
+    optimal: bool  # whether `covered_weight` equals the bound; of `cover_share`, `cost` its own bound
+    sensors: tuple[int, ...] = ()  # index into the sensors of each chosen pole
+    cost: float = 0.0  # of the chosen
+    marginal_gain: tuple[float, ...] = ()  # weight that each of the chosen alone covers: lost if it were left out
+
+
+def coverage(errors: ArrayLike, poles: ArrayLike, range_m: float) -> NDArray[np.bool_]:
+    """Return the coverage matrix (P, E): whether each of the `poles` (P, 3) is within `range_m` of each error (E, 3).
+
+    Positions are in the world frame [m].
+    """
+    sites, places = np.asarray(poles, dtype=np.float64), np.asarray(errors, dtype=np.float64)
+    return np.stack([((places - site) ** 2).sum(axis=1) <= range_m**2 for site in sites])
+
+
+def place(
+    errors: ArrayLike,
+    poles: ArrayLike,
+    range_m: float,
+    count: int,
+    *,
+    weight: ArrayLike | None = None,
+    method: Method = "exact",
+) -> Placement:
+    """Return the `count` of the poles (P, 3) that cover most of the weight (E,) of the errors (E, 3).
+
+    Positions are in the world frame [m]. Without `weight` each error weighs 1. Among equal choices earlier poles are
+    preferred. Raises `InputError` where positions, weights, range, count or method are invalid.
+
+    >>> from flcav import place
+    >>> placed = place([[0, 0, 1], [5, 0, 1], [90, 0, 1]], poles=[[0, 9, 3], [90, 9, 3]], range_m=40, count=1)
+    >>> placed.chosen, placed.covered, placed.optimal
+    ((0,), 2, True)
+    """
+    candidates = find_candidates(errors, poles, [range_m], weight=weight)
+    return place_count(candidates, count, method=method)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Every sensor on every pole: candidate k is the sensor `order[k % S]` on the pole k // S."""
+
+    covers: csr_array  # (P * S, E) 1.0 where a candidate covers an error
+    weight: Array  # (E,) of the errors
+    cost: Array  # (P * S,)
+    order: NDArray[np.int64]  # (S,) numbers of the sensors as they were given, by range
+
+    @property
+    def sensors(self) -> int:
+        """Return the number of kinds of sensors."""
+        return len(self.order)
+
+    @property
+    def poles(self) -> int:
+        """Return the number of poles."""
+        return len(self.cost) // self.sensors
+
+    def at_unit_cost(self) -> "Candidates":
+        """Return the same candidates, each of which costs 1."""
+        return replace(self, cost=np.ones(len(self.cost)))
+
+    def instance(self, method: Method = "exact") -> Instance:
+        """Return the instance with errors merged that the same candidates cover; greedy, not where it takes longest."""
+        if method == "greedy" and self.covers.nnz > SEARCHED:
+            return Instance(self.covers, self.weight, self.cost, self.sensors)
+        return merge_errors(self.covers, self.weight, self.cost, self.sensors)
+
+
+def find_candidates(
+    errors: ArrayLike,
+    poles: ArrayLike,
+    ranges_m: ArrayLike,
+    *,
+    weight: ArrayLike | None = None,
+    pole_cost: ArrayLike | None = None,
+    sensor_cost: ArrayLike | None = None,
+    visible: csr_array | None = None,
+) -> Candidates:
+    """Return all sensors of `ranges_m` (S,) [m] on all `poles` (P, 3), and which of the `errors` (E, 3) each covers.
+
+    Positions are in the world frame [m]; `weight` (E,) is 1 where not given. A candidate costs its pole's (P,) and its
+    sensor's (S,) cost, 0 where not given. An error is covered within the range, and where `visible` (P, E) is not 0.
+    Raises `InputError` where positions, weights, ranges or costs are invalid.
+    """
+    places, sites = _points(errors, "errors"), _points(poles, "poles")
+    weights = np.ones(len(places)) if weight is None else np.asarray(weight, dtype=np.float64)
+    if weights.shape != (len(places),) or not np.all((weights == 0) | (weights >= 1e-9) & (weights <= 1e9)):
+        raise InputError("errors: every weight must be 0, or a number from 1e-09 to 1e+09")
+    ranges = np.asarray(ranges_m, dtype=np.float64)
+    for range_m in ranges.tolist():
+        if not 0 < range_m <= FARTHEST_M:
+            raise InputError(f"range = {range_m}: must be a positive number of metres, at most {FARTHEST_M:g}")
+    of_pole = np.zeros(len(sites)) if pole_cost is None else np.asarray(pole_cost, dtype=np.float64)
+    of_sensor = np.zeros(len(ranges)) if sensor_cost is None else np.asarray(sensor_cost, dtype=np.float64)
+    for name, costs in (("poles", of_pole), ("sensors", of_sensor)):
+        if not np.all((costs == 0) | (costs >= 1e-9) & (costs <= 1e9)):
+            raise InputError(f"{name}: every cost must be 0, or a number from 1e-09 to 1e+09")
+    order = np.lexsort((of_sensor, ranges))
+    covers = find_covered(places, sites, ranges[order])
+    if visible is not None:
+        covers = csr_array(covers * visible[np.repeat(np.arange(len(sites)), len(ranges))])
+        covers.eliminate_zeros()
+    return Candidates(covers, weights, (of_pole[:, None] + of_sensor[order]).ravel(), order)
+
+
+def place_count(candidates: Candidates, count: int, *, method: Method = "exact") -> Placement:
+    """Return the placement of `count` sensors, one a pole, that covers most weight; costs play no part in the choice.
+
+    Raises `InputError` where count or method are invalid.
+    """
+    _check_method(method)
+    if not 1 <= count <= candidates.poles:
+        raise InputError(f"count = {count}: must be from 1 to the number of poles, {candidates.poles}")
+    instance = candidates.at_unit_cost().instance(method)
+    chosen, bound = maximise(instance, float(count), method)
+    kinds = candidates.sensors
+    used = {candidate // kinds for candidate in chosen}
+    unused = [pole * kinds for pole in range(candidates.poles) if pole not in used]
+    chosen = sorted(chosen + unused[: count - len(chosen)])
+    return describe(candidates, _prefer_earlier(instance, chosen), bound)
+
+
+def place_budget(candidates: Candidates, budget: float, *, method: Method = "exact") -> Placement:
+    """Return the placement of sensors, at most one a pole, that covers most weight for at most `budget`.
+
+    Raises `InputError` where the method is invalid, or the budget is below the cheapest candidate.
+    """
+    _check_method(method)
+    if not budget >= candidates.cost.min() * (1 - TIE):
+        raise InputError(f"budget = {budget:g}: the cheapest sensor on a pole costs {candidates.cost.min():g}")
+    if not np.isfinite(budget):
+        raise InputError(f"budget = {budget}: must be a finite number")
+    chosen, bound = maximise(candidates.instance(method), budget, method)
+    return describe(candidates, chosen, bound)
+
+
+def maximise(instance: Instance, budget: float, method: Method) -> tuple[list[int], float]:
+    """Return the candidates, ascending, that cover most weight within `budget`, and a proven bound on that weight."""
+    chosen = choose_greedily(instance, budget)
+    value = instance.value(chosen)
+    if instance.covers.nnz <= WHOLE:
+        bound = bound_by_highs(instance, budget)
+        if method == "greedy" or bound <= value * (1 + TIE):
+            return chosen, bound
+        best, bound = maximise_coverage(instance, budget)
+        return (chosen if best is None else best), bound
+    if method == "greedy":
+        return chosen, bound_of_choice(instance, budget, chosen).bound
+    relaxed = relax(instance, budget, value)
+    chosen = improve(instance, budget, chosen, relaxed)
+    value = instance.value(chosen)
+    rest = keep_candidates(instance, relaxed.bound - relaxed.loss > value * (1 + TIE))
+    if relaxed.bound <= value * (1 + TIE) or rest.covers.nnz > SEARCHED:
+        return chosen, relaxed.bound
+    if not rest.covers.nnz:
+        return chosen, value
+    best, bound = maximise_coverage(rest, budget, limited=True)
+    if best is not None and instance.value(best) > value:
+        chosen, value = best, instance.value(best)
+    return chosen, min(relaxed.bound, max(bound, value))
+
+
+def bound_of_choice(instance: Instance, budget: float, chosen: Sequence[int]) -> Relaxation:
+    """Return the bound that a choice proves: what is covered counts in full, and of the rest what could be afforded."""
+    left = np.where(reach(instance.covers, chosen), 0.0, instance.weight)
+    return bound_by(instance, budget, left, np.zeros(len(instance.cost)))
+
+
+def improve(instance: Instance, budget: float, chosen: Sequence[int], relaxed: Relaxation) -> list[int]:
+    """Return the better of `chosen` and the rounded relaxation, improved by exchanges."""
+    kinds, spent, taken = instance.sensors, 0.0, {}
+    for candidate in np.argsort(-relaxed.share, kind="stable").tolist():
+        fits = spent + instance.cost[candidate] <= budget * (1 + TIE)
+        if relaxed.share[candidate] >= SURE and fits and candidate // kinds not in taken:
+            taken[candidate // kinds] = candidate
+            spent += instance.cost[candidate]
+    rounded = extend_greedily(instance, budget, taken.values())
+    best = max((list(chosen), rounded), key=instance.value)
+    if relaxed.bound <= instance.value(best) * (1 + TIE):
+        return best
+    return exchange(instance, budget, best)
+
+
+def keep_candidates(instance: Instance, kept: NDArray[np.bool_]) -> Instance:
+    """Return the instance in which only the candidates `kept` (N,) cover anything, its groups merged anew."""
+    covers = csr_array(diags_array(kept.astype(np.float64)) @ instance.covers)
+    covers.eliminate_zeros()
+    return merge_errors(covers, instance.weight, instance.cost, instance.sensors)
+
+
+def describe(candidates: Candidates, chosen: Sequence[int], bound: float, optimal: bool | None = None) -> Placement:
+    """Return the placement of the `chosen` candidates, with the proven `bound` on the weight that could be covered."""
+    times = np.bincount(candidates.covers[np.asarray(chosen, np.int64)].indices, minlength=len(candidates.weight))
+    weight = float(candidates.weight[times > 0].sum())
+    exact = bound <= weight * (1 + TIE) + TIE
+    once = np.where(times == 1, candidates.weight, 0.0)
+    return Placement(
+        chosen=tuple(candidate // candidates.sensors for candidate in chosen),
+        covered=int((times > 0).sum()),
+        covered_weight=weight,
+        upper_bound=weight if exact else float(bound),
+        optimal=exact if optimal is None else optimal,
+        sensors=tuple(int(candidates.order[candidate % candidates.sensors]) for candidate in chosen),
+        cost=float(candidates.cost[np.asarray(chosen, np.int64)].sum()),
+        marginal_gain=tuple((candidates.covers[np.asarray(chosen, np.int64)] @ once).tolist()),
+    )
+
+
+def _check_method(method: str) -> None:
+    if method not in ("exact", "greedy"):
+        raise InputError(f"method = {method!r}: must be exact or greedy")
+
+
+def _points(values: ArrayLike, name: str) -> Array:
+    points = np.asarray(values, dtype=np.float64)
+    if points.size == 0:
+        raise InputError(f"{name}: there are none")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{name}: expected rows of x, y, z, found an array of shape {points.shape}")
+    odd = np.flatnonzero(~(np.abs(points) <= FARTHEST_M).all(axis=1))
+    if len(odd):
+        raise InputError(f"{name}: row {int(odd[0]) + 1} is not finite, or farther than {FARTHEST_M:g} m")
+    return points
+
+
+def _prefer_earlier(instance: Instance, chosen: Sequence[int]) -> list[int]:
+    """Return the choice with each candidate replaced by the earliest one, of a free pole, that loses no weight."""
+    best, kinds = instance.value(chosen), instance.sensors
+    chosen = list(chosen)
+    for candidate in sorted(chosen):
+        others = [other for other in chosen if other != candidate]
+        covered = reach(instance.covers, others)
+        gain = instance.covers @ np.where(covered, 0.0, instance.weight)
+        equal = np.flatnonzero(instance.weight[covered].sum() + gain >= best * (1 - TIE))
+        taken = {other // kinds for other in others}
+        chosen = sorted([*others, next(int(k) for k in equal if k // kinds not in taken)])
+    return chosen

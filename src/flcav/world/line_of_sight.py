@@ -1,0 +1,101 @@
+"""Line of sight from poles through a town and its traffic, by rays.
+
+A ray starts START_M from the pole's mount, outside its own mast, and ends before the surface of what it looks for.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.world.map.town import Town
+from flcav.world.scene import Scene
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+
+START_M = 0.6  # from the mount to the start of a ray
+END_M = 2.5  # from an error's position to the end of a ray: half of a long car may lie between
+INSTANTS = 20  # at which traffic is looked at, over all traces
+
+
+def find_visible(
+    town: Town,
+    traces: Sequence[Trace],
+    sites: Array,
+    places: Array,
+    pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
+) -> NDArray[np.bool_]:
+    """Return (M,) whether each pair's site (P, 3) sees its place (E, 3), at half of the instants or more.
+
+    `pairs` are the M rows of `sites` and of `places`, world frame [m]. Without `traces` only the town is in the way.
+    """
+    origins, directions, lengths = _rays(sites[pairs[0]], places[pairs[1]])
+    far = np.maximum(lengths - START_M - END_M, 0.0).astype(np.float32)
+    seen, instants = np.zeros(len(far), np.int64), 0
+    for scene in _instants(town, traces or [_no_traffic(town)]):
+        seen += ~scene.find_occluded(origins, directions, far)
+        instants += 1
+    return 2 * seen >= instants
+
+
+def count_visible_actors(town: Town, traces: Sequence[Trace], sites: Array, ranges_m: Sequence[float]) -> Array:
+    """Return (P, S): the mean number of actors within each of `ranges_m` of each site (P, 3) that it sees.
+
+    An actor is seen where the ray to the centre of its box is free up to half of its length before it.
+    """
+    total, instants = np.zeros((len(sites), len(ranges_m))), 0
+    for scene in _instants(town, traces):
+        size = scene.trace.size
+        here = np.flatnonzero(scene.trace.present[scene.index])
+        centre = scene.poses()[here, :3] + np.array([0.0, 0.0, 0.5]) * size[here, 2:]
+        site, actor = (each.ravel() for each in np.indices((len(sites), len(here))))
+        origins, directions, lengths = _rays(sites[site], centre[actor])
+        near = lengths <= max(ranges_m)
+        body = np.hypot(*size[here[actor], :2].T) / 2
+        far = np.where(near, np.maximum(lengths - START_M - body, 0.0), 0.0).astype(np.float32)
+        seen = near & ~scene.find_occluded(origins, directions, far)
+        for kind, range_m in enumerate(ranges_m):
+            total[:, kind] += np.bincount(site[seen & (lengths <= range_m)], minlength=len(sites))
+        instants += 1
+    return total / max(instants, 1)
+
+
+def _rays(starts: Array, ends: Array) -> tuple[NDArray[np.float32], NDArray[np.float32], Array]:
+    """Return origins (M, 3), unit directions (M, 3) and whole lengths (M,) [m] of rays from `starts` to `ends`."""
+    along = ends - starts
+    lengths = np.linalg.norm(along, axis=1)
+    directions = along / np.maximum(lengths, 1e-9)[:, None]
+    return (starts + START_M * directions).astype(np.float32), directions.astype(np.float32), lengths
+
+
+def _instants(town: Town, traces: Sequence[Trace]) -> Iterator[Scene]:
+    """Yield the scenes of about INSTANTS instants, evenly spread over each trace; each is the same object moved on."""
+    each = max(INSTANTS // max(len(traces), 1), 1)
+    for trace in traces:
+        scene = Scene(town, trace)
+        for index in np.unique(np.linspace(0, len(trace.time_s) - 1, each).round().astype(np.int64)).tolist():
+            scene.move_to(index)
+            yield scene
+
+
+def _no_traffic(town: Town) -> Trace:
+    """Return the trace of one instant without actors."""
+    none, instant = np.zeros((1, 0)), np.zeros((1, 0, 3))
+    words = np.array([], np.str_)
+    return Trace(
+        town=town.name,
+        time_s=np.zeros(1),
+        actor=words,
+        category=words,
+        shape=np.zeros(0, np.int64),
+        size=np.zeros((0, 3)),
+        present=np.zeros((1, 0), np.bool_),
+        position=instant,
+        yaw=none,
+        velocity=instant,
+        acceleration=instant,
+        yaw_rate=none,
+        light=words,
+        light_state=np.zeros((1, 0), np.str_),
+    )
