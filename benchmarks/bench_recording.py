@@ -202,7 +202,11 @@ def encodings() -> dict[str, dict[str, float]]:
 
         return save
 
-    raw_depth = image.depth_m.tobytes()
+    assert image.depth_m is not None
+    assert image.semantic is not None
+    assert image.instance is not None
+    depth, semantic, instance = image.depth_m, image.semantic, image.instance
+    raw_depth = depth.tobytes()
     ways: dict[str, Callable[[], bytes]] = {
         "rgb: WebP lossless (chosen)": lambda: encode_plane("rgb", image.rgb),
         "rgb: PNG level 1": saved(image.rgb, "png", compress_level=1),
@@ -210,10 +214,10 @@ def encodings() -> dict[str, dict[str, float]]:
         "rgb: JPEG 95 4:4:4": saved(image.rgb, "jpeg", quality=95, subsampling=0),
         "rgb: JPEG 98 4:4:4": saved(image.rgb, "jpeg", quality=98, subsampling=0),
         "rgb: WebP 95": saved(image.rgb, "webp", quality=95, method=0),
-        "depth: 14 bits, shuffled, zstd (chosen)": lambda: encode_plane("depth_m", image.depth_m),
+        "depth: 14 bits, shuffled, zstd (chosen)": lambda: encode_plane("depth_m", depth),
         "depth: float32, zstd": lambda: pa.Codec("zstd", compression_level=1).compress(raw_depth, asbytes=True),
-        "semantic: PNG level 1 (chosen)": lambda: encode_plane("semantic", image.semantic),
-        "instance: PNG level 1 (chosen)": lambda: encode_plane("instance", image.instance),
+        "semantic: PNG level 1 (chosen)": lambda: encode_plane("semantic", semantic),
+        "instance: PNG level 1 (chosen)": lambda: encode_plane("instance", instance),
     }
     rows = {}
     for (name, way), taken in zip(ways.items(), cpu_ms(list(ways.values()), 9)):

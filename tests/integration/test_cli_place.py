@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pyarrow.csv
 import pyarrow.parquet as pq
@@ -19,7 +20,7 @@ def called(*arguments: object) -> int:
     return int(stopped.value.code or 0)
 
 
-def at_random() -> dict[str, float]:
+def at_random() -> dict[str, Any]:
     """What one of the two poles covers on average: 2 errors of the weight 1, or one of 5; about half of the draws."""
     return {"covered": pytest.approx(1.5, abs=0.1), "covered_weight": pytest.approx(3.5, abs=0.3)}
 

@@ -110,7 +110,10 @@ def test_every_sensor_comes_back(recorded: Path, frames: list[Frame]):
         for name, image in frame.images.items():
             for plane in ("rgb", "semantic", "instance"):
                 np.testing.assert_array_equal(getattr(stored.images[name], plane), getattr(image, plane))
-            np.testing.assert_allclose(stored.images[name].depth_m, image.depth_m, rtol=2.0**-15)
+            depth = stored.images[name].depth_m
+            assert depth is not None
+            assert image.depth_m is not None
+            np.testing.assert_allclose(depth, image.depth_m, rtol=2.0**-15)
             np.testing.assert_array_equal(dataset.plane(i, name, "rgb"), image.rgb)
 
 

@@ -64,7 +64,7 @@ def test_the_spread_is_the_standard_deviation_of_several_trainings():
 def test_pooled_spreads_are_those_of_trainings_around_their_own_means():
     rng = np.random.default_rng(3)
     sets = [rng.normal(mean, 0.03, size) for mean, size in ((0.2, 4000), (0.7, 9000))]
-    found = pool_spreads([measure_spread(each) for each in sets])
+    found = pool_spreads([Spread(float(each.std(ddof=1)), len(each)) for each in sets])
     around = np.concatenate([each - each.mean() for each in sets])
     assert (found.sd, found.trainings) == (pytest.approx(around.std(ddof=2)), len(around) - 1)
 

@@ -129,7 +129,9 @@ class PaintedSource:
                 signs={name: _signs() for name in cameras},
             ),
             images={name: picture.image for name, picture in pictures.items()},
-            infrared={name: 28_000 + pictures["front"].image.instance for name in optical if name not in pictures},
+            infrared={
+                name: 28_000 + np.asarray(pictures["front"].image.instance) for name in optical if name not in pictures
+            },
             radar={"radar": radar} if agent == "cav0" else {},
             gnss={"gnss": np.array([49.001, 8.402, 113.5])} if agent == "cav0" else {},
             weather=WEATHER,

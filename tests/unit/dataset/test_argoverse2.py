@@ -32,7 +32,8 @@ def _write(path: Path, **columns: Any) -> None:
 
 def _placed(rotation: Rotation, places: np.ndarray) -> dict[str, Any]:
     x, y, z, w = np.broadcast_to(rotation.as_quat(), (len(places), 4)).T.tolist()
-    return dict(zip(("qw", "qx", "qy", "qz"), (w, x, y, z))) | dict(zip(("tx_m", "ty_m", "tz_m"), places.T.tolist()))
+    columns = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    return dict[str, Any](zip(columns, (w, x, y, z, *places.T.tolist()), strict=True))
 
 
 def _write_log(folder: Path, *, annotated: bool = True) -> None:

@@ -210,6 +210,7 @@ def test_what_the_camera_shows_is_what_is_annotated(driving: Scene):
     frame = observe(driving, Rig.model_validate(EVERYTHING), "cav0", 0, scene_name="s", seed=1)
     truth, image = frame.annotations, frame.images["front"]
     views = truth.views["front"]
+    assert image.instance is not None
     np.testing.assert_array_equal(np.bincount(image.instance.ravel(), minlength=len(truth) + 1)[1:], views.pixels)
     assert views.pixels[list(truth.track).index("veh1")] > 30
     assert set(truth.points) == {"lidar", "radar"}

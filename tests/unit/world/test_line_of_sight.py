@@ -8,7 +8,7 @@ from flcav.world.line_of_sight import count_visible_actors, find_visible
 HOUSE = np.array([[20.0, 0.0, 0.0, 10.0, 10.0, 10.0]])  # x 15-25, y -5-5, 10 m high
 SITES = np.array([[0.0, 0.0, 5.0], [20.0, 30.0, 5.0]])
 PLACES = np.array([[40.0, 0.0, 1.0], [10.0, 0.0, 1.0], [40.0, 40.0, 1.0]])
-PAIRS = tuple(each.ravel() for each in np.indices((2, 3)))
+PAIRS = (np.array([0, 0, 0, 1, 1, 1]), np.array([0, 1, 2, 0, 1, 2]))
 
 
 def test_a_building_hides_what_is_behind_it(small_town):

@@ -29,7 +29,9 @@ class Instance:
 
     def covered_by(self, candidate: int) -> NDArray[np.int32]:
         """Return the numbers of the groups that a candidate covers."""
-        return self.covers.indices[self.covers.indptr[candidate] : self.covers.indptr[candidate + 1]]
+        return np.asarray(
+            self.covers.indices[self.covers.indptr[candidate] : self.covers.indptr[candidate + 1]], np.int32
+        )
 
     def value(self, chosen: ArrayLike) -> float:
         """Return the weight that the `chosen` candidates cover together."""
@@ -38,7 +40,7 @@ class Instance:
 
 def reach(covers: csr_array, chosen: ArrayLike) -> NDArray[np.bool_]:
     """Return (K,) which columns of `covers` (N, K) the `chosen` rows cover together."""
-    return np.bincount(covers[np.asarray(chosen, np.int64)].indices, minlength=covers.shape[1]) > 0
+    return np.bincount(covers[np.asarray(chosen, np.int64)].indices, minlength=covers.shape[1]) > 0  # pyright: ignore[reportOptionalSubscript]
 
 
 def find_covered(errors: Array, poles: Array, ranges_m: ArrayLike) -> csr_array:
@@ -68,7 +70,7 @@ def merge_errors(covers: csr_array, weights: Array, cost: Array, sensors: int = 
     `covers` (N, E), `weights` (E,) and `cost` (N,) are of single errors. Errors that nobody covers are left out. Groups
     are in the lexical order of their columns.
     """
-    candidates, count = covers.shape
+    candidates, count = covers.shape  # pyright: ignore[reportGeneralTypeIssues]
     width = -(-candidates // 8)
     by, error = np.repeat(np.arange(candidates), np.diff(covers.indptr)), covers.indices.astype(np.int64)
     bits = np.zeros(count * width, np.uint8)

@@ -11,7 +11,7 @@ NODES = 2000  # of the search tree at most, where a limit is asked for
 
 def bound_by_highs(instance: Instance, budget: float) -> float:
     """Return the bound of the linear relaxation on the weight covered within `budget`."""
-    if not instance.covers.shape[1]:
+    if not instance.covers.shape[1]:  # pyright: ignore[reportOptionalSubscript]
         return 0.0
     objective, rows, limits = _program(instance, budget)
     return -float(linprog(objective, A_ub=rows, b_ub=limits, bounds=(0, 1), method="highs").fun)
@@ -44,7 +44,7 @@ def _program(instance: Instance, budget: float) -> tuple[Array, csr_array, Array
 
     A group is covered only where one of its candidates is chosen; the chosen cost at most `budget`, and a pole has one.
     """
-    candidates, groups = instance.covers.shape
+    candidates, groups = instance.covers.shape  # pyright: ignore[reportGeneralTypeIssues]
     rows = [hstack((csr_array(-instance.covers.T.tocsr()), eye_array(groups)))]
     limits = [np.zeros(groups)]
     if np.isfinite(budget):
@@ -53,8 +53,8 @@ def _program(instance: Instance, budget: float) -> tuple[Array, csr_array, Array
     if instance.sensors > 1:
         starts = np.arange(0, candidates + 1, instance.sensors)
         one = csr_array((np.ones(candidates), np.arange(candidates), starts))
-        rows.append(hstack((one, csr_array((one.shape[0], groups)))))
-        limits.append(np.ones(one.shape[0]))
+        rows.append(hstack((one, csr_array((one.shape[0], groups)))))  # pyright: ignore[reportOptionalSubscript]
+        limits.append(np.ones(one.shape[0]))  # pyright: ignore[reportOptionalSubscript]
     return np.r_[np.zeros(candidates), -instance.weight], csr_array(vstack(rows)), np.concatenate(limits)
 
 
@@ -62,7 +62,7 @@ def _solve(
     instance: Instance, objective: Array, rows: csr_array, limits: Array, limited: bool, sign: float
 ) -> tuple[list[int] | None, float]:
     """Return the choice that minimises `objective`, and `sign` times its bound."""
-    candidates, groups = instance.covers.shape
+    candidates, groups = instance.covers.shape  # pyright: ignore[reportGeneralTypeIssues]
     options = {"mip_rel_gap": 0.0} | ({"node_limit": NODES} if limited else {})
     result = milp(
         objective,
