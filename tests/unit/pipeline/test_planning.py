@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,8 @@ from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.plan import MessageSizes, Price, price
 from flcav.optimization.curves.curves import Additive, Federated
+from flcav.optimization.curves.fitting import fit
+from flcav.optimization.curves.held_out import hold_out_runs
 from flcav.optimization.curves.history import History
 from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.objects.model import second_tiny
@@ -33,6 +36,7 @@ from flcav.pipeline.planning import (
     remake_plan,
 )
 from flcav.pipeline.recipe import FixedPlan, Limits
+from flcav.pipeline.seeds.spread import read_spreads
 from flcav.pipeline.tables import append_records
 
 SIZES = MessageSizes(sample_mb=0.4, model_mb=1.4)
@@ -187,6 +191,27 @@ def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> 
     assert {each for joined in after.values() for each in joined} == set(
         range(1, 1 + later.tasks["objects"].cloud_rounds)
     )
+
+
+def test_a_doubled_budget_of_the_demo_moves_its_prediction_by_more_than_trainings_differ() -> None:
+    sizes, spreads = MessageSizes(0.451, 1.348), read_spreads("demo", Path())
+    least = max(spreads["objects", town, "main", "pretrain", "", ""].sd for town in ("grid", "ring"))
+    own = PlanRequest("objects", 1.0, sizes, 320, load_history("objects"), None, 4.4)
+    predicted = []
+    for factor in (1, 2, 4):
+        settings = PlanSettings(Price(80 * factor, 40 * factor), 0.02, Limits(), (4, 3), 1, (320, 240), 40.0)
+        plan = make_plan((own,), settings, "joint")[0].tasks["objects"].predicted
+        assert plan is not None
+        predicted.append(plan["cloud"])
+    assert predicted[1] - predicted[0] > least
+    assert 0 < predicted[2] - predicted[1] < least  # docs/runs.md: where more megabytes end to help
+
+
+def test_runs_of_the_package_s_history_are_predicted_from_the_others() -> None:
+    found = hold_out_runs(load_history("objects"), fit)
+    assert (found.runs, found.points) == (7, 91)
+    assert found.mean_error <= 0.02
+    assert found.rank_correlation > 0.7
 
 
 def test_a_small_pool_limits_the_samples() -> None:
