@@ -154,7 +154,18 @@ def test_weights_come_back_and_those_of_another_task_are_refused(task, tmp_path)
 @each_task
 def test_a_client_is_trainable(task, samples):
     client: Trainable = TaskClient(task, small(task), samples[task.name], batch=2)
-    assert inspect.signature(client.train).parameters.keys() == {"weights", "steps", "learning_rate", "seed"}
+    asked = inspect.signature(client.train).parameters
+    assert {name for name, each in asked.items() if each.default is each.empty} == {
+        "weights",
+        "steps",
+        "learning_rate",
+        "seed",
+    }
+    assert set(asked) - {"weights", "steps", "learning_rate", "seed"} == {
+        "proximal",
+        "shift",
+        "layers",
+    }  # of the strategies that ask for them
     weights = to_arrays(build_network(task, small(task), 1))
     before = {key: array.copy() for key, array in weights.items()}
     one, other = (client.train(weights, steps=1, learning_rate=1e-3, seed=3) for _ in range(2))
