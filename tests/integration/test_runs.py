@@ -331,7 +331,7 @@ def test_a_run_killed_in_pretraining_goes_on_from_its_last_validation(finished: 
         assert (work / "pretrain-objects" / name).read_bytes() == (
             finished / "work/pretrain-objects" / name
         ).read_bytes()
-    assert [each.step for each in Pretrained.load(work / "pretrain-objects").validated] == list(range(1, 13))
+    assert [each.step for each in Pretrained.load(work / "pretrain-objects").validated] == [5, 10]
 
 
 def test_runs_are_compared_on_the_same_frames(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

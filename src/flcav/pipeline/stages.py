@@ -37,7 +37,7 @@ from flcav.progress import Report
 from flcav.seeds import derive_seed, stream
 
 CHECKPOINT, ROUND = "checkpoint.pt", "round.json"
-VALIDATIONS = 10  # during pretraining
+VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def pretrain(
     Writes the weights of the last step. An interrupted training resumes after its last validation.
     """
     task, steps = learning.task, learning.training.steps
-    every = max(steps // VALIDATIONS, 1)
+    every = max(steps // VALIDATIONS, min(APART, steps))
     network = learning.build_network()
     history = train(
         task,
