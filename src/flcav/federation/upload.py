@@ -1,4 +1,4 @@
-"""What a client's update is sent as: named layers alone, and their changes in fewer bits or fewer coordinates.
+"""The form of a client's update on the link: named layers alone, and their changes in fewer bits or fewer coordinates.
 
 Nothing but arrays crosses the link, so that an update's bytes in the ledger are those of its serialised message.
 """

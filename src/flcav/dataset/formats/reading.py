@@ -1,4 +1,4 @@
-"""What readers of other formats share: annotations from boxes, what can be computed of them, and names of agents.
+"""Annotations of frames read from other formats: from boxes, with what can be computed of them; names of agents.
 
 What a format does not say is NaN, or UNKNOWN_PIXELS. Computed are returns (the points in an object's box), velocities
 from tracks, and the rectangles that boxes fill in images.

@@ -29,7 +29,7 @@ TIE = 1e-9  # [s] within which events are at the same time
 
 
 class RoundRules(Config):
-    """When a client is dropped from a round."""
+    """Conditions on which a client is dropped from a round."""
 
     outage_s: float = Field(default=1.0, gt=0, le=3600)  # without a rate: radio link failure, T310 of TS 38.331
     handover_margin_m: float = Field(default=0.0, ge=0, le=1e6)  # another edge server must be nearer by more than this

@@ -1,4 +1,4 @@
-"""What clients do in a round, also by the messages of a ledger."""
+"""The work of clients in a round: bytes down, seconds of training, bytes up; also by the messages of a ledger."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -12,7 +12,7 @@ from flcav.network.ledger import LedgerEntry
 
 @dataclass(frozen=True)
 class ClientWork:
-    """What a client does in a round. Raises `InputError` for a negative number."""
+    """The work of a client in a round. Raises `InputError` for a negative number."""
 
     client: str  # a vehicle of the links
     download_bytes: int  # the model, from its edge server

@@ -14,7 +14,7 @@ DRAWS = 200
 
 @dataclass(frozen=True)
 class Expected:
-    """What random placements cover on average."""
+    """Mean coverage of random placements."""
 
     covered: float  # errors
     covered_weight: float
