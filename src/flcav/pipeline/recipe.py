@@ -66,8 +66,8 @@ class Training(Config):
     batch: int | None = Field(default=None, ge=1, le=4096)  # samples per optimiser step; default: the task's
     steps: int = Field(default=1400, ge=1, le=10**6)  # optimiser steps of pretraining, with the task's own schedule
     local_steps: int = Field(default=16, ge=1, le=10**6)  # optimiser steps of one vehicle in one round
-    local_rate: float = Field(default=0.5, gt=0)  # learning rate of the first round
-    final_rate: float = Field(default=0.1, gt=0)  # learning rate of the last round
+    local_rate: float = Field(default=0.5, gt=0)  # learning rate of the first round after pretraining
+    final_rate: float = Field(default=0.1, gt=0)  # learning rate of their last, and of further rounds after them
     average_rounds: int = Field(default=3, ge=1)  # last rounds of a federation whose models its result averages
 
 

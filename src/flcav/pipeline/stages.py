@@ -63,11 +63,15 @@ class Learning:
         """Return a network with initial weights drawn from the seed."""
         return build_network(self.task, self.config, self.seed)
 
-    def schedule(self, rounds: int, steps: int, *names: str) -> Schedule:
-        """Return the clients' schedule of `rounds` rounds with `steps` local steps; `names` seed the stream."""
+    def schedule(self, rounds: int, steps: int, *names: str, earlier: int = 0) -> Schedule:
+        """Return the clients' schedule of `rounds` rounds with `steps` local steps; `names` seed the stream.
+
+        The learning rate falls over the first rounds after pretraining; where there were `earlier` ones, it stays at
+        its end. Begun anew it costs what the earlier rounds reached: reproductions/runs/retraining.
+        """
         rate, training = self.task.practice.learning_rate, self.training
-        rates = training.local_rate * rate, training.final_rate * rate
-        return Schedule(rounds, steps, *rates, derive_seed(self.seed, *names))
+        first = training.final_rate if earlier else training.local_rate
+        return Schedule(rounds, steps, first * rate, training.final_rate * rate, derive_seed(self.seed, *names))
 
 
 def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) -> dict[str, tuple[int, ...]]:
@@ -331,7 +335,8 @@ def federate_cloud(
         )
         for region, own in regions.items()
     }
-    schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
+    earlier = max(own.earlier for own in regions.values())
+    schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier)
     keep = federating.make_saver(rounds)
     how: Any = {"strategy": strategies.cloud, "rules": rules.of_servers(), "state": state}
     federate(servers, start, schedule, wireline, **how, done=done, on_round=keep)

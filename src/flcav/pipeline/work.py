@@ -290,9 +290,9 @@ def edge_step(
         samples, poles = _label_samples(work, learning, region, labels, steps, book)
     start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
     clients = make_clients(learning, start.config, samples)
-    schedule = learning.schedule(rounds, learning.training.local_steps, stage, region)
-    strategy, _ = find_strategies(how)
     earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
+    schedule = learning.schedule(rounds, learning.training.local_steps, stage, region, earlier=earlier)
+    strategy, _ = find_strategies(how)
     rules = follow_plan(how, own, earlier)
     losses = federate_edge(learning, start, clients, schedule, strategy, rules, earlier, book, work.folder, work.report)
     held = sum(len(client.samples) for client in clients.values())

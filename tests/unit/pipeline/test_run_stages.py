@@ -257,6 +257,14 @@ def test_a_central_control_takes_the_steps_of_all_vehicles_at_the_same_rates(mon
     assert taken[-1]["learning_rate"] == pytest.approx(2e-4)
 
 
+def test_further_rounds_stay_at_the_rate_at_which_the_earlier_ones_ended() -> None:
+    learning = Learning(OBJECTS, "tiny", Training(local_rate=0.5, final_rate=0.1), 3)
+    rate = OBJECTS.practice.learning_rate
+    first, further = learning.schedule(3, 16, "edge", "grid"), learning.schedule(3, 16, "cloud", "", earlier=3)
+    assert [first.work(number).learning_rate / rate for number in (1, 3)] == pytest.approx([0.5, 0.1])
+    assert [further.work(number).learning_rate / rate for number in (1, 2, 3)] == pytest.approx([0.1] * 3)
+
+
 def test_uploads_are_drawn_over_all_pools_and_by_the_seed() -> None:
     pools = {"a": range(10, 20), "b": range(5)}
     chosen = choose_uploads(pools, 9, seed=1)
