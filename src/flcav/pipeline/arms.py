@@ -26,7 +26,13 @@ PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
 PLANNED = ("plan",)  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
 PLACED = ("plan", "placement")  # those that decide where sensors stand
 PRETRAINED = ("plan", "pretraining", "repeat")  # those that decide pretraining
-OF_ROUNDS = ("local_steps", "local_rate", "final_rate", "average_rounds")  # fields of `Training` of federations alone
+OF_ROUNDS = (  # fields of `Training` of federations alone
+    "local_steps",
+    "local_rate",
+    "final_rate",
+    "average_rounds",
+    "start_share",
+)
 LEARNED = ("plan", "training", "repeat", "placement", "labels", "federation")  # those that decide a federation
 
 

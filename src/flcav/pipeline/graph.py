@@ -118,11 +118,12 @@ class Graph:
         for region in self.settings[MAIN].regions:
             trained = self.names.stage(MAIN, stage, region, task)
             frames = self.names.recording(region, "validation", task)
-            averaged = self.settings[MAIN].training[task].average_rounds
-            watched = {"task": task, "region": region, "stage": stage, "trained": trained, "frames": frames}
-            arguments = watched | {"averaged": averaged}
+            training, start = self.settings[MAIN].training[task], self.names.pretrain(MAIN, task)
+            watched = {"task": task, "region": region, "stage": stage, "start": start, "trained": trained}
+            share = training.start_share if stage == EDGE else 0.0
+            arguments = watched | {"frames": frames, "averaged": training.average_rounds, "share": share}
             added.append(self.names.rounds(trained, region))
-            self._add(_step(added[-1], rounds_step, arguments, [trained, frames]))
+            self._add(_step(added[-1], rounds_step, arguments, [start, trained, frames]))
         return added
 
     def _add(self, step: Step) -> None:

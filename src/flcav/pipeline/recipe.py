@@ -69,6 +69,7 @@ class Training(Config):
     local_rate: float = Field(default=0.5, gt=0)  # learning rate of the first round after pretraining
     final_rate: float = Field(default=0.1, gt=0)  # learning rate of their last, and of further rounds after them
     average_rounds: int = Field(default=3, ge=1)  # last rounds of a federation whose models its result averages
+    start_share: float = Field(default=0.3, ge=0, lt=1)  # of the pretrained weights in the result of stage II
 
 
 class FixedPlan(Config):

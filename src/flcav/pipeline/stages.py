@@ -255,13 +255,11 @@ class FederationCheckpoints:
     def _state_path(self, round_: int) -> Path:
         return self._folder / f"state{round_}.safetensors"
 
-    def finish(self, network: Any, rounds: int, averaged: int) -> None:
-        """Write the final weights and the ledger: the mean of the last `averaged` rounds' weights.
-
-        Without rounds, the weights are those of `network`.
-        """
+    def finish(self, start: Any, rounds: int, averaged: int, start_share: float = 0.0) -> None:
+        """Write the ledger and the final weights, see `load_round_network`; without rounds those of `start`."""
+        network = start
         if rounds:
-            network = load_round_network(self._task, network.config, self._folder, rounds, averaged)
+            network = load_round_network(self._task, start, self._folder, rounds, averaged, start_share)
         save_network(self._task, network, self._folder / WEIGHTS)
         self._book.save(self._folder / LEDGER)
 
@@ -291,7 +289,8 @@ def federate_edge(
     keep = federating.make_saver(schedule.rounds)
     how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
     federate(clients, start, schedule, account, **how, done=done, on_round=keep)
-    federating.finish(network, len(federating.losses), learning.training.average_rounds)
+    share = 0.0 if earlier else learning.training.start_share
+    federating.finish(network, len(federating.losses), learning.training.average_rounds, share)
     return tuple(federating.losses)
 
 
@@ -368,11 +367,19 @@ def round_path(folder: Path, round_: int) -> Path:
     return folder / f"round{round_}.safetensors"
 
 
-def load_round_network(task: Task, config: Any, folder: Path, round_: int, averaged: int) -> Any:
-    """Return the network of a federation that ends with a round: the mean of the last `averaged` rounds' weights."""
+def load_round_network(
+    task: Task, start: Any, folder: Path, round_: int, averaged: int, start_share: float = 0.0
+) -> Any:
+    """Return the network of a federation that ends with a round: the mean of the last `averaged` rounds' weights.
+
+    `start_share` of it are the weights of the network `start` that the federation began with, as in Wortsman et al.,
+    Robust fine-tuning of zero-shot models, CVPR 2022, equation 1.
+    """
     last = range(max(round_ - averaged, 0) + 1, round_ + 1)
-    network = task.build(config)
-    from_arrays(network, average([load_file(round_path(folder, number)) for number in last], [1.0] * len(last)))
+    first, rounds = to_arrays(start), [load_file(round_path(folder, number)) for number in last]
+    parts = [first, *({name: own[name] for name in first} for own in rounds)]  # files order names otherwise
+    network = task.build(start.config)
+    from_arrays(network, average(parts, [start_share, *((1 - start_share) / len(last) for _ in last)]))
     return network.eval()
 
 

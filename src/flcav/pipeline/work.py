@@ -389,19 +389,21 @@ def test_step(work: Work, task: str, region: str, trained: str, frames: str, see
     ).save(work.folder)
 
 
-def rounds_step(work: Work, task: str, region: str, stage: str, trained: str, frames: str, averaged: int) -> None:
+def rounds_step(
+    work: Work, task: str, region: str, stage: str, start: str, trained: str, frames: str, averaged: int, share: float
+) -> None:
     """Validate a federation's network after each round on a region's validation frames, used for nothing else.
 
-    The network is that of a federation which ends with this round, the mean of the last `averaged` rounds' weights. A
-    pretrained network is validated as round 0.
+    The network is that of a federation which ends with this round: the mean of the last `averaged` rounds' weights,
+    with `share` of those of the step `start`. A pretrained network is validated as round 0.
     """
     learned, split = task_named(task), Frames.open(work.inputs[frames])
-    last = load_stage_network(learned, work.inputs[trained])
-    networks = {0: last}
+    first = load_stage_network(learned, work.inputs[start])
+    networks = {0: first}
     if stage != PRETRAIN:
         numbers = range(1, StageResult.load(work.inputs[trained]).rounds + 1)
-        folder, config = work.inputs[trained], last.config
-        networks = {each: load_round_network(learned, config, folder, each, averaged) for each in numbers}
+        folder = work.inputs[trained]
+        networks = {each: load_round_network(learned, first, folder, each, averaged, share) for each in numbers}
     rounds = []
     for number, network in networks.items():
         rounds.append(Round(number, score_network(learned, network, split.data, split.vehicles)))

@@ -183,6 +183,10 @@ def test_the_mean_of_the_last_rounds_is_the_federation_s_result(tmp_path: Path) 
         found = load_file(tmp_path / WEIGHTS)
         for name in found:
             np.testing.assert_allclose(found[name], np.mean([each[name] for each in last], axis=0), rtol=1e-6)
+    start = to_arrays(network)
+    federating.finish(network, 3, 2, 0.3)
+    for name, array in load_file(tmp_path / WEIGHTS).items():
+        np.testing.assert_allclose(array, 0.7 * (start[name] + (4 + 9) / 2) + 0.3 * start[name], rtol=1e-6)
 
 
 SAMPLES = [np.float32(number) for number in range(5)]
