@@ -18,6 +18,7 @@ from flcav.federation.rounds import OnRound, Rounds
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust
@@ -61,6 +62,7 @@ def federate(
     done: int = 0,
     earlier: int = 0,
     on_round: OnRound = _ignore,
+    processes: ClientProcesses | None = None,
 ) -> LocalUpdate:
     """Run rounds `done + 1 .. schedule.rounds` of a federation, starting from `weights`.
 
@@ -73,7 +75,9 @@ def federate(
     `on_round` was given, and the state after it.
 
     Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
-    before this one, with the same clients and rules, which count against that budget.
+    before this one, with the same clients and rules, which count against that budget. With `processes`, which have to
+    have the same clients, these train there, several at a time; the weights are the same. Clients are made when they are
+    needed, where `clients` makes them, and of updates no more are in memory than the strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
     no update, and fewer are left than `rules` ask for (by default all), `InputError` where there are no clients, or
@@ -103,8 +107,8 @@ def federate(
     if rounds <= done:
         return LocalUpdate(weights, 0, 0.0)
     state = FederationState() if state is None else state
-    nodes = {name: {CLIENT: name} for name in clients}
-    with EmbeddedGrid(client_app(clients, strategy, rules), nodes, state.clients) as grid:
+    trained, at_once = (clients, 1) if processes is None else (RemoteClients(clients, processes), processes.count)
+    with EmbeddedGrid(client_app(trained, strategy, rules), names, CLIENT, state.clients, at_once) as grid:
 
         def keep(round_: int, aggregated: Weights, loss: float) -> None:
             state.clients = grid.read_states((OWN, RESIDUAL))
@@ -199,6 +203,7 @@ class EdgeServer:
     rules: Rules = EVERYBODY  # of the region's rounds
     state: FederationState = field(default_factory=FederationState)  # of the region's rounds
     earlier: int = 0  # rounds of stage II, which a privacy budget counts
+    processes: ClientProcesses | None = None  # in which the vehicles train; None: in this one
 
     def train(
         self, weights: Weights, *, steps: int, learning_rate: float, seed: int, layers: Sequence[str] = ()
@@ -223,4 +228,5 @@ class EdgeServer:
             state=self.state,
             done=done,
             earlier=self.earlier,
+            processes=self.processes,
         )
