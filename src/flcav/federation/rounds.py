@@ -46,12 +46,12 @@ from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
 
 
-class ClientFailed(RuntimeError):
-    """Fewer clients sent a usable update in a round than are wanted."""
+class ClientFailed(OSError):
+    """Fewer clients sent a usable update in a round than are wanted: a fault of their machines."""
 
 
 class Intake:
-    """The usable updates of a round: all of them or, where a strategy needs no more, their mean, added up as they come."""
+    """The usable updates of a round: all of them or, where a strategy needs no more, their mean as they come in."""
 
     def __init__(self, weigher: Averages | None) -> None:
         """Add up by the weights of `weigher`; None: keep every update."""

@@ -76,8 +76,8 @@ def federate(
 
     Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
     before this one, with the same clients and rules, which count against that budget. With `processes`, which have to
-    have the same clients, these train there, several at a time; the weights are the same. Clients are made when they are
-    needed, where `clients` makes them, and of updates no more are in memory than the strategy needs.
+    have the same clients, these train there, several at a time; the weights are the same. `clients` is asked for a
+    client when it is to train; of updates no more are in memory than the strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
     no update, and fewer are left than `rules` ask for (by default all), `InputError` where there are no clients, or
