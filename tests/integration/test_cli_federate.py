@@ -23,7 +23,10 @@ RECIPE = {
         ({"strategy": {"fedprox": {"mu": -1}}}, "strategy 'fedprox': mu = -1"),
         ({"strategy": "krum", "secure": {}}, "krum: 5 clients or more are wanted for byzantine = 1"),
         ({"strategy": "median", "secure": {}}, "Median looks at each update, and secure aggregation shows their sum"),
-        ({"privacy": {"clip": 1, "noise": 1, "epsilon": 0}}, "'federation.privacy.epsilon' = 0: Input should be greater"),
+        (
+            {"privacy": {"clip": 1, "noise": 1, "epsilon": 0}},
+            "'federation.privacy.epsilon' = 0: Input should be greater",
+        ),
         ({"privacy": {"clip": 1, "noise": 0}}, "'federation.privacy.noise' = 0: Input should be greater than 0"),
         ({"selection": {"rule": "uniform", "clients": 5}}, "5 clients are wanted in a round, and there are 4"),
         ({"least_clients": 5}, "least_clients: 5 are wanted in a round, and 4 take part"),

@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from flwr.app import Context, Message, MetricRecord
+from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
@@ -21,10 +21,10 @@ from flcav.federation.records import (
     SEND,
     VECTOR,
     LocalWork,
+    read_arrays,
     reply,
     reply_norm,
     to_arrays,
-    to_weights,
 )
 from flcav.federation.rules import Rules
 from flcav.federation.secure.masks import to_integers
@@ -57,7 +57,7 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
         if asked == SEND:
             start, update, extra = _recall(context)
         else:
-            start = to_weights(message.content.array_records[ARRAYS])
+            start = read_arrays(message.content, ARRAYS)
             update, extra = _train(trainables[name], message, context, start, work, seed)
         if asked == NORM:
             _keep(context, start, update)
@@ -76,8 +76,7 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
         trainable: Trainable, message: Message, context: Context, start: Weights, work: LocalWork, seed: int
     ) -> tuple[Update, Weights]:
         """Return the result of local training, and a strategy's arrays beside it."""
-        records = message.content.array_records
-        sent, own = to_weights(records[EXTRA]) if EXTRA in records else {}, _recorded(context, OWN)
+        sent, own = _optional(message.content, EXTRA), _recorded(context, OWN)
         correction = strategy.correct(sent, own) if isinstance(strategy, Corrects) else Correction()
         layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
         how = {**correction.arguments(), **layers}
@@ -93,7 +92,11 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
 
 
 def _recorded(context: Context, key: str) -> Arrays:
-    return to_weights(context.state.array_records[key]) if key in context.state.array_records else {}
+    return _optional(context.state, key)
+
+
+def _optional(content: RecordDict, key: str) -> Arrays:
+    return read_arrays(content, key) if key in content else {}
 
 
 def _record(context: Context, key: str, arrays: Weights) -> None:

@@ -18,7 +18,7 @@ from flwr.supercore.run import Run
 from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.federation.encoding import encode
-from flcav.federation.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, to_arrays, to_weights
+from flcav.federation.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, read_arrays, to_arrays
 from flcav.federation.rules import Rules
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.federation.upload import Upload
@@ -100,8 +100,8 @@ class EmbeddedGrid(Grid):
         found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
         for node, state in sorted(self._states.items()):
             for key in keys:
-                if key in state.array_records:
-                    found.setdefault(self.names[node], {})[key] = to_weights(state.array_records[key])
+                if key in state:
+                    found.setdefault(self.names[node], {})[key] = read_arrays(state, key)
         return found
 
     def set_run(self, run: Run) -> None:
