@@ -105,7 +105,7 @@ def compare(name: str, work: Work, rounds: int) -> None:
             "bare loop": lambda: combine([train(client, each, weights) for each, client in clients.items()]),
             "federation": lambda: federate(clients, weights, SCHEDULE, account),
             "two bare processes": lambda: combine([*pool.map(train_held, clients, [weights] * len(clients))]),
-            "two client processes": lambda: federate(clients, weights, SCHEDULE, account, processes=several),
+            "two client processes": lambda: federate(clients, weights, SCHEDULE, account, runtime=several),
         }
         for way in ways.values():
             way()  # starts processes

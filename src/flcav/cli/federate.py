@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import STALE, Stale
+from flcav.cli.options import STALE, Runtime, Stale
 from flcav.cli.terminal import print_json, when_interrupted
 from flcav.threads import use_threads
 
@@ -26,6 +26,9 @@ def federate(
     ),
     arm: str = typer.Option("main", "--arm", help="Arm of the recipe; by default what the recipe itself describes."),
     jobs: int = typer.Option(2, "--jobs", min=1, help="Processes that vehicles train in, of one thread each."),
+    runtime: Runtime = typer.Option(
+        Runtime.embedded, "--runtime", help="Processes here, or Flower's simulation on Ray."
+    ),
     stale: Stale = STALE,
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead of sentences."),
 ) -> None:
@@ -45,7 +48,7 @@ def federate(
     asked = load_run_recipe(found)
     with live_steps("federate") as notify:
         told = notify if as_json else _telling(notify)
-        how = {"beside": found.parent, "jobs": jobs, "stale": stale.value}
+        how = {"beside": found.parent, "jobs": jobs, "runtime": runtime.value, "stale": stale.value}
         results = federate_regions(asked, out, arm=arm, notify=told, **how)
     if as_json:
         print_json(results.as_json())

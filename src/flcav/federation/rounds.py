@@ -202,11 +202,11 @@ class Rounds(FlowerStrategy):
         return {name: norm * self._shares[name] for name, (norm, _) in told.items()}
 
     def _in_order(self, asked: Iterable[str], replies: Iterable[Message]) -> Iterator[tuple[str, Message]]:
-        """Yield the replies with content by client, in node order, as soon as that is known; note the failures.
+        """Yield the replies with content by client, in the order in which they were asked; note the failures.
 
         Replies that come in that order are yielded as they come, and not kept.
         """
-        awaited = deque(sorted(self._nodes[name] for name in asked))
+        awaited = deque(self._nodes[name] for name in asked)
         early: dict[int, Message] = {}
         for message in chain(replies, [None]):
             if message is not None:

@@ -8,7 +8,6 @@ vehicles federate with their edge server. Stage III: edge servers federate with 
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,8 @@ from safetensors.numpy import load_file, save
 from flcav.config import InputError
 from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.choice import open_runtime
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
@@ -297,12 +296,13 @@ def federate_edge(
     report: Report,
     validation: Mapping[str, Frames] = {},
     processes: int = 1,
+    runtime: str = "embedded",
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
 
     A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
     After each round the network that a federation of so many rounds ends with is scored on `validation`, frames by
-    region. Vehicles train in `processes` of their own, where these are several, to the same weights.
+    region. Vehicles train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights.
     """
     state, task, averaged = FederationState(), learning.task, learning.training.average_rounds
     share = 0.0 if earlier else learning.training.start_share
@@ -318,8 +318,8 @@ def federate_edge(
     account = Account(book, EDGE, task.name, "wireless")
     keep = federating.make_saver(schedule.rounds)
     how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
-    with ClientProcesses(clients, processes) if processes > 1 else nullcontext() as several:
-        federate(clients, start, schedule, account, **how, done=done, on_round=keep, processes=several)
+    with open_runtime(runtime, clients, processes) as where:
+        federate(clients, start, schedule, account, **how, done=done, on_round=keep, runtime=where)
     federating.finish(network, len(federating.losses), averaged, share)
     return tuple(federating.losses)
 

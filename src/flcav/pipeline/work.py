@@ -273,11 +273,12 @@ def edge_step(
     steps: Mapping[str, Any],
     validation: Mapping[str, str] = {},
     processes: int = 1,
+    runtime: str = "embedded",
 ) -> None:
     """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`.
 
     With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III. Each round is
-    scored on the frames of the steps `validation`, by region. Vehicles train in so many `processes`.
+    scored on the frames of the steps `validation`, by region. Vehicles train in so many `processes` of a `runtime`.
     """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
@@ -298,7 +299,7 @@ def edge_step(
     strategy, _ = find_strategies(how)
     rules = follow_plan(how, own, earlier)
     watched = {name: Frames.open(work.inputs[step]) for name, step in validation.items()}
-    where: Any = (book, work.folder, work.report, watched, processes)
+    where: Any = (book, work.folder, work.report, watched, processes, runtime)
     losses = federate_edge(learning, start, clients, schedule, strategy, rules, earlier, *where)
     held = sum(len(client.samples) for client in clients.values())
     StageResult(stage, task, region, len(losses), held, len(clients), poles, losses).save(work.folder)

@@ -40,7 +40,7 @@ def test_clients_in_two_processes_federate_to_the_same_bits_and_one_killed_is_na
         Rules(least_clients=3),
     )
     with ClientProcesses(clients, 2) as processes:
-        found = federate(clients, START, SCHEDULE, account, rules=rules, state=state, processes=processes)
+        found = federate(clients, START, SCHEDULE, account, rules=rules, state=state, runtime=processes)
     left = {name: client for name, client in clients.items() if name != "grid/cav1"}
     alone = Account(ledger(), "edge", "regression", "wireless")
     want = federate(left, START, SCHEDULE, alone)

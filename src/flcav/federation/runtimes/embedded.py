@@ -17,6 +17,7 @@ from flwr.serverapp import Grid
 from flwr.supercore.run import Run
 from flwr.supercore.task_identity import TaskIdentity
 
+from flcav.federation.client import PARTITION
 from flcav.federation.encoding import encode
 from flcav.federation.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, read_arrays, to_arrays
 from flcav.federation.rules import Rules
@@ -48,16 +49,23 @@ def update_bytes(weights: Weights, upload: Upload = WHOLE, *, exchanging: bool =
 
 
 @contextlib.contextmanager
-def _server_identity() -> Iterator[None]:
-    """Give messages created inside the server's identity; then restore the previous one, of an outer federation."""
+def keep_identity() -> Iterator[None]:
+    """Restore Flower's process-wide identity in the end: that of an outer federation."""
     names = ("_run_id", "_node_id", "_task_id")
     before = {name: getattr(TaskIdentity, name) for name in names}
-    TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SERVER_NODE, 1
     try:
         yield
     finally:
         for name, value in before.items():
             setattr(TaskIdentity, name, value)
+
+
+@contextlib.contextmanager
+def _server_identity() -> Iterator[None]:
+    """Give messages created inside the server's identity."""
+    with keep_identity():
+        TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SERVER_NODE, 1
+        yield
 
 
 class EmbeddedGrid(Grid):
@@ -70,16 +78,15 @@ class EmbeddedGrid(Grid):
         self,
         app: ClientApp,
         names: Sequence[str],
-        config_key: str,
         states: Mapping[str, Mapping[str, Weights]] = {},
         at_once: int = 1,
     ) -> None:
-        """Register a node for each of `names`, in their order; a node's config holds its name under `config_key`.
+        """Register a node for each of `names`; its config has its place among them, as in Flower's simulation.
 
         `states` are the arrays that nodes have kept from earlier rounds, by node and record. `at_once` nodes answer at
         the same time, each in a thread; replies come in the order of the messages all the same.
         """
-        self._app, self._config_key, self._at_once = app, config_key, at_once
+        self._app, self._at_once = app, at_once
         self.names = dict(enumerate(names, FIRST_NODE))
         nodes = {name: node for node, name in self.names.items()}
         self._states = {nodes[name]: _node_state(own) for name, own in states.items() if name in nodes}
@@ -141,9 +148,8 @@ class EmbeddedGrid(Grid):
         node = message.metadata.dst_node_id
         shared = message.content  # by all nodes: a change by one client app must not reach the next
         message.content = RecordDict({key: _copied(record) for key, record in shared.items()})
-        context = Context(
-            RUN_ID, node, {self._config_key: self.names[node]}, self._states.pop(node, None) or RecordDict(), {}
-        )
+        config = {PARTITION: node - FIRST_NODE, "num-partitions": len(self.names)}
+        context = Context(RUN_ID, node, config, self._states.pop(node, None) or RecordDict(), {})
         try:
             return self._app(message, context)
         except BudgetExceeded:

@@ -52,15 +52,16 @@ def federate_regions(
     arm: str = MAIN,
     beside: Path | str | None = None,
     jobs: int = 2,
+    runtime: str = "embedded",
     notify: Notify = ignore_steps,
     stale: Stale = "refuse",
 ) -> Federations:
     """Run or finish stage II of a recipe's arm in the folder `out`; return its results, federation.json there.
 
-    In every federating region and for every task vehicles train in `jobs` processes of one thread each. The weights do
-    not depend on how many there are. Other arguments are those of `flcav.run`. Raises `InputError` where a part of the
-    recipe cannot be used or the arm does not federate, `ClientFailed` where fewer vehicles are left in a round than are
-    wanted.
+    In every federating region and for every task vehicles train in `jobs` processes of one thread each, or actors where
+    the `runtime`, one of `RUNTIMES`, is "ray". The weights do not depend on that, on Ray up to rounding. The others
+    are those of `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not federate,
+    `ClientFailed` where fewer vehicles are left in a round than are wanted.
     """
     out, graph = Path(out), Graph(recipe, Path(beside or "."))
     if arm not in graph.settings:
@@ -69,7 +70,9 @@ def federate_regions(
         raise InputError(f"--arm {arm}: it trains centrally, without a federation")
     check_federations(recipe, graph.settings.values())
     asked = list_federations(graph, arm)
-    alone = {name: _federation_step(graph, *about, jobs) for name, about in asked.items()}
+    alone = {
+        name: _federation_step(graph, *about, {"processes": jobs, "runtime": runtime}) for name, about in asked.items()
+    }
     before = _needed(graph.steps, alone.values())
     run_steps(before, out / WORK, jobs=jobs, notify=notify, stale=stale)
 
@@ -96,14 +99,14 @@ def list_federations(graph: Graph, arm: str) -> dict[str, tuple[str, str, str]]:
     return {name if arm == MAIN else f"{name}-{arm}": (arm, *about) for about, name in named.items()}
 
 
-def _federation_step(graph: Graph, arm: str, region: str, task: str, processes: int) -> Step:
+def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, Any]) -> Step:
     """Return the step of stage II as a run has it, with validation after each round, and in several processes."""
     edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
     frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
     name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
     arguments: Mapping[str, Any] = {**edge.arguments, "validation": frames}
     needs = tuple(dict.fromkeys((*edge.needs, *frames.values())))
-    return replace(edge, name=name, arguments=arguments, needs=needs, means={"processes": processes})
+    return replace(edge, name=name, arguments=arguments, needs=needs, means=means)
 
 
 def _needed(steps: tuple[Step, ...], last: Any) -> list[Step]:
