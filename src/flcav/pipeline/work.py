@@ -24,6 +24,7 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule, find_strategies
 from flcav.pipeline.before_after import detect_before_after
+from flcav.pipeline.federations.rounds import load_round_network
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
     LABEL_SOURCES,
@@ -79,7 +80,6 @@ from flcav.pipeline.stages import (
     choose_uploads,
     federate_cloud,
     federate_edge,
-    load_round_network,
     load_stage_network,
     make_clients,
     pretrain,
