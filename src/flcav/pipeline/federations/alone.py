@@ -5,7 +5,7 @@ the same. Here each round is validated as it ends, and vehicles train in several
 """
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -109,7 +109,7 @@ def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapp
     return replace(edge, name=name, arguments=arguments, needs=needs, means=means)
 
 
-def _needed(steps: tuple[Step, ...], last: Any) -> list[Step]:
+def _needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
     """Return those of `steps` that the steps `last` need, directly or not, in their order."""
     needs = {step.name: step.needs for step in steps}
     wanted, open_ = set(), [name for step in last for name in step.needs]
