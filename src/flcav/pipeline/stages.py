@@ -12,31 +12,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import load_file, save
 
-from flcav.config import InputError
-from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.choice import open_runtime
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
-from flcav.federation.state import FederationState, RoundRecord
+from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
-from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Trainable, Weights
-from flcav.files import write_bytes, write_json
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.training import Checkpointing, Validation, train, train_steps
-from flcav.perception.weights import from_arrays, load_network, save_network, to_arrays
+from flcav.perception.weights import load_network, save_network, to_arrays
+from flcav.pipeline.federations.checkpoint import LAST
+from flcav.pipeline.federations.rounds import FederationCheckpoints, load_round_network
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, Training
-from flcav.pipeline.results import LEDGER, WEIGHTS, Validated
+from flcav.pipeline.results import WEIGHTS, Validated
 from flcav.progress import Report
 from flcav.seeds import derive_seed, stream
 
-CHECKPOINT, ROUND = "checkpoint.pt", "round.json"
+CHECKPOINT, ROUND = "checkpoint.pt", LAST
 VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart
 
 
@@ -186,84 +184,6 @@ def describe_federation(strategy: Strategy | Strategies, rules: Rules) -> str:
     return f"{strategy} by {json.dumps(changed)}" if changed else str(strategy)
 
 
-class FederationCheckpoints:
-    """Checkpoints of a federation: weights, loss, ledger and states after each round, to resume from."""
-
-    def __init__(
-        self,
-        task: Task,
-        folder: Path,
-        book: Ledger,
-        report: Report,
-        states: Mapping[str, FederationState] = {},
-        identity: str = "",
-    ) -> None:
-        """Keep the checkpoints in `folder`.
-
-        states: by name what federations keep between rounds, restored in place; of stage III also the edge servers'.
-        identity: what the federation is by; a checkpoint of another one is refused.
-        """
-        self._task, self._folder, self._book, self._report = task, folder, book, report
-        self._states, self._identity = states, identity
-        self.losses: list[float] = []
-
-    def resume(self, weights: Weights) -> tuple[Weights, int]:
-        """Return the last round's weights and number, restoring ledger, losses and states.
-
-        Without a checkpoint, returns `weights` and 0. Raises `InputError` for the checkpoint of another strategy.
-        """
-        if not (self._folder / ROUND).exists():
-            return weights, 0
-        state = json.loads((self._folder / ROUND).read_text())
-        if state.get("by", self._identity) != self._identity:
-            raise InputError(f"{self._folder}: a checkpoint of {state['by']}, which {self._identity} cannot go on with")
-        kept = Ledger.load(self._folder / LEDGER).entries[: state["entries"]]
-        for entry in kept[len(self._book.entries) :]:
-            self._book.enter(entry)
-        self.losses = state["losses"]
-        arrays = load_file(self._state_path(state["round"])) if state.get("states") else {}
-        for name, own in self._states.items():
-            begins = f"{name}|"
-            mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
-            own.restore(mine, [RoundRecord.from_json(record, str(self._folder)) for record in state["records"][name]])
-        return load_file(round_path(self._folder, state["round"])), state["round"]
-
-    def make_saver(self, rounds: int) -> OnRound:
-        """Return the callback that saves a checkpoint after each of `rounds` rounds."""
-
-        def keep(round_: int, weights: Weights, loss: float) -> None:
-            self.losses.append(loss)
-            write_bytes(round_path(self._folder, round_), save(dict(weights)))
-            arrays = {
-                f"{name}|{key}": array for name, own in self._states.items() for key, array in own.to_arrays().items()
-            }
-            if arrays:
-                write_bytes(self._state_path(round_), save(arrays))
-            self._book.save(self._folder / LEDGER)
-            state = {"round": round_, "entries": len(self._book.entries), "losses": self.losses}
-            if self._states:
-                records = {name: [record.as_json() for record in own.records] for name, own in self._states.items()}
-                state |= {"by": self._identity, "records": records, "states": bool(arrays)}
-            write_json(self._folder / ROUND, state)
-            self._state_path(round_ - 1).unlink(missing_ok=True)
-            spent = [own.records[-1].epsilon for own in self._states.values() if own.records]
-            private = [epsilon for epsilon in spent if epsilon is not None]
-            self._report(round_, rounds, f"loss {loss:.3f}" + (f", epsilon {max(private):.2f}" if private else ""))
-
-        return keep
-
-    def _state_path(self, round_: int) -> Path:
-        return self._folder / f"state{round_}.safetensors"
-
-    def finish(self, start: Any, rounds: int, averaged: int, start_share: float = 0.0) -> None:
-        """Write the ledger and the final weights, see `load_round_network`; without rounds those of `start`."""
-        network = start
-        if rounds:
-            network = load_round_network(self._task, start, self._folder, rounds, averaged, start_share)
-        save_network(self._task, network, self._folder / WEIGHTS)
-        self._book.save(self._folder / LEDGER)
-
-
 def federate_edge(
     learning: Learning,
     network: Any,
@@ -275,22 +195,33 @@ def federate_edge(
     book: Ledger,
     folder: Path,
     report: Report,
+    validation: Mapping[str, Frames] = {},
+    processes: int = 1,
+    runtime: str = "embedded",
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
 
     A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
+    After each round the network that a federation of so many rounds ends with is scored on `validation`, frames by
+    region. Vehicles train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights.
     """
-    state = FederationState()
-    federating = FederationCheckpoints(
-        learning.task, folder, book, report, {EDGE: state}, describe_federation(strategy, rules)
-    )
+    state, task, averaged = FederationState(), learning.task, learning.training.average_rounds
+    share = 0.0 if earlier else learning.training.start_share
+
+    def score(round_: int) -> Mapping[str, float]:
+        reached = load_round_network(task, network, folder, round_, averaged, share)
+        return {name: score_network(task, reached, own.data, own.vehicles) for name, own in validation.items()}
+
+    identity = describe_federation(strategy, rules)
+    scored = score if validation else None
+    federating = FederationCheckpoints(task, folder, book, report, {EDGE: state}, identity, scored)
     start, done = federating.resume(to_arrays(network))
-    account = Account(book, EDGE, learning.task.name, "wireless")
+    account = Account(book, EDGE, task.name, "wireless")
     keep = federating.make_saver(schedule.rounds)
     how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
-    federate(clients, start, schedule, account, **how, done=done, on_round=keep)
-    share = 0.0 if earlier else learning.training.start_share
-    federating.finish(network, len(federating.losses), learning.training.average_rounds, share)
+    with open_runtime(runtime, clients, processes) as where:
+        federate(clients, start, schedule, account, **how, done=done, on_round=keep, runtime=where)
+    federating.finish(network, len(federating.losses), averaged, share)
     return tuple(federating.losses)
 
 
@@ -360,27 +291,6 @@ def region_budget(stage_one: Ledger, vehicles: Mapping[str, int], region: str) -
     """Return the budget of a region's stage II: its share, by vehicles, of the wireless budget that stage I left."""
     share = vehicles[region] / sum(vehicles.values())
     return Budget(share * stage_one.left_mb("wireless"), 0.0)
-
-
-def round_path(folder: Path, round_: int) -> Path:
-    """Return the file of a federation's weights after a round."""
-    return folder / f"round{round_}.safetensors"
-
-
-def load_round_network(
-    task: Task, start: Any, folder: Path, round_: int, averaged: int, start_share: float = 0.0
-) -> Any:
-    """Return the network of a federation that ends with a round: the mean of the last `averaged` rounds' weights.
-
-    `start_share` of it are the weights of the network `start` that the federation began with, as in Wortsman et al.,
-    Robust fine-tuning of zero-shot models, CVPR 2022, equation 1.
-    """
-    last = range(max(round_ - averaged, 0) + 1, round_ + 1)
-    first, rounds = to_arrays(start), [load_file(round_path(folder, number)) for number in last]
-    parts = [first, *({name: own[name] for name in first} for own in rounds)]  # files order names otherwise
-    network = task.build(start.config)
-    from_arrays(network, average(parts, [start_share, *((1 - start_share) / len(last) for _ in last)]))
-    return network.eval()
 
 
 def load_stage_network(task: Task, folder: Path) -> Any:

@@ -24,6 +24,7 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule, find_strategies
 from flcav.pipeline.before_after import detect_before_after
+from flcav.pipeline.federations.rounds import load_round_network
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
     LABEL_SOURCES,
@@ -79,7 +80,6 @@ from flcav.pipeline.stages import (
     choose_uploads,
     federate_cloud,
     federate_edge,
-    load_round_network,
     load_stage_network,
     make_clients,
     pretrain,
@@ -271,10 +271,14 @@ def edge_step(
     labels: str,
     federation: Fields,
     steps: Mapping[str, Any],
+    validation: Mapping[str, str] = {},
+    processes: int = 1,
+    runtime: str = "embedded",
 ) -> None:
     """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`.
 
-    With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III.
+    With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III. Each round is
+    scored on the frames of the steps `validation`, by region. Vehicles train in so many `processes` of a `runtime`.
     """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
@@ -294,7 +298,9 @@ def edge_step(
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region, earlier=earlier)
     strategy, _ = find_strategies(how)
     rules = follow_plan(how, own, earlier)
-    losses = federate_edge(learning, start, clients, schedule, strategy, rules, earlier, book, work.folder, work.report)
+    watched = {name: Frames.open(work.inputs[step]) for name, step in validation.items()}
+    where: Any = (book, work.folder, work.report, watched, processes, runtime)
+    losses = federate_edge(learning, start, clients, schedule, strategy, rules, earlier, *where)
     held = sum(len(client.samples) for client in clients.values())
     StageResult(stage, task, region, len(losses), held, len(clients), poles, losses).save(work.folder)
 

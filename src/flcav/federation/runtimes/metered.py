@@ -1,6 +1,6 @@
 """A Flower grid that enters every message in a ledger and enforces the budgets; it wraps any other grid."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from flwr.app import Message, RecordDict
@@ -29,17 +29,17 @@ class MeteredGrid(Grid):
         self._grid, self._account, self._names = grid, account, names
         self._round = 0
 
-    def _enter(self, direction: Direction, node: int, content: RecordDict) -> None:
-        account = self._account
+    def _enter(self, direction: Direction, round_: int, size: int, node: int) -> None:
+        account, self._round = self._account, round_
         account.ledger.enter(
             LedgerEntry(
                 stage=account.stage,
                 task=account.task,
                 link=account.link,
                 direction=direction,
-                round=self._round,
+                round=round_,
                 client=self._names[node],
-                bytes=wire_bytes(content),
+                bytes=size,
             )
         )
 
@@ -47,8 +47,7 @@ class MeteredGrid(Grid):
         """Send messages, entering each as downlink first; return their ids."""
         messages = list(messages)
         for message in messages:
-            self._round = int(message.content.config_records[CONFIG]["round"])  # type: ignore[arg-type]
-            self._enter("down", message.metadata.dst_node_id, message.content)
+            self._enter("down", _round(message), wire_bytes(message.content), message.metadata.dst_node_id)
         return list(self._grid.push_messages(messages))
 
     def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
@@ -56,12 +55,40 @@ class MeteredGrid(Grid):
         replies = list(self._grid.pull_messages(message_ids))
         for message in replies:
             if message.has_content():
-                self._enter("up", message.metadata.src_node_id, message.content)
+                self._enter("up", self._round, wire_bytes(message.content), message.metadata.src_node_id)
         return replies
 
-    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
-        """Send messages one after another and return the replies: the first one over a budget ends the round."""
-        return [reply for message in messages for reply in self.pull_messages(self.push_messages([message]))]
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
+        """Yield the replies as they come, entering message and reply; the first reply over a budget ends the round.
+
+        A message is entered when it is sent or, while another one has no reply yet, with its own reply: so the entries
+        do not depend on how many are under way. Nothing is sent before the first reply is asked for.
+        """
+        waiting: dict[int, tuple[int, int]] = {}  # round and bytes of messages that are not entered, by node
+        open_: set[int] = set()  # nodes that have not answered
+
+        def noted() -> Iterator[Message]:
+            content, size = None, 0
+            for message in messages:
+                if message.content is not content:  # many messages share one
+                    content, size = message.content, wire_bytes(message.content)
+                node = message.metadata.dst_node_id
+                waiting[node] = _round(message), size
+                if not open_:
+                    self._enter("down", *waiting.pop(node), node)
+                open_.add(node)
+                yield message
+
+        for reply in self._grid.send_and_receive(noted(), timeout=timeout):
+            node = reply.metadata.src_node_id
+            open_.remove(node)
+            if node in waiting:
+                self._enter("down", *waiting.pop(node), node)
+            if reply.has_content():
+                self._enter("up", self._round, wire_bytes(reply.content), node)
+            yield reply
+        for node, about in waiting.items():
+            self._enter("down", *about, node)
 
     def get_node_ids(self) -> list[int]:
         """Return the node ids of the metered grid."""
@@ -81,3 +108,7 @@ class MeteredGrid(Grid):
     def run(self):
         """Return Flower's record of the run."""
         return self._grid.run
+
+
+def _round(message: Message) -> int:
+    return int(message.content.config_records[CONFIG]["round"])  # type: ignore[arg-type]
