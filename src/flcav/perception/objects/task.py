@@ -15,6 +15,7 @@ from flcav.perception.objects.calibrate import calibrate, measure_reliability
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.errors import register_errors
 from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, score_detections
+from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.infer import detect_objects
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
@@ -35,7 +36,7 @@ class ObjectsTask(ObjectsOutcomes):
     configurations = CONFIGURATIONS
     practice = Practice(batch=2, learning_rate=2e-3)
     recording: Mapping[str, Json] = {}
-    labels = ("ideal-road", "own-detections")
+    labels = ("ideal-road", "road", "own-detections")
     threshold = THRESHOLD
 
     def __init__(self) -> None:
@@ -101,7 +102,9 @@ class ObjectsTask(ObjectsOutcomes):
         """
         data.check_labelled("objects")
         numbers, classes = data.numbers(frames), network.config.classes
-        found, truths = detect_frames(network, map(data.frame, numbers), asked, total=len(numbers), progress=progress)
+        found, truths = detect_frames(
+            network, map(frame_reader(data, network.config), numbers), asked, total=len(numbers), progress=progress
+        )
         return ObjectsEvaluation(
             frames=len(truths),
             scenes=len({truth.scene for truth in truths}),
@@ -114,7 +117,7 @@ class ObjectsTask(ObjectsOutcomes):
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the Platt scaling of the network's scores, fitted on frames (None: all) it was not trained on."""
         data.check_labelled("objects")
-        calibrate(network, map(data.frame, data.numbers(frames)))
+        calibrate(network, map(frame_reader(data, network.config), data.numbers(frames)))
 
     def sample_bytes(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> list[int]:
         """Return the size of each frame's sweep with its annotation rows [bytes]."""
@@ -139,15 +142,15 @@ class ObjectsTask(ObjectsOutcomes):
         threshold: lowest score of a detection. See `flcav.perception.objects.errors`.
         """
         data.check_labelled("objects")
-        numbers = data.numbers(frames)
+        numbers, read = data.numbers(frames), frame_reader(data, network.config)
 
         def found() -> Iterator[Boxes]:
             for done, number in enumerate(numbers, start=1):
-                frame = data.frame(number)
+                frame = read(number)
                 yield detect(network, frame.lidar[choose_lidar(frame)], score_threshold=threshold)
                 progress(done, len(numbers), "")
 
-        return Registry(register_errors(map(data.frame, numbers), found(), network.config, threshold))
+        return Registry(register_errors(map(read, numbers), found(), network.config, threshold))
 
 
 OBJECTS = ObjectsTask()
