@@ -116,7 +116,11 @@ def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str,
     ranges = {arm: _range(cars, counts) for arm, counts in found.items()}
     result = Fig4(suites, cars, found, ranges, provenance())
     shown = [
-        Shown(arm, [transform_points(pose, cloud[:, :3]) for pose, cloud in zip(placed[arm], clouds, strict=True)])
+        Shown(
+            arm,
+            [transform_points(pose, cloud[:, :3]) for pose, cloud in zip(placed[arm], clouds, strict=True)],
+            [pose[:3, 3] for pose in placed[arm]],
+        )
         for arm in ARMS[1:]
     ]
     shares = {arm: [f / c if c else None for f, c in zip(own, cars, strict=True)] for arm, own in found.items()}

@@ -13,7 +13,7 @@ SUITE_COLOURS = (style.BLUE, style.VERMILLION, style.GREEN)
 ARM_COLOURS = (style.MUTED, style.ORANGE, style.BLUE)
 BAND_M = (-5.2, 0.5)  # heights about the first suite's LiDAR that are drawn: walls and trees, without the ground
 VIEW_M = (-22.0, 62.0, -48.0, 36.0)  # x and y about the first suite
-CLOSE_M = 9.0  # half the edge of the close-up
+CLOSE_M = 6.0  # half the edge of the close-up
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class Shown:
 
     title: str
     clouds: Sequence[NDArray]  # (N, 3) each
+    places: Sequence[NDArray]  # (3,) of each suite
 
 
 @style.styled
@@ -35,8 +36,8 @@ def draw_suites(
 
     shares: by arm, in the intervals between `edges_m`; None where there is nothing to find.
     """
-    figure = style.canvas(9.6, 6.6)
-    grid = figure.add_gridspec(2, 3, height_ratios=(1.35, 1))
+    figure = style.canvas(9.6, 6.4)
+    grid = figure.add_gridspec(2, 3, height_ratios=(1.25, 1))
     corner = _choose_corner(shown[-1].clouds)
     for column, each in enumerate(shown):
         wide, near = figure.add_subplot(grid[0, column]), figure.add_subplot(grid[1, column])
@@ -44,6 +45,9 @@ def draw_suites(
             own = cloud[(cloud[:, 2] > BAND_M[0]) & (cloud[:, 2] < BAND_M[1])]
             wide.plot(*own[:, :2].T, ".", color=colour, markersize=0.7, markeredgewidth=0)
             near.plot(*own[:, :2].T, ".", color=colour, markersize=2.2, markeredgewidth=0)
+        for number, ((x, y, _), colour) in enumerate(zip(each.places, SUITE_COLOURS, strict=True), start=1):
+            wide.plot(x, y, "o", markersize=12, color=colour, markeredgecolor="white")
+            wide.text(x, y, str(number), color="white", ha="center", va="center_baseline", fontsize=style.SMALL)
         wide.set(xlim=VIEW_M[:2], ylim=VIEW_M[2:], aspect="equal", title=each.title)
         x, y = corner
         near.set(xlim=(x - CLOSE_M, x + CLOSE_M), ylim=(y - CLOSE_M, y + CLOSE_M), aspect="equal", title="close-up")
@@ -60,9 +64,10 @@ def draw_suites(
         ylim=(0, 1.02), xlim=(0, edges_m[-1]), xlabel="distance from the first suite [m]", title="share of cars found"
     )
     axes.grid(axis="y")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False)
+    axes.legend(loc="upper right", frameon=False)
     handles = [
-        axes.plot([], [], "o", color=colour, label=name)[0] for name, colour in zip(names, SUITE_COLOURS, strict=True)
+        axes.plot([], [], "o", color=colour, label=f"{number}: {name}")[0]
+        for number, (name, colour) in enumerate(zip(names, SUITE_COLOURS, strict=True), start=1)
     ]
     style.key(figure, handles)
     return figure
