@@ -16,6 +16,7 @@ from flcav.fusion.detector import THRESHOLD, road_detector
 from flcav.fusion.road import MIN_RETURNS
 from flcav.geometry import Boxes
 from flcav.intervals import Estimate, bootstrap_over_scenes
+from flcav.perception.agents import POLE, kind_of
 from flcav.perception.metrics import match
 from flcav.perception.objects.truth import LOOKALIKE
 from flcav.pipeline.provenance import Provenance, provenance
@@ -125,6 +126,8 @@ def detect_frames(data: Dataset, lowest: float = 0.1) -> _Frames:
     """
     find, rows = road_detector(data, lowest), _Frames([], [], [], [], [])
     for number, key in enumerate(data.keys):
+        if kind_of(key.agent) != POLE:
+            continue
         truth, place = data.frame(number).annotations, data.world_from_agent(number)[:2, 3]
         near = np.linalg.norm(truth.boxes.center[:, :2] - place, axis=1) <= WITHIN_M
         car = np.isin(truth.boxes.label, CARS)
