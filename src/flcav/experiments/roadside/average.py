@@ -113,8 +113,8 @@ class RoadAverageResult(Record):
     def pictures(self) -> dict[str, bytes]:
         """Return the chart of all knobs as PNG, by file name."""
         panels = {
-            knob: {arm: [(p.size, p.mean, min(p.ap50), max(p.ap50)) for p in points] for arm, points in arms.items()}
-            for knob, arms in self.knobs.items()
+            knob: {arm: [(p.size, p.mean, min(p.ap50), max(p.ap50)) for p in self.knobs[knob][arm]] for arm in ARMS}
+            for knob in KNOBS
         }
         return {"knobs.png": style.png(draw_errors(panels))}
 

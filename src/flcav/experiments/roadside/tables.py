@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from flcav.experiments.roadside.average import ARMS, BOTH, GRAPH, RoadAverageResult
+from flcav.experiments.roadside.average import ARMS, BOTH, GRAPH, KNOBS, RoadAverageResult
 from flcav.experiments.roadside.detector import BINS_M, WITHIN_M, RoadDetectorResult
 from flcav.experiments.roadside.fig4 import ARMS as PLACED
 from flcav.experiments.roadside.fig4 import EDGES_M, Fig4
@@ -41,12 +41,13 @@ def average_tables(results: RoadAverageResult) -> dict[str, str]:
     """Return Markdown by name: joint, knobs, map."""
     joint = [
         [arm, f"{results.clean[arm]:.3f}", f"{point.mean:.3f} ({min(point.ap50):.3f} to {max(point.ap50):.3f})"]
-        for arm, point in results.joint.items()
+        for arm in ARMS
+        for point in (results.joint[arm],)
     ]
     rows = [
         [knob, f"{point.size:g}", *(f"{results.knobs[knob][arm][row].mean:.3f}" for arm in ARMS)]
-        for knob, arms in results.knobs.items()
-        for row, point in enumerate(arms[GRAPH])
+        for knob in KNOBS
+        for row, point in enumerate(results.knobs[knob][GRAPH])
     ]
     snapped = results.snapped
     context = [
