@@ -68,7 +68,7 @@ def test_what_lies_off_the_drivable_surface_is_left_out() -> None:
 
 def test_its_card_says_that_it_was_trained_elsewhere() -> None:
     card = read_card(find_shipped(OBJECTS, ROAD))
-    assert {entry.recipe["town"] for entry in card.data} == {"arterial", "suburb"}
+    assert sorted(str(entry.recipe["town"]) for entry in card.data) == ["arterial", "suburb"]
     assert card.network == "road"
     assert card.licence == LICENCE
     path = find_shipped(OBJECTS, ROAD)
