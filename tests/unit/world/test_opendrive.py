@@ -16,7 +16,7 @@ from flcav.world.map.parameters import TownParameters
 from flcav.world.map.roads import read_net
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import Town, load_town
-from flcav.world.opendrive.document import read_document
+from flcav.world.opendrive.document import read_map
 from flcav.world.opendrive.georeference import inverse_mercator, locate_origin
 from flcav.world.opendrive.importing import ImportedTown, import_town
 from flcav.world.traffic.traffic import simulate
@@ -185,4 +185,4 @@ def test_nothing_is_overwritten(cross: ImportedTown, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is a file; a town needs a folder"):
         import_town(CROSS, cross.town.net / "folder" / "town")
     with pytest.raises(InputError, match="no such file"):
-        read_document(tmp_path / "none.xodr")
+        read_map(tmp_path / "none.xodr")

@@ -67,20 +67,20 @@ def _generate_unclipped(net: RoadNet) -> Iterator[Marking]:
         if not lanes:
             continue
         approach = APPROACH_M if not inside and _is_controlled(net, edge) else 0.0
-        yield from _between_lanes(lanes, approach)
+        yield from _between_lanes(lanes, approach, net.side)
         across = facing.get(("", bends[edge.id]) if inside else (edge.end, edge.start), [])
-        yield from _left_side(edge, lanes, across, approach)
+        yield from _left_side(edge, lanes, across, approach, net.side)
         kerb = any(lane.kind == "sidewalk" for lane in edge.lanes) and lanes[0].speed < FAST
         if not kerb and not inside and lanes[0].kind == "driving":
-            yield Marking("edge", _beside(lanes[0], INSET_M - lanes[0].width / 2), LINE_M, 0.0, 0.0)
+            yield Marking("edge", _beside(lanes[0], INSET_M - lanes[0].width / 2, net.side), LINE_M, 0.0, 0.0)
         if not inside:
             yield from _entry(net, edge)
 
 
-def _between_lanes(lanes: list[Lane], approach: float) -> Iterator[Marking]:
+def _between_lanes(lanes: list[Lane], approach: float, side: int) -> Iterator[Marking]:
     """Yield the lines between neighbouring lanes (from the kerb to the middle); `approach` is as in `_broken`."""
     for right, left in pairwise(lanes):
-        line = _beside(right, right.width / 2)
+        line = _beside(right, right.width / 2, side)
         if right.kind == left.kind == "driving":
             yield from _broken(line, approach)
         else:
@@ -88,23 +88,25 @@ def _between_lanes(lanes: list[Lane], approach: float) -> Iterator[Marking]:
             yield Marking("solid", line, BICYCLE_LINE_M if wide else LINE_M, 0.0, 0.0)
 
 
-def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: float) -> Iterator[Marking]:
+def _left_side(
+    edge: Edge, lanes: list[Lane], across: list[Edge], approach: float, side: int
+) -> Iterator[Marking]:
     """Yield the centre line towards that edge of `across` (the opposite direction) which adjoins, else an edge line."""
-    line = _beside(lanes[-1], lanes[-1].width / 2)
+    line = _beside(lanes[-1], lanes[-1].width / 2, side)
     for other in across:
         theirs = [lane for lane in other.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
-        if other is edge or not theirs or not _coincide(line, _beside(theirs[-1], theirs[-1].width / 2)):
+        if other is edge or not theirs or not _coincide(line, _beside(theirs[-1], theirs[-1].width / 2, side)):
             continue
         if edge.id > other.id:
             return  # the other direction has it
         if len([lane for lane in (*lanes, *theirs) if lane.kind == "driving"]) > 2:
-            for side in (-DOUBLE_M, DOUBLE_M):
-                yield Marking("solid", _beside(lanes[-1], lanes[-1].width / 2 + side), LINE_M, 0.0, 0.0)
+            for aside in (-DOUBLE_M, DOUBLE_M):
+                yield Marking("solid", _beside(lanes[-1], lanes[-1].width / 2 + aside, side), LINE_M, 0.0, 0.0)
         else:
             yield from _broken(line, approach, both_ends=True)
         return
     if edge.function == "normal":
-        yield Marking("edge", _beside(lanes[-1], lanes[-1].width / 2 - INSET_M), LINE_M, 0.0, 0.0)
+        yield Marking("edge", _beside(lanes[-1], lanes[-1].width / 2 - INSET_M, side), LINE_M, 0.0, 0.0)
 
 
 def _broken(line: Array, approach: float, *, both_ends: bool = False) -> Iterator[Marking]:
@@ -135,7 +137,7 @@ def _entry(net: RoadNet, edge: Edge) -> Iterator[Marking]:
         a, b = lane.shape[-2], lane.shape[-1]
         forward = (b - a) / np.hypot(*(b - a))
         inset = 0.1 if len(lanes) == 1 or side < 0 else 0.15
-        left = np.array([-forward[1], forward[0]])
+        left = net.side * np.array([-forward[1], forward[0]])
         ends.append(b - TO_STOP_M * forward + (side * lane.width - np.sign(side) * inset) * left)
     line = np.array(ends)
     if stops:
@@ -171,9 +173,9 @@ def _bends(net: RoadNet) -> dict[str, str]:
     }
 
 
-def _beside(lane: Lane, left_m: float) -> Array:
-    """Return the line `left_m` to the left of a lane's middle, in driving direction."""
-    line = LineString(lane.shape).offset_curve(left_m, join_style="mitre")
+def _beside(lane: Lane, left_m: float, side: int) -> Array:
+    """Return the line `left_m` to the left of a lane's middle, in driving direction; to the right where `side` is -1."""
+    line = LineString(lane.shape).offset_curve(side * left_m, join_style="mitre")
     parts = _lines(line)
     return np.asarray(max(parts, key=lambda part: part.length).coords) if parts else lane.shape
 

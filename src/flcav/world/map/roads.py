@@ -82,6 +82,7 @@ class RoadNet:
     # s stops, o is at a traffic light, ...
     right_of_way: dict[str, str]
     connections: tuple[Connection, ...]
+    side: int = 1  # on which side of the road traffic keeps: 1 right, -1 left
 
     @property
     def streets(self) -> Iterator[Edge]:
@@ -130,7 +131,8 @@ def _net(root: ElementTree.Element) -> RoadNet:
     lanes = {lane.id for edge in edges.values() for lane in edge.lanes}
     led = [name for each in connections for name in (each.start, each.end, each.via) if name]
     _refuse_unknown("lane", led, lanes)
-    return RoadNet(edges, junctions, frozenset(circling), states, connections)
+    side = -1 if root.get("lefthand") in ("1", "true") else 1
+    return RoadNet(edges, junctions, frozenset(circling), states, connections, side)
 
 
 def _refuse_unknown(what: str, named: Iterable[str], known: Container[str]) -> None:

@@ -9,7 +9,7 @@ from shapely.geometry import LineString
 
 from flcav.geometry import left_vectors
 from flcav.world.map.parameters import StreetParameters
-from flcav.world.map.roads import Connection, Edge, RoadNet
+from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 
 Array = NDArray[np.float64]
@@ -43,23 +43,23 @@ def place_signals(net: RoadNet, sensors: Array) -> Signals:
 
     There is no arm within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) [m], since it would block the view.
     """
-    heads = [head for edge in net.streets for head in _approach(edge, net.connections, sensors)]
+    heads = [head for edge in net.streets for head in _approach(edge, net, sensors)]
     if not heads:
         return Signals.none()
     position, yaw, foot, link = zip(*heads)
     return Signals(np.array(position), np.array(yaw), np.array(foot), link)
 
 
-def _approach(edge: Edge, connections: tuple[Connection, ...], sensors: Array) -> Iterator[Head]:
+def _approach(edge: Edge, net: RoadNet, sensors: Array) -> Iterator[Head]:
     """Yield position, yaw, foot and link of each head of one approach."""
     driven = edge.lanes_of("driving")
     names = {lane.id for lane in driven}
-    ruled = [way for way in connections if way.light and way.start in names]
+    ruled = [way for way in net.connections if way.light and way.start in names]
     if not ruled:
         return
     link = min(ruled, key=lambda way: way.turn != "s").light  # the signal of the way straight on, where there is one
     outer = edge.lanes[0]
-    verge = Verge(LineString(outer.shape), outer.width / 2, StreetParameters())
+    verge = Verge(LineString(outer.shape), outer.width / 2, StreetParameters(), net.side)
     inwards = FROM_KERB_M - verge.half_width if outer.kind == "sidewalk" else verge.half_width + FROM_KERB_M
     x, y, heading = verge.at(verge.line.length - BEFORE_END_M, inwards)
     yaw = heading + np.pi

@@ -51,16 +51,20 @@ class Plot:
 
 @dataclass(frozen=True)
 class Verge:
-    """The centre line of an outer lane, mostly a sidewalk, in driving direction: its right is away from the road."""
+    """The centre line of an outer lane, mostly a sidewalk, in driving direction.
+
+    Its right, or with left-hand traffic its left, is away from the road.
+    """
 
     line: LineString  # world frame [m]
     half_width: float  # of the lane [m]
     street: StreetParameters
+    side: int = 1  # on which side of the road traffic keeps: 1 right, -1 left
 
     def at(self, along_m: float, right_m: float) -> tuple[float, float, float]:
-        """Return x, y [m] and the driving direction [rad] at `along_m` on the line, shifted `right_m` to its right.
+        """Return x, y [m] and the driving direction [rad] at `along_m` on the line, shifted `right_m` outwards.
 
-        Beyond its ends the line goes straight on.
+        Outwards is to the right, with left-hand traffic to the left. Beyond its ends the line goes straight on.
         """
         inside = float(np.clip(along_m, 0.0, self.line.length))
         before, after = max(inside - 0.5, 0.0), min(inside + 0.5, self.line.length)
@@ -69,8 +73,8 @@ class Verge:
         here = self.line.interpolate(inside)
         on = along_m - inside
         cos, sin = heading_vectors(yaw)
-        x = here.x + on * cos + right_m * sin
-        y = here.y + on * sin - right_m * cos
+        x = here.x + on * cos + self.side * right_m * sin
+        y = here.y + on * sin - self.side * right_m * cos
         return float(x), float(y), yaw
 
 
@@ -78,7 +82,7 @@ def list_verges(net: RoadNet, parameters: TownParameters) -> Iterator[Verge]:
     """Yield the verge of each sidewalk of all streets, in the net's order."""
     for edge in net.streets:
         for lane in edge.lanes_of("sidewalk"):
-            yield Verge(LineString(lane.shape), lane.width / 2, parameters.streets[edge.type])
+            yield Verge(LineString(lane.shape), lane.width / 2, parameters.streets[edge.type], net.side)
 
 
 def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) -> Array:
@@ -163,8 +167,8 @@ def place_poles(
     """
     out = []
     for pole in sorted(parameters, key=lambda pole: pole.id):
-        x, y, heading = _kerb_side(net.edges[pole.edge], pole.before_end_m)
-        yaw = heading + np.pi / 2
+        x, y, heading = _kerb_side(net.edges[pole.edge], pole.before_end_m, net.side)
+        yaw = heading + net.side * np.pi / 2
         if pole.kind != "straight":
             target = net.junctions[net.edges[pole.edge].end].centre
             if net.edges[pole.edge].end in net.roundabouts:
@@ -189,15 +193,15 @@ def place_signs(net: RoadNet) -> list[tuple[tuple[float, float, float], float, s
             limit = 3.6 * edge.lanes_of("driving")[0].speed
             wanted.append((SPEED_SIGNS[min(SPEED_SIGNS, key=lambda known: abs(known - limit))], length - 12.0))
         for name, before_end in wanted:
-            x, y, heading = _kerb_side(edge, before_end)
+            x, y, heading = _kerb_side(edge, before_end, net.side)
             out.append(((x, y, SIGN_HEIGHT_M), float(heading + np.pi), name))
     return out
 
 
-def _kerb_side(edge: Edge, before_end_m: float) -> tuple[float, float, float]:
+def _kerb_side(edge: Edge, before_end_m: float, side: int) -> tuple[float, float, float]:
     """Return x, y [m] of a point on the sidewalk 0.35 m from the kerb, and the driving direction [rad] there."""
     lane = edge.lanes_of("sidewalk")[-1]
-    verge = Verge(LineString(lane.shape), lane.width / 2, StreetParameters())
+    verge = Verge(LineString(lane.shape), lane.width / 2, StreetParameters(), side)
     return verge.at(verge.line.length - before_end_m, 0.35 - verge.half_width)
 
 

@@ -1,11 +1,12 @@
 """Ground surfaces of a town as polygons: roads, sidewalks and traffic islands, and the kerbs between them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.errors import GEOSException
 from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import linemerge, split
@@ -15,6 +16,7 @@ from flcav.world.map.roads import CARRIAGEWAY, RoadNet
 
 Array = NDArray[np.float64]
 
+GRID_M = 1e-3
 SLIVER_M = 0.25  # narrower pieces are dropped, narrower gaps closed, shorter lanes left out: artefacts of the net
 
 
@@ -49,10 +51,10 @@ def build_ground_surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Grou
             walked.append(area)
             paved.append(area.buffer(frontage, join_style="mitre"))
     inside = [Polygon(junction.shape).buffer(0) for junction in net.junctions.values() if len(junction.shape) > 2]
-    driven_area, walked_area = shapely.union_all(driven), shapely.union_all(walked)
-    roads = driven_area.union(shapely.union_all(inside).difference(walked_area))
+    driven_area, walked_area = unite(driven), unite(walked)
+    roads = add(driven_area, subtract(unite(inside), walked_area))
     roads = MultiPolygon([part for part in _clean(roads).geoms if part.intersects(driven_area)])
-    sidewalks = shapely.union_all(paved).difference(roads)
+    sidewalks = subtract(unite(paved), roads)
     islands = MultiPolygon(
         [
             hole
@@ -60,7 +62,36 @@ def build_ground_surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> Grou
             if not hole.intersects(walked_area.buffer(-SLIVER_M))
         ]
     )
-    return GroundSurfaces(roads, _clean(sidewalks.union(islands)), islands)
+    return GroundSurfaces(roads, _clean(add(sidewalks, islands)), islands)
+
+
+def unite(areas: Sequence[BaseGeometry]) -> BaseGeometry:
+    """Return the union of areas; where exact coordinates defeat GEOS, on a grid of `GRID_M`."""
+    try:
+        return shapely.union_all(areas)
+    except GEOSException:
+        return shapely.union_all([_snap(area) for area in areas], grid_size=GRID_M)
+
+
+def add(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
+    """Return the union of two areas, as `unite` does."""
+    try:
+        return shapely.union(area, other)
+    except GEOSException:
+        return shapely.union(_snap(area), _snap(other), grid_size=GRID_M)
+
+
+def subtract(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
+    """Return `area` without `other`; where exact coordinates defeat GEOS, on a grid of `GRID_M`."""
+    try:
+        return shapely.difference(area, other)
+    except GEOSException:
+        return shapely.difference(_snap(area), _snap(other), grid_size=GRID_M)
+
+
+def _snap(area: BaseGeometry) -> BaseGeometry:
+    """Return a valid area with its vertices on the grid."""
+    return shapely.set_precision(shapely.make_valid(area), GRID_M)
 
 
 def split_into_polygons(area: BaseGeometry) -> tuple[Array, ...]:

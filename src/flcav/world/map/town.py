@@ -16,7 +16,7 @@ from flcav.world.map import street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.signals import Signals, place_signals
-from flcav.world.map.surfaces import build_ground_surfaces, find_kerbs, split_into_polygons
+from flcav.world.map.surfaces import add, build_ground_surfaces, find_kerbs, split_into_polygons, unite
 
 Array = NDArray[np.float64]
 
@@ -131,21 +131,21 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
     """Return the town of a net: ground first, then buildings, clutter, trees, poles, signs, lamps and signals."""
     ground = build_ground_surfaces(net, {kind: street.frontage_m for kind, street in parameters.streets.items()})
     rows = list(street_furniture.list_verges(net, parameters))
-    paved = ground.roads.union(ground.sidewalks)
+    paved = add(ground.roads, ground.sidewalks)
     land = street_furniture.Plot(paved)
     buildings = street_furniture.place_buildings(rows, land, stream(parameters.seed, "buildings"))
-    walked = shapely.union_all([verge.line.buffer(verge.half_width, cap_style="flat") for verge in rows])
+    walked = unite([verge.line.buffer(verge.half_width, cap_style="flat") for verge in rows])
     facades = [
         street_furniture.make_footprint(x, y, yaw, length, width).buffer(0.1)
         for x, y, yaw, length, width, _ in buildings
     ]
-    open_land = street_furniture.Plot(shapely.union_all([ground.roads, walked, *facades]))
+    open_land = street_furniture.Plot(unite([ground.roads, walked, *facades]))
     clutter = street_furniture.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
     trees = street_furniture.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
     poles = street_furniture.place_poles(net, parameters.poles)
     mounts = np.array([row[1] for row in poles], dtype=np.float64).reshape(-1, 3)
     signs = street_furniture.place_signs(net)
-    low_x, low_y, high_x, high_y = shapely.union_all([paved, *facades]).bounds
+    low_x, low_y, high_x, high_y = shapely.total_bounds(np.array([paved, *facades]))
     return Town(
         name=name,
         net=path,

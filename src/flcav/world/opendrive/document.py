@@ -1,10 +1,11 @@
-"""Attributes of an OpenDRIVE file beside its geometry: geo-reference, types and speed limits of roads, stop signs."""
+"""Reading of an OpenDRIVE file, and its attributes beside the geometry: geo-reference, road types, limits, stops."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
+from flcav.world.opendrive.standard import check_standard
 
 STOP_SIGN = "206"  # type of <signal>: number in the German catalogue of signs, as in CARLA's maps
 TO_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
@@ -26,10 +27,14 @@ class Document:
     geo_reference: str  # a PROJ string; empty where there is none
     roads: dict[str, Road]  # by the road's id
     stops: frozenset[str]  # ids of the junctions with a stop sign
+    left_hand: bool  # whether most of its roads have left-hand traffic
 
 
-def read_document(path: Path) -> Document:
-    """Return the attributes of an OpenDRIVE file; raises `InputError` where it is missing or no map of version 1."""
+def read_map(path: Path) -> ElementTree.Element:
+    """Return the root of an OpenDRIVE file, its names without a namespace.
+
+    Raises `InputError` where the file is missing, no map of version 1, or breaks a rule of `standard`.
+    """
     try:
         root = ElementTree.parse(path).getroot()
     except FileNotFoundError:
@@ -43,17 +48,27 @@ def read_document(path: Path) -> Document:
     header = root.find("header")
     if root.tag.lower() != "opendrive" or header is None:
         raise InputError(
-            f"{path}: not an OpenDRIVE map (its root is <{root.tag}>, expected <OpenDRIVE> with a <header>)"
+            f"{path}: not an OpenDRIVE map (its root is <{shorten(root.tag)}>, expected <OpenDRIVE> with a <header>)"
         )
     if header.get("revMajor") != "1":
-        raise InputError(f"{path}: OpenDRIVE version {header.get('revMajor')!r} is not supported; supported: 1.x")
-    rows = root.findall("road")
-    if not rows:
+        raise InputError(
+            f"{path}: OpenDRIVE version {shorten(header.get('revMajor', ''))} is not supported; supported: 1.x"
+        )
+    if root.find("road") is None:
         raise InputError(f"{path}: has no <road>")
+    check_standard(root, path)
+    return root
+
+
+def describe_map(root: ElementTree.Element) -> Document:
+    """Return the attributes of the map below `root`."""
+    rows = root.findall("road")
+    left = sum(row.get("rule") == "LHT" for row in rows)
     return Document(
-        (header.findtext("geoReference") or "").strip(),
+        (root.findtext("header/geoReference") or "").strip(),
         {row.get("id", ""): _road(row) for row in rows},
         frozenset(junction for row in rows for junction in _stops(row)),
+        left_hand=2 * left > len(rows),
     )
 
 

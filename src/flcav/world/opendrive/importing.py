@@ -3,11 +3,13 @@
 The first pass splits the map into nodes, edges and connections; the second joins these, rewritten, to a net.
 """
 
+import copy
 import importlib.util
 import re
 import shutil
 import subprocess
 import tempfile
+import xml.etree.ElementTree as ElementTree
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +22,14 @@ from flcav.files import find_existing
 from flcav.world.map.parameters import GeoReference, MapSource
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town, load_town
-from flcav.world.opendrive.document import read_document
+from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.furnishing import furnish
 from flcav.world.opendrive.georeference import locate_origin
+from flcav.world.opendrive.mending import mend_map
+from flcav.world.opendrive.mirror import mirror_map, mirror_parts
 from flcav.world.opendrive.streets import rewrite_streets
 
+NETCONVERT_S = 300.0  # longest run of netconvert
 PARTS = ("nod", "edg", "con")  # netconvert's plain XML files: nodes, edges, connections
 OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
 JOINING = {
@@ -45,11 +50,21 @@ JOINING = {
 }
 
 
-def split_map(xodr: Path, prefix: Path) -> None:
-    """Split an OpenDRIVE map: write its `PARTS` as `prefix.nod.xml` and so on, and its net as `prefix.net.xml`.
+def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_hand: bool) -> None:
+    """Split the map below `root`: write its `PARTS` as `prefix.nod.xml` and so on, and its net as `prefix.net.xml`.
 
-    Heights are dropped, since towns are flat. Raises `InputError` where netconvert is missing or refuses the map.
+    They are plane: heights are read on their own. netconvert knows no left-hand traffic in OpenDRIVE; such a map is
+    mirrored for it, and its parts are mirrored back. Raises `InputError` naming `origin` where netconvert is missing or
+    refuses the map.
     """
+    plan = copy.deepcopy(root)
+    for road in plan.iterfind("road"):
+        for objects in road.findall("objects"):
+            road.remove(objects)
+    if left_hand:
+        mirror_map(plan)
+    xodr = prefix.with_suffix(".xodr")
+    ElementTree.ElementTree(plan).write(xodr, encoding="utf-8", xml_declaration=True)
     options = {
         "opendrive-files": str(xodr),
         "opendrive.import-all-lanes": "true",
@@ -58,13 +73,16 @@ def split_map(xodr: Path, prefix: Path) -> None:
         "plain-output-prefix": str(prefix),
         "output-file": f"{prefix}.net.xml",
     }
-    _run(options, xodr)
+    _run(options, origin)
+    if left_hand:
+        mirror_parts(prefix)
 
 
-def join_parts(prefix: Path, net: Path, origin: Path) -> None:
+def join_parts(prefix: Path, net: Path, origin: Path, *, left_hand: bool) -> None:
     """Join the `PARTS` beside `prefix` to the net file `net`; raises `InputError` naming `origin` where that fails."""
     options = {OPTIONS[part]: f"{prefix}.{part}.xml" for part in PARTS}
-    _run(options | JOINING | {"output-file": str(net)}, origin)
+    side = {"lefthand": "true"} if left_hand else {}
+    _run(options | JOINING | side | {"output-file": str(net)}, origin)
     text = net.read_text(encoding="utf-8")
     net.write_text(re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL), encoding="utf-8")  # no dates and paths
 
@@ -78,9 +96,14 @@ def _run(options: dict[str, str], origin: Path) -> None:
         )
     binary = Path(next(iter(found.submodule_search_locations))) / "bin" / "netconvert"
     command = [str(binary), *(word for name, value in options.items() for word in (f"--{name}", value))]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", check=False, timeout=NETCONVERT_S
+        )
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{origin}: netconvert did not come to an end with this map in {NETCONVERT_S:.0f} s") from None
     if done.returncode:
-        errors = re.findall(r"Error: (.*)", done.stderr) or [done.stderr.strip() or f"exit code {done.returncode}"]
+        errors = re.findall(r"Error: (.*)", done.stderr) or [f"exit code {done.returncode}"]
         raise InputError(f"{origin}: netconvert cannot read this OpenDRIVE map ({errors[0].strip().rstrip('.')})")
 
 
@@ -103,14 +126,15 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
     beside = find_existing(out.parent)
     if not beside.is_dir():
         raise InputError(f"{beside}: is a file; a town needs a folder")
-    document = read_document(xodr)
-    notes = ["Heights of the map are left out: towns are flat."]
+    root = read_map(xodr)
+    document = describe_map(root)
+    notes = [*mend_map(root), "Heights of the map are left out: towns are flat."]
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=beside) as scratch:
         prefix, folder = Path(scratch) / "map", Path(scratch) / out.name
         folder.mkdir()
-        split_map(xodr, prefix)
+        split_map(root, prefix, xodr, left_hand=document.left_hand)
         streets = rewrite_streets(prefix, document, xodr)
-        join_parts(prefix, folder / "town.net.xml", xodr)
+        join_parts(prefix, folder / "town.net.xml", xodr, left_hand=document.left_hand)
         net = read_net(folder / "town.net.xml")
         dx, dy = streets.offset_m
         geo = locate_origin(document.geo_reference, -dx, -dy)

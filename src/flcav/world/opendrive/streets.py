@@ -56,12 +56,14 @@ def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChange
     _write_widths(rows, Path(f"{prefix}.net.xml"))
     add = not any(lane.get("type") in WALKED for row in rows for lane in _plain_lanes(row))
     kept: dict[str, dict[int, int]] = {}  # edge -> index of a lane with traffic in the map -> in the town
+    added = False
     for row in rows:
         road = _road(row.attrib["id"], document)
         lanes = _lanes(row, road, add)
         if not any(lane.kind == "driving" for lane in lanes):
             edges.getroot().remove(row)
             continue
+        added |= any(lane.before is None for lane in lanes)
         _write_edge(row, lanes, road)
         kept[row.attrib["id"]] = {
             lane.before: i
@@ -71,14 +73,14 @@ def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChange
     if not kept:
         raise InputError(f"{origin}: has no road with a lane for driving")
     _connect(connections.getroot(), kept)
-    _open_short_lanes(
-        connections.getroot(), {row.attrib["id"]: _length(row) for row in edges.getroot().findall("edge")}
-    )
+    places = {row.attrib["id"]: f"{row.attrib['x']},{row.attrib['y']}" for row in nodes.getroot().findall("node")}
+    lengths = {row.attrib["id"]: _length(row, places) for row in edges.getroot().findall("edge")}
+    _open_short_lanes(connections.getroot(), lengths)
     _rule(nodes.getroot(), edges.getroot().findall("edge"), document)
     offset = _move(nodes.getroot(), edges.getroot())
     for part, tree in (("nod", nodes), ("edg", edges), ("con", connections)):
         tree.write(f"{prefix}.{part}.xml")
-    return MapChanges(offset, add)
+    return MapChanges(offset, added)
 
 
 def _write_widths(rows: list[ElementTree.Element], net: Path) -> None:
@@ -197,9 +199,10 @@ def _open_short_lanes(root: ElementTree.Element, length: dict[str, float]) -> No
                     ElementTree.SubElement(root, "connection", values)
 
 
-def _length(row: ElementTree.Element) -> float:
-    """Return the length of an edge's shape [m]."""
-    points = np.array([point.split(",")[:2] for point in row.attrib["shape"].split()], dtype=np.float64)
+def _length(row: ElementTree.Element, places: dict[str, str]) -> float:
+    """Return the length of an edge [m]; one without a shape is straight between its nodes, at `places`."""
+    shape = row.get("shape", f"{places[row.attrib['from']]} {places[row.attrib['to']]}")
+    points = np.array([point.split(",")[:2] for point in shape.split()], dtype=np.float64)
     return float(np.hypot(*np.diff(points, axis=0).T).sum())
 
 

@@ -84,7 +84,7 @@ def _way_is_free(stage: Stage, name: str) -> bool:
     for other in stage.sumo.vehicle.getIDList():
         other_x, other_y, _, speed = stage.state(other)
         ahead, left = rotate(other_x - x, other_y - y, -heading)
-        if -10.0 < ahead < _takes_m(own_speed) + braking_m(speed) and 1.0 < left < 12.0:
+        if -10.0 < ahead < _takes_m(own_speed) + braking_m(speed) and 1.0 < stage.net.side * left < 12.0:
             return False
     return True
 

@@ -83,7 +83,7 @@ class Stage:
     def point(self, lane: Lane, along: float, left: float) -> tuple[float, float, float]:
         """Return x, y [m] and heading [rad] at `along` metres of a lane, `left` metres to the left of its middle.
 
-        Beyond its ends the lane goes straight on.
+        With left-hand traffic it is to the right: towards the middle of the road. Beyond its ends the lane goes straight on.
         """
         edge, index = lane.id.rpartition("_")[::2]
         length = self.sumo.lane.getLength(lane.id)
@@ -93,7 +93,7 @@ class Stage:
         heading = math.atan2(b[1] - a[1], b[0] - a[0])
         x, y = self.sumo.simulation.convert2D(edge, inside, int(index))
         ahead_x, ahead_y = rotate(along - inside, 0.0, heading)
-        aside_x, aside_y = rotate(0.0, left, heading)
+        aside_x, aside_y = rotate(0.0, self.net.side * left, heading)
         return x + ahead_x + aside_x, y + ahead_y + aside_y, heading
 
     def cast(self, kind: str) -> str:
@@ -186,8 +186,8 @@ class Stage:
             return state
         left, turn = self.shifted[name]
         x, y, angle, speed = state
-        aside_x, aside_y = rotate(0.0, left, math.radians(90.0 - angle))
-        return x + aside_x, y + aside_y, angle - math.degrees(turn), speed
+        aside_x, aside_y = rotate(0.0, self.net.side * left, math.radians(90.0 - angle))
+        return x + aside_x, y + aside_y, angle - self.net.side * math.degrees(turn), speed
 
     def trail(self, name: str, behind_m: float) -> Iterator[tuple[int, State]]:
         """Yield steps and states of a follower on a vehicle's path, `behind_m` behind it from front to front.

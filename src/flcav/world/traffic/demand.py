@@ -17,6 +17,7 @@ from flcav.world.map.parameters import TownParameters
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 from flcav.world.shapes import SHAPES
+from flcav.world.traffic.reach import find_driven, find_walked
 
 Array = NDArray[np.float64]
 
@@ -36,6 +37,7 @@ DRIVER = {  # attributes of SUMO's vehicle types by category, where they differ 
     "pedestrian": {"vClass": "pedestrian", "maxSpeed": "1.6", "speedFactor": "normc(0.8,0.15,0.4,1.0)"},
 }
 CAV_TYPE = "car.sedan"
+NEXT_M = 5.0  # least distance between two destinations, where there is a choice
 FASTEST = 20.0  # speed for which tours are long enough, of vehicles [m/s]
 FASTEST_WALK = 1.7  # and of pedestrians [m/s]
 
@@ -62,7 +64,7 @@ def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) 
         categories = list(street.parked_mix)
         shares = np.array([street.parked_mix[category] for category in categories])
         for lane in edge.lanes_of("parking"):
-            verge = Verge(LineString(lane.shape), lane.width / 2, street)
+            verge = Verge(LineString(lane.shape), lane.width / 2, street, net.side)
             along = FROM_JUNCTION_M + random.uniform(0.0, 3.0)
             while True:
                 category = categories[int(random.choice(len(categories), p=shares / shares.sum()))]
@@ -106,11 +108,12 @@ def write_demand(
     footfall = np.array([parameters.streets[edge.type].footfall for edge in walked])
     watched = weigh_pole_approaches(net, parameters)
     watching = np.array([watched.get(edge.id, 0.0) for edge in driven])
+    by_car, on_foot = find_driven(net, driven), find_walked(net, walked)
     reach = FASTEST * until_s
     trips: list[tuple[float, Element]] = []
     for i in range(cavs):
         random = stream(seed, "cav", i)
-        edges = draw_tour(driven, watching if watching.any() else traffic, reach, random)
+        edges = draw_tour(driven, by_car, watching if watching.any() else traffic, reach, random)
         trips.append((0.0, _vehicle(f"cav{i}", CAV_TYPE, 0.0, edges)))
     categories = list(parameters.mix)
     shares = np.array([parameters.mix[category] for category in categories])
@@ -118,14 +121,16 @@ def write_demand(
         random = stream(seed, "vehicle", i)
         kind = draw_type(categories[int(random.choice(len(categories), p=shares / shares.sum()))], parameters, random)
         depart = round(float(random.uniform(0.0, fill_s)), 1)
-        trips.append((depart, _vehicle(f"veh{i}", kind, depart, draw_tour(driven, traffic, reach, random))))
-    for i in range(parameters.pedestrians):
+        tour = draw_tour(driven, by_car, traffic, reach, random)
+        trips.append((depart, _vehicle(f"veh{i}", kind, depart, tour)))
+    for i in range(parameters.pedestrians if walked else 0):
         random = stream(seed, "pedestrian", i)
         kind = draw_type("pedestrian", parameters, random)
         depart = round(float(random.uniform(0.0, fill_s)), 1)
-        trips.append(
-            (depart, _person(f"ped{i}", kind, depart, draw_tour(walked, footfall, FASTEST_WALK * until_s, random)))
-        )
+        tour = draw_tour(walked, on_foot, footfall, FASTEST_WALK * until_s, random)
+        tour = [edge for i, edge in enumerate(tour) if edge != tour[i - 1] or not i]  # nobody walks on the spot
+        if len(tour) > 1:
+            trips.append((depart, _person(f"ped{i}", kind, depart, tour)))
     for _, trip in sorted(trips, key=lambda item: item[0]):
         root.append(trip)
     return tostring(root, encoding="unicode")
@@ -148,19 +153,32 @@ def weigh_pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str,
     return out
 
 
-def draw_tour(edges: list[Edge], weight: Array, length_m: float, random: np.random.Generator) -> list[str]:
-    """Return the ids of edges to visit in order, drawn by `weight` (N,), at least `length_m` long as the crow flies."""
+def draw_tour(
+    edges: list[Edge], reach: NDArray[np.bool_], weight: Array, length_m: float, random: np.random.Generator
+) -> list[str]:
+    """Return the ids of edges to visit in order, drawn by `weight` (N,), at least `length_m` long as the crow flies.
+
+    `reach` (N, N) says which edges can be reached from which. The tour starts where it can go on, if there is such an
+    edge, and ends early where it cannot. Weights that are all zero count as equal.
+    """
     middle = np.array([edge.lanes[0].shape.mean(axis=0) for edge in edges])
-    share = weight / weight.sum()
+    weight = weight if weight.any() else np.ones(len(edges))
+    going_on = weight * (reach & (weight > 0)).any(axis=1)
+    share = going_on / going_on.sum() if going_on.any() else weight / weight.sum()
     at = int(random.choice(len(edges), p=share))
     out, done = [edges[at].id], 0.0
     while done < length_m:
-        to = int(random.choice(len(edges), p=share))
-        step = float(np.hypot(*(middle[to] - middle[at])))
-        if step < 5.0:
+        steps = np.hypot(*(middle - middle[at]).T)
+        share = weight * reach[at]
+        if not share.any():
+            break
+        if not (share * (steps >= NEXT_M)).any():
+            steps = np.maximum(steps, NEXT_M)  # nothing farther: round and round
+        to = int(random.choice(len(edges), p=share / share.sum()))
+        if steps[to] < NEXT_M:
             continue
         out.append(edges[to].id)
-        done, at = done + step, to
+        done, at = done + float(steps[to]), to
     return out
 
 

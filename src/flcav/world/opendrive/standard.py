@@ -1,0 +1,145 @@
+"""Rules of the OpenDRIVE standard that an import relies on, each with its clause in ASAM OpenDRIVE 1.8.
+
+A map that breaks one of them is refused; what else a map leaves out or gets wrong is mended (`mending`).
+"""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from pathlib import Path
+
+from flcav.config import InputError, shorten
+
+HEADER, LINES, ROADS, LINKS = "6.3", "9.2", "10", "10.3"  # clauses
+ELEVATIONS, LANES, WIDTHS, JUNCTIONS = "10.5", "11.3", "11.6", "12"
+SHAPES: dict[str, tuple[str, ...]] = {  # children of <geometry> with their coefficients
+    "line": (),
+    "arc": ("curvature",),
+    "spiral": ("curvStart", "curvEnd"),
+    "poly3": tuple("abcd"),
+    "paramPoly3": (*(f"{name}U" for name in "abcd"), *(f"{name}V" for name in "abcd")),
+}
+POLYNOMIALS: dict[str, tuple[str, str]] = {  # elements that hold a cubic polynomial: clause, attribute of its start
+    "elevationProfile/elevation": (ELEVATIONS, "s"),
+    "lateralProfile/superelevation": (ELEVATIONS, "s"),
+    "lateralProfile/shape": (ELEVATIONS, "s"),
+    "lanes/laneOffset": (WIDTHS, "s"),
+}
+FARTHEST_M = 1e7  # largest coordinate of a map: zones of UTM reach so far from their origin
+WIDEST_M = 100.0  # largest number of a lane's width
+LONGEST_M = 1e6  # of all roads together
+LENGTH_SHARE, LENGTH_M = 0.01, 0.5  # by which the length of a road may differ from that of its geometry
+
+
+class _Broken(ValueError):
+    """A rule that is broken: the sentence without the file's name."""
+
+
+def check_standard(root: ElementTree.Element, path: Path) -> None:
+    """Raise `InputError` for the first rule that the map below `root` breaks, with its clause."""
+    try:
+        _check(root)
+    except _Broken as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _check(root: ElementTree.Element) -> None:
+    roads = root.findall("road")
+    _refuse_twice("road", roads, ROADS)
+    _refuse_twice("junction", root.findall("junction"), JUNCTIONS)
+    total = 0.0
+    for road in roads:
+        name = f"road {shorten(road.get('id', ''))}"
+        _check_reference_line(road, name)
+        for where, (clause, start) in POLYNOMIALS.items():
+            for row in road.iterfind(where):
+                _numbers(row, (start, *"abcd"), name, clause)
+        _check_lanes(road, name)
+        total += float(road.attrib["length"])
+    if total > LONGEST_M:
+        raise _Broken(f"its roads are {total / 1000:.0f} km long; supported: {LONGEST_M / 1000:.0f} km")
+
+
+def _refuse_twice(kind: str, rows: list[ElementTree.Element], clause: str) -> None:
+    seen: set[str] = set()
+    for row in rows:
+        name = row.get("id", "")
+        if not name or name in seen:
+            what = "two have" if name else "one lacks"
+            raise _Broken(f"each {kind} needs an id of its own, and {what} {shorten(name)} (OpenDRIVE 1.8, {clause})")
+        seen.add(name)
+
+
+def _check_reference_line(road: ElementTree.Element, name: str) -> None:
+    rows = road.findall("planView/geometry")
+    if not rows:
+        raise _Broken(f"{name} has no <geometry> (OpenDRIVE 1.8, {LINES})")
+    (length,) = _numbers(road, ("length",), name, ROADS)
+    total, before = 0.0, -1.0
+    for row in rows:
+        s, x, y, _, own = _numbers(row, ("s", "x", "y", "hdg", "length"), name, LINES)
+        shapes = [child for child in row if child.tag in SHAPES]
+        if len(shapes) != 1:
+            raise _Broken(f"{name}: a <geometry> needs one of {', '.join(SHAPES)} (OpenDRIVE 1.8, {LINES})")
+        _numbers(shapes[0], SHAPES[shapes[0].tag], name, LINES)
+        if own < 0 or s <= before:
+            raise _Broken(f"{name}: its <geometry> elements do not follow one another (OpenDRIVE 1.8, {LINES})")
+        if max(abs(x), abs(y)) > FARTHEST_M:
+            raise _Broken(f"{name} begins more than {FARTHEST_M / 1000:g} km from the origin")
+        total, before = total + own, s
+    if not length > 0 or abs(total - length) > LENGTH_M + LENGTH_SHARE * length:
+        raise _Broken(f"{name} is {length:g} m long, and its geometry {total:g} m (OpenDRIVE 1.8, {LINES})")
+
+
+def _check_lanes(road: ElementTree.Element, name: str) -> None:
+    sections = road.findall("lanes/laneSection")
+    if not sections:
+        raise _Broken(f"{name} has no <laneSection> (OpenDRIVE 1.8, {LANES})")
+    before = -math.inf
+    for section in sections:
+        (start,) = _numbers(section, ("s",), name, LANES)
+        if start <= before:
+            raise _Broken(f"{name}: its lane sections are not in ascending order (OpenDRIVE 1.8, {LANES})")
+        before = start
+        for side, sign in (("left", 1), ("right", -1)):
+            numbers = [_lane_number(lane, name) for lane in section.iterfind(f"{side}/lane")]
+            if sorted(sign * number for number in numbers) != list(range(1, len(numbers) + 1)):
+                raise _Broken(f"{name}: its {side} lanes are not numbered one by one (OpenDRIVE 1.8, {LANES})")
+        for lane in _side_lanes(section):
+            for row in lane:
+                if row.tag in ("width", "border"):
+                    values = _numbers(row, ("sOffset", *"abcd"), name, WIDTHS)
+                    if abs(values[1]) > WIDEST_M:
+                        raise _Broken(f"{name}: a lane is {values[1]:g} m wide; supported: {WIDEST_M:g} m")
+
+
+def _lane_number(lane: ElementTree.Element, name: str) -> int:
+    try:
+        return int(lane.get("id", ""))
+    except ValueError:
+        raise _Broken(
+            f"{name}: the lane id {shorten(lane.get('id', ''))} is no integer (OpenDRIVE 1.8, {LANES})"
+        ) from None
+
+
+def _side_lanes(section: ElementTree.Element) -> Iterator[ElementTree.Element]:
+    """Yield the lanes left and right of the centre lane."""
+    for side in ("left", "right"):
+        yield from section.iterfind(f"{side}/lane")
+
+
+def _numbers(row: ElementTree.Element, names: tuple[str, ...], where: str, clause: str) -> list[float]:
+    """Return attributes as finite numbers; raises `_Broken` for others."""
+    out = []
+    for name in names:
+        text = row.get(name)
+        try:
+            value = float(text if text is not None else "")
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            said = "lacks" if text is None else "needs a number as"
+            found = "" if text is None else f", not {shorten(text)}"
+            raise _Broken(f"{where}: <{row.tag}> {said} '{name}'{found} (OpenDRIVE 1.8, {clause})")
+        out.append(value)
+    return out
