@@ -12,7 +12,7 @@ from flcav.sensors.frame import LONGEST_NAME, Frame, format_key
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.recipe import Recipe
-from flcav.world.map.town import TOWNS, load_town
+from flcav.world.map.town import HEIGHTS, TOWNS, load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
 from flcav.world.traffic.traffic import simulate
@@ -46,7 +46,8 @@ class EmbeddedSource:
             raise InputError("fields 'cavs' = 0 and 'poles' = []: nobody observes; give at least one of them")
         _check_mounts("vehicle_rig", recipe.vehicle_rig, "a vehicle", 0.0)
         for pole in self.poles:
-            mount_m = float(self.town.poles.position[known.index(pole), 2])
+            x, y, z = self.town.poles.position[known.index(pole)].tolist()
+            mount_m = z - self.town.ground(x, y)
             _check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
         self._per_scene = recipe.spins_per_scene * len(self.agents)
         self._frames = recipe.frames or recipe.scenes * self._per_scene
@@ -116,8 +117,9 @@ class EmbeddedSource:
             self._last_trace = scene, trace
         return self._last_trace[1]
 
-    def _town_paths(self) -> tuple[Path, Path]:
-        return self.town.net, self.town.net.parent / "town.yaml"
+    def _town_paths(self) -> list[Path]:
+        names = ("town.yaml", *([] if self.town.relief is None else [HEIGHTS]))
+        return [self.town.net, *(self.town.net.parent / name for name in names)]
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_last_trace": None, "_last_scene": None}

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from flcav.geometry import left_vectors
 from flcav.seeds import stream
+from flcav.world.map.relief import Relief
 from flcav.world.map.town import KERB_M, Town
 from flcav.world.materials import Material
 from flcav.world.meshes.buildings import make_building
+from flcav.world.meshes.drape import drape_polygon, drape_wall
 from flcav.world.meshes.furniture import (
     make_clutter,
     make_lamp,
@@ -124,6 +126,10 @@ def _parts(town: Town) -> Iterator[Owned]:
 
 
 def _ground(town: Town) -> Mesh:
+    if town.relief is not None:
+        vertices = (town.relief.points + (0.0, 0.0, GROUND_M)).astype(np.float32)
+        faces = town.relief.triangles.astype(np.int32)
+        return Mesh(vertices, faces, np.full(len(faces), Material.GROUND, np.uint8))
     x0, y0, x1, y1 = town.bounds
     x = np.linspace(x0 - LAND_M, x1 + LAND_M, 16)
     y = np.linspace(y0 - LAND_M, y1 + LAND_M, 16)
@@ -132,21 +138,28 @@ def _ground(town: Town) -> Mesh:
 
 
 def _roads(town: Town) -> Iterator[Owned]:
-    return ((Part.ROAD, row, _plate(polygon, 0.0, Material.ROAD)) for row, polygon in enumerate(town.roads))
+    return (
+        (Part.ROAD, row, _plate(polygon, 0.0, Material.ROAD, town.relief)) for row, polygon in enumerate(town.roads)
+    )
 
 
 def _sidewalks(town: Town) -> Iterator[Owned]:
     """Yield the sidewalks, each as its surface and its kerb face."""
     for row, polygon in enumerate(town.sidewalks):
-        yield Part.SIDEWALK, row, _plate(polygon, KERB_M, Material.SIDEWALK)
+        yield Part.SIDEWALK, row, _plate(polygon, KERB_M, Material.SIDEWALK, town.relief)
         ring = np.concatenate((polygon, polygon[:1]))
         heights = (GROUND_M, KERB_M)
+        if town.relief is not None:
+            yield Part.SIDEWALK, row, drape_wall(ring, town.relief, heights, Material.SIDEWALK)
+            continue
         kerb = sheet(np.stack([np.c_[ring, np.full(len(ring), z)] for z in heights]), Material.SIDEWALK)
         yield Part.SIDEWALK, row, kerb
 
 
-def _plate(polygon: NDArray[np.float64], z: float, material: Material) -> Mesh:
-    """Return a polygon (K, 2) as a horizontal surface at height `z` [m], by constrained Delaunay triangulation."""
+def _plate(polygon: NDArray[np.float64], z: float, material: Material, relief: Relief | None) -> Mesh:
+    """Return a polygon (K, 2) as a surface at height `z` [m] above the ground, by constrained Delaunay triangulation."""
+    if relief is not None:
+        return drape_polygon(polygon, relief, z, material)
     triangles = shapely.constrained_delaunay_triangles(shapely.Polygon(polygon))
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3].reshape(-1, 2)
     vertices = np.c_[corners, np.full(len(corners), z)].astype(np.float32)
@@ -156,28 +169,41 @@ def _plate(polygon: NDArray[np.float64], z: float, material: Material) -> Mesh:
 
 def _buildings(town: Town) -> Iterator[Owned]:
     rng = stream(0, "facades", town.name)
+    foot = find_lowest_ground(town, town.buildings)
     for row, (x, y, yaw, length, width, height) in enumerate(town.buildings):
-        yield Part.BUILDING, row, transform_mesh(make_building(length, width, height, rng), x, y, 0.0, yaw)
+        yield Part.BUILDING, row, transform_mesh(make_building(length, width, height, rng), x, y, foot[row], yaw)
+
+
+def find_lowest_ground(town: Town, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lowest ground (N,) [m] under the corners of footprints (N, >=5) x, y, yaw, length, width [m, rad]."""
+    x, y, yaw, length, width = rows[:, :5].T
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    corners = [(a * length / 2, b * width / 2) for a in (-1, 1) for b in (-1, 1)]
+    return np.min([town.grounds(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in corners], axis=0)
 
 
 def _plants(town: Town) -> Iterator[Owned]:
     rng = stream(0, "leaves", town.name)
     for row, (x, y, height, radius) in enumerate(town.trees):
-        yield Part.TREE, row, transform_mesh(make_tree(height, radius, rng), x, y)
+        yield Part.TREE, row, transform_mesh(make_tree(height, radius, rng), x, y, town.ground(x, y))
 
 
 def _furniture(town: Town) -> Iterator[Owned]:
     """Yield clutter, lamps, signs with their posts, sensor masts and signals."""
     pieces = [(kind, *values) for kind, rows in town.clutter for values in rows]
     for row, (kind, x, y, yaw, length, width, height) in enumerate(pieces):
-        yield Part.CLUTTER, row, transform_mesh(make_clutter(kind, length, width, height), x, y, 0.0, yaw)
+        yield Part.CLUTTER, row, transform_mesh(
+            make_clutter(kind, length, width, height), x, y, town.ground(x, y), yaw
+        )
     for row, (x, y, height) in enumerate(town.lamps):
-        yield Part.LAMP, row, transform_mesh(make_lamp(height), x, y)
+        yield Part.LAMP, row, transform_mesh(make_lamp(height), x, y, town.ground(x, y))
     for row, ((x, y, z), yaw, kind) in enumerate(zip(town.signs.position, town.signs.yaw, town.signs.kind)):
-        yield Part.SIGN, row, transform_mesh(sign_plate(kind, z), x, y, 0.0, yaw)
-        yield Part.POST, row, transform_mesh(sign_post(z), x, y, 0.0, yaw)
+        foot = town.ground(x, y)
+        yield Part.SIGN, row, transform_mesh(sign_plate(kind, z - foot), x, y, foot, yaw)
+        yield Part.POST, row, transform_mesh(sign_post(z - foot), x, y, foot, yaw)
     for row, ((x, y, z), yaw) in enumerate(zip(town.poles.position, town.poles.yaw)):
-        yield Part.MAST, row, transform_mesh(sensor_mast(z), x, y, 0.0, yaw)
+        foot = town.ground(x, y)
+        yield Part.MAST, row, transform_mesh(sensor_mast(z - foot), x, y, foot, yaw)
     yield from _signals(town)
 
 
@@ -187,5 +213,6 @@ def _signals(town: Town) -> Iterator[Owned]:
     for row, ((x, y, z), yaw, foot) in enumerate(zip(signals.position, signals.yaw, signals.foot)):
         left = left_vectors(yaw)
         reach = float(left @ ((x, y) - foot))
-        yield Part.SIGNAL, row, transform_mesh(signal_head(z), x, y, 0.0, yaw)
-        yield Part.POST, row, transform_mesh(signal_mast(z, reach), foot[0], foot[1], 0.0, yaw)
+        ground = town.ground(*foot)
+        yield Part.SIGNAL, row, transform_mesh(signal_head(z - ground), x, y, ground, yaw)
+        yield Part.POST, row, transform_mesh(signal_mast(z - ground, reach), foot[0], foot[1], ground, yaw)

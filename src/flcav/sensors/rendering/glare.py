@@ -108,7 +108,8 @@ def _glowing(
             out.append((place, TAIL_COLOUR, TAIL * float(state.tail[actor + 1]) * max(-ahead, 0.0) ** 2))
     if light.lamps > 0:
         street = STREET * float(light.lamps)
-        out.extend((np.array((x, y, z - 0.2)), STREET_COLOUR, street) for x, y, z in scene.town.lamps)
+        for x, y, z in scene.town.lamps:
+            out.append((np.array((x, y, z - 0.2 + scene.town.ground(x, y))), STREET_COLOUR, street))
         things = scene.things
         for number, (place, yaw, kind) in enumerate(zip(things.position, things.yaw, things.kind)):
             cos, sin = heading_vectors(yaw)

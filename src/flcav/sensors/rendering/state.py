@@ -63,6 +63,7 @@ def compute_lamp_state(scene: Scene, lamps_on: float, low_sight: bool) -> LampSt
 def collect_lamps(scene: Scene, state: LampState) -> Lamps:
     """Return the lamps that illuminate the scene: all street lamps, then the head lamps that are on."""
     street = scene.town.lamps - (0.0, 0.0, 0.08)
+    street[:, 2] += scene.town.grounds(*street[:, :2].T)
     places, beams = [street], [np.zeros_like(street)]
     for actor in np.flatnonzero(state.head[1:] > 0.5):
         body = scene.world_from_actor(int(actor))

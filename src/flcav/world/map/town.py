@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from flcav.config import InputError, read_config, shorten
 from flcav.seeds import stream
 from flcav.world.map import street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
+from flcav.world.map.relief import Relief
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.signals import Signals, place_signals
 from flcav.world.map.surfaces import add, build_ground_surfaces, find_kerbs, split_into_polygons, unite
@@ -21,6 +22,7 @@ from flcav.world.map.surfaces import add, build_ground_surfaces, find_kerbs, spl
 Array = NDArray[np.float64]
 
 TOWNS: tuple[str, ...] = ("suburb", "grid", "ring", "arterial")
+HEIGHTS = "heights.parquet"  # file of a town's relief, beside its net
 KERB_M = 0.12  # height of a sidewalk above the road
 MARGIN_M = 5.0  # from the outermost surface or building to the bounds
 
@@ -30,7 +32,7 @@ class Poles:
     """The P candidate sites of a roadside sensor."""
 
     id: NDArray[np.int64]  # (P,) site numbers, from 1
-    position: Array  # (P, 3) mount of the sensor, world [m]; z is its height above ground
+    position: Array  # (P, 3) mount of the sensor, world [m]
     yaw: Array  # (P,) direction the mount faces: the road or the junction, world [rad]
     kind: tuple[str, ...]  # (P,) straight | cross | tee | roundabout
 
@@ -46,7 +48,7 @@ class Signs:
 
 @dataclass(frozen=True)
 class Town:
-    """The static content of a town. World frame: ENU, metres, z = 0 at the road surface.
+    """The static content of a town. World frame: ENU, metres, z = 0 at the surface of a level road.
 
     >>> from flcav import Town, load_town
     >>> town: Town = load_town("suburb")
@@ -66,13 +68,22 @@ class Town:
     clutter: tuple[tuple[str, Array], ...]  # (kind of `parameters.CLUTTER`, (K, 6) x, y, yaw, length, width, height)
     poles: Poles
     signs: Signs
-    lamps: Array  # (L, 3) street lamps: x, y of the foot, height [m]
+    lamps: Array  # (L, 3) street lamps: x, y of the foot, height above it [m]
     geo: GeoReference = field(default_factory=GeoReference)  # geodetic position of the world frame's origin
     signals: Signals = field(default_factory=Signals.none)
+    relief: Relief | None = None  # heights of the ground; None: it is level, at z = 0
+
+    def grounds(self, x: Array, y: Array) -> Array:
+        """Return the height (...) [m] of the road, or of the land beside it, at `x`, `y` (...) [m]."""
+        return np.zeros(np.shape(x)) if self.relief is None else self.relief.heights(x, y)
+
+    def ground(self, x: float, y: float) -> float:
+        """Return the height [m] of the road, or of the land beside it, at one place."""
+        return 0.0 if self.relief is None else float(self.relief.heights(x, y))
 
 
 def load_town(name: str | Path, beside: Path | None = None) -> Town:
-    """Return a town of `TOWNS`, or the town of a folder that holds `town.net.xml` and `town.yaml`.
+    """Return a town of `TOWNS`, or the town of a folder that holds `town.net.xml`, `town.yaml` and maybe its heights.
 
     A `Path` is that folder; any other name is a folder in `beside`, where given, or else in the working directory. The
     same files give the same town. Raises `InputError` for an unknown name, and for files that are missing, not of their
@@ -101,7 +112,10 @@ def _build_town(folder: Path, files: str) -> Town:
     parameters = read_config(TownParameters, folder / "town.yaml")
     net = read_net(folder / "town.net.xml")
     _check(net, parameters, folder / "town.yaml")
-    return _furnish(folder.name, folder / "town.net.xml", net, parameters)
+    heights = folder / HEIGHTS
+    relief = Relief.load(heights) if heights.exists() else None
+    town = _furnish(folder.name, folder / "town.net.xml", net, parameters)
+    return town if relief is None else _lift(town, relief)
 
 
 def _folder(name: str, beside: Path | None) -> Path:
@@ -125,6 +139,23 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
     for pole in parameters.poles:
         if pole.edge not in walked:
             raise InputError(f"{origin}: pole {pole.id} stands on '{pole.edge}', which is no edge with a sidewalk")
+
+
+def _lift(town: Town, relief: Relief) -> Town:
+    """Return a level town lifted onto a relief: poles, signs and signals by the ground at their feet."""
+
+    def raise_by(position: Array, foot: Array) -> Array:
+        lift = relief.heights(*foot[:, :2].T)
+        return np.column_stack((position[:, :2], position[:, 2] + lift))
+
+    poles, signs, signals = town.poles, town.signs, town.signals
+    return replace(
+        town,
+        relief=relief,
+        poles=replace(poles, position=raise_by(poles.position, poles.position)),
+        signs=replace(signs, position=raise_by(signs.position, signs.position)),
+        signals=replace(signals, position=raise_by(signals.position, signals.foot)),
+    )
 
 
 def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:

@@ -7,6 +7,7 @@ from pathlib import Path
 from flcav.config import InputError, shorten
 from flcav.world.opendrive.standard import check_standard
 
+FASTEST = 100.0  # [m/s] a limit beyond is none
 STOP_SIGN = "206"  # type of <signal>: number in the German catalogue of signs, as in CARLA's maps
 TO_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
 OPEN_ROADS = ("rural", "motorway", "highway")  # types of roads outside towns
@@ -81,7 +82,7 @@ def _road(row: ElementTree.Element) -> Road:
         speed = float(limit.get("max", "")) * TO_METRES_PER_SECOND[limit.get("unit", "m/s")] if limit is not None else 0
     except (ValueError, KeyError):
         speed = 0.0  # "no limit", "undefined"
-    return Road(first.get("type", "unknown"), speed or None)
+    return Road(first.get("type", "unknown"), speed if 0 < speed <= FASTEST else None)
 
 
 def _stops(row: ElementTree.Element) -> list[str]:

@@ -20,11 +20,13 @@ from flcav.config import InputError
 from flcav.extras import format_install_command
 from flcav.files import find_existing
 from flcav.world.map.parameters import GeoReference, MapSource
+from flcav.world.map.relief import Relief
 from flcav.world.map.roads import read_net
-from flcav.world.map.town import Town, load_town
+from flcav.world.map.town import HEIGHTS, Town, load_town
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.furnishing import furnish
 from flcav.world.opendrive.georeference import locate_origin
+from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map, mirror_parts
 from flcav.world.opendrive.streets import rewrite_streets
@@ -128,7 +130,10 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         raise InputError(f"{beside}: is a file; a town needs a folder")
     root = read_map(xodr)
     document = describe_map(root)
-    notes = [*mend_map(root), "Heights of the map are left out: towns are flat."]
+    notes = [*mend_map(root)]
+    heights = sample_heights(root)
+    if heights.bridges:
+        notes.append(f"Roads that pass above others, which lie at the lower one's height there: {heights.bridges}.")
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=beside) as scratch:
         prefix, folder = Path(scratch) / "map", Path(scratch) / out.name
         folder.mkdir()
@@ -158,6 +163,8 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         values = parameters.model_dump(mode="json", exclude_defaults=True)
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
         (folder / "town.yaml").write_text(text, encoding="utf-8")
+        if len(heights.points):
+            Relief(heights.points + (dx, dy, 0.0)).save(folder / HEIGHTS)
         load_town(folder)
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(folder, out)

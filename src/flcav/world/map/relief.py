@@ -1,0 +1,121 @@
+"""Relief of a town: the height of the ground, linear over the triangles of a Delaunay triangulation (TIN)."""
+
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import shapely
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import Delaunay, QhullError
+
+from flcav.compiled import compiled
+from flcav.config import InputError
+from flcav.parquet import read_parquet
+
+Array = NDArray[np.float64]
+
+AXLE_SHARE, TRACK_SHARE = 0.3, 0.4  # from the middle of a vehicle to its wheels, of its length and width
+FARTHEST_M = 1e8
+
+
+class Relief:
+    """The heights of a town's ground; immutable."""
+
+    def __init__(self, points: Array) -> None:
+        """Take the points (N, 3) of the ground, world frame [m]; raises `ValueError` where they span no area."""
+        self.points = points
+        if len(points) < 3 or not (np.abs(points) <= FARTHEST_M).all():
+            raise ValueError("a relief needs three points or more, with finite coordinates")
+        try:
+            self.triangles  # noqa: B018 - so that points without an area are refused here
+        except QhullError:
+            raise ValueError("the points of a relief span no area") from None
+
+    def __getstate__(self) -> dict[str, Array]:
+        return {"points": self.points}
+
+    @cached_property
+    def triangles(self) -> NDArray[np.int32]:
+        """Return the triangles (F, 3), rows of `points`, counter-clockwise."""
+        return self._tin.simplices
+
+    @cached_property
+    def tree(self) -> shapely.STRtree:
+        """Return a search tree of the triangles, seen from above."""
+        return shapely.STRtree(shapely.polygons(self.points[self.triangles, :2]))
+
+    def heights(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Return the height [m] of the ground at `x`, `y` (...) [m]; outside the points that of their edge; NaN at NaN."""
+        low, high = self.points[:, :2].min(axis=0), self.points[:, :2].max(axis=0)
+        inset = 1e-6 * (high - low)
+        at = np.clip(np.stack(np.broadcast_arrays(x, y), axis=-1).astype(np.float64), low + inset, high - inset)
+        found = _interpolate(at.reshape(-1, 2), self.points, self._tin.simplices, self._tin.neighbors)
+        return found.reshape(at.shape[:-1])
+
+    def tilts(self, x: Array, y: Array, yaw: Array, size: Array) -> tuple[Array, Array, Array]:
+        """Return height [m], pitch and roll [rad] of bodies (...) that stand on four wheels at these places.
+
+        `size` (..., 3) is length, width, height [m]; the wheels are `AXLE_SHARE` and `TRACK_SHARE` of it from the
+        middle. A positive pitch turns the nose down, a positive roll lifts the left side, as in `geometry.pose`.
+        """
+        along, aside = AXLE_SHARE * size[..., 0], TRACK_SHARE * size[..., 1]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+
+        def wheel(ahead: int, left: int) -> Array:
+            return self.heights(
+                x + ahead * along * cos - left * aside * sin, y + ahead * along * sin + left * aside * cos
+            )
+
+        (front_left, front_right), (rear_left, rear_right) = ((wheel(a, 1), wheel(a, -1)) for a in (1, -1))
+        rise = (front_left + front_right - rear_left - rear_right) / 2
+        bank = (front_left + rear_left - front_right - rear_right) / 2
+        height = (front_left + front_right + rear_left + rear_right) / 4
+        pitch = -np.arctan2(rise, 2 * along)
+        return height, pitch, np.arctan2(bank * np.cos(pitch), 2 * aside)
+
+    def save(self, path: Path) -> None:
+        """Write the points as Parquet with the columns x, y, z."""
+        pq.write_table(pa.table(dict(zip("xyz", self.points.T))), path, compression="zstd")
+
+    @classmethod
+    def load(cls, path: Path) -> "Relief":
+        """Return the relief that `save` wrote; raises `InputError` where the file is damaged."""
+        table = read_parquet(path)
+        if table.column_names != ["x", "y", "z"] or any(column.null_count for column in table.columns):
+            raise InputError(f"{path}: not the heights of a town (its columns must be x, y, z)")
+        try:
+            return cls(np.stack([table[name].to_numpy().astype(np.float64) for name in "xyz"], axis=1))
+        except (ValueError, TypeError) as error:
+            raise InputError(f"{path}: not the heights of a town ({error})") from None
+
+    @cached_property
+    def _tin(self) -> Delaunay:
+        return Delaunay(self.points[:, :2])
+
+
+@compiled
+def _interpolate(at, points, triangles, neighbours):
+    """Return the heights (N,) at places (N, 2), each found by walking over the triangles from the one before."""
+    out = np.empty(len(at))
+    here = 0
+    for i in range(len(at)):
+        x, y = at[i]
+        out[i] = np.nan
+        if not np.isfinite(x + y):
+            continue
+        for _ in range(len(triangles)):
+            a, b, c = triangles[here]
+            ax, ay, bx, by = points[a, 0] - x, points[a, 1] - y, points[b, 0] - x, points[b, 1] - y
+            cx, cy = points[c, 0] - x, points[c, 1] - y
+            towards_a, towards_b, towards_c = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+            least = min(towards_a, towards_b, towards_c)
+            opposite = 0 if least == towards_a else 1 if least == towards_b else 2
+            if least >= 0 or neighbours[here, opposite] < 0:
+                weight_a, weight_b, weight_c = max(towards_a, 0.0), max(towards_b, 0.0), max(towards_c, 0.0)
+                total = max(weight_a + weight_b + weight_c, 1e-300)
+                out[i] = (weight_a * points[a, 2] + weight_b * points[b, 2] + weight_c * points[c, 2]) / total
+                break
+            here = neighbours[here, opposite]
+    return out

@@ -1,0 +1,94 @@
+"""Sampling of the surface of an OpenDRIVE map as points of a terrain (`flcav.world.map.relief`)."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from flcav.world.opendrive.road_surface import Road
+
+Array = NDArray[np.float64]
+
+STEP_M = 2.0  # between two cross-sections
+ASIDE_M = (2.0, 6.0)  # beyond the outermost lanes the ground goes on at their height
+CLEAR_M = 4.0  # such points are left out within this distance of another road
+BRIDGE_M = 2.5  # a road at least this far above another one passes over it
+CELL_M = 0.5  # points of different roads in one cell are one
+FAR_M = 400.0  # from the outermost points to the edge of the terrain
+
+
+@dataclass(frozen=True)
+class Heights:
+    """The points of a map's terrain."""
+
+    points: Array  # (N, 3) [m]; empty where the map is level at height 0
+    bridges: int  # roads of which parts pass above another one; the terrain follows the lower
+
+
+def sample_heights(root: ElementTree.Element) -> Heights:
+    """Return points of the surface of the map below `root`, which keeps to `standard`."""
+    roads = [Road(row) for row in root.iterfind("road")]
+    if all(road.is_level for road in roads):
+        return Heights(np.zeros((0, 3)), 0)
+    sections = [_cross_sections(road) for road in roads]
+    surface = np.concatenate([inner for inner, _ in sections])
+    aside = np.concatenate([outer for _, outer in sections])
+    owner = np.repeat(np.arange(len(roads)), [len(inner) for inner, _ in sections])
+    above = _find_above(surface, owner)
+    bridges = len(np.unique(owner[above]))
+    surface = surface[~above]
+    distance, _ = KDTree(surface[:, :2]).query(aside[:, :2])
+    room = np.minimum(np.array(ASIDE_M) - 0.1, CLEAR_M)
+    aside = aside[distance > np.tile(room, len(aside) // len(room))]
+    merged = _merge(np.concatenate((surface, aside)))
+    return Heights(np.concatenate((merged, _frame(merged))).round(4), bridges)
+
+
+def _cross_sections(road: Road) -> tuple[Array, Array]:
+    """Return the points (N, 3) of a road's surface at the borders of its lanes, and those (M, 3) beside it."""
+    count = max(int(np.ceil(road.length / STEP_M)), 1)
+    stations = np.unique(np.clip([*np.linspace(0.0, road.length, count + 1), *road.stations], 0.0, road.length))
+    inner, outer = [], []
+    for s in stations.tolist():
+        borders = road.borders(s)
+        t = np.unique(np.round([*borders.values(), 0.0], 6))
+        inner.append(road.point(np.full(len(t), s), t))
+        for side, edge in ((-1, t[0]), (1, t[-1])):
+            beyond = edge + side * np.array(ASIDE_M)
+            points = road.point(np.full(len(beyond), s), beyond)
+            points[:, 2] = road.height(np.array([s]), np.array([edge]))
+            outer.append(points)
+    return np.concatenate(inner), np.concatenate(outer)
+
+
+def _find_above(points: Array, owner: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return (N,) whether a point lies `BRIDGE_M` or more above a point of another road within `CLEAR_M`."""
+    if np.ptp(points[:, 2]) < BRIDGE_M:
+        return np.zeros(len(points), np.bool_)
+    one, other = KDTree(points[:, :2]).query_pairs(CLEAR_M, output_type="ndarray").T
+    rise = points[one, 2] - points[other, 2]
+    crossing = (owner[one] != owner[other]) & (np.abs(rise) >= BRIDGE_M)
+    out = np.zeros(len(points), np.bool_)
+    out[np.where(rise > 0, one, other)[crossing]] = True
+    return out
+
+
+def _merge(points: Array) -> Array:
+    """Return points (M, 3) of which no two lie in one cell: the means of those that did."""
+    cells = np.unique(np.floor(points[:, :2] / CELL_M), axis=0, return_inverse=True)[1].ravel()
+    count = np.bincount(cells)
+    return np.stack([np.bincount(cells, column) / count for column in points.T], axis=1)
+
+
+def _frame(points: Array) -> Array:
+    """Return points (K, 3) on a frame `FAR_M` around, at the height of the nearest point."""
+    low, high = points[:, :2].min(axis=0) - FAR_M, points[:, :2].max(axis=0) + FAR_M
+    share = np.linspace(0.0, 1.0, 9)
+    x, y = low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])
+    sides = [np.stack(np.broadcast_arrays(x, edge), axis=1) for edge in (low[1], high[1])]
+    sides += [np.stack(np.broadcast_arrays(edge, y[1:-1]), axis=1) for edge in (low[0], high[0])]
+    frame = np.concatenate(sides)
+    nearest = KDTree(points[:, :2]).query(frame)[1]
+    return np.column_stack((frame, points[nearest, 2]))
