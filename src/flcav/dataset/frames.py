@@ -1,6 +1,7 @@
 """Decoding of table rows into the parts of a frame, the inverse of `flcav.dataset.rows`."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +13,7 @@ from flcav.dataset.tables import (
     AMODAL_COLUMNS,
     BOX_COLUMNS,
     RECTANGLE_COLUMNS,
+    TILT_COLUMNS,
     VELOCITY_COLUMNS,
     VISIBLE_COLUMNS,
     WEATHER_COLUMNS,
@@ -22,9 +24,15 @@ from flcav.world.weather import Weather
 
 
 def decode_annotations(
-    rows: pa.Table, points: pa.Table, views: pa.Table, signs: pa.Table, ranging: Iterable[str], cameras: Iterable[str]
+    rows: pa.Table,
+    points: pa.Table,
+    views: pa.Table,
+    signs: pa.Table,
+    tilts: pa.Table,
+    ranging: Iterable[str],
+    cameras: Iterable[str],
 ) -> Annotations:
-    """Return the annotations of one frame from its rows in the tables `annotations`, `points`, `views` and `signs`.
+    """Return the annotations of one frame from its rows in the tables that its parameters are called by.
 
     `ranging` names the frame's LiDARs and radars, `cameras` its cameras, infrared ones included. Raises `InputError`
     where a row refers to an actor that is not annotated.
@@ -32,7 +40,7 @@ def decode_annotations(
     count, cameras = len(rows), list(cameras)
     return Annotations(
         track=_text(rows, "track"),
-        boxes=Boxes.from_array(_numbers(rows, BOX_COLUMNS), _text(rows, "category")),
+        boxes=replace(Boxes.from_array(_numbers(rows, BOX_COLUMNS), _text(rows, "category")), tilt=_tilt(tilts, count)),
         velocity=_numbers(rows, VELOCITY_COLUMNS),
         acceleration=_numbers(rows, ACCELERATION_COLUMNS),
         returns=rows["returns"].to_numpy().copy(),
@@ -60,6 +68,17 @@ def _points(rows: pa.Table, count: int) -> NDArray[np.int64]:
     points = np.zeros(count, np.int64)
     points[_actors(rows, count)] = rows["points"].to_numpy()
     return points
+
+
+def _tilt(rows: pa.Table, count: int) -> NDArray[np.float64] | None:
+    """Return pitch and roll (count, 2) of the boxes; None where no box is tilted."""
+    if not len(rows):
+        return None
+    tilt, at = np.zeros((count, 2)), rows["row"].to_numpy()
+    if ((at < 0) | (at >= count)).any():
+        raise InputError(f"{rows['frame'][0].as_py()}: a tilt is of no annotated actor")
+    tilt[at] = _numbers(rows, TILT_COLUMNS)
+    return tilt
 
 
 def _actors(rows: pa.Table, count: int) -> NDArray[np.int64]:

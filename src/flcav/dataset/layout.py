@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from flcav.config import InputError, describe_error, read_json
 from flcav.files import Json
 
-FORMAT = 2
+FORMAT = 3  # of datasets with tilted boxes, in the table `tilts`
+LEVEL_FORMAT = 2  # of all others
 MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
 CALIBRATION = "calibration.json"  # see `flcav.dataset.calibration`
 FILES = "files"  # table that lists all other files: payloads, traffic, the town's files
@@ -118,9 +119,11 @@ def read_manifest(folder: Path) -> Manifest:
         raise InputError(f"{path}: missing, so {folder} is {reason}")
     manifest = read_json(path)
     found = manifest.get("format") if isinstance(manifest, dict) else None
-    if isinstance(found, int) and found != FORMAT:
+    if isinstance(found, int) and found not in (LEVEL_FORMAT, FORMAT):
         advice = "update flcav to read it" if found > FORMAT else "record it again from its recipe"
-        raise InputError(f"{path}: dataset format {found}, this version of flcav reads format {FORMAT}; {advice}")
+        raise InputError(
+            f"{path}: dataset format {found}, this version of flcav reads formats {LEVEL_FORMAT} and {FORMAT}; {advice}"
+        )
     try:
         return Manifest.model_validate(manifest)
     except ValidationError as error:

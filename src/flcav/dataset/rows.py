@@ -14,6 +14,8 @@ from flcav.dataset.tables import (
     IMU_COLUMNS,
     RECTANGLE_COLUMNS,
     SCHEMAS,
+    TILT_COLUMNS,
+    TILTS,
     VELOCITY_COLUMNS,
     VISIBLE_COLUMNS,
     WEATHER_COLUMNS,
@@ -151,6 +153,16 @@ def _weather(frame: Frame) -> Columns:
     }
 
 
+def _tilts(frame: Frame) -> Columns:
+    tilt = frame.annotations.boxes.tilt
+    rows = np.zeros((0, 2)) if tilt is None else tilt
+    return {
+        "frame": [frame.key] * len(rows),
+        "row": np.arange(len(rows), dtype=np.int64),
+        **dict(zip(TILT_COLUMNS, rows.T)),
+    }
+
+
 COLUMNS: dict[str, Callable[[Frame], Columns]] = {
     "frames": _frames,
     "poses": _poses,
@@ -161,6 +173,7 @@ COLUMNS: dict[str, Callable[[Frame], Columns]] = {
     "gnss": _gnss,
     "imu": _imu,
     "weather": _weather,
+    TILTS: _tilts,
 }
 
 

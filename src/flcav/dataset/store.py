@@ -21,6 +21,7 @@ from flcav.dataset.frames import decode_annotations, decode_vectors, decode_weat
 from flcav.dataset.layout import (
     CALIBRATION,
     FILES,
+    LEVEL_FORMAT,
     FrameKey,
     Manifest,
     payload_path,
@@ -30,7 +31,7 @@ from flcav.dataset.layout import (
     trace_path,
 )
 from flcav.dataset.payloads import INFRARED, PICTURES, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
-from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, read_table
+from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, TILTS, read_table
 from flcav.sensors.frame import LONGEST_NAME, CameraImage, Frame, format_key
 from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
@@ -87,7 +88,11 @@ class Dataset:
         """
         folder = Path(path)
         manifest = read_manifest(folder)
-        tables = {name: read_table(folder / table_path(name), name) for name in SCHEMAS}
+        absent = {TILTS} if manifest.format == LEVEL_FORMAT else set()
+        tables = {
+            name: schema.empty_table() if name in absent else read_table(folder / table_path(name), name)
+            for name, schema in SCHEMAS.items()
+        }
         frames = tables["frames"]
         if not len(frames):
             raise InputError(f"{folder / table_path('frames')}: the dataset is empty, it holds no frames")
@@ -137,7 +142,7 @@ class Dataset:
             assumed=calibration.assumed,
             lidar=self._rows_of(i, self._lidar[i], POINTS),
             annotations=decode_annotations(
-                *(self._rows(name, i) for name in ("annotations", "points", "views", "signs")),
+                *(self._rows(name, i) for name in ("annotations", "points", "views", "signs", TILTS)),
                 ranging=(*self._lidar[i], *self._radar[i]),
                 cameras=(*self._cameras[i], *self._infrared[i]),
             ),

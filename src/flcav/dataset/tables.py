@@ -24,6 +24,8 @@ RECTANGLE_COLUMNS = ("x1", "y1", "x2", "y2")
 GNSS_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m")
 IMU_COLUMNS = ("force_x", "force_y", "force_z", "rate_x", "rate_y", "rate_z")
 WEATHER_COLUMNS = tuple(Weather.model_fields)
+TILTS = "tilts"
+TILT_COLUMNS = ("pitch", "roll")  # [rad], as in `geometry.pose`
 FILES_SCHEMA = pa.schema([("path", pa.string()), ("bytes", pa.int64()), ("sha256", pa.string())])
 
 
@@ -103,6 +105,9 @@ SCHEMAS: dict[str, pa.Schema] = {
     "gnss": pa.schema([("frame", pa.string()), ("sensor", pa.string()), *_numbers(GNSS_COLUMNS)]),
     "imu": pa.schema([("frame", pa.string()), ("sensor", pa.string()), *_numbers(IMU_COLUMNS)]),
     "weather": pa.schema([("frame", pa.string()), *_numbers(WEATHER_COLUMNS)]),
+    TILTS: pa.schema(  # only in datasets with tilted boxes
+        [("frame", pa.string()), ("row", pa.int64()), *_numbers(TILT_COLUMNS)]  # index into the frame's annotations
+    ),
 }
 
 

@@ -2,12 +2,14 @@
 
 from flcav.geometry.boxes import Boxes, concatenate, points_in_boxes, segments_meet_boxes
 from flcav.geometry.poses import (
+    angles_of,
     heading_vectors,
     inverse,
     is_rigid,
     left_vectors,
     pose,
     rotate,
+    rotations,
     rotations_about_z,
     transform_points,
     unit_vectors,
@@ -17,6 +19,7 @@ from flcav.geometry.poses import (
 
 __all__ = [
     "Boxes",
+    "angles_of",
     "concatenate",
     "heading_vectors",
     "inverse",
@@ -25,6 +28,7 @@ __all__ = [
     "points_in_boxes",
     "pose",
     "rotate",
+    "rotations",
     "rotations_about_z",
     "segments_meet_boxes",
     "transform_points",

@@ -1,4 +1,4 @@
-"""Upright oriented 3D boxes: transforms, corners, points in boxes."""
+"""Oriented 3D boxes: transforms, corners, points in boxes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,12 +6,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flcav.geometry.poses import Array, transform_points, wrap_angle, yaw_of
+from flcav.geometry.poses import (
+    Array,
+    angles_of,
+    pose,
+    rotations,
+    rotations_about_z,
+    transform_points,
+    wrap_angle,
+    yaw_of,
+)
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """N oriented 3D boxes, upright (yaw only), in one frame that the owner of the record states.
+    """N oriented 3D boxes, upright (yaw only) or tilted, in one frame that the owner of the record states.
 
     Raises ValueError where the lengths or shapes of the arrays do not match.
 
@@ -27,6 +36,7 @@ class Boxes:
     label: NDArray[np.str_]  # (N,) class name
     score: Array | None = None  # (N,) confidence in [0, 1]
     variance: Array | None = None  # (N, 7) of x, y, z [m^2], length, width, height [m^2], yaw [rad^2]
+    tilt: Array | None = None  # (N, 2) pitch and roll [rad], as in `pose`; None: upright
 
     def __post_init__(self) -> None:
         n = len(self.center)
@@ -37,6 +47,7 @@ class Boxes:
             "label": (n,),
             "score": (n,),
             "variance": (n, 7),
+            "tilt": (n, 2),
         }
         for name, shape in shapes.items():
             value = getattr(self, name)
@@ -53,7 +64,8 @@ class Boxes:
             index = index if index.dtype == bool else index.astype(np.int64)
         score = None if self.score is None else self.score[index]
         variance = None if self.variance is None else self.variance[index]
-        return Boxes(self.center[index], self.size[index], self.yaw[index], self.label[index], score, variance)
+        tilt = None if self.tilt is None else self.tilt[index]
+        return Boxes(self.center[index], self.size[index], self.yaw[index], self.label[index], score, variance, tilt)
 
     @classmethod
     def empty(cls) -> "Boxes":
@@ -78,10 +90,18 @@ class Boxes:
     def transform(self, target_from_source: Array) -> "Boxes":
         """Return the boxes in the target frame of a rigid (4, 4) transform.
 
+<<<<<<< HEAD
         Its roll and pitch move the centres but do not tilt the boxes. Variances of the centre are the diagonal of the
         rotated covariance R diag(v) R^T; those of size and yaw stay, and so do all under translations.
+=======
+        Its roll and pitch move the centres; they turn tilted boxes, and leave upright ones upright. Variances are left
+        as they are.
+>>>>>>> 8712682 (Actors, boxes, exports and datasets on a relief: pitch and roll, dataset format 3)
         """
         center = transform_points(target_from_source, self.center)
+        if self.tilt is not None:
+            yaw, pitch, roll = angles_of(target_from_source[:3, :3] @ self.rotations())
+            return replace(self, center=center, yaw=wrap_angle(yaw), tilt=np.stack((pitch, roll), axis=1))
         yaw = wrap_angle(self.yaw + yaw_of(target_from_source))
         variance = self.variance
         if variance is not None:
@@ -89,11 +109,21 @@ class Boxes:
             variance = np.concatenate((turned, variance[:, 3:]), axis=1)
         return replace(self, center=center, yaw=yaw, variance=variance)
 
+    def rotations(self) -> Array:
+        """Return (N, 3, 3) rotations of the boxes' own frames."""
+        return rotations_about_z(self.yaw) if self.tilt is None else rotations(self.yaw, *self.tilt.T)
+
+    def pose(self, i: int) -> Array:
+        """Return the (4, 4) pose of the centre of box `i`."""
+        return pose(*self.center[i], self.yaw[i], *((0.0, 0.0) if self.tilt is None else self.tilt[i]))
+
     def corners(self) -> Array:
         """Return (N, 8, 3) corners [m]: the bottom four counter-clockwise from front left, then the top four."""
         signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
         unit = np.concatenate((np.c_[signs, np.full(4, -0.5)], np.c_[signs, np.full(4, 0.5)]))
         local = unit[None] * self.size[:, None]
+        if self.tilt is not None:
+            return np.einsum("nij,nkj->nki", self.rotations(), local) + self.center[:, None]
         cos, sin = np.cos(self.yaw)[:, None], np.sin(self.yaw)[:, None]
         x = local[..., 0] * cos - local[..., 1] * sin
         y = local[..., 0] * sin + local[..., 1] * cos
@@ -110,17 +140,21 @@ def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> N
     inside = np.zeros((len(boxes), len(xyz)), dtype=bool)
     for i in range(len(boxes)):
         half = boxes.size[i] / 2 + margin_m
-        reach = np.hypot(half[0], half[1])
+        reach = np.hypot(half[0], half[1]) if boxes.tilt is None else np.linalg.norm(half)
         near = np.flatnonzero((np.abs(x - boxes.center[i, 0]) <= reach) & (np.abs(y - boxes.center[i, 1]) <= reach))
         cos, sin = np.cos(boxes.yaw[i]), np.sin(boxes.yaw[i])
         dx, dy, dz = (xyz[near] - boxes.center[i]).T
         local = np.stack((dx * cos + dy * sin, dy * cos - dx * sin, dz), axis=1)
+        if boxes.tilt is not None:
+            local = (xyz[near] - boxes.center[i]) @ boxes[[i]].rotations()[0]
         inside[i, near] = (np.abs(local) <= half).all(axis=1)
     return inside
 
 
 def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> NDArray[np.bool_]:
     """Return (S, N) whether each of S segments meets each of N boxes, by slabs (Kay and Kajiya, SIGGRAPH 1986).
+
+    Tilted boxes are taken as upright ones.
 
     `starts` and `ends` are (S, 3), x, y, z [m] in the frame of the boxes. Faces belong to the box.
     """
@@ -155,6 +189,9 @@ def concatenate(parts: Sequence[Boxes]) -> Boxes:
         values = [getattr(part, name) for part in parts]
         return None if any(value is None for value in values) else np.concatenate(values)
 
+    tilt = None
+    if any(part.tilt is not None for part in parts):
+        tilt = np.concatenate([np.zeros((len(part), 2)) if part.tilt is None else part.tilt for part in parts])
     rows = np.concatenate([part.array() for part in parts])
     labels = np.concatenate([part.label for part in parts])
-    return Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], labels, joined("score"), joined("variance"))
+    return Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], labels, joined("score"), joined("variance"), tilt)

@@ -86,6 +86,24 @@ def rotations_about_z(yaw: ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def rotations(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Array:
+    """Return (..., 3, 3) rotation matrices by Tait-Bryan angles (...) [rad], as in `pose`."""
+    sy, cy, sp, cp, sr, cr = (wave(angle) for angle in (yaw, pitch, roll) for wave in (np.sin, np.cos))
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+    return np.stack([np.stack(np.broadcast_arrays(*row), axis=-1) for row in rows], axis=-2)
+
+
+def angles_of(rotation: Array) -> tuple[Array, Array, Array]:
+    """Return yaw, pitch and roll (...) [rad] of rotation matrices (..., 3, 3): the inverse of `rotations`."""
+    forward = rotation[..., :, 0]
+    pitch = np.arctan2(-forward[..., 2], np.hypot(forward[..., 0], forward[..., 1]))
+    return np.arctan2(forward[..., 1], forward[..., 0]), pitch, np.arctan2(rotation[..., 2, 1], rotation[..., 2, 2])
+
+
 def rotate(x: Coordinate, y: Coordinate, yaw: float) -> tuple[Coordinate, Coordinate]:
     """Return vectors x, y of the plane rotated by `yaw` [rad]: from a body's frame to the one its heading is given in.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import pose, rotations_about_z
+from flcav.geometry import pose, rotations, rotations_about_z
 from flcav.world.map.town import Town
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
@@ -54,7 +54,9 @@ class Scene:
         self._engine = Embree()
         self._assembly = self._engine.assembly(self._solids)
         self._assembly.place(0, np.eye(4))
-        self._placed = np.full((len(trace.actor), 4), np.nan)  # x, y, z, yaw; NaN where an actor is not placed
+        self._placed = np.full(
+            (len(trace.actor), 6), np.nan
+        )  # x, y, z, yaw, pitch, roll; NaN where an actor is not placed
         self._hidden: int | None = None
         self._place()
 
@@ -86,11 +88,18 @@ class Scene:
 
     def world_from_actor(self, actor: int) -> NDArray[np.float64]:
         """Return the pose (4, 4) of an actor that is present; the origin of its body frame is its ground centre."""
-        return pose(*self.poses()[actor])
+        return pose(*self.poses()[actor], *self.trace.tilts(self.index)[actor])
 
     def world_from_instance(self) -> NDArray[np.float64]:
         """Return the rotations of the instances (I, 3, 3); the identity for the town and for absent actors."""
-        return rotations_about_z(np.concatenate(([0.0], np.nan_to_num(self.poses()[:, 3]))))
+        return np.concatenate((np.eye(3)[None], self.rotations()))
+
+    def rotations(self) -> NDArray[np.float64]:
+        """Return the rotations of the actors' body frames (A, 3, 3); the identity for absent ones."""
+        yaw = np.nan_to_num(self.poses()[:, 3])
+        if self.trace.tilt is None:
+            return rotations_about_z(yaw)
+        return rotations(yaw, *np.nan_to_num(self.trace.tilts(self.index)).T)
 
     def cast(
         self,
@@ -147,14 +156,15 @@ class Scene:
 
     def _place(self) -> None:
         """Place the instances of actors that have moved since the last time, and remove absent and hidden ones."""
-        wanted = np.where(self.trace.present[self.index, :, None], self.poses(), np.nan)
+        poses = np.concatenate((self.poses(), self.trace.tilts(self.index)), axis=1)
+        wanted = np.where(self.trace.present[self.index, :, None], poses, np.nan)
         if self._hidden is not None:
             wanted[self._hidden] = np.nan
         same = (wanted == self._placed) | np.isnan(wanted) & np.isnan(self._placed)
         moved = np.flatnonzero(~same.all(axis=1))
         nowhere = set(moved[np.isnan(wanted[moved, 0])].tolist())
         world_from_actor = np.tile(np.eye(4), (len(moved), 1, 1))
-        world_from_actor[:, :3, :3] = rotations_about_z(wanted[moved, 3])
+        world_from_actor[:, :3, :3] = self.rotations()[moved]
         world_from_actor[:, :3, 3] = wanted[moved, :3]
         for actor, matrix in zip(moved.tolist(), world_from_actor):
             self._assembly.place(actor + 1, None if actor in nowhere else matrix)

@@ -192,9 +192,7 @@ def _furniture(town: Town) -> Iterator[Owned]:
     """Yield clutter, lamps, signs with their posts, sensor masts and signals."""
     pieces = [(kind, *values) for kind, rows in town.clutter for values in rows]
     for row, (kind, x, y, yaw, length, width, height) in enumerate(pieces):
-        yield Part.CLUTTER, row, transform_mesh(
-            make_clutter(kind, length, width, height), x, y, town.ground(x, y), yaw
-        )
+        yield Part.CLUTTER, row, transform_mesh(make_clutter(kind, length, width, height), x, y, town.ground(x, y), yaw)
     for row, (x, y, height) in enumerate(town.lamps):
         yield Part.LAMP, row, transform_mesh(make_lamp(height), x, y, town.ground(x, y))
     for row, ((x, y, z), yaw, kind) in enumerate(zip(town.signs.position, town.signs.yaw, town.signs.kind)):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.files import atomic_path
+from flcav.geometry import rotations
 from flcav.parquet import read_parquet
 from flcav.world.shapes import SHAPES
 
@@ -25,6 +26,7 @@ STATE = (
     *("acceleration_x", "acceleration_y", "acceleration_z"),
     "yaw_rate",
 )
+TILT = ("pitch", "roll")  # further columns, of traces on a relief
 
 
 class Event(NamedTuple):
@@ -62,6 +64,20 @@ class Trace:
     light: NDArray[np.str_]  # (L,) ids of signals, "junction:link index"
     light_state: NDArray[np.str_]  # (T, L) one SUMO state letter: G g y r ...
     events: tuple[Event, ...] = ()
+    tilt: Array | None = (
+        None  # (T, A, 2) pitch and roll [rad], as in `geometry.pose`; NaN where absent; None: all level
+    )
+
+    def tilts(self, index: int) -> Array:
+        """Return pitch and roll (A, 2) [rad] at an instant."""
+        return np.zeros((len(self.actor), 2)) if self.tilt is None else self.tilt[index]
+
+    def box_centres(self, index: int) -> Array:
+        """Return the centres (A, 3) [m] of the actors' boxes at an instant; NaN where absent."""
+        middle = self.size * (0, 0, 0.5)
+        if self.tilt is not None:
+            middle = (rotations(self.yaw[index], *self.tilt[index].T) @ middle[..., None])[..., 0]
+        return self.position[index] + middle
 
     def save(self, path: Path) -> None:
         """Write the trace as one Parquet file: a row per instant and present actor, the rest in the file's metadata."""
@@ -70,6 +86,8 @@ class Trace:
         state = np.concatenate(motion, axis=2)[instant, actor]
         columns = {"instant": instant.astype(np.int32), "actor": actor.astype(np.int32)}
         columns |= {name: state[:, i] for i, name in enumerate(STATE)}
+        if self.tilt is not None:
+            columns |= dict(zip(TILT, self.tilt[instant, actor].T))
         changed = [0, *(np.flatnonzero((self.light_state[1:] != self.light_state[:-1]).any(axis=1)) + 1).tolist()]
         rest = {
             "town": self.town,
@@ -110,6 +128,10 @@ class Trace:
             raise ValueError("a row is of no instant or no actor")
         state = np.full((instants, actors, len(STATE)), np.nan)
         state[at] = np.stack([table[name].to_numpy() for name in STATE], axis=1)
+        tilt = None
+        if set(TILT) <= set(table.column_names):
+            tilt = np.full((instants, actors, 2), np.nan)
+            tilt[at] = np.stack([table[name].to_numpy() for name in TILT], axis=1)
         present = np.zeros((instants, actors), dtype=np.bool_)
         present[at] = True
         light_state = np.full((instants, lights), "", dtype="<U1")
@@ -131,6 +153,7 @@ class Trace:
             light=np.array(rest["light"], dtype=np.str_),
             light_state=light_state,
             events=tuple(Event(row["kind"], row["begins_s"], tuple(row["actors"])) for row in rest.get("events", [])),
+            tilt=tilt,
         )
         trace._check()
         return trace
@@ -145,7 +168,8 @@ class Trace:
             if not 0 <= shape < len(SHAPES.get(category, ())):
                 raise ValueError(f"there is no {category!r} of shape {shape}")
         motion = (self.position, self.velocity, self.acceleration, self.yaw[..., None], self.yaw_rate[..., None])
-        numbers = (np.concatenate(motion, axis=2)[self.present], self.time_s, self.size)
+        tilts = np.zeros(0) if self.tilt is None else self.tilt[self.present]
+        numbers = (np.concatenate(motion, axis=2)[self.present], self.time_s, self.size, tilts)
         if not all(np.isfinite(each).all() for each in numbers):
             raise ValueError("a number is not finite")
         if (self.size <= 0).any() or (np.diff(self.time_s) <= 0).any():

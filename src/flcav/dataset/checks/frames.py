@@ -143,7 +143,8 @@ def check_traffic(frame: Frame, trace: Trace) -> Iterator[str]:
     if not len(instant):
         yield f"{frame.key}: the traffic of '{frame.scene}' has no instant at {frame.time_s} s"
         return
-    t, truth = instant[0], frame.annotations
+    t, truth = int(instant[0]), frame.annotations
+    centres = trace.box_centres(t)
     actor = {name: i for i, name in enumerate(trace.actor.tolist()) if trace.present[t, i]}
     if frame.agent in actor:
         away = np.linalg.norm(frame.world_from_agent[:3, 3] - trace.position[t, actor[frame.agent]])
@@ -154,7 +155,7 @@ def check_traffic(frame: Frame, trace: Trace) -> Iterator[str]:
             yield f"{frame.key}: '{track}' is annotated but not in town"
             continue
         a = actor[track]
-        away = math.dist(truth.boxes.center[i], trace.position[t, a] + (0, 0, trace.size[a, 2] / 2))  # never overflows
+        away = math.dist(truth.boxes.center[i], centres[a])  # never overflows
         turned = np.abs(wrap_angle(truth.boxes.yaw[i] - trace.yaw[t, a]))
         grown = np.abs(truth.boxes.size[i] - trace.size[a]).max()
         faster = np.abs(truth.velocity[i] - trace.velocity[t, a]).max()

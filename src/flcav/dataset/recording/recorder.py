@@ -19,6 +19,7 @@ from flcav.dataset.layout import (
     CALIBRATION,
     FILES,
     FORMAT,
+    LEVEL_FORMAT,
     MANIFEST,
     WORK,
     package_versions,
@@ -30,7 +31,7 @@ from flcav.dataset.layout import (
 from flcav.dataset.recording.jobs import PAYLOADS, TRAFFIC, find_pending, record_scenes, split_scene
 from flcav.dataset.recording.ray_engine import start_ray_engine
 from flcav.dataset.recording.workers import start_processes
-from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, join_tables, write_table
+from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, write_table
 from flcav.files import Json, sha256, write_bytes, write_json
 from flcav.progress import Report, ignore_progress
 from flcav.sources.embedded import EmbeddedSource
@@ -149,9 +150,12 @@ def _assemble(source: Source, out: Path, header: Header) -> None:
         for name, schema in SCHEMAS.items()
     }
     write_json(joined / CALIBRATION, _calibrations(folders))
-    names = (CALIBRATION, *map(table_path, (*SCHEMAS, FILES)))
+    if not rows[TILTS]:
+        (joined / table_path(TILTS)).unlink()
+    held = [name for name in (*SCHEMAS, FILES) if rows.get(name, 1) or name != TILTS]
+    names = (CALIBRATION, *map(table_path, held))
     manifest = {
-        "format": FORMAT,
+        "format": FORMAT if rows[TILTS] else LEVEL_FORMAT,
         **header,
         "scenes": scenes,
         "counts": {

@@ -67,10 +67,12 @@ def annotate(
     scene.move_to(index)
 
     size = trace.size[actors]
-    center = trace.position[index, actors] + size * (0, 0, 0.5)
+    tilt = None if trace.tilt is None else trace.tilt[index, actors]
     annotations = Annotations(
         track=trace.actor[actors],
-        boxes=Boxes(center, size, trace.yaw[index, actors], trace.category[actors]),
+        boxes=Boxes(
+            trace.box_centres(index)[actors], size, trace.yaw[index, actors], trace.category[actors], tilt=tilt
+        ),
         velocity=trace.velocity[index, actors],
         acceleration=trace.acceleration[index, actors],
         returns=np.sum([sweep.returns[actors] for sweep in sweeps.values()], axis=0, dtype=np.int64)

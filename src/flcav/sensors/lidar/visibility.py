@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.compiled import compiled
-from flcav.geometry import rotations_about_z
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.sensors.lidar.returns import cast_through_glass
 from flcav.world.rays.hits import Hits
@@ -31,7 +30,7 @@ def count_occluded_rays(
     (N,) marks the rays that go through glass.
     """
     pattern, surfaces = build_ray_pattern(lidar), scene.surfaces
-    body_from_sensor = _bodies_from(scene.poses()[actors], world_from_sensor)
+    body_from_sensor = _bodies_from(scene.poses()[actors], scene.rotations()[actors], world_from_sensor)
     rays, counts = _stopped_rays(
         pattern, lidar.azimuth_steps, body_from_sensor, scene.trace.size[actors], BOX_MARGIN_M, distance
     )
@@ -49,9 +48,11 @@ def count_occluded_rays(
     return np.bincount(group[echoes.instance >= 0], minlength=len(actors))
 
 
-def _bodies_from(poses: NDArray[np.float64], world_from_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (K, 4, 4) transforms `body_from_sensor` of actors with the poses (K, 4) x, y, z, yaw."""
-    turn = rotations_about_z(-poses[:, 3])
+def _bodies_from(
+    poses: NDArray[np.float64], rotations: NDArray[np.float64], world_from_sensor: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return (K, 4, 4) transforms `body_from_sensor` of actors at `poses` (K, >=3) x, y, z, turned by (K, 3, 3)."""
+    turn = np.swapaxes(rotations, 1, 2)
     found = np.tile(np.eye(4), (len(poses), 1, 1))
     found[:, :3, :3] = turn @ world_from_sensor[:3, :3]
     found[:, :3, 3] = np.einsum("kij,kj->ki", turn, world_from_sensor[:3, 3] - poses[:, :3])

@@ -88,9 +88,7 @@ def _between_lanes(lanes: list[Lane], approach: float, side: int) -> Iterator[Ma
             yield Marking("solid", line, BICYCLE_LINE_M if wide else LINE_M, 0.0, 0.0)
 
 
-def _left_side(
-    edge: Edge, lanes: list[Lane], across: list[Edge], approach: float, side: int
-) -> Iterator[Marking]:
+def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: float, side: int) -> Iterator[Marking]:
     """Yield the centre line towards that edge of `across` (the opposite direction) which adjoins, else an edge line."""
     line = _beside(lanes[-1], lanes[-1].width / 2, side)
     for other in across:

@@ -20,6 +20,7 @@ from flcav.world.map.town import KERB_M, Town
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.shapes import SHAPES
 from flcav.world.trace import Event, Trace
+from flcav.world.traffic.climb import stand_on_relief
 from flcav.world.traffic.demand import Parked, list_vehicle_types, park, write_demand
 from flcav.world.traffic.sumo import simulate_in
 from flcav.world.traffic.sumo_process import STEP_S
@@ -116,6 +117,11 @@ def _build_trace(
     walking = np.flatnonzero(pedestrian)  # SUMO moves people aside without turning them
     velocity[:, walking], acceleration[:, walking] = (motion[:, walking] for motion in walk)
     z = np.where(np.isnan(x), np.nan, KERB_M * (shapely.contains_xy(_pavement(town), x, y) & pedestrian))
+    centre = _centre(state, np.append(half_length, np.zeros(len(still))))
+    tilt = None
+    if town.relief is not None:
+        ground = stand_on_relief(town.relief, centre, yaw, velocity, acceleration, size, pedestrian)
+        z, tilt, velocity, acceleration = z + ground.height, ground.tilt, ground.velocity, ground.acceleration
     lights = [(light, len(letters)) for light, letters in zip(raw["light"], raw["light_state"][0])]
     letters = [list("".join(row)) for row in raw["light_state"][now[:, SMOOTHING_STEPS]]]
     return Trace(
@@ -126,7 +132,7 @@ def _build_trace(
         shape=np.array([shape for _, shape in kinds], dtype=np.int64),
         size=size,
         present=~np.isnan(yaw),
-        position=np.concatenate((_centre(state, np.append(half_length, np.zeros(len(still)))), z[..., None]), axis=2),
+        position=np.concatenate((centre, z[..., None]), axis=2),
         yaw=yaw,
         velocity=velocity,
         acceleration=acceleration,
@@ -136,6 +142,7 @@ def _build_trace(
         events=tuple(
             Event(row["kind"], row["begins_s"], tuple(row["actors"])) for row in json.loads(str(raw["events"]))
         ),
+        tilt=tilt,
     )
 
 

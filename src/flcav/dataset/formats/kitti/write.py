@@ -109,9 +109,9 @@ def format_label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -
     within = (rectangle[:, 2:] > rectangle[:, :2]).all(axis=1)  # False where the box is NaN
     camera_from_world = inverse(frame.world_from_sensor(camera))
     boxes = truth.boxes
-    bottom = transform_points(camera_from_world, boxes.center - boxes.size * (0, 0, 0.5))
-    heading = np.column_stack((heading_vectors(boxes.yaw), np.zeros(len(boxes))))
-    ahead = heading @ camera_from_world[:3, :3].T
+    axes = boxes.rotations()
+    bottom = transform_points(camera_from_world, boxes.center - axes[:, :, 2] * boxes.size[:, 2:] / 2)
+    ahead = axes[:, :, 0] @ camera_from_world[:3, :3].T
     rotation = wrap_angle(np.arctan2(-ahead[:, 2], ahead[:, 0]))
     alpha = wrap_angle(rotation - np.arctan2(bottom[:, 0], bottom[:, 2]))
     level = occlusion_levels(views.occlusion, views.pixels)

@@ -53,7 +53,7 @@ def scene_update(frame: Frame, stamp: Timestamp) -> SceneUpdate:
     entities = []
     for i, label in enumerate(boxes.label.tolist()):
         cube = CubePrimitive(
-            pose=pose_message(pose(*boxes.center[i], yaw=boxes.yaw[i])),
+            pose=pose_message(boxes.pose(i)),
             size=Vector3(**dict(zip("xyz", boxes.size[i].tolist()))),
             color=_colour(COLOURS.get(label, OTHER), 0.4 if truth.returns[i] else 0.15),
         )

@@ -147,7 +147,7 @@ class Drive:
                     "attribute_tokens": attributes(category, track, speed),
                     "translation": center[i].tolist(),
                     "size": [width, length, height],
-                    "rotation": quaternion(pose(0, 0, yaw=boxes.yaw[i])),
+                    "rotation": quaternion(boxes.pose(i)),
                     "num_lidar_pts": int(lidar[i]),
                     "num_radar_pts": int(radar[i]),
                 }

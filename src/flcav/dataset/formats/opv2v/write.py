@@ -183,12 +183,14 @@ def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[in
     vehicles: dict[int, Vehicle] = {}
     for i in np.flatnonzero(np.isin(boxes.label, VEHICLES) & enough):
         tall = boxes.size[i, 2]
-        x, y, z, *rotation = carla_pose(pose(*boxes.center[i], yaw=boxes.yaw[i]))
+        placed = boxes.pose(int(i))
+        placed[:3, 3] -= tall / 2 * placed[:3, 2]
+        x, y, z, *rotation = carla_pose(placed)
         vehicles[numbers[str(truth.track[i])]] = {
             "angle": rotation,
             "center": [0.0, 0.0, float(tall / 2)],
             "extent": (boxes.size[i] / 2).tolist(),
-            "location": [x, y, float(z - tall / 2)],
+            "location": [x, y, z],
             "speed": float(np.linalg.norm(truth.velocity[i]) * KMH),
         }
     return vehicles
