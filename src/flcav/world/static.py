@@ -127,7 +127,7 @@ def _parts(town: Town) -> Iterator[Owned]:
 
 def _ground(town: Town) -> Mesh:
     if town.relief is not None:
-        vertices = (town.relief.points + (0.0, 0.0, GROUND_M)).astype(np.float32)
+        vertices = (town.relief.points + np.array([0.0, 0.0, GROUND_M])).astype(np.float32)
         faces = town.relief.triangles.astype(np.int32)
         return Mesh(vertices, faces, np.full(len(faces), Material.GROUND, np.uint8))
     x0, y0, x1, y1 = town.bounds
@@ -157,7 +157,7 @@ def _sidewalks(town: Town) -> Iterator[Owned]:
 
 
 def _plate(polygon: NDArray[np.float64], z: float, material: Material, relief: Relief | None) -> Mesh:
-    """Return a polygon (K, 2) as a surface at height `z` [m] above the ground, by constrained Delaunay triangulation."""
+    """Return a polygon (K, 2) as a surface `z` [m] above the ground, by constrained Delaunay triangulation."""
     if relief is not None:
         return drape_polygon(polygon, relief, z, material)
     triangles = shapely.constrained_delaunay_triangles(shapely.Polygon(polygon))

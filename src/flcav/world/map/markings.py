@@ -172,7 +172,7 @@ def _bends(net: RoadNet) -> dict[str, str]:
 
 
 def _beside(lane: Lane, left_m: float, side: int) -> Array:
-    """Return the line `left_m` to the left of a lane's middle, in driving direction; to the right where `side` is -1."""
+    """Return the line `left_m` to the left of a lane's middle, with left-hand traffic (`side` -1) to the right."""
     line = LineString(lane.shape).offset_curve(side * left_m, join_style="mitre")
     parts = _lines(line)
     return np.asarray(max(parts, key=lambda part: part.length).coords) if parts else lane.shape

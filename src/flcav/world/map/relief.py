@@ -44,10 +44,10 @@ class Relief:
     @cached_property
     def tree(self) -> shapely.STRtree:
         """Return a search tree of the triangles, seen from above."""
-        return shapely.STRtree(shapely.polygons(self.points[self.triangles, :2]))
+        return shapely.STRtree(list(np.atleast_1d(shapely.polygons(self.points[self.triangles, :2]))))
 
     def heights(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """Return the height [m] of the ground at `x`, `y` (...) [m]; outside the points that of their edge; NaN at NaN."""
+        """Return the height [m] of the ground at `x`, `y` (...) [m]; outside as at their edge; NaN at NaN."""
         low, high = self.points[:, :2].min(axis=0), self.points[:, :2].max(axis=0)
         inset = 1e-6 * (high - low)
         at = np.clip(np.stack(np.broadcast_arrays(x, y), axis=-1).astype(np.float64), low + inset, high - inset)

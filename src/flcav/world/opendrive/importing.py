@@ -14,6 +14,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from flcav.config import InputError
@@ -164,7 +165,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
         (folder / "town.yaml").write_text(text, encoding="utf-8")
         if len(heights.points):
-            Relief(heights.points + (dx, dy, 0.0)).save(folder / HEIGHTS)
+            Relief(heights.points + np.array([dx, dy, 0.0])).save(folder / HEIGHTS)
         load_town(folder)
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(folder, out)

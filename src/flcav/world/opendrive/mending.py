@@ -1,4 +1,4 @@
-"""Mending of OpenDRIVE maps: what netconvert stumbles over although a map can do without it is completed or left out."""
+"""Mending of OpenDRIVE maps: gaps over which netconvert stumbles, although a map can do without what is missing."""
 
 import xml.etree.ElementTree as ElementTree
 

@@ -68,7 +68,7 @@ class Road:
         return [*(section.s for section in self._sections), *(s for s, _ in self._shapes)]
 
     def point(self, s: Array, t: Array) -> Array:
-        """Return x, y, z (N, 3) [m] of the surface at `s` (N,) along the line and `t` (N,) to its left, as seen in plan.
+        """Return x, y, z (N, 3) [m] of the surface at `s` (N,) along the line and `t` (N,) to its left, in plan.
 
         A tilted cross-section is not shortened in plan: t is the horizontal distance.
         """

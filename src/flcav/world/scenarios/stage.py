@@ -83,7 +83,8 @@ class Stage:
     def point(self, lane: Lane, along: float, left: float) -> tuple[float, float, float]:
         """Return x, y [m] and heading [rad] at `along` metres of a lane, `left` metres to the left of its middle.
 
-        With left-hand traffic it is to the right: towards the middle of the road. Beyond its ends the lane goes straight on.
+        With left-hand traffic it is to the right: towards the middle of the road. Beyond its ends the lane goes
+        straight on.
         """
         edge, index = lane.id.rpartition("_")[::2]
         length = self.sumo.lane.getLength(lane.id)

@@ -41,11 +41,11 @@ def stand_on_relief(
 
     def height_at(time_s: float) -> Array:
         moved = centre + time_s * velocity[..., :2] + time_s**2 / 2 * acceleration[..., :2]
-        return np.where(upright, relief.heights(*np.moveaxis(moved, 2, 0)), relief.tilts(*moved.T, yaw.T, size_t)[0].T)
+        x, y = moved[..., 0], moved[..., 1]
+        return np.where(upright, relief.heights(x, y), relief.tilts(x, y, yaw, size)[0])
 
-    size_t = size[:, None]
-    _, pitch, roll = relief.tilts(*centre.T, yaw.T, size_t)
-    tilt = np.where(upright[:, None], 0.0, np.stack((pitch.T, roll.T), axis=2))
+    _, pitch, roll = relief.tilts(centre[..., 0], centre[..., 1], yaw, size)
+    tilt = np.where(upright[:, None], 0.0, np.stack((pitch, roll), axis=2))
     tilt[np.isnan(yaw)] = np.nan
     before, now, after = (height_at(time_s) for time_s in (-STEP_S, 0.0, STEP_S))
     climb = (after - before) / (2 * STEP_S)

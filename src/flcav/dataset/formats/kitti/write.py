@@ -25,7 +25,7 @@ from flcav.dataset.formats.kitti.files import CLASSES as KITTI_CLASSES
 from flcav.dataset.formats.mounts import find_front_camera
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import heading_vectors, inverse, transform_points, wrap_angle
+from flcav.geometry import inverse, transform_points, wrap_angle
 from flcav.progress import Report
 from flcav.sensors.frame import Frame
 

@@ -37,7 +37,6 @@ from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
 from flcav.dataset.formats.mounts import quaternion
 from flcav.dataset.payloads import encode_png
 from flcav.files import Json
-from flcav.geometry import pose
 from flcav.sensors.frame import Frame
 from flcav.sensors.radar.radar import compute_echo_directions
 

@@ -22,7 +22,7 @@ from flcav.dataset.formats.nuscenes.tables import (
     visibility,
 )
 from flcav.dataset.payloads import encode_png
-from flcav.geometry import pose, transform_points, yaw_of
+from flcav.geometry import transform_points, yaw_of
 from flcav.sensors.frame import Frame
 from flcav.sensors.radar.radar import compute_echo_directions
 

@@ -25,7 +25,7 @@ from flcav.dataset.formats.exporter import (
 from flcav.dataset.formats.mounts import agent_velocities, assign_channels, optical_yaw
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import pose, yaw_of
+from flcav.geometry import yaw_of
 from flcav.progress import Report
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Frame
