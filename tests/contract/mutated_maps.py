@@ -39,7 +39,7 @@ class _Hang(BaseException):
     """The time for one case is over."""
 
 
-def _mutate_often(path: Path, rng: np.random.Generator, times: int) -> Iterator[str]:
+def mutate_often(path: Path, rng: np.random.Generator, times: int) -> Iterator[str]:
     """Damage the file's bytes, or change its elements `times` times; yield what was done."""
     if rng.random() < BYTES:
         yield mutate(path, rng)
@@ -65,7 +65,7 @@ def try_map(maps: list[Path], number: int, folder: Path, *, limit_s: int, every:
     folder.mkdir(parents=True)
     path = folder / "map.xodr"
     path.write_bytes(source.read_bytes())
-    done = "; ".join(_mutate_often(path, rng, int(rng.integers(1, 4))))
+    done = "; ".join(mutate_often(path, rng, int(rng.integers(1, 4))))
 
     def stop(_number: int, _frame: FrameType | None) -> None:
         raise _Hang

@@ -34,7 +34,7 @@ def test_lane_centres_and_heights_are_carlas(lanes: dict[str, list[list]]) -> No
     for path, rows in lanes.items():
         root = read_map(Path(path))
         roads = {row.get("id"): Road(row) for row in root.iterfind("road")}
-        points = sample_heights(root).points
+        points = sample_heights(root, Path("map")).points
         for road, lane, s, *centre, _ in rows:
             found = roads[road].point(np.array([s]), np.array([roads[road].lane_centre(s, lane)]))[0]
             assert np.hypot(*(found[:2] - centre[:2])) < CLOSE_M, path
@@ -50,7 +50,9 @@ def test_lanes_of_the_town_are_carlas(lanes: dict[str, list[list]], tmp_path: Pa
         source = town.parameters.source
         assert source is not None
         streets = [LineString(lane.shape) for edge in read_net(town.net).streets for lane in edge.lanes_of("driving")]
-        at = [shapely.Point(x + source.offset_m[0], y + source.offset_m[1]) for *_, x, y, _, inside in rows if not inside]
+        at = [
+            shapely.Point(x + source.offset_m[0], y + source.offset_m[1]) for *_, x, y, _, inside in rows if not inside
+        ]
         away = shapely.STRtree(streets).query_nearest(at, return_distance=True, all_matches=False)[1]
         assert np.quantile(away, 0.9) < CLOSE_M, path  # the others lie where a street gives way to its junction
 

@@ -4,7 +4,7 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 
-from flcav.config import InputError, shorten
+from flcav.config import SHOWN, InputError, shorten
 from flcav.world.opendrive.standard import check_standard
 
 FASTEST = 100.0  # [m/s] a limit beyond is none
@@ -49,7 +49,7 @@ def read_map(path: Path) -> ElementTree.Element:
     header = root.find("header")
     if root.tag.lower() != "opendrive" or header is None:
         raise InputError(
-            f"{path}: not an OpenDRIVE map (its root is <{shorten(root.tag)}>, expected <OpenDRIVE> with a <header>)"
+            f"{path}: not an OpenDRIVE map (its root is <{root.tag[:SHOWN]}>, expected <OpenDRIVE> with a <header>)"
         )
     if header.get("revMajor") != "1":
         raise InputError(

@@ -2,15 +2,19 @@
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from flcav.config import InputError, shorten
 from flcav.world.opendrive.road_surface import Road
+from flcav.world.opendrive.standard import FARTHEST_M
 
 Array = NDArray[np.float64]
 
+HIGHEST_M = 10_000.0
 STEP_M = 2.0  # between two cross-sections
 ASIDE_M = (2.0, 6.0)  # beyond the outermost lanes the ground goes on at their height
 CLEAR_M = 4.0  # such points are left out within this distance of another road
@@ -27,12 +31,21 @@ class Heights:
     bridges: int  # roads of which parts pass above another one; the terrain follows the lower
 
 
-def sample_heights(root: ElementTree.Element) -> Heights:
-    """Return points of the surface of the map below `root`, which keeps to `standard`."""
+def sample_heights(root: ElementTree.Element, origin: Path) -> Heights:
+    """Return points of the surface of the map below `root`, which keeps to `standard`.
+
+    Raises `InputError` naming `origin` where the surface leaves the Earth.
+    """
     roads = [Road(row) for row in root.iterfind("road")]
     if all(road.is_level for road in roads):
         return Heights(np.zeros((0, 3)), 0)
-    sections = [_cross_sections(road) for road in roads]
+    with np.errstate(all="ignore"):  # numbers that overflow are refused below
+        sections = [_cross_sections(road) for road in roads]
+    for road, parts in zip(roads, sections):
+        if not all((np.abs(points) <= (FARTHEST_M, FARTHEST_M, HIGHEST_M)).all() for points in parts):
+            raise InputError(
+                f"{origin}: road {shorten(road.id)} reaches beyond {FARTHEST_M / 1000:g} km or {HIGHEST_M:g} m in height"
+            )
     surface = np.concatenate([inner for inner, _ in sections])
     aside = np.concatenate([outer for _, outer in sections])
     owner = np.repeat(np.arange(len(roads)), [len(inner) for inner, _ in sections])
@@ -51,14 +64,13 @@ def _cross_sections(road: Road) -> tuple[Array, Array]:
     count = max(int(np.ceil(road.length / STEP_M)), 1)
     stations = np.unique(np.clip([*np.linspace(0.0, road.length, count + 1), *road.stations], 0.0, road.length))
     inner, outer = [], []
-    for s in stations.tolist():
-        borders = road.borders(s)
-        t = np.unique(np.round([*borders.values(), 0.0], 6))
-        inner.append(road.point(np.full(len(t), s), t))
-        for side, edge in ((-1, t[0]), (1, t[-1])):
-            beyond = edge + side * np.array(ASIDE_M)
-            points = road.point(np.full(len(beyond), s), beyond)
-            points[:, 2] = road.height(np.array([s]), np.array([edge]))
+    for s, borders in road.sections(stations):
+        t = np.stack([*borders.values(), np.zeros(len(s))])  # (lanes and the reference line, K)
+        inner.append(road.point(np.tile(s, len(t)), t.ravel()))
+        for side, edge in ((-1, t.min(axis=0)), (1, t.max(axis=0))):
+            beyond = edge[:, None] + side * np.array(ASIDE_M)
+            points = road.point(np.repeat(s, len(ASIDE_M)), beyond.ravel())
+            points[:, 2] = np.repeat(road.height(s, edge), len(ASIDE_M))
             outer.append(points)
     return np.concatenate(inner), np.concatenate(outer)
 

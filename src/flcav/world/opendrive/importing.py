@@ -22,7 +22,7 @@ from flcav.extras import format_install_command
 from flcav.files import find_existing
 from flcav.world.map.parameters import GeoReference, MapSource
 from flcav.world.map.relief import Relief
-from flcav.world.map.roads import read_net
+from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.town import HEIGHTS, Town, load_town
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.furnishing import furnish
@@ -110,6 +110,17 @@ def _run(options: dict[str, str], origin: Path) -> None:
         raise InputError(f"{origin}: netconvert cannot read this OpenDRIVE map ({errors[0].strip().rstrip('.')})")
 
 
+def _read_joined(path: Path, origin: Path) -> RoadNet:
+    """Return the net that netconvert made; raises `InputError` naming `origin` where no town can be made of it."""
+    try:
+        net = read_net(path)
+    except InputError as error:
+        raise InputError(f"{origin}: netconvert makes no net of it ({str(error).removeprefix(f'{path}: ')})") from None
+    if not any(edge.lanes_of("driving") for edge in net.streets):
+        raise InputError(f"{origin}: has no road with a lane for driving")
+    return net
+
+
 @dataclass(frozen=True)
 class ImportedTown:
     """An imported town, and notes on what differs from the map."""
@@ -132,7 +143,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
     root = read_map(xodr)
     document = describe_map(root)
     notes = [*mend_map(root)]
-    heights = sample_heights(root)
+    heights = sample_heights(root, xodr)
     if heights.bridges:
         notes.append(f"Roads that pass above others, which lie at the lower one's height there: {heights.bridges}.")
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=beside) as scratch:
@@ -141,7 +152,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         split_map(root, prefix, xodr, left_hand=document.left_hand)
         streets = rewrite_streets(prefix, document, xodr)
         join_parts(prefix, folder / "town.net.xml", xodr, left_hand=document.left_hand)
-        net = read_net(folder / "town.net.xml")
+        net = _read_joined(folder / "town.net.xml", xodr)
         dx, dy = streets.offset_m
         geo = locate_origin(document.geo_reference, -dx, -dy)
         if geo is None:

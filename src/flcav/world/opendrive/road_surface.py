@@ -4,7 +4,7 @@ Sources: OpenDRIVE 1.8, 10.5 (elevation, superelevation, shape) and 11 (lanes); 
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,13 +81,21 @@ class Road:
         tilted = t * np.tan(self._superelevation.at(s)) - np.abs(t) * np.tan(fall)
         return self._elevation.at(s) + tilted + self._shape(s, t)
 
-    def section_at(self, s: float) -> "Section":
-        """Return the lane section at `s`."""
-        return next((section for section in reversed(self._sections) if section.s <= s + 1e-9), self._sections[0])
+    def sections(self, s: Array) -> Iterator[tuple[Array, dict[int, Array]]]:
+        """Yield, for each lane section among `s` (N,), those s (K,), and lane id -> t (K,) [m] of its outer border.
+
+        The border of 0 is the centre line.
+        """
+        starts = [section.s for section in self._sections]
+        number = np.clip(np.searchsorted(starts, s + 1e-9, side="right") - 1, 0, None)
+        for i in np.unique(number).tolist():
+            own = s[number == i]
+            yield own, self._sections[i].borders(own, self._offset.at(own))
 
     def borders(self, s: float) -> dict[int, float]:
         """Return lane id -> t [m] of its outer border at `s`; of 0 the centre line."""
-        return self.section_at(s).borders(s, float(self._offset.at(np.array([s]))[0]))
+        ((_, found),) = self.sections(np.array([s]))
+        return {lane: float(t[0]) for lane, t in found.items()}
 
     def lane_centre(self, s: float, lane: int) -> float:
         """Return t [m] of the middle of a lane at `s`; raises `KeyError` where there is no such lane."""
@@ -124,16 +132,16 @@ class Section:
             if lane.find("width") is None and lane.find("border") is not None
         }
 
-    def borders(self, s: float, offset: float) -> dict[int, float]:
-        """Return lane id -> t [m] of its outer border at `s`; `offset` is that of the centre line, under 0."""
-        along = np.array([s - self.s])
+    def borders(self, s: Array, offset: Array) -> dict[int, Array]:
+        """Return lane id -> t (K,) [m] of its outer border at `s` (K,); `offset` is t of the centre line, under 0."""
+        along = s - self.s
         out = {0: offset}
         for lane in sorted(self.kinds, key=abs):
             side = 1 if lane > 0 else -1
             if lane in self._borders:
-                out[lane] = offset + float(self._borders[lane].at(along)[0])
+                out[lane] = offset + self._borders[lane].at(along)
             else:
-                out[lane] = out[lane - side] + side * max(float(self._widths[lane].at(along)[0]), 0.0)
+                out[lane] = out[lane - side] + side * np.maximum(self._widths[lane].at(along), 0.0)
         return out
 
 

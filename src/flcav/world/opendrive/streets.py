@@ -96,8 +96,11 @@ def _write_widths(rows: list[ElementTree.Element], net: Path) -> None:
 
 
 def _road(edge: str, document: Document) -> Road:
-    """Return the road of an edge, which netconvert names by the road's id with a sign before and a section behind."""
-    name = edge.removeprefix("-")
+    """Return the road of an edge, which netconvert names by the road's id with a sign before and a section behind.
+
+    A road that ends where it begins is cut: "1#0", "1#1".
+    """
+    name = edge.removeprefix("-").partition("#")[0]
     while name not in document.roads and "." in name:
         name = name.rpartition(".")[0]
     return document.roads.get(name, Road("unknown", None))

@@ -1,0 +1,188 @@
+"""OpenDRIVE maps as others make them: left-hand traffic, circles, lone roads, gaps, and broken rules."""
+
+import xml.etree.ElementTree as ElementTree
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shapely.geometry import LineString, Point, Polygon
+
+from flcav.config import InputError
+from flcav.world.map.roads import Edge, RoadNet, read_net
+from flcav.world.map.surfaces import subtract, unite
+from flcav.world.map.town import Town
+from flcav.world.opendrive.document import describe_map, read_map
+from flcav.world.opendrive.importing import import_town
+from flcav.world.opendrive.mending import mend_map
+from flcav.world.opendrive.mirror import mirror_map
+from flcav.world.traffic.demand import draw_tour
+from flcav.world.traffic.reach import find_driven, find_walked
+from flcav.world.traffic.traffic import simulate
+
+CROSS = Path(__file__).parents[2] / "data" / "cross.xodr"
+
+pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
+
+
+def lines(net: RoadNet, sign: int, kind: str) -> list[LineString]:
+    return [LineString(lane.shape * (1, sign)) for edge in net.streets for lane in edge.lanes_of(kind)]
+
+
+def write(root: ElementTree.Element, path: Path) -> Path:
+    ElementTree.ElementTree(root).write(path)
+    return path
+
+
+def test_left_hand_traffic_is_the_mirror_image(tmp_path: Path) -> None:
+    root = read_map(CROSS)
+    for geometry in root.iter("geometry"):  # the map at its origin, so that both towns are mirrored in the same axis
+        geometry.set("x", str(float(geometry.attrib["x"]) - 458_000))
+        geometry.set("y", str(float(geometry.attrib["y"]) - 5_428_000))
+    right = import_town(write(root, tmp_path / "right.xodr"), tmp_path / "right").town
+    mirror_map(root)
+    left = import_town(write(root, tmp_path / "left.xodr"), tmp_path / "left").town
+    one, other = read_net(right.net), read_net(left.net)
+    assert (one.side, other.side) == (1, -1)
+    for kind in ("driving", "sidewalk"):
+        for line in lines(other, -1, kind):
+            assert min(line.hausdorff_distance(known) for known in lines(one, 1, kind)) < 0.1
+            start = Point(line.coords[0])
+            assert min(start.distance(Point(known.coords[0])) for known in lines(one, 1, kind)) < 0.1
+    for name in ("poles", "signs"):
+        here, there = getattr(right, name), getattr(left, name)
+        away = np.linalg.norm(here.position[:, None] - there.position * (1, -1, 1), axis=2)
+        assert (away.min(axis=0) < 0.3).all(), name
+    trace = simulate(left, seed=1, cavs=1, times_s=np.array([20.0, 21.0]))
+    _keeps_to_its_lanes(left, trace.position[:, np.char.startswith(trace.actor, "cav"), :2].reshape(-1, 2))
+
+
+def _keeps_to_its_lanes(town: Town, at: np.ndarray) -> None:
+    roads = [Polygon(outline) for outline in town.roads]
+    for place in at:
+        assert min(road.distance(Point(place)) for road in roads) < 0.1
+
+
+def circles() -> ElementTree.Element:
+    """Return a ring road whose two directions do not meet, without sidewalks."""
+    lane = '<lane id="{}" type="driving"><link><predecessor id="{}"/><successor id="{}"/></link>'
+    width = '<width sOffset="0" a="3" b="0" c="0" d="0"/></lane>'
+    return ElementTree.fromstring(
+        '<OpenDRIVE><header revMajor="1" revMinor="4"/><road id="1" length="300" junction="-1"><link>'
+        '<predecessor elementType="road" elementId="1" contactPoint="end"/>'
+        '<successor elementType="road" elementId="1" contactPoint="start"/></link><type s="0" type="rural"/>'
+        '<planView><geometry s="0" x="0" y="0" hdg="0" length="300"><arc curvature="0.0209439510"/></geometry>'
+        "</planView>"
+        f'<lanes><laneSection s="0"><left>{lane.format(1, 1, 1)}{width}</left>'
+        '<center><lane id="0" type="none"/></center>'
+        f"<right>{lane.format(-1, -1, -1)}{width}</right></laneSection></lanes></road></OpenDRIVE>"
+    )
+
+
+def test_a_circle_without_junctions_is_driven(tmp_path: Path) -> None:
+    imported = import_town(write(circles(), tmp_path / "ring.xodr"), tmp_path / "ring")
+    assert not any("sidewalks" in note for note in imported.notes)
+    net = read_net(imported.town.net)
+    edges = list(net.streets)
+    reach = find_driven(net, edges)
+    for i, edge in enumerate(edges):
+        assert {edges[j].id.startswith("-") for j in np.flatnonzero(reach[i])} == {edge.id.startswith("-")}
+    trace = simulate(imported.town, seed=1, cavs=1, times_s=np.array([20.0, 30.0]))
+    assert trace.present[:, trace.actor == "cav0"].all()
+
+
+def chain(*names: str) -> list[Edge]:
+    """Return edges without lanes that matter, 50 m apart."""
+    from flcav.world.map.roads import Lane
+
+    return [
+        Edge(name, "normal", "", "", "street", (Lane(f"{name}_0", "driving", np.full((2, 2), 50.0 * i), 3.0, 10.0),))
+        for i, name in enumerate(names)
+    ]
+
+
+def test_tours_go_only_where_there_is_a_way() -> None:
+    from flcav.world.map.roads import Connection
+
+    edges = chain("a", "b", "c", "d")
+    ways = [("a", "b"), ("b", "a"), ("b", "c"), ("d", "d")]  # c is a dead end, d a circle of its own
+    net = RoadNet(
+        {edge.id: edge for edge in edges},
+        {},
+        frozenset(),
+        {},
+        tuple(Connection(f"{start}_0", f"{end}_0", "", "s", "") for start, end in ways),
+    )
+    reach = find_driven(net, edges)
+    np.testing.assert_array_equal(reach, np.array([[1, 1, 1, 0], [1, 1, 1, 0], [0, 0, 0, 0], [0, 0, 0, 1]], bool))
+    for seed in range(20):
+        tour = draw_tour(edges, reach, np.ones(4), 500.0, np.random.default_rng(seed))
+        assert tour[0] != "c"  # nobody starts where nothing follows
+        assert "d" not in tour or set(tour) == {"d"}
+        assert all(reach["abcd".index(one), "abcd".index(other)] for one, other in pairwise(tour))
+    walked = find_walked(net, edges)  # no sidewalk leads anywhere
+    np.testing.assert_array_equal(walked, np.eye(4, dtype=bool))
+
+
+def test_gaps_are_mended() -> None:
+    root = read_map(CROSS)
+    road, junction = root.findall("road")[0], root.find("junction")
+    assert junction is not None
+    road.append(ElementTree.fromstring('<signals><signal id="1" s="1" t="2" type=""/></signals>'))
+    junction[0].attrib.pop("connectingRoad")
+    junction[1].set("incomingRoad", "77")
+    before = len(junction)
+    notes = mend_map(root)
+    assert len(junction) == before - 2
+    assert root.find("road/signals/signal").get("type") == "-1"  # pyright: ignore[reportOptionalMemberAccess]
+    assert len(notes) == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('length="60.0000"', 'length="nan"', r"road '1': <geometry> needs a number as 'length', not 'nan' .*9\.2"),
+        ('length="60.0000"', 'length="6"', r"road '1' is 90 m long, and its geometry 36 m .*9\.2"),
+        ('<arc curvature="0.02"/>', "", r"a <geometry> needs one of line, arc"),
+        ('id="2" junction', 'id="1" junction', r"each road needs an id of its own, and two have '1' .*10\)"),
+        ('<lane id="1" type', '<lane id="2" type', r"road '1': its left lanes are not numbered one by one .*11\.3"),
+        ('a="3.5"', 'a="3500"', r"a lane is 3500 m wide"),
+        ('<laneSection s="0">', '<laneSection s="">', r"<laneSection> needs a number as 's', not '' .*11\.3"),
+        ('x="458010.0000"', 'x="1e12"', r"road '1' begins more than 10000 km from the origin"),
+    ],
+)
+def test_a_broken_rule_is_told_with_its_clause(old: str, new: str, message: str, tmp_path: Path) -> None:
+    text = CROSS.read_text()
+    assert old in text
+    path = tmp_path / "map.xodr"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as caught:
+        read_map(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_most_roads_say_on_which_side_traffic_keeps() -> None:
+    root = read_map(CROSS)
+    assert not describe_map(root).left_hand
+    mirror_map(root)
+    assert describe_map(root).left_hand
+    mirror_map(root)
+    assert ElementTree.tostring(root.findall("road")[1][2]) == ElementTree.tostring(
+        read_map(CROSS).findall("road")[1][2]
+    )
+
+
+def test_areas_that_defeat_exact_overlay_are_snapped(monkeypatch: pytest.MonkeyPatch) -> None:
+    import shapely
+
+    exact = shapely.difference
+
+    def fails(one, other, grid_size=None):
+        if grid_size is None:
+            raise shapely.GEOSException("no overlay")
+        return exact(one, other, grid_size=grid_size)
+
+    monkeypatch.setattr(shapely, "difference", fails)
+    assert subtract(shapely.box(0, 0, 2, 2), shapely.box(1, 0, 3, 2)).area == pytest.approx(2.0)
+    assert unite([shapely.box(0, 0, 1, 1), shapely.box(1, 0, 2, 1)]).area == pytest.approx(2.0)
