@@ -64,6 +64,39 @@ def test_a_dataset_brings_its_town_along(tmp_path: Path):
     assert np.asarray(Image.open(tmp_path / "nuscenes" / "maps" / "map.png")).any()
 
 
+def test_a_dataset_of_a_slope_is_tilted(tmp_path: Path):
+    profile = (
+        '<elevationProfile><elevation s="0" a="10" b="0.08" c="0" d="0"/></elevationProfile><lateralProfile>'
+        '<superelevation s="0" a="0.04" b="0" c="0" d="0"/></lateralProfile><lanes>'
+    )
+    text = CROSS.read_text()
+    first, then = text.index("<road"), text.index('<road name="way')
+    xodr = tmp_path / "slope.xodr"
+    level = '<elevationProfile><elevation s="0" a="10" b="0" c="0" d="0"/></elevationProfile><lanes>'
+    xodr.write_text(text[:first] + text[first:then].replace("<lanes>", profile) + text[then:].replace("<lanes>", level))
+    lidar = {"lidars": {"lidar": {"mount": {"z": 1.85}, "settings": SMALL}}}
+    data = Dataset.open(recorded(xodr, tmp_path, poles=[], vehicle_rig=lidar, pole_rig="roadside"))
+    assert data.manifest.format == 3
+    town, trace = data.town(), data.trace(data.keys[0].scene)
+    assert town is not None
+    assert town.relief is not None
+    assert trace is not None
+    for i in range(len(data)):
+        frame = data.frame(i)
+        x, y, z = frame.world_from_agent[:3, 3]
+        assert z == pytest.approx(town.ground(x, y), abs=0.1)
+        ahead, nose = frame.world_from_agent[:3, 0], frame.world_from_agent[:3, 3] + 2 * frame.world_from_agent[:3, 0]
+        assert ahead[2] == pytest.approx((town.ground(*nose[:2]) - z) / 2, abs=0.05)
+        boxes = frame.annotations.boxes
+        assert boxes.tilt is not None
+        vehicles = boxes.label != "pedestrian"
+        feet = boxes.center - boxes.rotations()[:, :, 2] * boxes.size[:, 2:] / 2
+        np.testing.assert_allclose(feet[vehicles, 2], town.grounds(*feet[vehicles, :2].T), atol=0.1)
+    steep = np.abs(trace.tilts(0)[trace.present[0]])
+    assert np.degrees(steep[:, 0].max()) == pytest.approx(4.57, abs=1.0)
+    flcav("export", "opv2v", data.folder, "--out", tmp_path / "opv2v", "--validation", 0)
+
+
 def test_a_folder_whose_name_no_file_can_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     flcav("towns", "import", CROSS, "--out", tmp_path / "my town")
     (tmp_path / "recipe.yaml").write_text(yaml.safe_dump({**RECIPE, "town": str(tmp_path / "my town")}))

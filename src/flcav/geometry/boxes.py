@@ -116,7 +116,8 @@ class Boxes:
     def pose(self, i: int) -> Array:
         """Return the (4, 4) pose of the centre of box `i`."""
         pitch, roll = (0.0, 0.0) if self.tilt is None else self.tilt[i]
-        return pose(*self.center[i], self.yaw[i], pitch, roll)
+        x, y, z = self.center[i]
+        return pose(x, y, z, self.yaw[i], pitch, roll)
 
     def corners(self) -> Array:
         """Return (N, 8, 3) corners [m]: the bottom four counter-clockwise from front left, then the top four."""

@@ -22,6 +22,7 @@ from flcav.world.meshes.furniture import (
     make_clutter,
     make_lamp,
     make_tree,
+    map_pole,
     sensor_mast,
     sign_plate,
     sign_post,
@@ -49,6 +50,7 @@ class Part(IntEnum):
     MAST = 8  # of a roadside sensor
     SIGN = 9
     SIGNAL = 10
+    POLE = 11  # of the map that the town was imported from
 
 
 class StaticWorld(NamedTuple):
@@ -193,6 +195,8 @@ def _furniture(town: Town) -> Iterator[Owned]:
     pieces = [(kind, *values) for kind, rows in town.clutter for values in rows]
     for row, (kind, x, y, yaw, length, width, height) in enumerate(pieces):
         yield Part.CLUTTER, row, transform_mesh(make_clutter(kind, length, width, height), x, y, town.ground(x, y), yaw)
+    for row, (x, y, height) in enumerate(town.posts):
+        yield Part.POLE, row, transform_mesh(map_pole(height), x, y, town.ground(x, y))
     for row, (x, y, height) in enumerate(town.lamps):
         yield Part.LAMP, row, transform_mesh(make_lamp(height), x, y, town.ground(x, y))
     for row, ((x, y, z), yaw, kind) in enumerate(zip(town.signs.position, town.signs.yaw, town.signs.kind)):

@@ -16,6 +16,7 @@ from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.importing import import_town
 from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map
+from flcav.world.static import Part, build_static_world
 from flcav.world.traffic.demand import draw_tour
 from flcav.world.traffic.reach import find_driven, find_walked
 from flcav.world.traffic.traffic import simulate
@@ -186,3 +187,30 @@ def test_areas_that_defeat_exact_overlay_are_snapped(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(shapely, "difference", fails)
     assert subtract(shapely.box(0, 0, 2, 2), shapely.box(1, 0, 3, 2)).area == pytest.approx(2.0)
     assert unite([shapely.box(0, 0, 1, 1), shapely.box(1, 0, 2, 1)]).area == pytest.approx(2.0)
+
+
+def test_signs_and_poles_of_the_map_stand_where_it_says(tmp_path: Path) -> None:
+    root = read_map(CROSS)
+    for road in root.findall("road")[:1]:
+        road.append(
+            ElementTree.fromstring(
+                '<signals><signal id="1" s="20" t="-5" type="206" orientation="-" zOffset="1.9" height="0.8"/>'
+                '<signal id="2" s="30" t="-5" type="274" value="50" orientation="+"/>'
+                '<signal id="3" s="30" t="-5" type="274" value="many"/>'
+                '<signal id="4" s="400" t="0" type="206"/></signals>'
+            )
+        )
+        road.append(
+            ElementTree.fromstring(
+                '<objects><object id="1" type="pole" s="10" t="6" height="3"><repeat s="10" length="20" distance="10" '
+                'tStart="6" tEnd="8"/></object><object id="2" type="pole" s="1" t="1"/></objects>'
+            )
+        )
+    town = import_town(write(root, tmp_path / "map.xodr"), tmp_path / "town").town
+    assert sorted(town.signs.kind) == ["speed_60", "stop"]
+    stop = town.signs.kind.index("stop")
+    np.testing.assert_allclose(town.signs.position[stop], (30.0, -5.0, 2.3), atol=1e-3)  # the road begins at (10, 0)
+    np.testing.assert_allclose(np.cos(town.signs.yaw[[stop, 1 - stop]]), (1, -1), atol=1e-6)
+    np.testing.assert_allclose(town.posts, ((20, 6, 3), (30, 7, 3), (40, 8, 3)), atol=1e-3)
+    poles = build_static_world(town).part == Part.POLE
+    assert poles.any()

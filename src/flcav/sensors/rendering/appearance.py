@@ -44,6 +44,7 @@ _OF_PART = {
     Part.MAST: "pole",
     Part.SIGN: "traffic_sign",
     Part.SIGNAL: "traffic_light",
+    Part.POLE: "pole",
 }
 _RIDER = (Material.SKIN, Material.CLOTH, Material.TROUSERS)
 

@@ -90,6 +90,27 @@ class PoleParameters(Config):
     height_m: Height = 6.0  # height of the mount above the ground
 
 
+Ordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+
+class SignParameters(Config):
+    """A traffic sign of the map that a town was imported from."""
+
+    kind: Literal["stop", "yield", "speed_30", "speed_60", "speed_90"]  # kind of sign
+    x: Ordinate  # place of the plate
+    y: Ordinate  # place of the plate
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)]  # direction that the plate faces, counter-clockwise from east
+    height_m: Height = 2.2  # height of the plate's centre above the ground
+
+
+class PostParameters(Config):
+    """A pole of the map that a town was imported from."""
+
+    x: Ordinate  # place of its foot
+    y: Ordinate  # place of its foot
+    height_m: Height  # height above the ground
+
+
 class GeoReference(Config):
     """Geodetic position of a town's local origin on the WGS 84 ellipsoid; x points east there and y north."""
 
@@ -118,6 +139,8 @@ class TownParameters(Config):
     shapes: dict[str, dict[str, float]] = Field(default={})  # weights of shapes, by category; equal where left out
     streets: dict[str, StreetParameters]  # parameters of the streets, by the net's edge type
     poles: tuple[PoleParameters, ...] = ()  # candidate sites of roadside sensors
+    signs: tuple[SignParameters, ...] = ()  # signs of the map; signs of the same sort are not placed by rule then
+    posts: tuple[PostParameters, ...] = ()  # poles of the map
 
     @model_validator(mode="after")
     def _known_shapes(self) -> "TownParameters":

@@ -44,7 +44,7 @@ class Relief:
     @cached_property
     def tree(self) -> shapely.STRtree:
         """Return a search tree of the triangles, seen from above."""
-        return shapely.STRtree(list(np.atleast_1d(shapely.polygons(self.points[self.triangles, :2]))))
+        return shapely.STRtree([shapely.Polygon(corners) for corners in self.points[self.triangles, :2]])
 
     def heights(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Return the height [m] of the ground at `x`, `y` (...) [m]; outside as at their edge; NaN at NaN."""

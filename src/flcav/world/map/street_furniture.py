@@ -5,6 +5,7 @@ Positions and yaws are in the world frame [m, rad]. The same random generator gi
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import shapely
@@ -13,7 +14,14 @@ from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from flcav.geometry import heading_vectors
-from flcav.world.map.parameters import CLUTTER, Interval, PoleParameters, StreetParameters, TownParameters
+from flcav.world.map.parameters import (
+    CLUTTER,
+    Interval,
+    PoleParameters,
+    SignParameters,
+    StreetParameters,
+    TownParameters,
+)
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.surfaces import GroundSurfaces, make_footprint
 
@@ -24,7 +32,11 @@ STEP_M = 1.0  # shift along the street to the next try where something did not f
 CLEARANCE_M = 0.25  # least distance between solid objects
 SENSOR_CLEAR_M = 2.5  # no street lamp is nearer to a roadside sensor, since it would block the view
 SIGN_HEIGHT_M = 2.2  # of the plate's centre
-SPEED_SIGNS = {30: "speed_30", 60: "speed_60", 90: "speed_90"}  # limit [km/h] -> kind of sign
+SPEED_SIGNS: dict[int, Literal["speed_30", "speed_60", "speed_90"]] = {  # limit [km/h] -> kind of sign
+    30: "speed_30",
+    60: "speed_60",
+    90: "speed_90",
+}
 
 
 class Plot:
@@ -179,9 +191,15 @@ def place_poles(
     return out
 
 
-def place_signs(net: RoadNet) -> list[tuple[tuple[float, float, float], float, str]]:
-    """Return position, yaw and kind of each traffic sign: give way and stop before junctions, the limit after them."""
-    out = []
+def place_signs(
+    net: RoadNet, known: tuple[SignParameters, ...] = ()
+) -> list[tuple[tuple[float, float, float], float, str]]:
+    """Return position, yaw and kind of each traffic sign: give way and stop before junctions, the limit after them.
+
+    Where some are `known`, these stand instead: signs of right of way, or speed limits.
+    """
+    out = [((sign.x, sign.y, sign.height_m), float(np.radians(sign.yaw_deg)), str(sign.kind)) for sign in known]
+    sorts = {kind.partition("_")[0] == "speed" for _, _, kind in out}
     for edge in net.streets:
         if not edge.lanes_of("sidewalk") or not edge.lanes_of("driving"):
             continue
@@ -191,8 +209,10 @@ def place_signs(net: RoadNet) -> list[tuple[tuple[float, float, float], float, s
         wanted = [(kind, 1.5)] if kind else []
         if length > 45.0:
             limit = 3.6 * edge.lanes_of("driving")[0].speed
-            wanted.append((SPEED_SIGNS[min(SPEED_SIGNS, key=lambda known: abs(known - limit))], length - 12.0))
+            wanted.append((SPEED_SIGNS[min(SPEED_SIGNS, key=lambda shown: abs(shown - limit))], length - 12.0))
         for name, before_end in wanted:
+            if (name.partition("_")[0] == "speed") in sorts:
+                continue
             x, y, heading = _kerb_side(edge, before_end, net.side)
             out.append(((x, y, SIGN_HEIGHT_M), float(heading + np.pi), name))
     return out

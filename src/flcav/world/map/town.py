@@ -71,6 +71,9 @@ class Town:
     lamps: Array  # (L, 3) street lamps: x, y of the foot, height above it [m]
     geo: GeoReference = field(default_factory=GeoReference)  # geodetic position of the world frame's origin
     signals: Signals = field(default_factory=Signals.none)
+    posts: Array = field(
+        default_factory=lambda: np.zeros((0, 3))
+    )  # (K, 3) poles of a map: x, y of the foot, height [m]
     relief: Relief | None = None  # heights of the ground; None: it is level, at z = 0
 
     def grounds(self, x: Array, y: Array) -> Array:
@@ -175,7 +178,8 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
     trees = street_furniture.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
     poles = street_furniture.place_poles(net, parameters.poles)
     mounts = np.array([row[1] for row in poles], dtype=np.float64).reshape(-1, 3)
-    signs = street_furniture.place_signs(net)
+    signs = street_furniture.place_signs(net, parameters.signs)
+    posts = np.array([(post.x, post.y, post.height_m) for post in parameters.posts], dtype=np.float64).reshape(-1, 3)
     low_x, low_y, high_x, high_y = shapely.total_bounds(np.array([paved, *facades]))
     return Town(
         name=name,
@@ -200,6 +204,7 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
             yaw=np.array([row[1] for row in signs], dtype=np.float64),
             kind=tuple(row[2] for row in signs),
         ),
+        posts=posts,
         lamps=street_furniture.place_lamps(rows, mounts, stream(parameters.seed, "lamps")),
         signals=place_signals(net, mounts),
     )

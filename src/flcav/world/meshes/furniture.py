@@ -57,6 +57,11 @@ def signal_head(height: float) -> Mesh:
     return join_meshes(parts)
 
 
+def map_pole(height: float) -> Mesh:
+    """Return a plain pole `height` [m] tall above the origin."""
+    return tube((0, 0, 0), (0, 0, height), 0.04, Material.METAL, sides=8)
+
+
 def signal_mast(height: float, reach: float = 0.0) -> Mesh:
     """Return the mast of a signal head `height` [m] above the origin; with a `reach` [m], on an arm to its left."""
     foot = np.array((-LIGHT_MAST_BEHIND_M, 0.0, 0.0))

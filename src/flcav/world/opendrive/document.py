@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flcav.config import SHOWN, InputError, shorten
+from flcav.world.opendrive.objects import read_limit
 from flcav.world.opendrive.standard import check_standard
 
 FASTEST = 100.0  # [m/s] a limit beyond is none
@@ -18,7 +19,7 @@ class Road:
     """Type and speed limit of one road of the map."""
 
     kind: str  # of the first <type>: town, rural, motorway, ...; "unknown" where there is none
-    speed: float | None  # limit of the first <type> [m/s]; None where there is none
+    speed: float | None  # limit of the first <type>, else of the first speed-limit sign [m/s]; None without both
 
 
 @dataclass(frozen=True)
@@ -74,15 +75,17 @@ def describe_map(root: ElementTree.Element) -> Document:
 
 
 def _road(row: ElementTree.Element) -> Road:
+    limits = [limit for signal in row.iterfind("signals/signal") if (limit := read_limit(signal)) is not None]
+    signed = limits[0] if limits else None
     first = row.find("type")
     if first is None:
-        return Road("unknown", None)
+        return Road("unknown", signed)
     limit = first.find("speed")
     try:
         speed = float(limit.get("max", "")) * TO_METRES_PER_SECOND[limit.get("unit", "m/s")] if limit is not None else 0
     except (ValueError, KeyError):
         speed = 0.0  # "no limit", "undefined"
-    return Road(first.get("type", "unknown"), speed if 0 < speed <= FASTEST else None)
+    return Road(first.get("type", "unknown"), speed if 0 < speed <= FASTEST else signed)
 
 
 def _stops(row: ElementTree.Element) -> list[str]:

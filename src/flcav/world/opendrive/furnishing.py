@@ -6,7 +6,15 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString
 
-from flcav.world.map.parameters import GeoReference, MapSource, PoleParameters, StreetParameters, TownParameters
+from flcav.world.map.parameters import (
+    GeoReference,
+    MapSource,
+    PoleParameters,
+    PostParameters,
+    SignParameters,
+    StreetParameters,
+    TownParameters,
+)
 from flcav.world.map.roads import Edge, RoadNet
 
 VEHICLES_PER_KM = 9.0  # of driving lane
@@ -46,7 +54,16 @@ STREETS: dict[str, StreetParameters] = {
 MIX = {"car": 0.66, "van": 0.12, "truck": 0.05, "bus": 0.03, "motorcycle": 0.05, "bicycle": 0.09}
 
 
-def furnish(net: RoadNet, *, description: str, seed: int, geo: GeoReference, source: MapSource) -> TownParameters:
+def furnish(
+    net: RoadNet,
+    *,
+    description: str,
+    seed: int,
+    geo: GeoReference,
+    source: MapSource,
+    signs: tuple[SignParameters, ...] = (),
+    posts: tuple[PostParameters, ...] = (),
+) -> TownParameters:
     """Return the parameters of a town on `net`; raises `KeyError` for a street type that is not in `STREETS`."""
     kinds = sorted({edge.type for edge in net.streets})
     return TownParameters(
@@ -59,6 +76,8 @@ def furnish(net: RoadNet, *, description: str, seed: int, geo: GeoReference, sou
         mix=MIX,
         streets={kind: STREETS[kind] for kind in kinds},
         poles=tuple(find_candidate_poles(net)),
+        signs=signs,
+        posts=posts,
     )
 
 

@@ -43,9 +43,8 @@ def sample_heights(root: ElementTree.Element, origin: Path) -> Heights:
         sections = [_cross_sections(road) for road in roads]
     for road, parts in zip(roads, sections):
         if not all((np.abs(points) <= (FARTHEST_M, FARTHEST_M, HIGHEST_M)).all() for points in parts):
-            raise InputError(
-                f"{origin}: road {shorten(road.id)} reaches beyond {FARTHEST_M / 1000:g} km or {HIGHEST_M:g} m in height"
-            )
+            far = f"{FARTHEST_M / 1000:g} km, or {HIGHEST_M:g} m in height"
+            raise InputError(f"{origin}: road {shorten(road.id)} reaches beyond {far}")
     surface = np.concatenate([inner for inner, _ in sections])
     aside = np.concatenate([outer for _, outer in sections])
     owner = np.repeat(np.arange(len(roads)), [len(inner) for inner, _ in sections])

@@ -30,6 +30,7 @@ from flcav.world.opendrive.georeference import locate_origin
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map, mirror_parts
+from flcav.world.opendrive.objects import find_posts, find_signs
 from flcav.world.opendrive.streets import rewrite_streets
 
 NETCONVERT_S = 300.0  # longest run of netconvert
@@ -171,6 +172,8 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
             seed=zlib.crc32(xodr.read_bytes()) % 10_000,
             geo=geo,
             source=MapSource(file=xodr.name, offset_m=streets.offset_m),
+            signs=find_signs(root, streets.offset_m),
+            posts=find_posts(root, streets.offset_m),
         )
         values = parameters.model_dump(mode="json", exclude_defaults=True)
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)

@@ -2,14 +2,14 @@
 
 import xml.etree.ElementTree as ElementTree
 
-NO_TYPE = "-1"  # type of a signal that is in no catalogue: OpenDRIVE 1.8, 14.1
+SIGNAL = {"type": "-1", "dynamic": "no", "orientation": "none"}  # what a signal is that does not say; -1: of no type
 ENDS = ("predecessor", "successor")
 
 
 def mend_map(root: ElementTree.Element) -> tuple[str, ...]:
     """Mend the map below `root` in place; return a note on each kind of change.
 
-    Signals without a type get `NO_TYPE`; links and connections that lead nowhere are removed.
+    Signals get what they lack of `SIGNAL`; links and connections that lead nowhere are removed.
     """
     roads = {row.get("id", "") for row in root.iterfind("road")}
     known = {"road": roads, "junction": {row.get("id", "") for row in root.iterfind("junction")}}
@@ -17,7 +17,8 @@ def mend_map(root: ElementTree.Element) -> tuple[str, ...]:
     for road in root.iterfind("road"):
         for signal in road.iterfind("signals/signal"):
             untyped += not signal.get("type")
-            signal.set("type", signal.get("type") or NO_TYPE)
+            for name, value in {"id": f"unnamed{untyped}", **SIGNAL}.items():
+                signal.set(name, signal.get(name) or value)
         link = road.find("link")
         for end in list(link) if link is not None else []:
             if end.tag in ENDS and end.get("elementId") not in known.get(end.get("elementType", ""), ()):
