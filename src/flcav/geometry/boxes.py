@@ -90,24 +90,20 @@ class Boxes:
     def transform(self, target_from_source: Array) -> "Boxes":
         """Return the boxes in the target frame of a rigid (4, 4) transform.
 
-<<<<<<< HEAD
-        Its roll and pitch move the centres but do not tilt the boxes. Variances of the centre are the diagonal of the
-        rotated covariance R diag(v) R^T; those of size and yaw stay, and so do all under translations.
-=======
-        Its roll and pitch move the centres; they turn tilted boxes, and leave upright ones upright. Variances are left
-        as they are.
->>>>>>> 8712682 (Actors, boxes, exports and datasets on a relief: pitch and roll, dataset format 3)
+        Its roll and pitch move the centres; they turn tilted boxes, and leave upright ones upright. Variances of the
+        centre are the diagonal of the rotated covariance R diag(v) R^T; those of size and yaw stay, and so do all under
+        translations.
         """
         center = transform_points(target_from_source, self.center)
-        if self.tilt is not None:
-            yaw, pitch, roll = angles_of(target_from_source[:3, :3] @ self.rotations())
-            return replace(self, center=center, yaw=wrap_angle(yaw), tilt=np.stack((pitch, roll), axis=1))
-        yaw = wrap_angle(self.yaw + yaw_of(target_from_source))
+        yaw, tilt = wrap_angle(self.yaw + yaw_of(target_from_source)), self.tilt
+        if tilt is not None:
+            turned, *tilts = angles_of(target_from_source[:3, :3] @ self.rotations())
+            yaw, tilt = wrap_angle(turned), np.stack(tilts, axis=1)
         variance = self.variance
         if variance is not None:
             turned = variance[:, :3] @ np.square(target_from_source[:3, :3]).T
             variance = np.concatenate((turned, variance[:, 3:]), axis=1)
-        return replace(self, center=center, yaw=yaw, variance=variance)
+        return replace(self, center=center, yaw=yaw, variance=variance, tilt=tilt)
 
     def rotations(self) -> Array:
         """Return (N, 3, 3) rotations of the boxes' own frames."""
