@@ -15,7 +15,10 @@ from flcav.world.opendrive.standard import FARTHEST_M
 Array = NDArray[np.float64]
 
 HIGHEST_M = 10_000.0
-STEP_M = 2.0  # between two cross-sections
+STEP_M = 1.0  # between two cross-sections, of which those are kept that are needed
+TOLERANCE_M = 0.003  # by which the surface may differ from a cross-section that is left out
+TWIST_M = 0.008  # and by which it may leave the plane between two of them
+BEND_SHARE = 0.1  # of an error in plan that counts as one of height
 ASIDE_M = (2.0, 6.0)  # beyond the outermost lanes the ground goes on at their height
 CLEAR_M = 4.0  # such points are left out within this distance of another road
 BRIDGE_M = 2.5  # a road at least this far above another one passes over it
@@ -65,13 +68,46 @@ def _cross_sections(road: Road) -> tuple[Array, Array]:
     inner, outer = [], []
     for s, borders in road.sections(stations):
         t = np.stack([*borders.values(), np.zeros(len(s))])  # (lanes and the reference line, K)
-        inner.append(road.point(np.tile(s, len(t)), t.ravel()))
+        t = t if road.is_tilted_across else np.stack((t.min(axis=0), np.zeros(len(s)), t.max(axis=0)))
+        t = np.sort(t, axis=0)
+        points = road.point(np.tile(s, len(t)), t.ravel()).reshape(*t.shape, 3)
+        kept = _find_needed(points)
+        s, t = s[kept], t[:, kept]
+        inner.append(points[:, kept].reshape(-1, 3))
         for side, edge in ((-1, t.min(axis=0)), (1, t.max(axis=0))):
             beyond = edge[:, None] + side * np.array(ASIDE_M)
             points = road.point(np.repeat(s, len(ASIDE_M)), beyond.ravel())
             points[:, 2] = np.repeat(road.height(s, edge), len(ASIDE_M))
             outer.append(points)
     return np.concatenate(inner), np.concatenate(outer)
+
+
+def _find_needed(points: Array) -> NDArray[np.int64]:
+    """Return the columns of points (T, K, 3) between which the others are linear, to `TOLERANCE_M` (Douglas-Peucker).
+
+    Rows are in the order of t. Height errors count in full; errors in plan as far as the cross-section is tilted, and
+    at least to `BEND_SHARE`.
+    """
+    across = points[-1] - points[0]
+    tilt = np.abs(across[:, 2]) / np.maximum(np.hypot(across[:, 0], across[:, 1]), 0.1)
+    weight = np.array([1.0, 1.0, 0.0]) * max(BEND_SHARE, float(np.nan_to_num(tilt.max()))) + (0.0, 0.0, 1.0)
+    kept, waiting = {0, points.shape[1] - 1}, [(0, points.shape[1] - 1)]
+    while waiting:
+        first, last = waiting.pop()
+        if last - first < 2:
+            continue
+        share = (np.arange(first + 1, last) - first) / (last - first)
+        chord = points[:, first, None] + share[:, None] * (points[:, last] - points[:, first])[:, None]
+        error = np.abs((points[:, first + 1 : last] - chord) * weight).max(axis=(0, 2))
+        worst = int(error.argmax())
+        fall = points[-1, (first, last), 2] - points[0, (first, last), 2]  # across, at both ends
+        if abs(fall[1] - fall[0]) / 4 > TWIST_M:  # two triangles differ so much from a twisted patch
+            worst = (last - first) // 2 - 1
+            error[worst] = np.inf
+        if error[worst] > TOLERANCE_M:
+            kept.add(first + 1 + worst)
+            waiting += [(first, first + 1 + worst), (first + 1 + worst, last)]
+    return np.array(sorted(kept))
 
 
 def _find_above(points: Array, owner: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -63,6 +63,11 @@ class Road:
         return not any(profiles) and not any(shape for _, shape in self._shapes)
 
     @property
+    def is_tilted_across(self) -> bool:
+        """Return whether cross-sections have superelevation or lateral shapes, which may change along the road."""
+        return bool(self._superelevation) or any(shape for _, shape in self._shapes)
+
+    @property
     def stations(self) -> list[float]:
         """Return the s [m] at which a lane section or a lateral shape begins."""
         return [*(section.s for section in self._sections), *(s for s, _ in self._shapes)]
