@@ -21,7 +21,7 @@ from flcav.world.traffic.demand import draw_tour
 from flcav.world.traffic.reach import find_driven, find_walked
 from flcav.world.traffic.traffic import simulate
 
-CROSS = Path(__file__).parents[2] / "data" / "cross.xodr"
+CROSS = Path(__file__).parents[3] / "data" / "cross.xodr"
 
 pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
 

@@ -21,8 +21,8 @@ from flcav.world.opendrive.georeference import inverse_mercator, locate_origin
 from flcav.world.opendrive.importing import ImportedTown, import_town
 from flcav.world.traffic.traffic import simulate
 
-CROSS = Path(__file__).parents[2] / "data" / "cross.xodr"
-REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[3].parent / "shared" / "data")) / "carla_maps"
+CROSS = Path(__file__).parents[3] / "data" / "cross.xodr"
+REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[4].parent / "shared" / "data")) / "carla_maps"
 CENTRE = (458_000.0, 5_428_000.0)  # of the cross, UTM 32
 
 pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
