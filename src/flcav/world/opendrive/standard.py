@@ -10,7 +10,7 @@ from pathlib import Path
 
 from flcav.config import InputError, shorten
 
-HEADER, LINES, ROADS, LINKS = "6.3", "9.2", "10", "10.3"  # clauses
+LINES, ROADS = "9.2", "10"  # clauses
 ELEVATIONS, LANES, WIDTHS, JUNCTIONS = "10.5", "11.3", "11.6", "12"
 SHAPES: dict[str, tuple[str, ...]] = {  # children of <geometry> with their coefficients
     "line": (),
