@@ -257,7 +257,7 @@ def test_a_models_size_is_what_flower_sends() -> None:
     assert book.used_mb("wireless") == pytest.approx(sent / 1e6, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", ["objects", "weather"])
+@pytest.mark.parametrize("name", ["objects", "signs", "weather"])
 def test_a_history_of_the_package_falls_with_every_resource(name: str) -> None:
     known = load_history(name)
     assert len(known.accuracy) >= 6
