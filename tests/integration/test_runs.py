@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
 from flwr.common.serde import recorddict_to_proto
 from PIL import Image
 from safetensors.numpy import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
@@ -27,11 +29,13 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.arms.run import ARMS, ArmsResult, compare_arms
 from flcav.experiments.fig6a.results import AllocationResult
 from flcav.experiments.fig6a.run import compare_plans
+from flcav.federation.privacy import account_epsilon
+from flcav.federation.rules import Rules
 from flcav.network.ledger import LINKS, Ledger
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, load_run_recipe
-from flcav.pipeline.results import Placed, Pretrained, Run, StageResult, Watched
+from flcav.pipeline.results import FederatedRound, Placed, Pretrained, Run, StageResult, Watched
 from flcav.pipeline.running import RESULTS, SUMMARY, run, run_seeds
 from flcav.pipeline.seeds.comparing import compare
 from flcav.report.pages.run_page import write_report
@@ -183,6 +187,64 @@ def test_the_ledger_is_what_crossed_the_links(finished: Path, result: Run) -> No
         assert use.used_mb == pytest.approx(use.planned_mb, rel=1e-3)
         assert use.used_mb <= use.budget_mb == getattr(RECIPE.budgets_mb, link)
         assert sum(spent.mb for spent in main.spent if spent.link == link) == pytest.approx(use.used_mb)
+
+
+def rounds_of(result: Run, arm: str, stage: str, server: str) -> list[FederatedRound]:
+    records = [record for each in result.arms[arm].stages if each.stage == stage for record in each.records or ()]
+    return [record for record in records if record.server == server]
+
+
+def test_every_round_is_in_the_results_with_its_bytes_and_its_loss(finished: Path, result: Run) -> None:
+    book = Ledger.load(finished / "ledgers/main.parquet")
+    both = ("grid/cav0", "grid/cav1")
+    edge, inner, cloud = (rounds_of(result, MAIN, *at) for at in ((EDGE, "grid"), (CLOUD, "grid"), (CLOUD, "cloud")))
+    assert [(each.round, each.clients) for each in (*edge, *inner)] == [(1, both), (2, both), (1, both)]
+    assert [(each.clients, each.failed) for each in cloud] == [(("grid", "ring"), {})]
+    assert tuple(each.loss for each in edge) == result.arms[MAIN].stages[0].losses
+    for link, stage, records in (("wireless", EDGE, edge), ("wireless", CLOUD, inner), ("wireline", CLOUD, cloud)):
+        for direction in ("up", "down"):
+            sent = [
+                e.bytes
+                for e in book.entries
+                if (e.link, e.stage, e.direction) == (link, stage, direction)
+                and e.round
+                and e.client.startswith("grid/" if link == "wireless" else ("grid", "ring"))
+            ]
+            assert sum(getattr(each, f"{direction}_bytes") for each in records) == sum(sent) > 0
+    table = pq.read_table(finished / "rounds.parquet").to_pylist()
+    assert {row["loss"] for row in table if (row["arm"], row["stage"]) == (MAIN, EDGE)} >= {each.loss for each in edge}
+    curves = EventAccumulator(str(finished / "events/main/edge/objects/grid"))
+    curves.Reload()
+    assert [(event.step, event.value) for event in curves.Scalars("loss")] == [
+        (each.round, pytest.approx(each.loss)) for each in edge
+    ]
+    assert "Rounds of federated learning" in (finished / "report.html").read_text()
+
+
+def test_noise_and_masks_hold_in_a_whole_run(finished: Path, result: Run) -> None:
+    arms = {MAIN: "", "masked": "-masked", "noisy": "-noisy", "noisy_vehicles": "-noisy_vehicles"}
+    folders = {arm: finished / f"work/grid-edge-fl-objects{suffix}" for arm, suffix in arms.items()}
+    start = load_file(finished / "work/pretrain-objects/weights.safetensors")
+    ends = {arm: load_file(folder / "round1.safetensors") for arm, folder in folders.items()}
+    learned = [name for name in start if name.endswith("weight") and start[name].size > 1000]
+    for name in learned:
+        np.testing.assert_allclose(ends["masked"][name], (ends[MAIN][name]), atol=1e-4)
+        for arm, spread in (("noisy", 1 / 2), ("noisy_vehicles", 1 / np.sqrt(2))):  # of the sum of two; of each
+            assert np.std(ends[arm][name] - start[name]) == pytest.approx(spread, rel=0.1)
+    for arm in arms:
+        told = [record.epsilon for record in rounds_of(result, arm, EDGE, "grid")]
+        if arm in (MAIN, "masked"):
+            assert told == [None, None]
+            continue
+        where = "central" if arm == "noisy" else "local"
+        rules = Rules.model_validate({"privacy": {"where": where, "clip": 1.0, "noise": 1.0}})
+        assert rules.privacy is not None
+        names = ["grid/cav0", "grid/cav1"]
+        assert told == pytest.approx([account_epsilon(rules.privacy, rules.selection, names, n) for n in (1, 2)])
+    book = Ledger.load(folders["masked"] / "ledger.parquet").entries
+    ups = [entry.client for entry in book if (entry.round, entry.direction) == (1, "up")]
+    assert [ups.count(f"grid/cav{number}") for number in range(2)] == [4, 4]  # keys, shares, update, unmasking
+    assert not any("state" in path.name for path in folders["masked"].iterdir())  # nothing of a vehicle is kept
 
 
 def test_no_two_splits_share_a_scene(finished: Path) -> None:

@@ -151,7 +151,7 @@ class Rounds(FlowerStrategy):
         if self._rules.privacy is not None:
             rounds, names = self._earlier + number, [*self._names.values()]
             epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
-        self._state.records.append(RoundRecord(number, tuple(updates), self._failed, epsilon))
+        self._state.records.append(RoundRecord(number, tuple(updates), self._failed, epsilon, loss, sum(samples)))
         self._on_round(number, weights, loss)
         return to_arrays(weights), MetricRecord({SAMPLES: sum(samples), LOSS: loss})
 

@@ -15,12 +15,14 @@ SERVER, CLIENT = "server", "client"
 
 @dataclass(frozen=True)
 class RoundRecord(Record):
-    """One round: whose updates were combined, and who failed."""
+    """One round: whose updates were combined, who failed, and what the updates say of themselves."""
 
     round: int  # from 1
     clients: tuple[str, ...]  # whose updates were combined, by name
     failed: Mapping[str, str] = field(default_factory=dict)  # by client what was wrong
     epsilon: float | None = None  # of differential privacy, of all rounds so far; None: without noise
+    loss: float = 0.0  # mean training loss, weighted by samples
+    samples: int = 0  # of the clients together
 
 
 @dataclass

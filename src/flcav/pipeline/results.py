@@ -149,6 +149,22 @@ class Round:
 
 
 @dataclass(frozen=True)
+class FederatedRound(Record):
+    """One round of a federation: whose updates were combined, who failed and why, what was sent, loss and epsilon."""
+
+    server: str  # region of the edge server, or "cloud"
+    round: int  # from 1 in its stage
+    clients: tuple[str, ...]  # whose updates were combined
+    failed: Mapping[str, str]  # by client what was wrong
+    samples: int  # of the clients together
+    loss: float  # mean training loss, weighted by samples
+    up_bytes: int  # of all clients' messages, on their link
+    down_bytes: int
+    epsilon: float | None  # of differential privacy, of all rounds so far; None: without noise
+    seconds: float | None = None  # of the simulated network; None: without one
+
+
+@dataclass(frozen=True)
 class StageResult(Saved):
     """Result of a federated stage of a task, or of centralised training; the weights are in the same folder."""
 
@@ -160,6 +176,7 @@ class StageResult(Saved):
     clients: int
     poles: tuple[int, ...]  # whose sensors contributed labels
     losses: tuple[float, ...] = ()  # mean training loss of each round
+    records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule, find_strategies
 from flcav.pipeline.before_after import detect_before_after
+from flcav.pipeline.federations.records import read_rounds
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
     LABEL_SOURCES,
@@ -294,9 +295,11 @@ def edge_step(
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region, earlier=earlier)
     strategy, _ = find_strategies(how)
     rules = follow_plan(how, own, earlier)
+    before = len(book.entries)
     losses = federate_edge(learning, start, clients, schedule, strategy, rules, earlier, book, work.folder, work.report)
     held = sum(len(client.samples) for client in clients.values())
-    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses).save(work.folder)
+    records = read_rounds(work.folder, region, before)
+    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses, records).save(work.folder)
 
 
 def cloud_step(
@@ -329,8 +332,10 @@ def cloud_step(
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
     federating = Strategies(*find_strategies(how))
     rules = follow_plan(how, own.tasks[task], own.tasks[task].edge_rounds)
+    before = len(book.entries)
     losses = federate_cloud(learning, start, servers, rounds, k, federating, rules, book, work.folder, work.report)
-    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses).save(work.folder)
+    records = read_rounds(work.folder, None, before)
+    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses, records).save(work.folder)
 
 
 def central_step(

@@ -12,6 +12,7 @@ from flcav.geometry import Boxes
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.arms import Names, resolve_settings
+from flcav.pipeline.federations.records import list_rounds
 from flcav.pipeline.findings import WORDS
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import LOOK
@@ -62,6 +63,11 @@ def page(run: Run) -> dict[str, Any]:
         }
         for test in run.tested
     ]
+    rounds = [
+        {**vars(record), "stage": WORDS[stage.stage], "task": stage.task}
+        for arm, stage, record in list_rounds(run)
+        if arm == MAIN
+    ]
     return {
         "seed": recipe.seed,
         "retrained": recipe.retrainings,
@@ -77,6 +83,9 @@ def page(run: Run) -> dict[str, Any]:
         "links": main.links,
         "sent": {link: [main.sent_mb(task, link) for task in recipe.tasks] for link in main.links},
         "gap_closed": run.gap_closed,
+        "rounds": rounds,
+        "private": any(row["epsilon"] is not None for row in rounds),
+        "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
         "caveats": run.caveats,
         "elapsed_s": run.elapsed_s,

@@ -1,0 +1,1 @@
+"""Federations of a run: the records of their rounds, as results, tables and curves."""
