@@ -228,8 +228,9 @@ class Graph:
         for task in arm.placement.tasks:
             pretrained, registry = names.pretrain(arm.name, task), names.recording(region, "registry", task)
             errors[task] = names.errors(arm.name, region, task)
-            arguments = {"task": task, "region": region, "pretrained": pretrained, "registry": registry}
-            self._add(_step(errors[task], errors_step, arguments, [pretrained, registry]))
+            plan, own = names.plan(arm.name), {"vehicles": self._vehicles(), "budget_mb": self._budget_mb}
+            arguments = {"task": task, "region": region, "pretrained": pretrained, "registry": registry, "plan": plan}
+            self._add(_step(errors[task], errors_step, arguments | own, [pretrained, registry, plan]))
         first = (self.recipe.placement.tasks or tuple(self.recipe.tasks))[0]
         registry = names.recording(region, "registry", first)
         edge = names.recording(region, EDGE, first) if self.recipe.regions[region].data is not None else None
@@ -251,7 +252,8 @@ class Graph:
         """Return the steps and settings that a stage and its labelled samples depend on, see `flcav.pipeline.work`."""
         names = self.names
         helped = any(LABEL_SOURCES[each.labels[task]].from_poles for each in self.settings.values())
-        return {
+        reported = {"errors": names.errors(arm.name, region, task)} if task in arm.placement.tasks else {}
+        return reported | {
             "plan": names.plan(arm.name, stage),
             "pretrain": names.pretrain(arm.name, task),
             "frames": names.recording(region, EDGE, task),
@@ -347,5 +349,5 @@ def _step(name: str, function: Callable[..., None], arguments: Mapping[str, Any]
 
 def _named_in(steps: Mapping[str, Any]) -> list[str]:
     """Return the names of the steps in what `Graph._rests_on` returned; for stage III also that of stage II."""
-    one = [steps[key] for key in ("plan", "pretrain", "frames", "place", "edge") if key in steps]
+    one = [steps[key] for key in ("plan", "pretrain", "errors", "frames", "place", "edge") if key in steps]
     return [*one, *steps["sites"]]

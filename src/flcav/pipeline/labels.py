@@ -9,7 +9,8 @@ import numpy as np
 from flcav.config import InputError
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, build_road_view
-from flcav.network.ledger import Ledger, LedgerEntry
+from flcav.network.ledger import Ledger
+from flcav.network.messages import send
 from flcav.perception.client import as_shared
 from flcav.perception.metrics import match
 from flcav.perception.objects.model import Second
@@ -20,6 +21,7 @@ from flcav.perception.objects.truth import asked_of, choose_lidar
 from flcav.perception.task import Task
 from flcav.perception.tasks import task_named
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.recipe import EDGE
 from flcav.progress import Report
 
 PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
@@ -88,8 +90,9 @@ def pseudo_label_samples(
 ) -> dict[str, list[Sample]]:
     """Return each vehicle's sweeps with pseudo-labels, by "region/vehicle".
 
-    Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`.
-    Messages of the sensors enter `book` as downlinks; stage III passes none, since its labels are those of stage II.
+    Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`, as
+    their messages have them, which enter `book` as downlinks; stage III passes none, since its labels are those of
+    stage II.
     """
     data = split.data
     views = _views(split, poles)
@@ -98,12 +101,11 @@ def pseudo_label_samples(
         key, frame = data.keys[i], data.frame(i)
         lidar = choose_lidar(frame)
         detections = detect_all(network, [frame.lidar[lidar]], score_threshold=threshold)[0]
-        told = views.get((key.scene, key.index), [])
-        name = f"{region}/{key.agent}"
-        samples.setdefault(name, []).append(label_sample(frame, detections, told, network.config, lidar))
+        told, name = views.get((key.scene, key.index), []), f"{region}/{key.agent}"
         if book is not None:
-            for view in told:
-                book.enter(LedgerEntry("edge", OBJECTS.name, "wireless", "down", 0, name, len(view.message())))
+            about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
+            told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
+        samples.setdefault(name, []).append(label_sample(frame, detections, told, network.config, lidar))
         report(done, len(frames), "labels")
     return samples
 

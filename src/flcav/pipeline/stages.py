@@ -24,7 +24,8 @@ from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Trainable, Weights
 from flcav.files import write_bytes, write_json
-from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.network.ledger import Budget, Ledger
+from flcav.network.messages import send
 from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
@@ -85,13 +86,21 @@ def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) 
     return {region: tuple(frames) for region, frames in chosen.items()}
 
 
-def book_uploads(book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int]) -> None:
-    """Enter each sample in the ledger twice: vehicle to edge server (wireless), edge server to cloud (wireline)."""
-    sizes = as_shared(task).sample_bytes(pool.data, config, chosen)
-    for frame, size in zip(chosen, sizes, strict=True):
+def upload_samples(
+    book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int]
+) -> Sequence[Any]:
+    """Return the samples of frames as they reach the cloud: from vehicle to edge server (wireless), then by wireline.
+
+    Samples of a task without messages of its own are read from the recording, each on access.
+    """
+    shared, received = as_shared(task), []
+    about: Any = {"stage": PRETRAIN, "task": task.name, "direction": "up"}
+    for frame, message in zip(chosen, shared.pack_samples(pool.data, config, chosen), strict=True):
         key = pool.data.keys[frame]
-        book.enter(LedgerEntry(PRETRAIN, task.name, "wireless", "up", 0, f"{key.scene}/{key.agent}", size))
-        book.enter(LedgerEntry(PRETRAIN, task.name, "wireline", "up", 0, region, size))
+        at_edge = send(book, message, **about, link="wireless", client=f"{key.scene}/{key.agent}")
+        received.append(send(book, at_edge, **about, link="wireline", client=region))
+    samples = shared.unpack_samples(received, config)
+    return task.samples(pool.data, config, chosen) if samples is None else samples
 
 
 def pretrain(

@@ -24,6 +24,7 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule, find_strategies
 from flcav.pipeline.before_after import detect_before_after
+from flcav.pipeline.federations.messages import release_network, report_errors
 from flcav.pipeline.federations.records import read_rounds
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
@@ -76,7 +77,6 @@ from flcav.pipeline.stages import (
     Learning,
     RegionStart,
     Strategies,
-    book_uploads,
     choose_uploads,
     federate_cloud,
     federate_edge,
@@ -87,6 +87,7 @@ from flcav.pipeline.stages import (
     region_budget,
     share_budget,
     train_centrally,
+    upload_samples,
 )
 from flcav.pipeline.steps import Work
 
@@ -136,10 +137,10 @@ def plan_step(
         task, network = task_named(name), asked_for.tasks[name].network
         config = find_configuration(task, network)
         sizes = [
-            size
+            len(message)
             for step in pools[name]
             for split in (Frames.open(work.inputs[step]),)
-            for size in as_shared(task).sample_bytes(split.data, config, split.vehicles)
+            for message in as_shared(task).pack_samples(split.data, config, split.vehicles)
         ]
         messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network, forms))
         own = asked_for.tasks[name]
@@ -206,8 +207,7 @@ def pretrain_step(
     samples: list[Any] = []
     for region, frames in chosen.items():
         if frames:
-            book_uploads(book, learning.task, config, region, opened[region], frames)
-            samples += _each(learning.task.samples(opened[region].data, config, frames))
+            samples += _each(upload_samples(book, learning.task, config, region, opened[region], frames))
     book.save(work.folder / LEDGER)
     validated = pretrain(learning, samples, watched, work.folder, work.report)
     trained = load_stage_network(learning.task, work.folder)
@@ -221,8 +221,17 @@ def pretrain_step(
     ).save(work.folder)
 
 
-def errors_step(work: Work, task: str, region: str, pretrained: str, registry: str) -> None:
-    """Register the errors of the pretrained network in a region.
+def errors_step(
+    work: Work,
+    task: str,
+    region: str,
+    pretrained: str,
+    registry: str,
+    plan: str,
+    vehicles: Mapping[str, int],
+    budget_mb: tuple[float, float],
+) -> None:
+    """Register the errors of the pretrained network in a region, as its vehicles report them to the edge server.
 
     Raises `InputError` for a task whose errors have no position.
     """
@@ -230,10 +239,13 @@ def errors_step(work: Work, task: str, region: str, pretrained: str, registry: s
     if not isinstance(learned, RegistersErrors):
         raise InputError(f"placement.tasks: the errors of '{task}' have no place in a town")
     drive = Frames.open(work.inputs[registry])
-    network = load_stage_network(learned, work.inputs[pretrained])
+    book = _region_book(work, task, region, plan, pretrained, vehicles, budget_mb)
+    network = release_network(book, learned, load_stage_network(learned, work.inputs[pretrained]), region, drive)
     threshold = Pretrained.load(work.inputs[pretrained]).threshold
     lowest = THRESHOLD if threshold is None else threshold
     found = learned.register_errors(network, drive.data, drive.vehicles, lowest, work.report)
+    found = report_errors(book, learned, found, region, drive)
+    book.save(work.folder / LEDGER)
     save_errors(found.errors, work.folder / ERRORS)
     kinds = sorted({error.kind for error in found.errors})
     counts = {kind: sum(error.kind == kind for error in found.errors) for kind in kinds}
@@ -280,14 +292,15 @@ def edge_step(
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
     own = plan.tasks[task]
-    stage_one = Ledger.load(work.inputs[steps["pretrain"]] / LEDGER)
-    budget = region_budget(Ledger(_share_budget(plan, budget_mb, task), stage_one.entries), vehicles, region)
+    book = _region_book(work, task, region, steps["plan"], steps["pretrain"], vehicles, budget_mb)
+    if "errors" in steps:
+        book = Ledger(book.budget, _entries(work, steps["errors"]))
     if "edge" in steps:
         stage, rounds = MORE_EDGE, own.cloud_rounds * how.edge_rounds_per_cloud_round
-        book = Ledger(budget, Ledger.load(work.inputs[steps["edge"]] / LEDGER).entries)
+        book = Ledger(book.budget, _entries(work, steps["edge"]))
         samples, poles = _label_samples(work, learning, region, labels, steps)
     else:
-        stage, rounds, book = EDGE, own.edge_rounds, Ledger(budget)
+        stage, rounds = EDGE, own.edge_rounds
         samples, poles = _label_samples(work, learning, region, labels, steps, book)
     start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
     clients = make_clients(learning, start.config, samples)
@@ -471,6 +484,20 @@ def list_speeds(recipe: RunRecipe) -> dict[str, float]:
 def _edge_groups(recipe: RunRecipe) -> tuple[int, ...]:
     """Return the number of vehicles of each federating region's edge server."""
     return tuple(recipe.vehicles(region) for region in recipe.with_role("federate"))
+
+
+def _region_book(
+    work: Work,
+    task: str,
+    region: str,
+    plan: str,
+    pretrained: str,
+    vehicles: Mapping[str, int],
+    budget_mb: tuple[float, float],
+) -> Ledger:
+    """Return an empty ledger of a region's stage II, with its share of what stage I left."""
+    whole = _share_budget(Plan.load(work.inputs[plan]), budget_mb, task)
+    return Ledger(region_budget(Ledger(whole, _entries(work, pretrained)), vehicles, region))
 
 
 def _share_budget(plan: Plan, budget_mb: tuple[float, float], task: str) -> Budget:

@@ -4,6 +4,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
@@ -42,8 +43,9 @@ def read_rounds(folder: Path, region: str | None, before: int) -> tuple[Federate
     if not (folder / ROUND).exists():
         return ()
     entries = Ledger.load(folder / LEDGER).entries[before:]
+    told: Any = read_json(folder / ROUND)
     found = []
-    for name, records in read_json(folder / ROUND)["records"].items():
+    for name, records in told["records"].items():
         server = region or name.rpartition("/")[2]
         link = "wireline" if server == CLOUD else "wireless"
         for each in records:
