@@ -31,6 +31,7 @@ from flcav.experiments.fig6a.results import AllocationResult
 from flcav.experiments.fig6a.run import compare_plans
 from flcav.federation.privacy import account_epsilon
 from flcav.federation.rules import Rules
+from flcav.network.clock.records import load_rounds
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import find_configuration
@@ -163,10 +164,11 @@ def test_road_labels_are_booked_as_downlink(finished: Path) -> None:
         entries = Ledger.load(finished / f"work/{step}/ledger.parquet").entries
         return [e.bytes for e in entries if (e.stage, e.direction, e.round) == ("edge", "down", 0)]
 
-    held = StageResult.load(finished / "work/grid-edge-fl-objects").samples
-    assert len(told("grid-edge-fl-objects")) == held > 0
-    assert min(told("grid-edge-fl-objects")) > 100
-    assert told("grid-edge-fl-objects-no_pole") == []
+    held, released = StageResult.load(finished / "work/grid-edge-fl-objects").samples, told("grid-errors-objects")
+    labels = told("grid-edge-fl-objects")[len(released) :]
+    assert len(labels) == held > 0
+    assert min(labels) > 100
+    assert told("grid-edge-fl-objects-no_pole") == released
 
 
 def test_the_ledger_is_what_crossed_the_links(finished: Path, result: Run) -> None:
@@ -257,6 +259,22 @@ def test_noise_and_masks_hold_in_a_whole_run(finished: Path, result: Run) -> Non
     ups = [entry.client for entry in book if (entry.round, entry.direction) == (1, "up")]
     assert [ups.count(f"grid/cav{number}") for number in range(2)] == [4, 4]  # keys, shares, update, unmasking
     assert not any("state" in path.name for path in folders["masked"].iterdir())  # nothing of a vehicle is kept
+
+
+def test_the_network_takes_time_and_loses_vehicles_by_name(finished: Path, result: Run) -> None:
+    lost, inner, cloud = (
+        rounds_of(result, "driven", *at) for at in ((EDGE, "grid"), (CLOUD, "grid"), (CLOUD, "cloud"))
+    )
+    clock = load_rounds(finished / "work/grid-edge-fl-objects-driven/clock-grid.parquet")
+    assert [each.seconds for each in lost] == pytest.approx([each.end_s - each.start_s for each in clock])
+    for record, timed in zip(lost, clock, strict=True):
+        named = {f"grid/{client.client}": client.dropped for client in timed.clients}
+        assert record.failed == {name: why for name, why in named.items() if why}
+        assert record.clients == tuple(name for name, why in named.items() if not why)
+        assert record.seconds is not None
+        assert 0 < record.seconds <= 3
+    assert cloud[0].seconds == pytest.approx(inner[0].seconds + 2 * (0.01 + 8 * 1337440 / 1e9), rel=1e-3)
+    assert all(record.seconds is None for record in rounds_of(result, MAIN, EDGE, "grid"))
 
 
 def test_no_two_splits_share_a_scene(finished: Path) -> None:

@@ -6,7 +6,7 @@ server is k rounds of federation with the vehicles of its region (Wang et al., I
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from flwr.app import ArrayRecord
 
@@ -18,6 +18,7 @@ from flcav.federation.rounds import OnRound, Rounds
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust
@@ -110,7 +111,8 @@ def federate(
             state.clients = grid.read_states((OWN, RESIDUAL))
             on_round(round_, aggregated, loss)
 
-        metered = MeteredGrid(grid, account, grid.names)
+        lossy = LossyGrid(grid, account, grid.names) if account.outages else grid
+        metered = MeteredGrid(lossy, account, grid.names)
         app = Rounds(strategy, rules, schedule.work, grid.names, state, done, earlier, keep)
         result = app.start(metered, to_arrays(weights), rounds - done)
     arrays: ArrayRecord = result.arrays
@@ -213,7 +215,7 @@ class EdgeServer:
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
         self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
-        return federate(
+        found = federate(
             self.vehicles,
             start,
             schedule,
@@ -224,3 +226,4 @@ class EdgeServer:
             done=done,
             earlier=self.earlier,
         )
+        return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody

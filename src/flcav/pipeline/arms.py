@@ -112,6 +112,13 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
     """
     for setting in settings:
         edge, cloud = find_strategies(setting.federation)
+        selection = setting.federation.selection
+        if setting.federation.network is not None and selection.rule == "importance":
+            raise InputError("federation.network: importance selection draws the clients after they have trained")
+        if setting.federation.network is not None and selection.rule == "deadline" and setting.federation.privacy:
+            raise InputError(
+                "federation.network: a deadline leaves other numbers of clients, and noise is for one number"
+            )
         for region in setting.regions:
             if recipe.regions[region].data is None:
                 check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])

@@ -33,6 +33,7 @@ from flcav.pipeline.work import (
     deal_step,
     edge_step,
     errors_step,
+    list_speeds,
     look_step,
     place_step,
     plan_step,
@@ -267,6 +268,8 @@ class Graph:
         """Return the settings that all federated stages of a task have in common."""
         federation = arm.federation.model_dump(mode="json")
         own = {"labels": arm.labels[task], "federation": federation, "budget_mb": self._budget_mb}
+        if arm.federation.network is not None:
+            own |= {"train_s": self.recipe.tasks[task].train_s, "speeds": list_speeds(self.recipe)}
         return self._learning(arm, task) | own
 
     def _add_edge(self, arm: Setting) -> None:

@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save
 from flcav.config import InputError
 from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
 from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
@@ -284,17 +284,19 @@ def federate_edge(
     book: Ledger,
     folder: Path,
     report: Report,
+    outages: Mapping[tuple[int, str], Outage] = {},
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
 
     A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
+    The vehicles that `outages` name by round are lost in it.
     """
     state = FederationState()
     federating = FederationCheckpoints(
         learning.task, folder, book, report, {EDGE: state}, describe_federation(strategy, rules)
     )
     start, done = federating.resume(to_arrays(network))
-    account = Account(book, EDGE, learning.task.name, "wireless")
+    account = Account(book, EDGE, learning.task.name, "wireless", outages)
     keep = federating.make_saver(schedule.rounds)
     how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
     federate(clients, start, schedule, account, **how, done=done, on_round=keep)
@@ -314,10 +316,12 @@ def federate_cloud(
     book: Ledger,
     folder: Path,
     report: Report,
+    outages: Mapping[tuple[int, str], Outage] = {},
 ) -> tuple[float, ...]:
     """Run stage III from `network`; `regions`: where each edge server starts.
 
-    An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers.
+    An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers, and
+    an edge round loses the vehicles that `outages` names.
     Writes weights and ledger, returns each round's loss.
     """
     state, own_states = FederationState(), {region: FederationState() for region in regions}
@@ -328,7 +332,8 @@ def federate_cloud(
         learning.task, folder, book, report, states, describe_federation(strategies, rules)
     )
     start, done = federating.resume(to_arrays(network))
-    wireless, wireline = (Account(book, CLOUD, learning.task.name, link) for link in ("wireless", "wireline"))
+    wireless = Account(book, CLOUD, learning.task.name, "wireless", outages)
+    wireline = Account(book, CLOUD, learning.task.name, "wireline")
     servers: dict[str, Trainable] = {
         region: EdgeServer(
             own.clients,

@@ -2,7 +2,7 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,14 @@ SCHEMA = pa.schema(
 )
 
 
-def read_rounds(folder: Path, region: str | None, before: int) -> tuple[FederatedRound, ...]:
+def read_rounds(
+    folder: Path, region: str | None, before: int, seconds: Mapping[str, Sequence[float]] = {}
+) -> tuple[FederatedRound, ...]:
     """Return the rounds of the federation that was carried out in `folder`, with the bytes of their messages.
 
     region: of stage II; of stage III None, and the cloud's rounds come before those of the edge servers. before: number
-    of entries that its ledger begins with, of messages before the first round.
+    of entries that its ledger begins with, of messages before the first round. seconds: of each round, by server, where
+    there is a network.
     """
     if not (folder / ROUND).exists():
         return ()
@@ -56,7 +59,9 @@ def read_rounds(folder: Path, region: str | None, before: int) -> tuple[Federate
                 if own and (entry.link, entry.round) == (link, record.round):
                     sent[entry.direction] += entry.bytes
             about = (record.clients, record.failed, record.samples, record.loss)
-            found.append(FederatedRound(server, record.round, *about, sent["up"], sent["down"], record.epsilon))
+            took = seconds.get(server)
+            lasted = took[record.round - 1] if took else None
+            found.append(FederatedRound(server, record.round, *about, sent["up"], sent["down"], record.epsilon, lasted))
     return tuple(found)
 
 
