@@ -188,6 +188,13 @@ def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_ro
     return afforded
 
 
+def edge_seeds(schedule: Schedule, cloud_round: int, region: str, edge_rounds: int) -> list[int]:
+    """Return the seeds of a region's edge rounds in a cloud round of `schedule`, as `EdgeServer` derives them."""
+    seed, done = derive_seed(schedule.work(cloud_round).seed, region), (cloud_round - 1) * edge_rounds
+    own = Schedule(done + edge_rounds, 0, 1.0, 1.0, seed)
+    return [own.work(done + number).seed for number in range(1, edge_rounds + 1)]
+
+
 @dataclass
 class EdgeServer:
     """A region's edge server as a client of the cloud: its local training is k edge rounds with its vehicles."""

@@ -11,13 +11,10 @@ from typing import Any, Literal
 import numpy as np
 
 from flcav.config import InputError, read_config
-from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.stages import Schedule
-from flcav.federation.strategies import exchanges_more
+from flcav.federation.stages import edge_seeds
 from flcav.files import write_json
 from flcav.intervals import Estimate
-from flcav.network.clock.records import save_rounds
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Budget, Ledger, LedgerEntry, Link
 from flcav.network.plan import MessageSizes, Price
 from flcav.optimization.problem import Problem
@@ -30,7 +27,7 @@ from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule, find_strategies
 from flcav.pipeline.before_after import detect_before_after
 from flcav.pipeline.federations.messages import release_network, report_errors
-from flcav.pipeline.federations.network import CLOCK, DrivenRounds, Fleet, drive_rounds, join_regions, link_scenes
+from flcav.pipeline.federations.network import drive_region, join_regions
 from flcav.pipeline.federations.records import read_rounds
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
@@ -318,7 +315,8 @@ def edge_step(
     strategy, _ = find_strategies(how)
     rules = follow_plan(how, own, earlier)
     before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
-    driven = _drive(work, learning, how, rules, region, [*clients], steps, schedule, earlier, train_s, speeds)
+    seeds = [schedule.work(number).seed for number in range(1, rounds + 1)]
+    driven = drive_region(work, learning, how, rules, region, [*clients], steps, seeds, earlier, train_s, speeds)
     lost = driven.outages
     losses = federate_edge(*asked, driven.rules, earlier, book, work.folder, work.report, lost)
     held = sum(len(client.samples) for client in clients.values())
@@ -358,10 +356,13 @@ def cloud_step(
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
     federating = Strategies(*find_strategies(how))
     rules = follow_plan(how, own.tasks[task], own.tasks[task].edge_rounds)
-    before, schedule = len(book.entries), learning.schedule(rounds * k, learning.training.local_steps, CLOUD, "")
+    before, schedule = len(book.entries), learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
+    seeds = {
+        name: [seed for n in range(1, rounds + 1) for seed in edge_seeds(schedule, n, name, k)] for name in servers
+    }
     driven = {
-        name: _drive(
-            work, learning, how, rules, name, [*at.clients], regions[name], schedule, at.earlier, train_s, speeds
+        name: drive_region(
+            work, learning, how, rules, name, [*at.clients], regions[name], seeds[name], at.earlier, train_s, speeds
         )
         for name, at in servers.items()
     }
@@ -505,32 +506,6 @@ def list_speeds(recipe: RunRecipe) -> dict[str, float]:
 def _edge_groups(recipe: RunRecipe) -> tuple[int, ...]:
     """Return the number of vehicles of each federating region's edge server."""
     return tuple(recipe.vehicles(region) for region in recipe.with_role("federate"))
-
-
-def _drive(
-    work: Work,
-    learning: Learning,
-    how: Federation,
-    rules: Rules,
-    region: str,
-    clients: Sequence[str],
-    steps: Mapping[str, Any],
-    schedule: Schedule,
-    earlier: int,
-    train_s: float,
-    speeds: Mapping[str, float],
-) -> DrivenRounds:
-    """Return what the network makes of a region's rounds, and write them; without a network nobody is lost."""
-    if how.network is None:
-        return DrivenRounds(rules, {}, ())
-    weights = to_arrays(learning.build_network())
-    sizes = update_bytes(weights), update_bytes(weights, rules.upload, exchanging=exchanges_more(how.strategy))
-    fleet = Fleet(region, tuple(clients), *sizes, train_s, speeds)
-    split, placed = Frames.open(work.inputs[steps["frames"]]), Placed.load(work.inputs[steps["place"]])
-    scenes = link_scenes(split, placed, how.network, earlier + schedule.rounds, learning.seed)
-    driven = drive_rounds(fleet, scenes, how.network, rules, lambda n: schedule.work(n).seed, schedule.rounds, earlier)
-    save_rounds(driven.records, work.folder / f"{CLOCK}-{region}.parquet")
-    return driven
 
 
 def _region_book(

@@ -10,7 +10,7 @@ import pytest
 from flcav.config import InputError
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.stages import EdgeServer, Schedule, edge_seeds, federate
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.clock.rounds import NetworkSettings, RoundRules
@@ -39,7 +39,7 @@ def drive(
     deadline_s: float | None = None,
 ) -> DrivenRounds:
     settings = NetworkSettings(rounds=RoundRules(deadline_s=deadline_s))
-    return drive_rounds(FLEET, scenes, settings, Rules.model_validate(rules or {}), lambda n: n, rounds, earlier)
+    return drive_rounds(FLEET, scenes, settings, Rules.model_validate(rules or {}), range(1, rounds + 1), earlier)
 
 
 def test_a_round_takes_download_training_and_upload_of_all_that_share_the_band() -> None:
@@ -132,6 +132,19 @@ def test_a_round_that_loses_everybody_leaves_the_weights() -> None:
     end = federate({"grid": server}, START, schedule, Account(book, CLOUD, "t", "wireline"))
     assert np.array_equal(end.weights["w"], START["w"])
     assert (state.records[0].clients, state.records[0].loss, len(state.records[0].failed)) == ((), 0.0, 3)
+
+
+def test_the_network_knows_whom_an_edge_server_will_draw() -> None:
+    names = [f"grid/cav{i}" for i in range(6)]
+    rules, state = Rules.model_validate({"selection": {"rule": "uniform", "clients": 2}}), FederationState()
+    book, schedule = Ledger(Budget(1.0, 1.0)), Schedule(3, 1, 0.1, 0.1, 3)
+    clients: dict[str, Trainable] = {name: Walk() for name in names}
+    server = EdgeServer(clients, 2, Account(book, CLOUD, "t", "wireless"), START, rules=rules, state=state)
+    federate({"grid": server}, START, schedule, Account(book, CLOUD, "t", "wireline"))
+    seeds = [seed for number in (1, 2, 3) for seed in edge_seeds(schedule, number, "grid", 2)]
+    drawn = [tuple(rules.selection.choose(names, number, seed)) for number, seed in enumerate(seeds, start=1)]
+    assert [record.clients for record in state.records] == drawn
+    assert len(set(drawn)) > 1
 
 
 def test_a_cloud_round_waits_for_the_slowest_region_and_the_wireline() -> None:

@@ -4,21 +4,27 @@ Round n of a region is driven in one of the scenes of its training data, in turn
 roadside units are on the poles of its sensors.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from flcav.config import InputError
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.runtimes.metered import Outage
 from flcav.federation.selection import Selection
-from flcav.network.clock.records import ClientTiming, RoundRecord
+from flcav.federation.strategies import exchanges_more
+from flcav.network.clock.records import ClientTiming, RoundRecord, save_rounds
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
 from flcav.network.clock.work import ClientWork
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
+from flcav.perception.weights import to_arrays
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import CLOUD
+from flcav.pipeline.recipe import CLOUD, Federation
 from flcav.pipeline.results import Placed
+from flcav.pipeline.stages import Learning
+from flcav.pipeline.steps import Work
 
 CLOCK = "clock"  # begins the names of the files of rounds on the network, by region
 AWAY, TOO_SLOW = "not in the town", "predicted past the deadline"
@@ -74,23 +80,22 @@ def drive_rounds(
     scenes: Sequence[RadioLinks],
     settings: NetworkSettings,
     rules: Rules,
-    seed_of: Callable[[int], int],
-    rounds: int,
+    seeds: Sequence[int],
     earlier: int,
 ) -> DrivenRounds:
-    """Return what the network makes of `rounds` rounds by `rules`, after `earlier` ones in the scenes before.
+    """Return what the network makes of rounds by `rules`, after `earlier` ones in the scenes before.
 
-    seed_of: the seed of each round, which its clients are drawn by. Under deadline selection without given `seconds`
+    seeds: of each round, which its clients are drawn by. Under deadline selection without given `seconds`
     those take part whose round is predicted to end in time, with all that are in the town at once. A round goes on
     without the vehicles that it loses, however many they are, unless the rules say how many it needs.
     """
     outages: dict[tuple[int, str], Outage] = {}
     records, joins, now = [], dict.fromkeys(fleet.clients, ()), 0.0
     predicts = rules.selection.rule == "deadline" and not rules.selection.seconds
-    for number in range(1, rounds + 1):
+    for number, seed in enumerate(seeds, start=1):
         links = scenes[(earlier + number - 1) % len(scenes)]
         present = {name for name, here in zip(links.vehicle, links.present[0].tolist(), strict=True) if here}
-        chosen = rules.selection.choose(fleet.clients, number, seed_of(number))
+        chosen = rules.selection.choose(fleet.clients, number, seed)
         outages |= {(number, each): Outage(AWAY) for each in chosen if fleet.work(each).client not in present}
         there = [each for each in chosen if (number, each) not in outages]
         if predicts:
@@ -126,6 +131,32 @@ def _find_slow(fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: 
     """Return the clients whose update is not predicted to arrive within `deadline_s` [s] of the round's start."""
     timings = _time(fleet, links, clients, number, PATIENT)
     return {name for name, t in timings.items() if t.dropped or t.end_s - t.start_s > deadline_s}
+
+
+def drive_region(
+    work: Work,
+    learning: Learning,
+    how: Federation,
+    rules: Rules,
+    region: str,
+    clients: Sequence[str],
+    steps: Mapping[str, Any],
+    seeds: Sequence[int],
+    earlier: int,
+    train_s: float,
+    speeds: Mapping[str, float],
+) -> DrivenRounds:
+    """Return what the network makes of a region's rounds, and write them; without a network nobody is lost."""
+    if how.network is None:
+        return DrivenRounds(rules, {}, ())
+    weights = to_arrays(learning.build_network())
+    sizes = update_bytes(weights), update_bytes(weights, rules.upload, exchanging=exchanges_more(how.strategy))
+    fleet = Fleet(region, tuple(clients), *sizes, train_s, speeds)
+    split, placed = Frames.open(work.inputs[steps["frames"]]), Placed.load(work.inputs[steps["place"]])
+    scenes = link_scenes(split, placed, how.network, earlier + len(seeds), learning.seed)
+    driven = drive_rounds(fleet, scenes, how.network, rules, seeds, earlier)
+    save_rounds(driven.records, work.folder / f"{CLOCK}-{region}.parquet")
+    return driven
 
 
 def join_regions(
