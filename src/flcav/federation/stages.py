@@ -8,6 +8,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 from flwr.app import ArrayRecord
 
 from flcav.config import InputError
@@ -23,6 +24,7 @@ from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.federation.upload import name_like
 from flcav.seeds import derive_seed
 
 EVERYBODY = Rules()
@@ -215,10 +217,11 @@ class EdgeServer:
         """Return the update of the region after k edge rounds from the cloud's `weights`; raises as `federate` does.
 
         The first cloud round starts from the server's own stage II model instead: the cloud has not averaged yet, and
-        its model is older. Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the
-        rules, which vehicles keep to.
+        its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are.
+        Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles
+        keep to.
         """
-        start = weights if self.cloud_rounds_done else self.own
+        start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
         self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
@@ -233,4 +236,6 @@ class EdgeServer:
             done=done,
             earlier=self.earlier,
         )
+        names = name_like(found.weights, self.rules.personal)
+        self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
         return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody

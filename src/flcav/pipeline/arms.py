@@ -181,9 +181,9 @@ class Names:
             return self.cloud(arm, task)
         return {EDGE: self.edge, MORE_EDGE: self.more_edge, CENTRAL: self.central}[stage](arm, region, task)
 
-    def test(self, trained: str, region: str) -> str:
-        """Return the test of a step's network in a region."""
-        return f"test-{trained}-{region}"
+    def test(self, trained: str, region: str, model: str | None = None) -> str:
+        """Return the test of a step's network, or of the own model of the region `model`, in a region."""
+        return f"test-{trained}-{region}" if model is None else f"test-{trained}-of-{model}-{region}"
 
     def rounds(self, trained: str, region: str) -> str:
         """Return the validation of a step's network after each of its rounds in a region."""

@@ -107,6 +107,10 @@ class Graph:
                 tests += [(stage, region, task) for region in where]
         return tests
 
+    def models(self, arm: Setting, stage: str) -> tuple[str | None, ...]:
+        """Return whose models a stage ends with: None for the federation's, and regions that keep arrays."""
+        return (None, *arm.regions) if stage == CLOUD and arm.federation.personal else (None,)
+
     def watched(self) -> list[tuple[str, str, str]]:
         """Return stage, region and task of what is validated in each federating region: the main arm's stages."""
         main = self.settings[MAIN]
@@ -332,8 +336,10 @@ class Graph:
             trained = self.names.stage(arm.name, stage, region, task)
             frames = self.names.recording(region, "test", task)
             arguments = {"task": task, "region": region, "trained": trained, "frames": frames}
-            step = self.names.test(trained, region)
-            self._add(_step(step, test_step, arguments | {"seed": self.recipe.seed}, [trained, frames]))
+            arguments |= {"seed": self.recipe.seed}
+            for model in self.models(arm, stage):
+                step = self.names.test(trained, region, model)
+                self._add(_step(step, test_step, arguments | {"model": model}, [trained, frames]))
         if arm.name == MAIN:
             if self.shown is not None:
                 region, stage = self.shown

@@ -228,6 +228,17 @@ class Test:
 
 
 @dataclass(frozen=True)
+class RegionalTest:
+    """A test of the model that a region keeps for itself, by `federation.personal`."""
+
+    model: str  # region whose model it is
+    region: str  # whose test frames
+    task: str
+    measure: str
+    estimate: Estimate  # the interval is over scenes
+
+
+@dataclass(frozen=True)
 class Difference:
     """Paired difference of a measure on the same test frames: `arm` at `stage` minus `before_arm` at its stage."""
 
@@ -301,6 +312,7 @@ class ArmResult:
     stages: tuple[StageResult, ...]
     links: Mapping[str, LinkUse]
     spent: tuple[Spent, ...]
+    regional: Annotated[tuple[RegionalTest, ...] | None, LEFT_OUT] = None  # of stage III, where regions keep arrays
     earlier: Annotated[tuple[Plan, ...] | None, LEFT_OUT] = None  # plans that others took the place of, oldest first
 
     @property

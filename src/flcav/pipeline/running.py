@@ -26,6 +26,7 @@ from flcav.pipeline.results import (
     Placed,
     Plan,
     Pretrained,
+    RegionalTest,
     Run,
     Spent,
     StageResult,
@@ -253,7 +254,19 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
             for link in LINKS
         ),
         earlier=tuple(earlier) or None,
+        regional=_regional_tests(graph, work, arm) or None,
     )
+
+
+def _regional_tests(graph: Graph, work: Path, arm: Setting) -> tuple[RegionalTest, ...]:
+    found = []
+    for stage, region, task in graph.tested(arm):
+        trained = graph.names.stage(arm.name, stage, region, task)
+        for model in graph.models(arm, stage):
+            if model is not None:
+                tested = Tested.load(work / graph.names.test(trained, region, model))
+                found.append(RegionalTest(model, region, task, tested.measure, tested.estimate))
+    return tuple(found)
 
 
 def _differences(graph: Graph, work: Path) -> list[Difference]:

@@ -321,8 +321,8 @@ def federate_cloud(
     """Run stage III from `network`; `regions`: where each edge server starts.
 
     An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers, and
-    an edge round loses the vehicles that `outages` names.
-    Writes weights and ledger, returns each round's loss.
+    an edge round loses the vehicles that `outages` names. Writes weights and ledger, returns each round's loss. Where
+    rules make arrays personal, the weights have the mean of the regions' own, and each region's model is beside them.
     """
     state, own_states = FederationState(), {region: FederationState() for region in regions}
     states = {CLOUD: state, **{f"{EDGE}/{region}": own for region, own in own_states.items()}}
@@ -331,6 +331,7 @@ def federate_cloud(
     federating = FederationCheckpoints(
         learning.task, folder, book, report, states, describe_federation(strategies, rules)
     )
+    rules.check_personal(to_arrays(network))
     start, done = federating.resume(to_arrays(network))
     wireless = Account(book, CLOUD, learning.task.name, "wireless", outages)
     wireline = Account(book, CLOUD, learning.task.name, "wireline")
@@ -351,9 +352,18 @@ def federate_cloud(
     earlier = max(own.earlier for own in regions.values())
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier)
     keep = federating.make_saver(rounds)
+
+    def keep_whole(round_: int, weights: Weights, loss: float) -> None:
+        personal = [own.personal for own in own_states.values() if own.personal]
+        keep(round_, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
+
     how: Any = {"strategy": strategies.cloud, "rules": rules.of_servers(), "state": state}
-    federate(servers, start, schedule, wireline, **how, done=done, on_round=keep)
+    federate(servers, start, schedule, wireline, **how, done=done, on_round=keep_whole)
     federating.finish(network, rounds, learning.training.average_rounds)
+    for region, own in own_states.items() if rules.personal else ():
+        model = load_stage_network(learning.task, folder)
+        from_arrays(model, {**to_arrays(model), **own.personal})
+        save_network(learning.task, model, folder / regional_weights(region))
     return tuple(federating.losses)
 
 
@@ -397,6 +407,11 @@ def load_round_network(
     return network.eval()
 
 
-def load_stage_network(task: Task, folder: Path) -> Any:
-    """Return the trained network of the stage in `folder`."""
-    return load_network(task, folder / WEIGHTS)
+def regional_weights(region: str) -> str:
+    """Return the name of the file of a region's own model, of a stage III with personal arrays."""
+    return f"weights-{region}.safetensors"
+
+
+def load_stage_network(task: Task, folder: Path, region: str | None = None) -> Any:
+    """Return the trained network of the stage in `folder`; with a `region` its own model."""
+    return load_network(task, folder / (WEIGHTS if region is None else regional_weights(region)))

@@ -405,13 +405,13 @@ def central_step(
     StageResult(CENTRAL, task, region, rounds, len(samples), 1, (), losses).save(work.folder)
 
 
-def test_step(work: Work, task: str, region: str, trained: str, frames: str, seed: int) -> None:
-    """Test the network of the step `trained` on a region's test frames.
+def test_step(work: Work, task: str, region: str, trained: str, frames: str, seed: int, model: str | None) -> None:
+    """Test the network of the step `trained`, or the own model of a region, `model`, on a region's test frames.
 
     Raises `InputError` where the frames hold no target, so that the measure is undefined.
     """
     learned, split = task_named(task), Frames.open(work.inputs[frames])
-    network, how = load_stage_network(learned, work.inputs[trained]), as_measurable(learned)
+    network, how = load_stage_network(learned, work.inputs[trained], model), as_measurable(learned)
     outcomes = how.outcomes(network, split.data, split.vehicles, work.report)
     outcomes.save(work.folder / OUTCOMES)
     mean = compute_measure(learned, outcomes)

@@ -87,6 +87,7 @@ def page(run: Run) -> dict[str, Any]:
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},
         "links": main.links,
         "sent": {link: [main.sent_mb(task, link) for task in recipe.tasks] for link in main.links},
+        "regional": [(arm, test) for arm, result in run.arms.items() for test in result.regional or ()],
         "gap_closed": run.gap_closed,
         "rounds": rounds,
         "private": any(row["epsilon"] is not None for row in rounds),
