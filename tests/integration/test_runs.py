@@ -273,6 +273,7 @@ def test_the_network_takes_time_and_loses_vehicles_by_name(finished: Path, resul
         assert record.clients == tuple(name for name, why in named.items() if not why)
         assert record.seconds is not None
         assert 0 < record.seconds <= 3
+    assert inner[0].seconds is not None
     assert cloud[0].seconds == pytest.approx(inner[0].seconds + 2 * (0.01 + 8 * 1337440 / 1e9), rel=1e-3)
     assert all(record.seconds is None for record in rounds_of(result, MAIN, EDGE, "grid"))
 

@@ -30,7 +30,8 @@ from flcav.pipeline.stages import (
     federate_edge,
     load_stage_network,
     make_clients,
-)from flcav.progress import ignore_progress
+)
+from flcav.progress import ignore_progress
 
 PRIVACY = {"clip": 1.0, "noise": 4.0}
 
@@ -137,11 +138,8 @@ def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
     for region, x in (("a", 1.0), ("b", 4.0)):
         clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
-    strategies, book = Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0))
-    rules = Rules(personal=("bias",))
-    federate_cloud(
-        learning, network, starts, 2, 1, strategies, rules, book, tmp_path, lambda done, total, note="": None
-    )
+    strategies, where = Strategies(FEDAVG, FEDAVG), (Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    federate_cloud(learning, network, starts, 2, 1, strategies, Rules(personal=("bias",)), *where)
     found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
     assert np.array_equal(found["a"]["weight"], found["b"]["weight"])
     assert np.array_equal(found["a"]["weight"], found[None]["weight"])

@@ -4,6 +4,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
@@ -23,7 +24,7 @@ def pack_frames(data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) 
     for row, i in enumerate(columns.frame.tolist()):
         rows.setdefault(instants[i], []).append(row)
     for i in frames:
-        own = Columns(*(column[rows.get(instants[i], [])] for column in columns))._asdict()
+        own: dict[str, NDArray] = {name: each[rows.get(instants[i], [])] for name, each in columns._asdict().items()}
         own["scene"] = from_names(own["scene"].tolist())
         own["shape"] = np.array(own["raster"].shape)
         own["raster"] = np.frombuffer(zlib.compress(own["raster"].tobytes()), dtype=np.uint8)

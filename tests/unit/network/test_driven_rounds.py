@@ -1,11 +1,10 @@
 """Rounds on a network: who takes part, who is lost, by name and in bytes, and how long a round takes."""
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from moving import made_links
 
 from flcav.config import InputError
 from flcav.federation.rules import Rules
@@ -19,9 +18,6 @@ from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.wireline import Wireline
 from flcav.pipeline.federations.network import DrivenRounds, Fleet, drive_rounds, join_regions
 from flcav.pipeline.recipe import CLOUD
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "network"))
-from moving import made_links
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
 MB = 1_000_000
