@@ -32,17 +32,17 @@ def _exit_after_parent() -> None:
 
 
 @contextlib.contextmanager
-def ray_session(jobs: int) -> Iterator[ModuleType]:
+def ray_session(jobs: int, asked: str = "--engine ray") -> Iterator[ModuleType]:
     """Yield the module `ray`, connected to the cluster of RAY_ADDRESS or, without it, to a local one of `jobs` CPUs.
 
-    Its workers compute on one thread each. Raises `InputError` where Ray is not installed.
+    Its workers compute on one thread each. Raises `InputError` where Ray is not installed; `asked` is what needs it.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without it, Ray prints a warning
     try:
         import ray  # pyright: ignore[reportMissingImports]: an extra
     except ImportError:
-        raise InputError(f"--engine ray needs Ray, which is not installed: {format_install_command('ray')}") from None
+        raise InputError(f"{asked} needs Ray, which is not installed: {format_install_command('ray')}") from None
     variables: dict[str, str] = dict.fromkeys(VARIABLES, "1")
     local: dict[str, Any] = {}
     if "RAY_ADDRESS" not in os.environ:

@@ -43,6 +43,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "run": dict.fromkeys(("--jobs", "--seeds", "--engine", "--stale"), ALWAYS),
     "demo": dict.fromkeys(("--seed", "--recipe", "--jobs", "--engine", "--stale"), ALWAYS),
     "compare": {},
+    "federate": dict.fromkeys(("--arm", "--jobs", "--runtime", "--stale"), ALWAYS),
     "towns list": {},
     "towns show": {"--poles": ALWAYS},
     "towns import": {},

@@ -387,6 +387,26 @@ def test_a_finished_run_is_not_done_again(finished: Path, tmp_path: Path) -> Non
         run(RECIPE.model_copy(update={"seed": 2}), tmp_path, beside=TOY.parent)
 
 
+def test_stage_two_alone_goes_on_with_a_run_and_ends_with_its_weights(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    work = without(finished, tmp_path, lambda name: name.startswith(("grid-edge-fl", "test-", "rounds-", "cloud-")))
+    with pytest.raises(SystemExit) as stopped:
+        command(["federate", str(TOY), "--out", str(tmp_path), "--arm", "no_pole", "--jobs", "1"])
+    assert not stopped.value.code
+    printed = capsys.readouterr().out.splitlines()
+    name = "grid-federate-objects-no_pole"
+    assert [line.partition(": loss")[0] for line in printed[:2]] == [f"{name}, round {n} of 2" for n in (1, 2)]
+    found = json.loads((tmp_path / "federation.json").read_text())["federations"][0]
+    assert [each["region"] for each in found["watched"]] == ["suburb", "grid", "ring"]
+    at = {each["region"]: f"{each['region']} {each['rounds'][1]['score']:.3f}" for each in found["watched"]}
+    assert printed[1].endswith(", ".join(at.values()))
+    own, edge = (
+        folder / "weights.safetensors" for folder in (work / name, finished / "work/grid-edge-fl-objects-no_pole")
+    )
+    assert (tmp_path / f"{name}.safetensors").read_bytes() == own.read_bytes() == edge.read_bytes()
+
+
 def killed_at(sign: Path, out: Path) -> None:
     """Run the recipe in a process group of its own and kill it once the file `sign` is there."""
     process = subprocess.Popen([sys.executable, "-c", GO, TOY, out], start_new_session=True)

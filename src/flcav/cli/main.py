@@ -6,7 +6,7 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import reproduce, towns
+from flcav.cli import federate, reproduce, towns
 from flcav.cli import (
     run as run_command,
 )
@@ -46,6 +46,7 @@ def _main(
 
 for command in (
     run_command,
+    federate,
     towns,
     record,
     validate,

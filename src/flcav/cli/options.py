@@ -63,6 +63,13 @@ class Engine(StrEnum):
     ray = "ray"
 
 
+class Runtime(StrEnum):
+    """Runtime of a federation, see `flcav.federation.runtimes`."""
+
+    embedded = "embedded"
+    ray = "ray"
+
+
 class Stale(StrEnum):
     """Treatment of steps that were done by other code, see `flcav.pipeline.steps`."""
 

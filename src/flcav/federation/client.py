@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from flwr.app import Context, Message, MetricRecord
+from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
@@ -16,15 +16,16 @@ from flcav.federation.records import (
     CONFIG,
     EXTRA,
     LOSS,
+    METRICS,
     NORM,
     SAMPLES,
     SEND,
     VECTOR,
     LocalWork,
+    read_arrays,
     reply,
     reply_norm,
     to_arrays,
-    to_weights,
 )
 from flcav.federation.rules import Rules
 from flcav.federation.secure.masks import to_integers
@@ -34,7 +35,7 @@ from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Updat
 from flcav.federation.upload import Arrays, subtract
 from flcav.seeds import derive_seed
 
-CLIENT = "client"  # node config key: the client's registered name
+PARTITION = "partition-id"  # key of Flower's simulation in a node's config: place of the client among all
 OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy and compression keep between rounds
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 
@@ -42,13 +43,15 @@ KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, un
 def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> ClientApp:
     """Return a Flower client app that trains the one of `trainables` (by client name) that its node stands for.
 
-    A node's name is the entry `CLIENT` of its node config. Its seed is derived from the round's seed and its name.
+    A node stands for the client at the place `PARTITION` of its config. Its seed is derived from the round's seed and
+    the client's name. To a query it answers with its place and with what it keeps between rounds, after taking over
+    what the message brings of that.
     """
-    app = ClientApp()
+    app, clients = ClientApp(), [*trainables]
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
-        name = str(context.node_config[CLIENT])
+        name = clients[int(context.node_config[PARTITION])]
         asked = message.content.config_records[ASK][ASK] if ASK in message.content.config_records else None
         if asked in (KEYS, SHARES, UNMASK):
             return answer_secretly(message, context, name)
@@ -57,27 +60,34 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
         if asked == SEND:
             start, update, extra = _recall(context)
         else:
-            start = to_weights(message.content.array_records[ARRAYS])
+            start = read_arrays(message.content, ARRAYS)
             update, extra = _train(trainables[name], message, context, start, work, seed)
         if asked == NORM:
             _keep(context, start, update)
             names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
             return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
         if asked == MASKED and rules.secure is not None:
-            clients = len(message.content.config_records[ASK][NAMES]) + 1  # type: ignore[arg-type]
-            integers = to_integers(flatten(update, start, rules), rules.secure.largest, clients)
+            peers = len(message.content.config_records[ASK][NAMES]) + 1  # type: ignore[arg-type]
+            integers = to_integers(flatten(update, start, rules), rules.secure.largest, peers)
             masked = {VECTOR: mask_update(message, context, integers)}
             return reply(message, LocalUpdate(masked, update.samples, update.loss), {})
         sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed)
         _record(context, RESIDUAL, left)
         return reply(message, sent, extra)
 
+    @app.query()
+    def query(message: Message, context: Context) -> Message:
+        for key in message.content:
+            context.state[key] = message.content[key]
+        kept = {key: context.state[key] for key in (OWN, RESIDUAL) if key in context.state}
+        place = MetricRecord({PARTITION: int(context.node_config[PARTITION])})
+        return Message(RecordDict({**kept, METRICS: place}), reply_to=message)
+
     def _train(
         trainable: Trainable, message: Message, context: Context, start: Weights, work: LocalWork, seed: int
     ) -> tuple[Update, Weights]:
         """Return the result of local training, and a strategy's arrays beside it."""
-        records = message.content.array_records
-        sent, own = to_weights(records[EXTRA]) if EXTRA in records else {}, _recorded(context, OWN)
+        sent, own = _optional(message.content, EXTRA), _recorded(context, OWN)
         correction = strategy.correct(sent, own) if isinstance(strategy, Corrects) else Correction()
         layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
         how = {**correction.arguments(), **layers}
@@ -93,7 +103,11 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
 
 
 def _recorded(context: Context, key: str) -> Arrays:
-    return to_weights(context.state.array_records[key]) if key in context.state.array_records else {}
+    return _optional(context.state, key)
+
+
+def _optional(content: RecordDict, key: str) -> Arrays:
+    return read_arrays(content, key) if key in content else {}
 
 
 def _record(context: Context, key: str, arrays: Weights) -> None:

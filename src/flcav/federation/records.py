@@ -1,6 +1,7 @@
 """Conversion between weights and updates (NumPy) and the records of Flower's messages."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
@@ -44,6 +45,18 @@ def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
     return {name: array.numpy() for name, array in arrays.items()}
 
 
+def read_arrays(content: RecordDict, key: str) -> dict[str, np.ndarray]:
+    """Return the weights in a record of a message or a state.
+
+    Raises KeyError where it is missing, TypeError where it has none. `content.array_records` would leave a reference
+    cycle, by which the arrays stay in memory until they are collected.
+    """
+    record = content[key]
+    if not isinstance(record, ArrayRecord):
+        raise TypeError(f"'{key}' holds no arrays")
+    return to_weights(record)
+
+
 def reply(message: Message, update: Update, extra: Weights) -> Message:
     """Return the reply to a training message: the weights, a strategy's `extra` arrays, samples and loss.
 
@@ -56,10 +69,9 @@ def reply(message: Message, update: Update, extra: Weights) -> Message:
 
 def to_update(answer: Message) -> LocalUpdate:
     """Return the update in a client's reply: the inverse of `reply`. Raises KeyError where a record is missing."""
-    metrics, arrays = answer.content.metric_records[METRICS], answer.content.array_records
-    extra = to_weights(arrays[EXTRA]) if EXTRA in arrays else {}
-    weights, samples, loss = to_weights(arrays[ARRAYS]), metrics[SAMPLES], metrics[LOSS]
-    return LocalUpdate(weights, int(samples), float(loss), extra=extra)  # type: ignore[arg-type]
+    metrics: Any = answer.content[METRICS]
+    extra = read_arrays(answer.content, EXTRA) if EXTRA in answer.content else {}
+    return LocalUpdate(read_arrays(answer.content, ARRAYS), int(metrics[SAMPLES]), float(metrics[LOSS]), extra=extra)
 
 
 def reply_norm(message: Message, norm: float, samples: int) -> Message:

@@ -4,14 +4,17 @@ Flower's own strategies sample nodes from the global random state, multiply inte
 round where one client fails.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from flwr.app import ArrayRecord, ConfigRecord, Message, MessageType, MetricRecord, RecordDict
 from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
+from numpy.typing import NDArray
 
 from flcav.federation.encoding import decode, flatten, unflatten
 from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
@@ -36,15 +39,50 @@ from flcav.federation.secure.masks import to_values
 from flcav.federation.secure.messages import SecureSum
 from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
-from flcav.federation.strategies.fedavg import average
-from flcav.federation.strategies.strategy import Exchanges, Stateful
+from flcav.federation.strategies.fedavg import RunningMean, average
+from flcav.federation.strategies.strategy import Averages, Exchanges, Stateful, find_weigher
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 
 OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
 
 
-class ClientFailed(RuntimeError):
-    """Fewer clients sent a usable update in a round than are wanted."""
+class ClientFailed(OSError):
+    """Fewer clients sent a usable update in a round than are wanted: a fault of their machines."""
+
+
+class Intake:
+    """The usable updates of a round: all of them or, where a strategy needs no more, their mean as they come in."""
+
+    def __init__(self, weigher: Averages | None) -> None:
+        """Add up by the weights of `weigher`; None: keep every update."""
+        self._weigher, self._mean = weigher, RunningMean()
+        self._extra: dict[str, NDArray[np.number]] = {}  # sums of the arrays beside the weights
+        self.updates: dict[str, LocalUpdate] = {}  # by client, where they are kept
+        self.samples: dict[str, int] = {}  # by client
+        self.losses: dict[str, float] = {}  # by client
+        self.extra: Weights | None = None  # of the first update; None: there is none yet
+
+    def add(self, client: str, update: LocalUpdate) -> None:
+        """Add a client's update."""
+        self.samples[client], self.losses[client] = update.samples, update.loss
+        self.extra = update.extra if self.extra is None else self.extra
+        if self._weigher is None:
+            self.updates[client] = update
+            return
+        self._mean.add(update.weights, self._weigher.weigh(update))
+        for name, array in update.extra.items():
+            self._extra[name] = self._extra.get(name, 0.0) + array.astype(np.float64)
+
+    @property
+    def combinable(self) -> list[LocalUpdate]:
+        """Return what a strategy is given: all updates, or one that stands for them; none where none came."""
+        if self._weigher is None or not self.samples:
+            return [*self.updates.values()]
+        return [LocalUpdate(self._mean.mean(), sum(self.samples.values()), 0.0, extra=self._extra)]
+
+    def mean_loss(self) -> float:
+        """Return the mean loss weighted by samples; 0 where no update came."""
+        return float(np.average([*self.losses.values()], weights=[*self.samples.values()])) if self.samples else 0.0
 
 
 class Rounds(FlowerStrategy):
@@ -110,7 +148,7 @@ class Rounds(FlowerStrategy):
 
         def exchange(asks: Mapping[str, ConfigRecord]) -> dict[str, ConfigRecord]:
             asked = [each for name, ask in asks.items() for each in self._address([name], {CONFIG: local, ASK: ask})]
-            replies = self._sort_replies(grid.send_and_receive(asked))
+            replies = self._in_order([*asks], grid.send_and_receive(asked))
             return {name: message.content.config_records[ASK] for name, message in replies}
 
         local = records[CONFIG]
@@ -118,12 +156,10 @@ class Rounds(FlowerStrategy):
         asks = self._secure.agree(self._chosen)
         return [each for name, ask in asks.items() for each in self._address([name], {**records, ASK: ask})]
 
-    def _address(self, clients: Iterable[str], records: dict[str, Any]) -> list[Message]:
+    def _address(self, clients: Iterable[str], records: dict[str, Any]) -> Iterator[Message]:
         content = RecordDict(records)
-        return [
-            Message(content=content, message_type=MessageType.TRAIN, dst_node_id=self._nodes[client])
-            for client in clients
-        ]
+        for client in clients:
+            yield Message(content=content, message_type=MessageType.TRAIN, dst_node_id=self._nodes[client])
 
     def aggregate_train(
         self, server_round: int, replies: Iterable[Message]
@@ -134,31 +170,29 @@ class Rounds(FlowerStrategy):
         returns arrays of other names, shapes or types.
         """
         number = self._done + server_round
-        updates = self._receive(replies)
+        received = self._receive(replies)
         least = self._rules.least_clients
         wanted = len(self._chosen) if least is None else min(least, len(self._chosen))
-        if len(updates) < wanted or (self._failed and least is None):
+        if len(received.samples) < wanted or (self._failed and least is None):
             reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
             raise ClientFailed(
-                f"round {number}: {len(updates)} of {len(self._chosen)} clients sent an update that can be used, "
-                f"{wanted} are wanted ({reasons})"
+                f"round {number}: {len(received.samples)} of {len(self._chosen)} clients sent an update that can be "
+                f"used, {wanted} are wanted ({reasons})"
             )
-        weights = self._combine(updates, number)
-        samples = [update.samples for update in updates.values()]
-        losses = [update.loss for update in updates.values()]
-        loss = float(np.average(losses, weights=samples)) if updates else 0.0
+        weights, loss = self._combine(received, number), received.mean_loss()
         epsilon = None
         if self._rules.privacy is not None:
             rounds, names = self._earlier + number, [*self._names.values()]
             epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
-        self._state.records.append(RoundRecord(number, tuple(updates), self._failed, epsilon, loss, sum(samples)))
+        about = (number, tuple(received.samples), self._failed, epsilon)
+        self._state.records.append(RoundRecord(*about, loss, sum(received.samples.values())))
         self._on_round(number, weights, loss)
-        return to_arrays(weights), MetricRecord({SAMPLES: sum(samples), LOSS: loss})
+        return to_arrays(weights), MetricRecord({SAMPLES: sum(received.samples.values()), LOSS: loss})
 
     def _receive_norms(self, replies: Iterable[Message]) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
         told: dict[str, tuple[float, int]] = {}
-        for name, message in self._sort_replies(replies):
+        for name, message in self._in_order(self._chosen, replies):
             norm, samples = to_norm(message)
             if np.isfinite(norm) and norm >= 0 and samples >= 0:
                 told[name] = norm, samples
@@ -168,37 +202,47 @@ class Rounds(FlowerStrategy):
         self._shares = {name: samples / max(total, 1) for name, (_, samples) in told.items()}
         return {name: norm * self._shares[name] for name, (norm, _) in told.items()}
 
-    def _sort_replies(self, replies: Iterable[Message]) -> list[tuple[str, Message]]:
-        """Return the replies with content by client, in node order, and note the failures."""
-        found = []
-        for message in sorted(replies, key=lambda message: message.metadata.src_node_id):
-            name = self._names[message.metadata.src_node_id]
-            if message.has_error():
-                self._failed[name] = str(message.error.reason)
-            else:
-                found.append((name, message))
-        return found
+    def _in_order(self, asked: Iterable[str], replies: Iterable[Message]) -> Iterator[tuple[str, Message]]:
+        """Yield the replies with content by client, in the order in which they were asked; note the failures.
 
-    def _receive(self, replies: Iterable[Message]) -> dict[str, LocalUpdate]:
-        """Return the usable updates by client, in node order, and note what is wrong with the others."""
-        updates: dict[str, LocalUpdate] = {}
-        for name, message in self._sort_replies(replies):
+        Replies that come in that order are yielded as they come, and not kept.
+        """
+        awaited = deque(self._nodes[name] for name in asked)
+        early: dict[int, Message] = {}
+        for message in chain(replies, [None]):
+            if message is not None:
+                early[message.metadata.src_node_id] = message
+            while awaited and (message is None or awaited[0] in early):
+                node = awaited.popleft()
+                found, name = early.pop(node, None), self._names[node]
+                if found is None:
+                    self._failed[name] = "no answer"
+                elif found.has_error():
+                    self._failed[name] = str(found.error.reason)
+                else:
+                    yield name, found
+
+    def _receive(self, replies: Iterable[Message]) -> Intake:
+        """Return the usable updates, and note what is wrong with the others."""
+        rules = self._rules
+        plain = rules.secure is None and rules.privacy is None and rules.selection.rule != "importance"
+        received = Intake(find_weigher(self._strategy) if plain else None)
+        for name, message in self._in_order(self._chosen, replies):
             try:
                 sent = to_update(message)
                 if self._secure is not None:
-                    updates[name] = self._check_masked(sent)
+                    received.add(name, self._check_masked(sent))
                     continue
                 update = replace(sent, weights=decode(sent.weights, self._start, self._rules))
             except (KeyError, IndexError, TypeError, ValueError) as error:
                 self._failed[name] = f"a message that is no update ({error})"
                 continue
-            others = next(iter(updates.values())).extra if updates else update.extra
-            fault = find_fault(update, self._start, others)
+            fault = find_fault(update, self._start, update.extra if received.extra is None else received.extra)
             if fault is None:
-                updates[name] = update
+                received.add(name, update)
             else:
                 self._failed[name] = fault
-        return updates
+        return received
 
     def _check_masked(self, sent: LocalUpdate) -> LocalUpdate:
         """Return a masked update; raises ValueError where it is none. Its values cannot be told from others."""
@@ -215,9 +259,9 @@ class Rounds(FlowerStrategy):
         total = to_values(self._secure.finish(masked), how.largest, peers)
         return unflatten(total / len(updates), self._start, self._rules)
 
-    def _combine(self, updates: Mapping[str, LocalUpdate], number: int) -> Weights:
+    def _combine(self, received: Intake, number: int) -> Weights:
         """Return the weights after round `number`, and change the strategy's state."""
-        privacy, start, each = self._rules.privacy, self._start, list(updates.values())
+        privacy, start, updates, each = self._rules.privacy, self._start, received.updates, received.combinable
         if self._rules.secure is not None:
             each = [LocalUpdate(self._average_securely(updates, self._rules.secure), 1, 0.0)]
         elif privacy is not None and privacy.where == "central":

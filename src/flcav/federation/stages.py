@@ -5,14 +5,18 @@ server is k rounds of federation with the vehicles of its region (Wang et al., I
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from flwr.app import ArrayRecord
+from flwr.serverapp import Grid
+from flwr.serverapp.strategy import Result
 
 from flcav.config import InputError
-from flcav.federation.client import CLIENT, OWN, RESIDUAL, check_arguments, client_app
+from flcav.federation.client import OWN, RESIDUAL, check_arguments, client_app
 from flcav.federation.privacy import affordable_rounds, expected_clients
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.rounds import OnRound, Rounds
@@ -20,12 +24,16 @@ from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.runtimes.outages import LossyGrid
-from flcav.federation.state import FederationState
+from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
+from flcav.federation.state import ClientStates, FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.federation.upload import name_like
 from flcav.seeds import derive_seed
+
+if TYPE_CHECKING:
+    from flcav.federation.runtimes.simulation import RaySimulation
 
 EVERYBODY = Rules()
 logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each round; a stage reports its own
@@ -64,6 +72,7 @@ def federate(
     done: int = 0,
     earlier: int = 0,
     on_round: OnRound = _ignore,
+    runtime: "ClientProcesses | RaySimulation | None" = None,
 ) -> LocalUpdate:
     """Run rounds `done + 1 .. schedule.rounds` of a federation, starting from `weights`.
 
@@ -76,7 +85,10 @@ def federate(
     `on_round` was given, and the state after it.
 
     Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
-    before this one, with the same clients and rules, which count against that budget.
+    before this one, with the same clients and rules, which count against that budget. Clients train in this process, or
+    several at a time in a `runtime`: `ClientProcesses` of the same clients, or Flower's simulation on Ray; the weights
+    are the same. `clients` is asked for a client when it is to train; of updates no more are in memory than the
+    strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
     no update, and fewer are left than `rules` ask for (by default all), `InputError` where there are no clients, or
@@ -106,19 +118,28 @@ def federate(
     if rounds <= done:
         return LocalUpdate(weights, 0, 0.0)
     state = FederationState() if state is None else state
-    nodes = {name: {CLIENT: name} for name in clients}
-    with EmbeddedGrid(client_app(clients, strategy, rules), nodes, state.clients) as grid:
+    results: list[Result] = []
 
+    def serve(grid: Grid, nodes: Mapping[int, str], read_states: Callable[[], ClientStates]) -> None:
         def keep(round_: int, aggregated: Weights, loss: float) -> None:
-            state.clients = grid.read_states((OWN, RESIDUAL))
+            if keeps:
+                state.clients = read_states()
             on_round(round_, aggregated, loss)
 
-        lossy = LossyGrid(grid, account, grid.names) if account.outages else grid
-        metered = MeteredGrid(lossy, account, grid.names)
-        app = Rounds(strategy, rules, schedule.work, grid.names, state, done, earlier, keep)
-        result = app.start(metered, to_arrays(weights), rounds - done)
-    arrays: ArrayRecord = result.arrays
-    metrics = result.train_metrics_clientapp[rounds - done]
+        app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep)
+        lossy = LossyGrid(grid, account, nodes) if account.outages else grid
+        results.append(app.start(MeteredGrid(lossy, account, nodes), to_arrays(weights), rounds - done))
+
+    keeps = isinstance(strategy, Exchanges) or rules.upload.compression == "top-k"  # something on the clients
+    make_app = partial(client_app, strategy=strategy, rules=rules)
+    if runtime is None or isinstance(runtime, ClientProcesses):
+        trained, at_once = (clients, 1) if runtime is None else (RemoteClients(clients, runtime), runtime.count)
+        with EmbeddedGrid(make_app(trained), names, state.clients, at_once) as grid:
+            serve(grid, grid.names, lambda: grid.read_states((OWN, RESIDUAL)))
+    else:
+        runtime.run(clients, make_app, state.clients, serve)
+    arrays: ArrayRecord = results[0].arrays
+    metrics = results[0].train_metrics_clientapp[rounds - done]
     return LocalUpdate(to_weights(arrays), int(metrics[SAMPLES]), float(metrics[LOSS]))  # type: ignore[arg-type]
 
 
@@ -210,6 +231,7 @@ class EdgeServer:
     rules: Rules = EVERYBODY  # of the region's rounds
     state: FederationState = field(default_factory=FederationState)  # of the region's rounds
     earlier: int = 0  # rounds of stage II, which a privacy budget counts
+    runtime: ClientProcesses | None = None  # where the vehicles train; None: in this process
 
     def train(
         self, weights: Weights, *, steps: int, learning_rate: float, seed: int, layers: Sequence[str] = ()
@@ -235,6 +257,7 @@ class EdgeServer:
             state=self.state,
             done=done,
             earlier=self.earlier,
+            runtime=self.runtime,
         )
         names = name_like(found.weights, self.rules.personal)
         self.state.personal = {name: np.asarray(found.weights[name]) for name in names}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from flcav.records import Record
 
 Arrays = dict[str, NDArray[np.number]]  # by name
+ClientStates = dict[str, dict[str, Arrays]]  # by client and kind
 
 SERVER, CLIENT, PERSONAL = "server", "client", "personal"
 
@@ -33,7 +34,7 @@ class FederationState:
     """
 
     server: Arrays = field(default_factory=dict)
-    clients: dict[str, dict[str, Arrays]] = field(default_factory=dict)  # by client and kind
+    clients: ClientStates = field(default_factory=dict)
     records: list[RoundRecord] = field(default_factory=list)
     personal: Arrays = field(default_factory=dict)  # arrays of an edge server's region alone
 

@@ -38,14 +38,10 @@ from flcav.pipeline.results import (
 )
 from flcav.pipeline.seeds.spread import difference_key, list_spreads, test_key
 from flcav.pipeline.seeds.summary import summarise
-from flcav.pipeline.steps import Notify, Stale, run_side_by_side, run_steps, stopwatch
+from flcav.pipeline.steps import Notify, Stale, ignore_steps, run_side_by_side, run_steps, stopwatch
 from flcav.pipeline.tables import append_records
 
 WORK, RESULTS, SUMMARY, HISTORY, SPREAD = "work", "results.json", "summary.json", "history.csv", "spread.csv"
-
-
-def _silent(step: str, done: int, total: int, note: str) -> None:
-    pass
 
 
 def run(
@@ -54,7 +50,7 @@ def run(
     *,
     beside: Path | str | None = None,
     jobs: int = 1,
-    notify: Notify = _silent,
+    notify: Notify = ignore_steps,
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> Run:
@@ -104,7 +100,7 @@ def run_seeds(
     seeds: int,
     beside: Path | str | None = None,
     jobs: int = 1,
-    notify: Notify = _silent,
+    notify: Notify = ignore_steps,
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> tuple[tuple[Run, ...], Summary]:
@@ -127,7 +123,7 @@ def run_several(
     *,
     beside: Path | str | None = None,
     jobs: int = 1,
-    notify: Notify = _silent,
+    notify: Notify = ignore_steps,
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> tuple[Run, ...]:

@@ -5,8 +5,9 @@ vehicles federate with their edge server. Stage III: edge servers federate with 
 37(3), 2023). Every message is entered in a ledger.
 """
 
+import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,14 @@ from safetensors.numpy import load_file, save
 from flcav.config import InputError
 from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.choice import open_runtime
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
-from flcav.federation.state import FederationState, RoundRecord
+from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Trainable, Weights
-from flcav.files import write_bytes, write_json
+from flcav.files import sha256, write_bytes
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.messages import send
 from flcav.perception.client import TaskClient, as_shared
@@ -31,13 +33,15 @@ from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.training import Checkpointing, Validation, train, train_steps
 from flcav.perception.weights import from_arrays, load_network, save_network, to_arrays
+from flcav.pipeline.federations.checkpoint import LAST, Checkpoint, find_checkpoint
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, Training
 from flcav.pipeline.results import LEDGER, WEIGHTS, Validated
 from flcav.progress import Report
 from flcav.seeds import derive_seed, stream
 
-CHECKPOINT, ROUND = "checkpoint.pt", "round.json"
+CHECKPOINT, ROUND = "checkpoint.pt", LAST
+LOSS = "loss"  # begins the note of a round
 VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart
 
 
@@ -206,63 +210,78 @@ class FederationCheckpoints:
         report: Report,
         states: Mapping[str, FederationState] = {},
         identity: str = "",
+        score: Callable[[int], Mapping[str, float]] | None = None,
     ) -> None:
         """Keep the checkpoints in `folder`.
 
         states: by name what federations keep between rounds, restored in place; of stage III also the edge servers'.
-        identity: what the federation is by; a checkpoint of another one is refused.
+        identity: what the federation is by; a checkpoint of another one is refused. score: the scores on validation
+        frames after a round, by region.
         """
         self._task, self._folder, self._book, self._report = task, folder, book, report
-        self._states, self._identity = states, identity
+        self._states, self._identity, self._score = states, identity, score
+        self._hashes: dict[str, str] = {}  # of the files of weights, by name
         self.losses: list[float] = []
+        self.scores: list[Mapping[str, float]] = []
 
     def resume(self, weights: Weights) -> tuple[Weights, int]:
         """Return the last round's weights and number, restoring ledger, losses and states.
 
-        Without a checkpoint, returns `weights` and 0. Raises `InputError` for the checkpoint of another strategy.
+        Without a checkpoint, returns `weights` and 0; where one is damaged, the round before. Raises `InputError` for
+        the checkpoint of another strategy, and where the last two are damaged.
         """
-        if not (self._folder / ROUND).exists():
+        found, damage = find_checkpoint(self._folder)
+        number = 0 if found is None else found.round
+        if damage:
+            self._report(number, max(number, 1), damage)
+        if found is None:
             return weights, 0
-        state = json.loads((self._folder / ROUND).read_text())
-        if state.get("by", self._identity) != self._identity:
-            raise InputError(f"{self._folder}: a checkpoint of {state['by']}, which {self._identity} cannot go on with")
-        kept = Ledger.load(self._folder / LEDGER).entries[: state["entries"]]
+        if found.by != self._identity:
+            raise InputError(f"{self._folder}: a checkpoint of {found.by}, which {self._identity} cannot go on with")
+        kept = Ledger.load(self._folder / _ledger_name(number)).entries[: found.entries]
         for entry in kept[len(self._book.entries) :]:
             self._book.enter(entry)
-        self.losses = state["losses"]
-        arrays = load_file(self._state_path(state["round"])) if state.get("states") else {}
+        self.losses, self.scores = [*found.losses], [*found.scores]
+        state, names = _state_name(number), [round_path(self._folder, each).name for each in range(1, number + 1)]
+        self._hashes = {name: found.sha256[name] for name in names}
+        arrays = load_file(self._folder / state) if state in found.sha256 else {}
         for name, own in self._states.items():
             begins = f"{name}|"
             mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
-            own.restore(mine, [RoundRecord.from_json(record, str(self._folder)) for record in state["records"][name]])
-        return load_file(round_path(self._folder, state["round"])), state["round"]
+            own.restore(mine, found.records[name])
+        return load_file(round_path(self._folder, number)), number
 
     def make_saver(self, rounds: int) -> OnRound:
         """Return the callback that saves a checkpoint after each of `rounds` rounds."""
 
         def keep(round_: int, weights: Weights, loss: float) -> None:
             self.losses.append(loss)
-            write_bytes(round_path(self._folder, round_), save(dict(weights)))
+            self._write(round_path(self._folder, round_).name, save(dict(weights)), self._hashes)
+            self.scores += [self._score(round_)] if self._score is not None else []
             arrays = {
                 f"{name}|{key}": array for name, own in self._states.items() for key, array in own.to_arrays().items()
             }
+            hashes = dict(self._hashes)
             if arrays:
-                write_bytes(self._state_path(round_), save(arrays))
-            self._book.save(self._folder / LEDGER)
-            state = {"round": round_, "entries": len(self._book.entries), "losses": self.losses}
-            if self._states:
-                records = {name: [record.as_json() for record in own.records] for name, own in self._states.items()}
-                state |= {"by": self._identity, "records": records, "states": bool(arrays)}
-            write_json(self._folder / ROUND, state)
-            self._state_path(round_ - 1).unlink(missing_ok=True)
+                self._write(_state_name(round_), save(arrays), hashes)
+            self._book.save(self._folder / _ledger_name(round_))
+            hashes[_ledger_name(round_)] = sha256(self._folder / _ledger_name(round_))
+            records = {name: tuple(own.records) for name, own in self._states.items()}
+            done = (round_, len(self._book.entries), tuple(self.losses), self._identity, hashes, records)
+            Checkpoint(*done, tuple(self.scores)).keep(self._folder)
+            for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
+                (self._folder / name).unlink(missing_ok=True)
             spent = [own.records[-1].epsilon for own in self._states.values() if own.records]
             private = [epsilon for epsilon in spent if epsilon is not None]
-            self._report(round_, rounds, f"loss {loss:.3f}" + (f", epsilon {max(private):.2f}" if private else ""))
+            note = [f"{LOSS} {loss:.3f}", *([f"epsilon {max(private):.2f}"] if private else [])]
+            note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self._score else {}).items()]
+            self._report(round_, rounds, ", ".join(note))
 
         return keep
 
-    def _state_path(self, round_: int) -> Path:
-        return self._folder / f"state{round_}.safetensors"
+    def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
+        write_bytes(self._folder / name, data)
+        hashes[name] = hashlib.sha256(data).hexdigest()
 
     def finish(self, start: Any, rounds: int, averaged: int, start_share: float = 0.0) -> None:
         """Write the ledger and the final weights, see `load_round_network`; without rounds those of `start`."""
@@ -285,23 +304,34 @@ def federate_edge(
     folder: Path,
     report: Report,
     outages: Mapping[tuple[int, str], Outage] = {},
+    validation: Mapping[str, Frames] = {},
+    processes: int = 1,
+    runtime: str = "embedded",
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
 
     A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
+    After each round the network that a federation of so many rounds ends with is scored on `validation`, frames by
+    region. Vehicles train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights.
     The vehicles that `outages` name by round are lost in it.
     """
-    state = FederationState()
-    federating = FederationCheckpoints(
-        learning.task, folder, book, report, {EDGE: state}, describe_federation(strategy, rules)
-    )
+    state, task, averaged = FederationState(), learning.task, learning.training.average_rounds
+    share = 0.0 if earlier else learning.training.start_share
+
+    def score(round_: int) -> Mapping[str, float]:
+        reached = load_round_network(task, network, folder, round_, averaged, share)
+        return {name: score_network(task, reached, own.data, own.vehicles) for name, own in validation.items()}
+
+    identity = describe_federation(strategy, rules)
+    scored = score if validation else None
+    federating = FederationCheckpoints(task, folder, book, report, {EDGE: state}, identity, scored)
     start, done = federating.resume(to_arrays(network))
-    account = Account(book, EDGE, learning.task.name, "wireless", outages)
+    account = Account(book, EDGE, task.name, "wireless", outages)
     keep = federating.make_saver(schedule.rounds)
     how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
-    federate(clients, start, schedule, account, **how, done=done, on_round=keep)
-    share = 0.0 if earlier else learning.training.start_share
-    federating.finish(network, len(federating.losses), learning.training.average_rounds, share)
+    with open_runtime(runtime, clients, processes) as where:
+        federate(clients, start, schedule, account, **how, done=done, on_round=keep, runtime=where)
+    federating.finish(network, len(federating.losses), averaged, share)
     return tuple(federating.losses)
 
 
@@ -384,6 +414,14 @@ def region_budget(stage_one: Ledger, vehicles: Mapping[str, int], region: str) -
     """Return the budget of a region's stage II: its share, by vehicles, of the wireless budget that stage I left."""
     share = vehicles[region] / sum(vehicles.values())
     return Budget(share * stage_one.left_mb("wireless"), 0.0)
+
+
+def _state_name(round_: int) -> str:
+    return f"state{round_}.safetensors"
+
+
+def _ledger_name(round_: int) -> str:
+    return f"ledger{round_}.parquet"
 
 
 def round_path(folder: Path, round_: int) -> Path:

@@ -289,11 +289,15 @@ def edge_step(
     steps: Mapping[str, Any],
     train_s: float = 0.0,
     speeds: Mapping[str, float] = {},
+    validation: Mapping[str, str] = {},
+    processes: int = 1,
+    runtime: str = "embedded",
 ) -> None:
     """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`.
 
     With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III. On a network,
-    a vehicle trains `train_s` / speed in a round [s].
+    a vehicle trains `train_s` / speed in a round [s]. Each round is scored on the frames of the steps `validation`, by
+    region. Vehicles train in so many `processes` of a `runtime`.
     """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
@@ -317,8 +321,9 @@ def edge_step(
     before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
     seeds = [schedule.work(number).seed for number in range(1, rounds + 1)]
     driven = drive_region(work, learning, how, rules, region, [*clients], steps, seeds, earlier, train_s, speeds)
-    lost = driven.outages
-    losses = federate_edge(*asked, driven.rules, earlier, book, work.folder, work.report, lost)
+    watched = {name: Frames.open(work.inputs[step]) for name, step in validation.items()}
+    where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
+    losses = federate_edge(*asked, driven.rules, earlier, *where)
     held = sum(len(client.samples) for client in clients.values())
     records = read_rounds(work.folder, region, before, {region: driven.seconds})
     StageResult(stage, task, region, len(losses), held, len(clients), poles, losses, records).save(work.folder)

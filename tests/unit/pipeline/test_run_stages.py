@@ -1,5 +1,7 @@
 """Stages as functions: how pretraining ends, what a kill leaves, who pays, how many steps a control takes."""
 
+import errno
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -10,6 +12,7 @@ import torch
 from pydantic.dataclasses import dataclass
 from safetensors.numpy import load_file, save
 
+from flcav import files
 from flcav.config import InputError
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, federate
@@ -37,7 +40,7 @@ from flcav.pipeline.stages import (
     share_budget,
     train_centrally,
 )
-from flcav.progress import ignore_progress
+from flcav.progress import Report, ignore_progress
 from flcav.seeds import derive_seed
 
 START = {"w": np.zeros(3, dtype=np.float32), "count": np.array(0, dtype=np.int64)}
@@ -58,12 +61,12 @@ class Walk:
         return LocalUpdate({"w": moved, "count": weights["count"] + np.int64(steps)}, 3, 0.5, {"w": gradient})
 
 
-def edge(folder: Path, strategy: Strategy = FEDAVG) -> tuple[Weights, Ledger]:
+def edge(folder: Path, strategy: Strategy = FEDAVG, report: Report = ignore_progress) -> tuple[Weights, Ledger]:
     """Federate as stage II does: the road's views are booked before the rounds."""
     book = Ledger(Budget(1.0, 0.0))
     book.enter(ROAD)
     states = {"edge": FederationState()}
-    federating = FederationCheckpoints(OBJECTS, folder, book, lambda done, total, note="": None, states, str(strategy))
+    federating = FederationCheckpoints(OBJECTS, folder, book, report, states, str(strategy))
     start, done = federating.resume(START)
     clients = {f"grid/cav{i}": Walk() for i in range(2)}
     account = Account(book, "edge", "t", "wireless")
@@ -122,9 +125,7 @@ def test_a_federation_killed_at_any_write_ends_the_same(
         return counted
 
     with monkeypatch.context() as patched:
-        patched.setattr(stages, "write_bytes", dying(stages.write_bytes))
-        patched.setattr(stages, "write_json", dying(stages.write_json))
-        patched.setattr(Ledger, "save", dying(Ledger.save))
+        patched.setattr(Path, "replace", dying(Path.replace))  # the end of every write
         stage(fresh("counted"), strategy)
         total = writes
         for last in range(1, total + 1):
@@ -135,6 +136,46 @@ def test_a_federation_killed_at_any_write_ends_the_same(
             assert all(np.array_equal(found[name], weights[name]) for name in weights), last
             assert resumed.entries == book.entries, last
     assert total >= 3 * SCHEDULE.rounds
+
+
+def test_a_damaged_checkpoint_is_found_and_the_one_before_it_is_used(tmp_path: Path) -> None:
+    weights, book = edge(tmp_path / "whole", Scaffold())
+    for name in ("round3.safetensors", "state3.safetensors", "ledger3.parquet", "round.json", "round2.safetensors"):
+        folder, told = tmp_path / name, list[str]()
+        shutil.copytree(tmp_path / "whole", folder)
+        held = bytearray((folder / name).read_bytes())
+        held[len(held) // 2] ^= 1
+        (folder / name).write_bytes(held)
+        if name == "round2.safetensors":  # which both checkpoints rest on
+            with pytest.raises(InputError, match="the last two checkpoints are damaged; remove the folder"):
+                edge(folder, Scaffold())
+            continue
+        found, resumed = edge(folder, Scaffold(), lambda done, total, note="", told=told: told.append(note))
+        assert told == [f"{folder / name} is damaged, the checkpoint before it is used", "loss 0.500"]
+        assert all(np.array_equal(found[key], weights[key]) for key in weights)
+        assert resumed.entries == book.entries
+
+
+def test_a_full_disk_leaves_nothing_half_written_and_the_federation_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights, _ = edge(tmp_path / "whole")
+    whole, written = files.write_in_pieces, 0
+
+    def full(path: Path, data: bytes) -> None:
+        nonlocal written
+        written += 1
+        whole(path, data[: len(data) // 2] if written == 5 else data)
+        if written == 5:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(files, "write_in_pieces", full)
+        with pytest.raises(OSError, match=r"No space left on device: '.*round.json'"):
+            edge(tmp_path / "full")
+    assert not [path for path in (tmp_path / "full").iterdir() if path.name.endswith(".part")]
+    found, _ = edge(tmp_path / "full")
+    assert all(np.array_equal(found[name], weights[name]) for name in weights)
 
 
 def test_a_checkpoint_of_another_strategy_is_refused(tmp_path: Path) -> None:

@@ -5,7 +5,9 @@ record, the id of a message, and the serialised form of a record.
 """
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from flwr.app import ConfigRecord, Context, Error, Message, MetricRecord, RecordDict
@@ -15,8 +17,9 @@ from flwr.serverapp import Grid
 from flwr.supercore.run import Run
 from flwr.supercore.task_identity import TaskIdentity
 
+from flcav.federation.client import PARTITION
 from flcav.federation.encoding import encode
-from flcav.federation.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, to_arrays, to_weights
+from flcav.federation.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, read_arrays, to_arrays
 from flcav.federation.rules import Rules
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.federation.upload import Upload
@@ -46,11 +49,10 @@ def update_bytes(weights: Weights, upload: Upload = WHOLE, *, exchanging: bool =
 
 
 @contextlib.contextmanager
-def _server_identity() -> Iterator[None]:
-    """Give messages created inside the server's identity; then restore the previous one, of an outer federation."""
+def keep_identity() -> Iterator[None]:
+    """Restore Flower's process-wide identity in the end: that of an outer federation."""
     names = ("_run_id", "_node_id", "_task_id")
     before = {name: getattr(TaskIdentity, name) for name in names}
-    TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SERVER_NODE, 1
     try:
         yield
     finally:
@@ -58,22 +60,36 @@ def _server_identity() -> Iterator[None]:
             setattr(TaskIdentity, name, value)
 
 
+@contextlib.contextmanager
+def _server_identity() -> Iterator[None]:
+    """Give messages created inside the server's identity."""
+    with keep_identity():
+        TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SERVER_NODE, 1
+        yield
+
+
 class EmbeddedGrid(Grid):
-    """Flower grid whose nodes are in this process; a context manager."""
+    """Flower grid whose nodes are in this process; a context manager.
+
+    A node exists while it answers, and what it keeps for later rounds beyond that.
+    """
 
     def __init__(
-        self, app: ClientApp, nodes: Mapping[str, Mapping[str, str]], states: Mapping[str, Mapping[str, Weights]] = {}
+        self,
+        app: ClientApp,
+        names: Sequence[str],
+        states: Mapping[str, Mapping[str, Weights]] = {},
+        at_once: int = 1,
     ) -> None:
-        """Register a node for each name in `nodes`, in their order; the values are the node configs.
+        """Register a node for each of `names`; its config has its place among them, as in Flower's simulation.
 
-        `states` are the arrays that nodes have kept from earlier rounds, by node and record.
+        `states` are the arrays that nodes have kept from earlier rounds, by node and record. `at_once` nodes answer at
+        the same time, each in a thread; replies come in the order of the messages all the same.
         """
-        self._app = app
-        self.names = dict(enumerate(nodes, FIRST_NODE))
-        self._contexts = {
-            node: Context(RUN_ID, node, dict(nodes[name]), _node_state(states.get(name, {})), {})
-            for node, name in self.names.items()
-        }
+        self._app, self._at_once = app, at_once
+        self.names = dict(enumerate(names, FIRST_NODE))
+        nodes = {name: node for node, name in self.names.items()}
+        self._states = {nodes[name]: _node_state(own) for name, own in states.items() if name in nodes}
         self._replies: dict[str, Message] = {}
         self._sent = 0
         self._run = Run.create_empty(RUN_ID)
@@ -89,10 +105,10 @@ class EmbeddedGrid(Grid):
     def read_states(self, keys: Iterable[str]) -> dict[str, dict[str, dict[str, np.ndarray]]]:
         """Return the arrays that nodes have under these records of their state, by node and record."""
         found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
-        for node, context in self._contexts.items():
+        for node, state in sorted(self._states.items()):
             for key in keys:
-                if key in context.state.array_records:
-                    found.setdefault(self.names[node], {})[key] = to_weights(context.state.array_records[key])
+                if key in state:
+                    found.setdefault(self.names[node], {})[key] = read_arrays(state, key)
         return found
 
     def set_run(self, run: Run) -> None:
@@ -112,37 +128,66 @@ class EmbeddedGrid(Grid):
 
     def get_node_ids(self) -> list[int]:
         """Return the ids of the registered nodes, in registration order."""
-        return list(self._contexts)
+        return list(self.names)
 
     def push_messages(self, messages: Iterable[Message]) -> list[str]:
-        """Deliver each message to its node, keep the reply, and return the message ids.
-
-        An exception in the client app becomes an error reply; `BudgetExceeded` is raised.
-        """
+        """Deliver each message to its node, keep the reply, and return the message ids."""
         ids = []
         for message in messages:
-            self._sent += 1
-            identifier = f"{RUN_ID}-{self._sent}"
-            message.metadata.__dict__["_message_id"] = identifier
-            # Nodes share one RecordDict: a change by one client app must not reach the next.
-            message.content = RecordDict({key: _copied(record) for key, record in message.content.items()})
-            try:
-                answer = self._app(message, self._contexts[message.metadata.dst_node_id])
-            except BudgetExceeded:
-                raise
-            except Exception as error:
-                answer = Message(Error(code=CLIENT_APP_RAISED, reason=repr(error)), reply_to=message)
-            self._replies[identifier] = answer
-            ids.append(identifier)
+            self._number(message)
+            ids.append(message.metadata.message_id)
+            self._replies[ids[-1]] = self._deliver(message)
         return ids
+
+    def _number(self, message: Message) -> None:
+        self._sent += 1
+        message.metadata.__dict__["_message_id"] = f"{RUN_ID}-{self._sent}"
+
+    def _deliver(self, message: Message) -> Message:
+        """Return a node's reply; an exception in the client app is an error reply, but `BudgetExceeded` is raised."""
+        node = message.metadata.dst_node_id
+        shared = message.content  # by all nodes: a change by one client app must not reach the next
+        message.content = RecordDict({key: _copied(record) for key, record in shared.items()})
+        config = {PARTITION: node - FIRST_NODE, "num-partitions": len(self.names)}
+        context = Context(RUN_ID, node, config, self._states.pop(node, None) or RecordDict(), {})
+        try:
+            return self._app(message, context)
+        except BudgetExceeded:
+            raise
+        except Exception as error:
+            return Message(Error(code=CLIENT_APP_RAISED, reason=repr(error)), reply_to=message)
+        finally:
+            message.content = shared
+            if context.state:
+                self._states[node] = context.state
 
     def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
         """Return the available replies to these messages and forget them."""
         return [self._replies.pop(identifier) for identifier in message_ids if identifier in self._replies]
 
-    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
-        """Deliver messages one after another and return their replies."""
-        return [reply for message in messages for reply in self.pull_messages(self.push_messages([message]))]
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
+        """Yield the replies in the order of the messages, as soon as each is there; raises what a node raises.
+
+        At most `at_once` messages are under way, or answered and not taken yet.
+        """
+        if self._at_once == 1:  # in this thread: others have thread counts of their own
+            for message in messages:
+                self._number(message)
+                yield self._deliver(message)
+            return
+        under_way: deque[Future[Message]] = deque()
+        with ThreadPoolExecutor(self._at_once) as threads:
+            try:
+                for message in messages:
+                    self._number(message)
+                    under_way.append(threads.submit(self._deliver, message))
+                    if len(under_way) == self._at_once:
+                        yield under_way.popleft().result()
+                while under_way:
+                    yield under_way.popleft().result()
+            finally:
+                for each in under_way:
+                    each.cancel()
 
 
 def _node_state(arrays: Mapping[str, Weights]) -> RecordDict:

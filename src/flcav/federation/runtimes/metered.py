@@ -1,6 +1,6 @@
 """A Flower grid that enters every message in a ledger and enforces the budgets; it wraps any other grid."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from flwr.app import Message, RecordDict
@@ -38,7 +38,7 @@ class MeteredGrid(Grid):
         self._grid, self._account, self._names = grid, account, names
         self._round = 0
 
-    def _enter(self, direction: Direction, node: int, content: RecordDict) -> None:
+    def _enter(self, direction: Direction, round_: int, node: int, size: int) -> None:
         account = self._account
         account.ledger.enter(
             LedgerEntry(
@@ -46,9 +46,9 @@ class MeteredGrid(Grid):
                 task=account.task,
                 link=account.link,
                 direction=direction,
-                round=self._round,
+                round=round_,
                 client=self._names[node],
-                bytes=wire_bytes(content),
+                bytes=size,
             )
         )
 
@@ -56,8 +56,8 @@ class MeteredGrid(Grid):
         """Send messages, entering each as downlink first; return their ids."""
         messages = list(messages)
         for message in messages:
-            self._round = int(message.content.config_records[CONFIG]["round"])  # type: ignore[arg-type]
-            self._enter("down", message.metadata.dst_node_id, message.content)
+            self._round = _round(message)
+            self._enter("down", self._round, message.metadata.dst_node_id, wire_bytes(message.content))
         return list(self._grid.push_messages(messages))
 
     def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
@@ -65,12 +65,33 @@ class MeteredGrid(Grid):
         replies = list(self._grid.pull_messages(message_ids))
         for message in replies:
             if message.has_content():
-                self._enter("up", message.metadata.src_node_id, message.content)
+                self._enter("up", self._round, message.metadata.src_node_id, wire_bytes(message.content))
         return replies
 
-    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> list[Message]:
-        """Send messages one after another and return the replies: the first one over a budget ends the round."""
-        return [reply for message in messages for reply in self.pull_messages(self.push_messages([message]))]
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
+        """Yield the replies as they come, entering message and reply; the first reply over a budget ends the round.
+
+        Messages without a reply are entered at the end. Nothing is sent before the first reply is asked for.
+        """
+        sent: dict[int, tuple[int, int]] = {}  # round and bytes, by node that has not answered
+
+        def noted() -> Iterator[Message]:
+            content, size = None, 0
+            for message in messages:
+                if message.content is not content:  # many messages share one
+                    content, size = message.content, wire_bytes(message.content)
+                sent[message.metadata.dst_node_id] = _round(message), size
+                yield message
+
+        for reply in self._grid.send_and_receive(noted(), timeout=timeout):
+            node = reply.metadata.src_node_id
+            round_, size = sent.pop(node)
+            self._enter("down", round_, node, size)
+            if reply.has_content():
+                self._enter("up", round_, node, wire_bytes(reply.content))
+            yield reply
+        for node, (round_, size) in sent.items():
+            self._enter("down", round_, node, size)
 
     def get_node_ids(self) -> list[int]:
         """Return the node ids of the metered grid."""
@@ -90,3 +111,7 @@ class MeteredGrid(Grid):
     def run(self):
         """Return Flower's record of the run."""
         return self._grid.run
+
+
+def _round(message: Message) -> int:
+    return int(message.content.config_records[CONFIG]["round"])  # type: ignore[arg-type]

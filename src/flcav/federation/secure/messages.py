@@ -18,7 +18,7 @@ SECRETS = "secrets"  # record of a node's state: the client's own part of a roun
 Exchange = Callable[[Mapping[str, ConfigRecord]], dict[str, ConfigRecord]]  # asks by client; answers of those who did
 
 
-class TooFewClients(RuntimeError):
+class TooFewClients(OSError):
     """Fewer clients are left than secure aggregation needs."""
 
 

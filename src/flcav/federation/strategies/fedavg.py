@@ -4,34 +4,66 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flcav.federation.trainable import Update, Weights
 
+NO_MEAN = "clients cannot be averaged by shares of {}: they must be 0 or more, not all 0"
 
-def average(weights: Sequence[Weights], shares: Sequence[float]) -> dict[str, np.ndarray]:
-    """Return the weighted mean of the clients' arrays by name: sum_i share_i w_i / sum_i share_i, in their own type.
 
-    `shares` has one entry per client. Floating arrays are summed in float64; of any other array the first client's is
-    returned. Raises ValueError where a share is negative or not finite, or all are 0, and where the clients' arrays
-    differ in name, order or shape.
+class RunningMean:
+    """Weighted mean of arrays by name, sum_i share_i w_i / sum_i share_i, to which clients are added one by one.
+
+    Its memory is that of one client in float64, however many there are. Floating arrays are summed; of any other array
+    the first client's is the mean.
     """
-    first = weights[0]
-    for other in weights[1:]:
-        if [(n, a.shape) for n, a in first.items()] != [(n, a.shape) for n, a in other.items()]:
+
+    def __init__(self) -> None:
+        self._form: dict[str, tuple[tuple[int, ...], np.dtype]] = {}  # of the first client
+        self._others: Weights = {}  # its arrays that are not floating
+        self._sums: dict[str, NDArray[np.float64]] = {}
+        self._shares: list[float] = []
+
+    def add(self, weights: Weights, share: float) -> None:
+        """Add a client.
+
+        Raises ValueError where its share is negative or not finite, or its arrays differ from the first one's in name,
+        order or shape.
+        """
+        if not (np.isfinite(share) and share >= 0):
+            raise ValueError(NO_MEAN.format([share]))
+        if not self._shares:
+            self._form = {name: (array.shape, array.dtype) for name, array in weights.items()}
+            floating = [name for name, array in weights.items() if np.issubdtype(array.dtype, np.floating)]
+            self._others = {name: array for name, array in weights.items() if name not in floating}
+            self._sums = {name: np.zeros(weights[name].shape) for name in floating}
+        elif [(name, a.shape) for name, a in weights.items()] != [(name, form[0]) for name, form in self._form.items()]:
             raise ValueError("clients sent arrays of different names or shapes: they train different networks")
-    share = np.asarray(shares, dtype=np.float64)
-    if not (np.isfinite(share).all() and (share >= 0).all() and share.any()):
-        raise ValueError(f"clients cannot be averaged by shares of {share.tolist()}: they must be 0 or more, not all 0")
-    share = share / share.sum()
+        self._shares.append(share)
+        for name, total in self._sums.items():
+            total += share * weights[name].astype(np.float64)
 
-    def combined(name: str) -> np.ndarray:
-        array = first[name]
-        if not np.issubdtype(array.dtype, np.floating):
-            return array
-        total = sum(s * w[name].astype(np.float64) for s, w in zip(share, weights, strict=True))
-        return np.asarray(total).astype(array.dtype)
+    def mean(self) -> dict[str, NDArray[np.number]]:
+        """Return the mean, in the first client's types; raises ValueError where all shares are 0."""
+        whole = float(np.sum(self._shares))
+        if not whole:
+            raise ValueError(NO_MEAN.format(self._shares))
+        return {
+            name: self._others[name] if name in self._others else np.asarray(self._sums[name] / whole).astype(dtype)
+            for name, (_, dtype) in self._form.items()
+        }
 
-    return {name: combined(name) for name in first}
+
+def average(weights: Sequence[Weights], shares: Sequence[float]) -> dict[str, NDArray[np.number]]:
+    """Return the weighted mean of the clients' arrays, see `RunningMean`; `shares` has one entry per client.
+
+    Raises ValueError where a share is negative or not finite, or all are 0, and where the clients' arrays differ in
+    name, order or shape.
+    """
+    mean = RunningMean()
+    for each, share in zip(weights, shares, strict=True):
+        mean.add(each, share)
+    return mean.mean()
 
 
 @dataclass(frozen=True)
@@ -41,3 +73,7 @@ class FedAvg:
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
         """Return the mean of the updates' weights, weighted by samples; raises ValueError as `average` does."""
         return average([update.weights for update in updates], [update.samples for update in updates])
+
+    def weigh(self, update: Update) -> float:
+        """Return the update's number of samples."""
+        return float(update.samples)

@@ -39,6 +39,10 @@ class FedAvgM:
         """Return the weights after a first round."""
         return self._step(start, updates, {})[0]
 
+    def weigh(self, update: Update) -> float:
+        """Return the update's number of samples."""
+        return float(update.samples)
+
     def step(
         self, start: Weights, updates: Sequence[LocalUpdate], state: Weights, clients: int
     ) -> tuple[Weights, Weights]:

@@ -20,6 +20,10 @@ class FedProx:
         """Return the mean of the updates' weights, weighted by samples."""
         return FedAvg().combine(start, updates)
 
+    def weigh(self, update: Update) -> float:
+        """Return the update's number of samples."""
+        return float(update.samples)
+
     def correct(self, sent: Weights, own: Weights) -> Correction:
         """Return the gradient of the proximal term, mu (w - start)."""
         return Correction(proximal=self.mu)

@@ -23,6 +23,10 @@ class FedYogi:
         """Return the weights after a first round."""
         return self._step(start, updates, {})[0]
 
+    def weigh(self, update: Update) -> float:
+        """Return the update's number of samples."""
+        return float(update.samples)
+
     def step(
         self, start: Weights, updates: Sequence[LocalUpdate], state: Weights, clients: int
     ) -> tuple[Weights, Weights]:

@@ -22,6 +22,10 @@ class Scaffold:
 
     rate: Annotated[float, Field(gt=0, le=1e3)] = 1.0  # of the server
 
+    def weigh(self, update: Update) -> float:
+        """Return 1: all clients count the same."""
+        return 1.0
+
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
         """Return start + rate (mean - start) of learned arrays, and the mean of all others."""
         mean = average([update.weights for update in updates], [1.0] * len(updates))

@@ -36,6 +36,26 @@ class Stateful(Protocol):
         ...
 
 
+class Averages(Protocol):
+    """A strategy that sees no more of the updates than their weighted mean, so that one at a time is in memory.
+
+    It is then given one update: the mean of the weights, and the sums of the samples and of the extra arrays.
+    """
+
+    def weigh(self, update: Update) -> float:
+        """Return the weight of an update in the mean: finite, not negative."""
+        ...
+
+
+def find_weigher(strategy: Strategy) -> Averages | None:
+    """Return the strategy where it `Averages`, None where it needs every update.
+
+    A class that overrides `combine` without `weigh` needs every update.
+    """
+    owner = next((each for each in type(strategy).__mro__ if "combine" in vars(each)), type(strategy))
+    return strategy if "weigh" in vars(owner) else None  # type: ignore[return-value]
+
+
 @runtime_checkable
 class Corrects(Protocol):
     """A strategy whose clients correct the gradients of their local steps."""

@@ -1,7 +1,7 @@
 """Resumable workflows of named steps: finished steps are kept, independent ones run in parallel."""
 
 from flcav.pipeline.steps.run import run_side_by_side, run_steps, stopwatch
-from flcav.pipeline.steps.step import FINISHED, STALE, Notify, Stale, Step, Work
+from flcav.pipeline.steps.step import FINISHED, STALE, Notify, Stale, Step, Work, ignore_steps
 
 __all__ = [
     "FINISHED",
@@ -10,6 +10,7 @@ __all__ = [
     "Stale",
     "Step",
     "Work",
+    "ignore_steps",
     "run_side_by_side",
     "run_steps",
     "stopwatch",

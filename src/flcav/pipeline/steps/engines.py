@@ -70,7 +70,7 @@ def perform(step: Step, folder: Path, record: Record, made_by: Provenance, repor
     own.mkdir(parents=True, exist_ok=True)
     report(0, 1, "")
     write_started(own, record)
-    value = step.run(Work(own, {name: folder / name for name in step.needs}, report), **step.arguments)
+    value = step.run(Work(own, {name: folder / name for name in step.needs}, report), **step.arguments, **step.means)
     write_done(own, record, value, asdict(replace(made_by, seed=find_seed(step.arguments))))
     return read_value(own)
 

@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,10 @@ DONE, STARTED = "done.json", "started.json"
 Stale = str  # one of STALE
 STALE = ("refuse", "redo", "keep")  # what to do with steps begun or done by other code
 NAMED = 3  # most steps, or modules, that a message lists
+
+
+def ignore_steps(step: str, done: int, total: int, note: str) -> None:
+    """Do nothing: the default `Notify`, without a display."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,7 @@ class Step:
     run: Callable[..., Any]
     arguments: Mapping[str, Any]  # JSON values, and frozen dataclasses of them
     needs: tuple[str, ...] = ()
+    means: Mapping[str, Any] = field(default_factory=dict)  # further arguments, which do not change the result
 
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
         """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).

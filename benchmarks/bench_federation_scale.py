@@ -1,0 +1,75 @@
+"""A federation of 100, 1,000 and 10,000 simulated vehicles with updates of LeNet's size: CPU time and peak memory.
+
+Each number in a process of its own, one round with every vehicle. A vehicle is made when it is its turn; its training
+is one draw of random numbers, so that what is measured is the federation itself.
+"""
+
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.stages import Schedule, federate
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.network.ledger import Budget, Ledger
+from flcav.perception.task import build_network
+from flcav.perception.weather.config import LeNetConfig
+from flcav.perception.weather.task import WEATHER
+from flcav.perception.weights import to_arrays
+
+NUMBERS = 100, 1_000, 10_000
+
+
+class Vehicle:
+    """A client whose update is a random step."""
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        """Return the weights plus one random number."""
+        step = np.float32(learning_rate * np.random.default_rng(seed).normal())
+        return LocalUpdate({name: array + step for name, array in weights.items()}, 1, 0.5)
+
+
+class Fleet(Mapping[str, Trainable]):
+    """Vehicles that are made when they are asked for."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __getitem__(self, name: str) -> Trainable:
+        return Vehicle()
+
+    def __iter__(self) -> Iterator[str]:
+        return (f"cav{number}" for number in range(self.count))
+
+    def __len__(self) -> int:
+        return self.count
+
+
+def measure(vehicles: int) -> None:
+    weights = to_arrays(build_network(WEATHER, LeNetConfig(), 0))
+    account = Account(Ledger(Budget(1e6, 1e6)), "edge", "weather", "wireless")
+    start = time.process_time()
+    federate(Fleet(vehicles), weights, Schedule(1, 1, 1e-3, 1e-3, 0), account)
+    spent = time.process_time() - start
+    print(json.dumps({"cpu_s": spent, "mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3}))
+
+
+def main() -> None:
+    found = {}
+    for vehicles in NUMBERS:
+        told = subprocess.run([sys.executable, __file__, str(vehicles)], check=True, capture_output=True, text=True)
+        found[vehicles] = json.loads(told.stdout)
+        cpu_s, mb = found[vehicles]["cpu_s"], found[vehicles]["mb"]
+        print(f"{vehicles:>6} vehicles {cpu_s:7.2f} CPU-s, {1e3 * cpu_s / vehicles:.2f} ms each, peak {mb:.0f} MB")
+    few, more, most = (found[vehicles] for vehicles in NUMBERS)
+    print(f"  time of 10,000 / 10 x that of 1,000: {most['cpu_s'] / (10 * more['cpu_s']):.2f} (aim: 1, linear)")
+    print(f"  memory of 10,000 / that of 100: {most['mb'] / few['mb']:.2f} (aim <= 1.20)")
+
+
+if __name__ == "__main__":
+    measure(int(sys.argv[1])) if len(sys.argv) > 1 else main()

@@ -1,0 +1,73 @@
+"""`flcav federate`: stage II of a run recipe alone, round by round."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from flcav.cli.options import STALE, Runtime, Stale
+from flcav.cli.terminal import print_json, when_interrupted
+from flcav.threads import use_threads
+
+if TYPE_CHECKING:
+    from flcav.pipeline.steps import Notify
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(federate)
+
+
+@when_interrupted()
+def federate(
+    recipe: Path = typer.Argument(help="Run recipe (YAML), of which stage II is run; see docs/runs.md."),
+    out: Path = typer.Option(
+        ..., "--out", help="Folder, also one of flcav run; the same command goes on after a stop."
+    ),
+    arm: str = typer.Option("main", "--arm", help="Arm of the recipe; by default what the recipe itself describes."),
+    jobs: int = typer.Option(2, "--jobs", min=1, help="Processes that vehicles train in, of one thread each."),
+    runtime: Runtime = typer.Option(
+        Runtime.embedded, "--runtime", help="Processes here, or Flower's simulation on Ray."
+    ),
+    stale: Stale = STALE,
+    as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead of sentences."),
+) -> None:
+    """Run stage II of a recipe alone, edge FL in every region; print each round with its scores on validation frames.
+
+    Writes federation.json, and the weights of each federation as safetensors.
+    """
+    use_threads(1)
+    from flcav.cli.steps import live_steps
+    from flcav.files import check_writable
+    from flcav.pipeline.federations.alone import RESULTS, federate_regions
+    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.sources.recipe import find_recipe
+
+    check_writable(out)
+    found = find_recipe(recipe)
+    asked = load_run_recipe(found)
+    with live_steps("federate") as notify:
+        told = notify if as_json else _telling(notify)
+        how = {"beside": found.parent, "jobs": jobs, "runtime": runtime.value, "stale": stale.value}
+        results = federate_regions(asked, out, arm=arm, notify=told, **how)
+    if as_json:
+        print_json(results.as_json())
+        return
+    for each in results.federations:
+        result = each.result
+        best = max((row.rounds for row in each.watched), key=len)
+        told_rounds = f"{len(best)} rounds, {result.clients} vehicles, {result.samples} samples"
+        typer.echo(f"{out / each.weights}: {result.task} in {result.region}, {told_rounds}")
+    typer.echo(f"{out / RESULTS}: all rounds")
+
+
+def _telling(notify: "Notify") -> "Notify":
+    """Return a `Notify` that also prints the rounds as they end."""
+    from flcav.pipeline.federations.alone import tells_of_round
+
+    def tell(step: str, done: int, total: int, note: str) -> None:
+        notify(step, done, total, note)
+        if tells_of_round(step, note):
+            typer.echo(f"{step}, round {done} of {total}: {note}")
+
+    return tell

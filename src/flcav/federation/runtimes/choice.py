@@ -1,0 +1,37 @@
+"""Where the clients of a federation train, by name."""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+from flcav.config import InputError
+from flcav.federation.runtimes.processes import ClientProcesses
+from flcav.federation.trainable import Trainable
+
+if TYPE_CHECKING:
+    from flcav.federation.runtimes.simulation import RaySimulation
+
+RUNTIMES = "embedded", "ray"
+
+
+@contextlib.contextmanager
+def open_runtime(
+    name: str, clients: Mapping[str, Trainable], count: int
+) -> Iterator["ClientProcesses | RaySimulation | None"]:
+    """Yield what `federate` takes as its `runtime`.
+
+    embedded: messages within this process, and clients in `count` processes where these are several. ray: Flower's
+    simulation with `count` actors. Raises `InputError` for another name.
+    """
+    match name:
+        case "embedded" if count > 1:
+            with ClientProcesses(clients, count) as processes:
+                yield processes
+        case "embedded":
+            yield None
+        case "ray":
+            from flcav.federation.runtimes.simulation import RaySimulation
+
+            yield RaySimulation(count)
+        case _:
+            raise InputError(f"runtime '{name}': choose one of {', '.join(RUNTIMES)}")

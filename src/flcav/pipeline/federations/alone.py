@@ -1,0 +1,140 @@
+"""Stage II of a run recipe alone: the federation of each region's vehicles, with the steps that it rests on.
+
+They are the steps of `flcav run`, so that a folder of one goes on with what the other left in it, and the weights are
+the same. Here each round is validated as it ends, and vehicles train in several processes.
+"""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flcav.config import InputError
+from flcav.files import atomic_path
+from flcav.pipeline.arms import check_federations
+from flcav.pipeline.federations.checkpoint import DAMAGED, LAST, Checkpoint
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.graph import Graph
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
+from flcav.pipeline.results import WEIGHTS, Round, Saved, StageResult, Watched
+from flcav.pipeline.stages import LOSS
+from flcav.pipeline.steps import Notify, Stale, Step, ignore_steps, run_steps
+
+WORK, RESULTS = "work", "federation.json"
+FEDERATE = "federate"  # in the names of the steps
+
+
+@dataclass(frozen=True)
+class Federation:
+    """The federation of a region's vehicles: its result, and the scores of its network after each round."""
+
+    result: StageResult
+    watched: tuple[Watched, ...]  # on the validation frames of each region
+    weights: str  # file of the weights after the last round (safetensors), beside the results
+
+
+@dataclass(frozen=True)
+class Federations(Saved):
+    """Results of stage II alone."""
+
+    recipe: RunRecipe
+    arm: str
+    federations: tuple[Federation, ...]
+    provenance: Provenance
+
+
+def federate_regions(
+    recipe: RunRecipe,
+    out: Path | str,
+    *,
+    arm: str = MAIN,
+    beside: Path | str | None = None,
+    jobs: int = 2,
+    runtime: str = "embedded",
+    notify: Notify = ignore_steps,
+    stale: Stale = "refuse",
+) -> Federations:
+    """Run or finish stage II of a recipe's arm in the folder `out`; return its results, federation.json there.
+
+    In every federating region and for every task vehicles train in `jobs` processes of one thread each, or actors where
+    the `runtime`, one of `RUNTIMES`, is "ray". The weights do not depend on that, on Ray up to rounding. The others
+    are those of `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not federate,
+    `ClientFailed` where fewer vehicles are left in a round than are wanted.
+    """
+    out, graph = Path(out), Graph(recipe, Path(beside or "."))
+    if arm not in graph.settings:
+        raise InputError(f"--arm {arm}: the recipe has {', '.join(graph.settings)}")
+    if graph.settings[arm].central:
+        raise InputError(f"--arm {arm}: it trains centrally, without a federation")
+    check_federations(recipe, graph.settings.values())
+    asked = list_federations(graph, arm)
+    alone = {
+        name: _federation_step(graph, *about, {"processes": jobs, "runtime": runtime}) for name, about in asked.items()
+    }
+    before = _needed(graph.steps, alone.values())
+    run_steps(before, out / WORK, jobs=jobs, notify=notify, stale=stale)
+
+    def tell(step: str, done: int, total: int, note: str) -> None:
+        if step in alone:
+            notify(step, done, total, note)
+
+    run_steps([*before, *alone.values()], out / WORK, jobs=1, notify=tell, stale=stale)
+    found = tuple(_collect(graph, out, name, about[1]) for name, about in asked.items())
+    results = Federations(recipe, arm, found, provenance(recipe.seed))
+    results.save(out, RESULTS)
+    return results
+
+
+def tells_of_round(step: str, note: str) -> bool:
+    """Return whether a note of a step tells of a round of a federation, or of a damaged checkpoint."""
+    return FEDERATE in step and (note.startswith(LOSS) or DAMAGED in note)
+
+
+def list_federations(graph: Graph, arm: str) -> dict[str, tuple[str, str, str]]:
+    """Return arm, region and task of each federation of an arm, by the name of its step."""
+    setting = graph.settings[arm]
+    named = {(region, task): f"{region}-{FEDERATE}-{task}" for task in graph.recipe.tasks for region in setting.regions}
+    return {name if arm == MAIN else f"{name}-{arm}": (arm, *about) for about, name in named.items()}
+
+
+def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, Any]) -> Step:
+    """Return the step of stage II as a run has it, with validation after each round, and in several processes."""
+    edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
+    frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
+    name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
+    arguments: Mapping[str, Any] = {**edge.arguments, "validation": frames}
+    needs = tuple(dict.fromkeys((*edge.needs, *frames.values())))
+    return replace(edge, name=name, arguments=arguments, needs=needs, means=means)
+
+
+def _needed(steps: tuple[Step, ...], last: Any) -> list[Step]:
+    """Return those of `steps` that the steps `last` need, directly or not, in their order."""
+    needs = {step.name: step.needs for step in steps}
+    wanted, open_ = set(), [name for step in last for name in step.needs]
+    while open_:
+        name = open_.pop()
+        if name not in wanted:
+            wanted.add(name)
+            open_ += needs[name]
+    return [step for step in steps if step.name in wanted]
+
+
+def _collect(graph: Graph, out: Path, step: str, region: str) -> Federation:
+    """Return the results of a finished federation, and copy its weights beside them."""
+    folder = out / WORK / step
+    result = StageResult.load(folder)
+    scores = Checkpoint.read(folder, LAST).scores if result.rounds else ()
+    frames = {
+        name: len(Frames.open(out / WORK / graph.names.recording(name, "validation", result.task)).vehicles)
+        for name in graph.recipe.regions
+    }
+    watched = tuple(
+        Watched(EDGE, result.task, name, count, tuple(Round(i, each[name]) for i, each in enumerate(scores, start=1)))
+        for name, count in frames.items()
+    )
+    weights = f"{step}.safetensors"
+    with atomic_path(out / weights) as temporary:
+        shutil.copyfile(folder / WEIGHTS, temporary)
+    return Federation(result, watched, weights)

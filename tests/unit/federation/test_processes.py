@@ -1,0 +1,55 @@
+"""Clients in processes of their own: the same rounds, and one that is killed is named."""
+
+import os
+import signal
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from regression import START, Regression, ledger, vehicles
+
+from flcav.config import InputError
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.runtimes.processes import ClientProcesses
+from flcav.federation.stages import Schedule, federate
+from flcav.federation.state import FederationState
+from flcav.federation.trainable import LocalUpdate, Weights
+
+SCHEDULE = Schedule(rounds=1, steps=5, learning_rate=0.05, final_learning_rate=0.01, seed=3)
+
+
+@dataclass
+class Mortal(Regression):
+    """Is killed by the system when it begins to train."""
+
+    killed: bool = False
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        if self.killed:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().train(weights, steps=steps, learning_rate=learning_rate, seed=seed)
+
+
+def test_clients_in_two_processes_federate_to_the_same_bits_and_one_killed_is_named():
+    clients = {name: Mortal(each.inputs, each.targets) for name, each in vehicles("grid", 4).items()}
+    clients["grid/cav1"].killed = True
+    account, state, rules = (
+        Account(ledger(), "edge", "regression", "wireless"),
+        FederationState(),
+        Rules(least_clients=3),
+    )
+    with ClientProcesses(clients, 2) as processes:
+        found = federate(clients, START, SCHEDULE, account, rules=rules, state=state, runtime=processes)
+    left = {name: client for name, client in clients.items() if name != "grid/cav1"}
+    alone = Account(ledger(), "edge", "regression", "wireless")
+    want = federate(left, START, SCHEDULE, alone)
+    np.testing.assert_array_equal(found.weights["w"], want.weights["w"])
+    assert [record.clients for record in state.records] == [tuple(left)]
+    assert state.records[0].failed == {"grid/cav1": "ClientKilled('its process was killed while it trained')"}
+    assert [each for each in account.ledger.entries if each.client != "grid/cav1"] == [*alone.ledger.entries]
+
+
+def test_clients_that_cannot_be_sent_are_refused():
+    with pytest.raises(InputError, match="clients cannot be sent to processes"):
+        ClientProcesses({"cav0": Regression(np.zeros((1, 3)), (lambda: 0))}, 2)  # type: ignore[arg-type]
