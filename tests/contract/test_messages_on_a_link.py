@@ -2,21 +2,23 @@
 
 import socket
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from flwr.app import RecordDict
+from flwr.app import Message, RecordDict
 from flwr.common.serde import recorddict_from_proto, recorddict_to_proto
 from flwr.proto.recorddict_pb2 import RecordDict as Serialised
+from flwr.serverapp import Grid
 from task_drives import Drives
 
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.federation import stages
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes import metered
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.fusion.road import RoadView
@@ -49,11 +51,45 @@ class Wire:
         self.arrived.append(len(received))
         return bytes(received)
 
-    def carry_records(self, content: RecordDict) -> int:
-        """Send a message of Flower; return its size, as `wire_bytes` does."""
+    def carry_content(self, content: RecordDict) -> RecordDict:
+        """Send the content of a message of Flower; return it as it was received."""
         received = Serialised.FromString(self.carry(recorddict_to_proto(content).SerializeToString()))
-        assert recorddict_to_proto(recorddict_from_proto(received)) == recorddict_to_proto(content)
-        return self.arrived[-1]
+        return recorddict_from_proto(received)
+
+
+class WiredGrid(Grid):
+    """A grid whose messages and replies go through a socket, one by one."""
+
+    def __init__(self, grid: Grid, wire: Wire) -> None:
+        self.grid, self.wire = grid, wire
+
+    def carried(self, message: Message) -> Message:
+        if message.has_content():
+            message.content = self.wire.carry_content(message.content)
+        return message
+
+    def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
+        return self.grid.push_messages([self.carried(message) for message in messages])
+
+    def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]:
+        return [self.carried(reply) for reply in self.grid.pull_messages(message_ids)]
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
+        sent = (self.carried(message) for message in messages)
+        return (self.carried(reply) for reply in self.grid.send_and_receive(sent, timeout=timeout))
+
+    def get_node_ids(self) -> Iterable[int]:
+        return self.grid.get_node_ids()
+
+    def create_message(self, *arguments: Any, **named: Any) -> Message:
+        return self.grid.create_message(*arguments, **named)
+
+    def set_run(self, run: Any) -> None:
+        self.grid.set_run(run)
+
+    @property
+    def run(self) -> Any:
+        return self.grid.run
 
 
 class Walk:
@@ -66,7 +102,9 @@ class Walk:
 def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
     found = Wire()
     monkeypatch.setattr(messages, "carry", found.carry)
-    monkeypatch.setattr(metered, "wire_bytes", found.carry_records)
+    monkeypatch.setattr(
+        stages, "MeteredGrid", lambda grid, account, names: MeteredGrid(WiredGrid(grid, found), account, names)
+    )
     return found
 
 
@@ -104,5 +142,5 @@ def test_the_ledger_has_what_a_socket_carried_in_every_stage(wire: Wire, tmp_pat
     assert sum(wire.arrived) == sum(
         book.used_bytes(link, direction=direction) for link in ("wireless", "wireline") for direction in ("up", "down")
     )
-    stages = {(entry.stage, entry.link, entry.direction) for entry in book.entries}
-    assert len(stages) == 2 + 3 + 4  # samples up; network, mistakes, views and rounds; edge and cloud rounds
+    kinds = {(entry.stage, entry.link, entry.direction) for entry in book.entries}
+    assert len(kinds) == 2 + 3 + 4  # samples up; network, mistakes, views and rounds; edge and cloud rounds
