@@ -216,7 +216,7 @@ class Rounds(FlowerStrategy):
                 node = awaited.popleft()
                 found, name = early.pop(node, None), self._names[node]
                 if found is None:
-                    self._failed[name] = "no answer"
+                    self._failed.setdefault(name, "no answer")  # or what it failed by before
                 elif found.has_error():
                     self._failed[name] = str(found.error.reason)
                 else:
