@@ -55,8 +55,7 @@ def federate(
         return
     for each in results.federations:
         result = each.result
-        best = max((row.rounds for row in each.watched), key=len)
-        told_rounds = f"{len(best)} rounds, {result.clients} vehicles, {result.samples} samples"
+        told_rounds = f"{result.rounds} rounds, {result.clients} vehicles, {result.samples} samples"
         typer.echo(f"{out / each.weights}: {result.task} in {result.region}, {told_rounds}")
     typer.echo(f"{out / RESULTS}: all rounds")
 

@@ -1,8 +1,11 @@
 """Federated learning over a vehicle-edge-cloud network: rounds, aggregation strategies, metered messages."""
 
+import os
 from typing import TYPE_CHECKING
 
 from flcav.lazy import lazy_names
+
+os.environ.setdefault("FLWR_TELEMETRY_ENABLED", "0")  # read when Flower is imported
 
 if TYPE_CHECKING:
     from flcav.federation.privacy import Privacy

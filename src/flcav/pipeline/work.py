@@ -29,6 +29,7 @@ from flcav.pipeline.before_after import detect_before_after
 from flcav.pipeline.federations.messages import release_network, report_errors
 from flcav.pipeline.federations.network import drive_region, join_regions
 from flcav.pipeline.federations.records import read_rounds
+from flcav.pipeline.federations.rounds import load_round_network
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
     LABEL_SOURCES,
@@ -83,7 +84,6 @@ from flcav.pipeline.stages import (
     choose_uploads,
     federate_cloud,
     federate_edge,
-    load_round_network,
     load_stage_network,
     make_clients,
     pretrain,

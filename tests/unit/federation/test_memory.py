@@ -1,7 +1,7 @@
 """Memory of a round: clients are made when it is their turn, and a mean needs one update at a time."""
 
 import tracemalloc
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_the_median_holds_every_update():
 
 def test_a_strategy_that_overrides_the_mean_is_given_every_update():
     class ByLoss(FedAvg):
-        def combine(self, start: Weights, updates: list[Update]) -> Weights:  # type: ignore[override]
+        def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
             return updates[0].weights
 
     assert find_weigher(FEDAVG) is FEDAVG

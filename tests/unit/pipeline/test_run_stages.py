@@ -28,15 +28,14 @@ from flcav.perception.task import Practice, Task
 from flcav.perception.training import train
 from flcav.perception.weights import to_arrays
 from flcav.pipeline import stages
+from flcav.pipeline.federations.rounds import FederationCheckpoints, round_path
 from flcav.pipeline.recipe import Training
 from flcav.pipeline.results import WEIGHTS
 from flcav.pipeline.stages import (
-    FederationCheckpoints,
     Learning,
     choose_uploads,
     pretrain,
     region_budget,
-    round_path,
     share_budget,
     train_centrally,
 )
@@ -114,7 +113,7 @@ def test_a_federation_killed_at_any_write_ends_the_same(
     weights, book = stage(fresh("whole"), strategy)
     writes, last = 0, 0
 
-    def dying(write: Callable[..., None]) -> Callable[..., None]:
+    def dying(write: Callable[..., object]) -> Callable[..., None]:
         def counted(*arguments: object) -> None:
             nonlocal writes
             writes += 1

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -10,12 +9,11 @@ from made_up_run import run as made_up_run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from flcav.federation.state import RoundRecord
-from flcav.files import write_json
 from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
+from flcav.pipeline.federations.checkpoint import Checkpoint
 from flcav.pipeline.federations.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
 from flcav.pipeline.results import LEDGER, FederatedRound, Run, StageResult
-from flcav.pipeline.stages import ROUND
 from flcav.report.pages import html
 from flcav.report.pages.run_page import page
 
@@ -26,8 +24,8 @@ def entry(link: Link, direction: Direction, round_: int, client: str, size: int)
 
 def checkpoint(folder: Path, entries: list[LedgerEntry], **records: RoundRecord) -> None:
     Ledger(Budget(1.0, 1.0), entries).save(folder / LEDGER)
-    told: dict[str, Any] = {name.replace("_", "/"): [each.as_json()] for name, each in records.items()}
-    write_json(folder / ROUND, {"round": 1, "records": told})
+    told = {name.replace("_", "/"): (each,) for name, each in records.items()}
+    Checkpoint(1, len(entries), (0.25,), "FedAvg()", {}, told).keep(folder)
 
 
 def test_a_round_has_the_bytes_of_its_own_messages(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from flcav.config import InputError
+from flcav.world.map import town as town_module
 from flcav.world.map.parameters import CLUTTER
 from flcav.world.map.roads import read_net
 from flcav.world.map.surfaces import make_footprint
@@ -133,7 +134,18 @@ def test_everything_is_within_bounds(town: Town) -> None:
 
 
 def test_same_files_same_town(town: Town) -> None:
+    town_module._build_town.cache_clear()
     assert pickle.dumps(load_town(town.name)) == pickle.dumps(town)
+
+
+def test_a_town_is_built_once_and_anew_where_a_file_changed(tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    shutil.copytree(load_town("ring").net.parent, folder)
+    first = load_town(folder)
+    assert load_town(folder) is first
+    path = folder / "town.yaml"
+    path.write_text(path.read_text().replace("vehicles: 40", "vehicles: 39"))
+    assert load_town(folder).parameters.vehicles == 39
 
 
 def test_all_situations_occur() -> None:

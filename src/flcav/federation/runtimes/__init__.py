@@ -1,1 +1,1 @@
-"""Flower grids: message passing in this process, and metering of messages."""
+"""Where clients train: in this process, in several, in Flower's simulation on Ray; and metering of their messages."""

@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from flwr.app import ConfigRecord, Context, Error, Message, MetricRecord, RecordDict
+from flwr.app.user_config import UserConfig
 from flwr.clientapp import ClientApp
 from flwr.common.serde import recorddict_to_proto
 from flwr.serverapp import Grid
@@ -148,7 +149,7 @@ class EmbeddedGrid(Grid):
         node = message.metadata.dst_node_id
         shared = message.content  # by all nodes: a change by one client app must not reach the next
         message.content = RecordDict({key: _copied(record) for key, record in shared.items()})
-        config = {PARTITION: node - FIRST_NODE, "num-partitions": len(self.names)}
+        config: UserConfig = {PARTITION: node - FIRST_NODE, "num-partitions": len(self.names)}
         context = Context(RUN_ID, node, config, self._states.pop(node, None) or RecordDict(), {})
         try:
             return self._app(message, context)

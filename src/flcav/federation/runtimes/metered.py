@@ -38,8 +38,8 @@ class MeteredGrid(Grid):
         self._grid, self._account, self._names = grid, account, names
         self._round = 0
 
-    def _enter(self, direction: Direction, round_: int, node: int, size: int) -> None:
-        account = self._account
+    def _enter(self, direction: Direction, round_: int, size: int, node: int) -> None:
+        account, self._round = self._account, round_
         account.ledger.enter(
             LedgerEntry(
                 stage=account.stage,
@@ -56,8 +56,7 @@ class MeteredGrid(Grid):
         """Send messages, entering each as downlink first; return their ids."""
         messages = list(messages)
         for message in messages:
-            self._round = _round(message)
-            self._enter("down", self._round, message.metadata.dst_node_id, wire_bytes(message.content))
+            self._enter("down", _round(message), wire_bytes(message.content), message.metadata.dst_node_id)
         return list(self._grid.push_messages(messages))
 
     def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
@@ -65,33 +64,40 @@ class MeteredGrid(Grid):
         replies = list(self._grid.pull_messages(message_ids))
         for message in replies:
             if message.has_content():
-                self._enter("up", self._round, message.metadata.src_node_id, wire_bytes(message.content))
+                self._enter("up", self._round, wire_bytes(message.content), message.metadata.src_node_id)
         return replies
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
         """Yield the replies as they come, entering message and reply; the first reply over a budget ends the round.
 
-        Messages without a reply are entered at the end. Nothing is sent before the first reply is asked for.
+        A message is entered when it is sent or, while another one has no reply yet, with its own reply: so the entries
+        do not depend on how many are under way. Nothing is sent before the first reply is asked for.
         """
-        sent: dict[int, tuple[int, int]] = {}  # round and bytes, by node that has not answered
+        waiting: dict[int, tuple[int, int]] = {}  # round and bytes of messages that are not entered, by node
+        open_: set[int] = set()  # nodes that have not answered
 
         def noted() -> Iterator[Message]:
             content, size = None, 0
             for message in messages:
                 if message.content is not content:  # many messages share one
                     content, size = message.content, wire_bytes(message.content)
-                sent[message.metadata.dst_node_id] = _round(message), size
+                node = message.metadata.dst_node_id
+                waiting[node] = _round(message), size
+                if not open_:
+                    self._enter("down", *waiting.pop(node), node)
+                open_.add(node)
                 yield message
 
         for reply in self._grid.send_and_receive(noted(), timeout=timeout):
             node = reply.metadata.src_node_id
-            round_, size = sent.pop(node)
-            self._enter("down", round_, node, size)
+            open_.remove(node)
+            if node in waiting:
+                self._enter("down", *waiting.pop(node), node)
             if reply.has_content():
-                self._enter("up", round_, node, wire_bytes(reply.content))
+                self._enter("up", self._round, wire_bytes(reply.content), node)
             yield reply
-        for node, (round_, size) in sent.items():
-            self._enter("down", round_, node, size)
+        for node, about in waiting.items():
+            self._enter("down", *about, node)
 
     def get_node_ids(self) -> list[int]:
         """Return the node ids of the metered grid."""

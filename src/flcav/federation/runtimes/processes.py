@@ -63,7 +63,7 @@ class ClientProcesses:
         """
         process = self._free.get()
         try:
-            return process.submit(_train, name, weights, how).result()
+            return process.submit(_train_here, name, weights, how).result()
         except BrokenProcessPool:
             process.shutdown(wait=False)
             self._all.remove(process)
@@ -108,5 +108,5 @@ def _start(pickled: bytes) -> None:
     _clients = pickle.loads(pickled)
 
 
-def _train(name: str, weights: Weights, how: Mapping[str, Any]) -> Update:
+def _train_here(name: str, weights: Weights, how: Mapping[str, Any]) -> Update:
     return _clients[name].train(weights, **how)

@@ -5,7 +5,7 @@ the same. Here each round is validated as it ends, and vehicles train in several
 """
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,12 @@ from flcav.config import InputError
 from flcav.files import atomic_path
 from flcav.pipeline.arms import check_federations
 from flcav.pipeline.federations.checkpoint import DAMAGED, LAST, Checkpoint
+from flcav.pipeline.federations.rounds import LOSS
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
 from flcav.pipeline.results import WEIGHTS, Round, Saved, StageResult, Watched
-from flcav.pipeline.stages import LOSS
 from flcav.pipeline.steps import Notify, Stale, Step, ignore_steps, run_steps
 
 WORK, RESULTS = "work", "federation.json"
@@ -59,9 +59,9 @@ def federate_regions(
     """Run or finish stage II of a recipe's arm in the folder `out`; return its results, federation.json there.
 
     In every federating region and for every task vehicles train in `jobs` processes of one thread each, or actors where
-    the `runtime`, one of `RUNTIMES`, is "ray". The weights do not depend on that, on Ray up to rounding. The others
-    are those of `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not federate,
-    `ClientFailed` where fewer vehicles are left in a round than are wanted.
+    the `runtime`, one of `RUNTIMES`, is "ray". The weights do not depend on that, on Ray up to rounding. Others
+    are those of `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not
+    federate, `ClientFailed` where fewer vehicles are left in a round than are wanted.
     """
     out, graph = Path(out), Graph(recipe, Path(beside or "."))
     if arm not in graph.settings:
@@ -99,7 +99,7 @@ def list_federations(graph: Graph, arm: str) -> dict[str, tuple[str, str, str]]:
     return {name if arm == MAIN else f"{name}-{arm}": (arm, *about) for about, name in named.items()}
 
 
-def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, Any]) -> Step:
+def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, int | str]) -> Step:
     """Return the step of stage II as a run has it, with validation after each round, and in several processes."""
     edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
     frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
@@ -109,7 +109,7 @@ def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapp
     return replace(edge, name=name, arguments=arguments, needs=needs, means=means)
 
 
-def _needed(steps: tuple[Step, ...], last: Any) -> list[Step]:
+def _needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
     """Return those of `steps` that the steps `last` need, directly or not, in their order."""
     needs = {step.name: step.needs for step in steps}
     wanted, open_ = set(), [name for step in last for name in step.needs]

@@ -4,18 +4,15 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 
-from flcav.config import read_json
 from flcav.exchange import write_table
-from flcav.federation.state import RoundRecord
 from flcav.network.ledger import BYTES_PER_MB, Ledger
 from flcav.perception.training.run import event_files
+from flcav.pipeline.federations.checkpoint import LAST, Checkpoint
 from flcav.pipeline.recipe import CLOUD
 from flcav.pipeline.results import LEDGER, FederatedRound, Run, StageResult
-from flcav.pipeline.stages import ROUND
 
 ROUNDS, EVENTS = "rounds.parquet", "events"  # of a run, beside its results
 SCHEMA = pa.schema(
@@ -43,16 +40,14 @@ def read_rounds(
     of entries that its ledger begins with, of messages before the first round. seconds: of each round, by server, where
     there is a network.
     """
-    if not (folder / ROUND).exists():
+    if not (folder / LAST).exists():
         return ()
     entries = Ledger.load(folder / LEDGER).entries[before:]
-    told: Any = read_json(folder / ROUND)
     found = []
-    for name, records in told["records"].items():
+    for name, records in Checkpoint.read(folder, LAST).records.items():
         server = region or name.rpartition("/")[2]
         link = "wireline" if server == CLOUD else "wireless"
-        for each in records:
-            record = RoundRecord.from_json(each, str(folder))
+        for record in records:
             sent = Counter[str]()
             for entry in entries:
                 own = server == CLOUD or entry.client.startswith(f"{server}/")

@@ -50,7 +50,7 @@ class Step:
     run: Callable[..., Any]
     arguments: Mapping[str, Any]  # JSON values, and frozen dataclasses of them
     needs: tuple[str, ...] = ()
-    means: Mapping[str, Any] = field(default_factory=dict)  # further arguments, which do not change the result
+    means: Mapping[str, int | str] = field(default_factory=dict)  # further arguments, which do not change the result
 
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
         """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).

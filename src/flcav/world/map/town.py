@@ -1,7 +1,9 @@
 """Towns: static content from a SUMO net (roads) and a parameter file (buildings, furniture, candidate sites)."""
 
+import hashlib
 import os
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +86,18 @@ def load_town(name: str | Path, beside: Path | None = None) -> Town:
     flcav.config.InputError: unknown town 'atlantis'; known towns: ...
     """
     folder = name if isinstance(name, Path) else _folder(name, beside)
+    return _build_town(folder.absolute(), _hash_files(folder))
+
+
+def _hash_files(folder: Path) -> str:
+    """Return a hash of the names and bytes of the files in a folder."""
+    files = sorted(path for path in folder.glob("*") if path.is_file())
+    return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()
+
+
+@lru_cache(maxsize=16)
+def _build_town(folder: Path, files: str) -> Town:
+    """Return the town of a folder whose `files` have that hash; the last ones are kept in memory."""
     parameters = read_config(TownParameters, folder / "town.yaml")
     net = read_net(folder / "town.net.xml")
     _check(net, parameters, folder / "town.yaml")

@@ -1,0 +1,145 @@
+"""What a federation leaves in its folder after each round, to go on from, and the network that it comes to."""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors.numpy import load_file, save
+
+from flcav.config import InputError
+from flcav.federation.rounds import OnRound
+from flcav.federation.state import FederationState
+from flcav.federation.strategies.fedavg import average
+from flcav.federation.trainable import Weights
+from flcav.files import sha256, write_bytes
+from flcav.network.ledger import Ledger
+from flcav.perception.task import Task
+from flcav.perception.weights import from_arrays, save_network, to_arrays
+from flcav.pipeline.federations.checkpoint import Checkpoint, find_checkpoint
+from flcav.pipeline.results import LEDGER, WEIGHTS
+from flcav.progress import Report
+
+LOSS = "loss"  # begins the note of a round
+
+
+class FederationCheckpoints:
+    """Checkpoints of a federation: weights, loss, ledger and states after each round, to resume from."""
+
+    def __init__(
+        self,
+        task: Task,
+        folder: Path,
+        book: Ledger,
+        report: Report,
+        states: Mapping[str, FederationState] = {},
+        identity: str = "",
+        score: Callable[[int], Mapping[str, float]] | None = None,
+    ) -> None:
+        """Keep the checkpoints in `folder`.
+
+        states: by name what federations keep between rounds, restored in place; of stage III also the edge servers'.
+        identity: what the federation is by; a checkpoint of another one is refused. score: the scores on validation
+        frames after a round, by region.
+        """
+        self._task, self._folder, self._book, self._report = task, folder, book, report
+        self._states, self._identity, self._score = states, identity, score
+        self._hashes: dict[str, str] = {}  # of the files of weights, by name
+        self.losses: list[float] = []
+        self.scores: list[Mapping[str, float]] = []
+
+    def resume(self, weights: Weights) -> tuple[Weights, int]:
+        """Return the last round's weights and number, restoring ledger, losses and states.
+
+        Without a checkpoint, returns `weights` and 0; where one is damaged, the round before. Raises `InputError` for
+        the checkpoint of another strategy, and where the last two are damaged.
+        """
+        found, damage = find_checkpoint(self._folder)
+        number = 0 if found is None else found.round
+        if damage:
+            self._report(number, max(number, 1), damage)
+        if found is None:
+            return weights, 0
+        if found.by != self._identity:
+            raise InputError(f"{self._folder}: a checkpoint of {found.by}, which {self._identity} cannot go on with")
+        kept = Ledger.load(self._folder / _ledger_name(number)).entries[: found.entries]
+        for entry in kept[len(self._book.entries) :]:
+            self._book.enter(entry)
+        self.losses, self.scores = [*found.losses], [*found.scores]
+        state, names = _state_name(number), [round_path(self._folder, each).name for each in range(1, number + 1)]
+        self._hashes = {name: found.sha256[name] for name in names}
+        arrays = load_file(self._folder / state) if state in found.sha256 else {}
+        for name, own in self._states.items():
+            begins = f"{name}|"
+            mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
+            own.restore(mine, found.records[name])
+        return load_file(round_path(self._folder, number)), number
+
+    def make_saver(self, rounds: int) -> OnRound:
+        """Return the callback that saves a checkpoint after each of `rounds` rounds."""
+
+        def keep(round_: int, weights: Weights, loss: float) -> None:
+            self.losses.append(loss)
+            self._write(round_path(self._folder, round_).name, save(dict(weights)), self._hashes)
+            self.scores += [self._score(round_)] if self._score is not None else []
+            arrays = {
+                f"{name}|{key}": array for name, own in self._states.items() for key, array in own.to_arrays().items()
+            }
+            hashes = dict(self._hashes)
+            if arrays:
+                self._write(_state_name(round_), save(arrays), hashes)
+            self._book.save(self._folder / _ledger_name(round_))
+            hashes[_ledger_name(round_)] = sha256(self._folder / _ledger_name(round_))
+            records = {name: tuple(own.records) for name, own in self._states.items()}
+            done = (round_, len(self._book.entries), tuple(self.losses), self._identity, hashes, records)
+            Checkpoint(*done, tuple(self.scores)).keep(self._folder)
+            for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
+                (self._folder / name).unlink(missing_ok=True)
+            spent = [own.records[-1].epsilon for own in self._states.values() if own.records]
+            private = [epsilon for epsilon in spent if epsilon is not None]
+            note = [f"{LOSS} {loss:.3f}", *([f"epsilon {max(private):.2f}"] if private else [])]
+            note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self._score else {}).items()]
+            self._report(round_, rounds, ", ".join(note))
+
+        return keep
+
+    def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
+        write_bytes(self._folder / name, data)
+        hashes[name] = hashlib.sha256(data).hexdigest()
+
+    def finish(self, start: Any, rounds: int, averaged: int, start_share: float = 0.0) -> None:
+        """Write the ledger and the final weights, see `load_round_network`; without rounds those of `start`."""
+        network = start
+        if rounds:
+            network = load_round_network(self._task, start, self._folder, rounds, averaged, start_share)
+        save_network(self._task, network, self._folder / WEIGHTS)
+        self._book.save(self._folder / LEDGER)
+
+
+def _state_name(round_: int) -> str:
+    return f"state{round_}.safetensors"
+
+
+def _ledger_name(round_: int) -> str:
+    return f"ledger{round_}.parquet"
+
+
+def round_path(folder: Path, round_: int) -> Path:
+    """Return the file of a federation's weights after a round."""
+    return folder / f"round{round_}.safetensors"
+
+
+def load_round_network(
+    task: Task, start: Any, folder: Path, round_: int, averaged: int, start_share: float = 0.0
+) -> Any:
+    """Return the network of a federation that ends with a round: the mean of the last `averaged` rounds' weights.
+
+    `start_share` of it are the weights of the network `start` that the federation began with, as in Wortsman et al.,
+    Robust fine-tuning of zero-shot models, CVPR 2022, equation 1.
+    """
+    last = range(max(round_ - averaged, 0) + 1, round_ + 1)
+    first, rounds = to_arrays(start), [load_file(round_path(folder, number)) for number in last]
+    parts = [first, *({name: own[name] for name in first} for own in rounds)]  # files order names otherwise
+    network = task.build(start.config)
+    from_arrays(network, average(parts, [start_share, *((1 - start_share) / len(last) for _ in last)]))
+    return network.eval()
