@@ -17,8 +17,14 @@ from flcav.experiments.arms import tables as arms_tables
 from flcav.experiments.arms.run import ArmsResult
 from flcav.experiments.fig3a import tables as fig3a_tables
 from flcav.experiments.fig3a.run import Fig3a
+from flcav.experiments.fig3b import tables as fig3b_tables
+from flcav.experiments.fig3b.run import Fig3b
 from flcav.experiments.fig6a import tables as fig6a_tables
 from flcav.experiments.fig6a.results import AllocationResult
+from flcav.experiments.roadside import tables as roadside_tables
+from flcav.experiments.roadside.average import RoadAverageResult
+from flcav.experiments.roadside.detector import RoadDetectorResult
+from flcav.experiments.roadside.fig4 import Fig4
 from flcav.experiments.sim_to_real import tables as sim_to_real_tables
 from flcav.experiments.sim_to_real.run import SimToReal
 from flcav.experiments.studies import objects, signs, trajectory, weather
@@ -49,7 +55,11 @@ def _of_study(
 TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of (content of its result.json, path)
     "demo": _told(ArmsResult, arms_tables.tables),
     "fig3a": _told(Fig3a, fig3a_tables.tables),
+    "fig3b": _told(Fig3b, fig3b_tables.tables),
+    "fig4": _told(Fig4, roadside_tables.fig4_tables),
     "fig6a-allocation": _told(AllocationResult, fig6a_tables.tables),
+    "road-average": _told(RoadAverageResult, roadside_tables.average_tables),
+    "road-detector": _told(RoadDetectorResult, roadside_tables.detector_tables),
     "sim-to-real": _told(SimToReal, sim_to_real_tables.tables),
     "task-objects": _of_study(objects.STUDY, objects_tables.tables),
     "task-signs": _of_study(signs.STUDY, signs_tables.tables),

@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.reproduce import TARGETS
+from flcav.cli.reproduce import RECORDED, TARGETS
 from flcav.config import InputError
 from flcav.dataset.formats.export import FORMATS
 from flcav.dataset.formats.importing import READABLE
@@ -20,7 +20,7 @@ from flcav.perception.tasks import TASKS, task_named
 
 ALWAYS = "always"
 SCORED = tuple(name for name in TASKS if isinstance(task_named(name), Scores))
-STUDIES = tuple(target for target in TARGETS if target not in ("fig1b", "fig3a", "sim-to-real"))
+STUDIES = tuple(target for target in TARGETS if target not in ("fig1b", "fig3a", "sim-to-real", *map(str, RECORDED)))
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
     "export": {name: f"{name} none --out out" for name in FORMATS},

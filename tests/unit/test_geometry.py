@@ -64,3 +64,17 @@ def test_a_matrix_of_huge_numbers_is_not_rigid(value: float):
     matrix = np.eye(4)
     matrix[0, 1] = value
     assert not is_rigid(matrix)
+
+
+def test_variances_of_the_centre_turn_with_the_boxes():
+    rng = np.random.default_rng(4)
+    variance = rng.uniform(0.1, 2.0, (5, 7))
+    rows = rng.uniform(-5, 5, (5, 7))
+    boxes = Boxes(rows[:, :3], np.abs(rows[:, 3:6]) + 1, rows[:, 6], np.full(5, "car"), variance=variance)
+    turn = pose(3.0, -2.0, 1.0, 0.7, 0.2, -0.1)
+    turned = boxes.transform(turn).variance
+    assert turned is not None
+    for before, after in zip(variance, turned):
+        covariance = turn[:3, :3] @ np.diag(before[:3]) @ turn[:3, :3].T
+        np.testing.assert_allclose(after[:3], np.diag(covariance))
+        np.testing.assert_array_equal(after[3:], before[3:])

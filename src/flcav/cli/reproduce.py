@@ -30,8 +30,15 @@ class Target(StrEnum):
     demo_arms = "demo-arms"
     fig1b = "fig1b"
     fig3a = "fig3a"
+    fig3b = "fig3b"
+    fig4 = "fig4"
     fig6a_allocation = "fig6a-allocation"
+    road_average = "road-average"
+    road_detector = "road-detector"
     sim_to_real = "sim-to-real"
+
+
+RECORDED = (Target.fig3b, Target.fig4, Target.road_average, Target.road_detector)  # one recording, no training
 
 
 class Scale(StrEnum):
@@ -46,6 +53,7 @@ TARGETS: tuple[str, ...] = (*(target.value for target in Target), *(f"{TASK}{nam
 TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig1b: (),
     Target.fig3a: (),
+    **dict.fromkeys(RECORDED, ()),
     Target.sim_to_real: (*RUN, "kitti", "weights"),
 }
 SEEDS: Mapping[str, int] = {Target.demo_arms: 5}
@@ -88,6 +96,9 @@ def reproduce(
         draw = _fig1b if target == Target.fig1b else _fig3a
         draw(out)
         return
+    if target in RECORDED:
+        _record_and_draw(Target(target), out)
+        return
     if target == Target.sim_to_real:
         _sim_to_real(out, kitti, weights, jobs, engine, stale)
         return
@@ -122,6 +133,28 @@ def _fig3a(out: Path) -> None:
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "fig3a.png", draw_fig3a(results))
     for sentence in results.findings:
+        typer.echo(sentence)
+
+
+@when_interrupted()
+def _record_and_draw(target: Target, out: Path) -> None:
+    from flcav import progress
+    from flcav.files import write_bytes, write_json
+
+    with progress.show_progress(target.value) as report:
+        if target == Target.fig3b:
+            from flcav.experiments.fig3b.run import fig3b as repeat
+        elif target == Target.fig4:
+            from flcav.experiments.roadside.fig4 import fig4 as repeat
+        elif target == Target.road_average:
+            from flcav.experiments.roadside.average import evaluate_road_average as repeat
+        else:
+            from flcav.experiments.roadside.detector import evaluate_road_detector as repeat
+        results, pictures = repeat(out, report)
+    write_json(out / "result.json", results.as_json())
+    for name, picture in pictures.items():
+        write_bytes(out / name, picture)
+    for sentence in results.sentences():
         typer.echo(sentence)
 
 

@@ -1,7 +1,7 @@
 """Roadside perception of one LiDAR spin: object boxes, and grids of free and occupied cells, sent to the vehicles.
 
-The roadside detector is *ideal*: it labels exactly the objects from which its own LiDAR has at least `MIN_RETURNS`
-returns. Every figure that uses it is an upper bound for a trained roadside detector.
+The boxes come from a trained detector (`flcav.fusion.detector`), or from an *ideal* one: it labels exactly the objects
+from which its own LiDAR has at least `MIN_RETURNS` returns. Every figure that uses the ideal one is an upper bound.
 """
 
 from dataclasses import dataclass
@@ -65,12 +65,16 @@ class RoadView:
         return cls(boxes, arrays["origin"], ground, occupied)
 
 
-def build_road_view(frame: Frame, lidar: str = "lidar") -> RoadView:
-    """Return the view of an ideal detector at the roadside sensor that recorded `frame`, from its LiDAR `lidar`.
+def label_ideally(frame: Frame) -> Boxes:
+    """Return the boxes of an ideal detector at the roadside sensor that recorded `frame`, world frame."""
+    return frame.annotations.boxes[frame.annotations.returns >= MIN_RETURNS]
 
-    The grids cover the returns of the sweep.
+
+def build_road_view(frame: Frame, boxes: Boxes, lidar: str = "lidar") -> RoadView:
+    """Return the view of the roadside sensor that recorded `frame`: its LiDAR `lidar`, and what its detector found.
+
+    `boxes`: world frame, label = actor category. The grids cover the returns of the sweep.
     """
-    labelled = frame.annotations.returns >= MIN_RETURNS
     points = transform_points(frame.world_from_sensor(lidar), frame.lidar[lidar][:, :3].astype(np.float64))
     origin = np.floor(points[:, :2].min(axis=0) / CELL_M) * CELL_M
     shape = tuple(np.floor((points[:, :2].max(axis=0) - origin) / CELL_M).astype(int) + 1)
@@ -80,7 +84,7 @@ def build_road_view(frame: Frame, lidar: str = "lidar") -> RoadView:
     high = (points[:, 2] >= GROUND_M[1]) & (points[:, 2] < TOP_M)
     ground[x[low], y[low]] = True
     occupied[x[high], y[high]] = True
-    return RoadView(frame.annotations.boxes[labelled], origin, find_free_cells(ground, occupied), occupied)
+    return RoadView(boxes, origin, find_free_cells(ground, occupied), occupied)
 
 
 def find_free_cells(ground: NDArray[np.bool_], standing: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -78,11 +78,16 @@ class Boxes:
     def transform(self, target_from_source: Array) -> "Boxes":
         """Return the boxes in the target frame of a rigid (4, 4) transform.
 
-        Its roll and pitch move the centres but do not tilt the boxes. Variances are left as they are.
+        Its roll and pitch move the centres but do not tilt the boxes. Variances of the centre are the diagonal of the
+        rotated covariance R diag(v) R^T; those of size and yaw stay, and so do all under translations.
         """
         center = transform_points(target_from_source, self.center)
         yaw = wrap_angle(self.yaw + yaw_of(target_from_source))
-        return replace(self, center=center, yaw=yaw)
+        variance = self.variance
+        if variance is not None:
+            turned = variance[:, :3] @ np.square(target_from_source[:3, :3]).T
+            variance = np.concatenate((turned, variance[:, 3:]), axis=1)
+        return replace(self, center=center, yaw=yaw, variance=variance)
 
     def corners(self) -> Array:
         """Return (N, 8, 3) corners [m]: the bottom four counter-clockwise from front left, then the top four."""

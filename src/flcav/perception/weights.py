@@ -25,10 +25,13 @@ SHIPPED = "shipped/weights.safetensors"  # relative to the folder of a task's mo
 COUNTER = "num_batches_tracked"  # buffer of batch normalisation, unused with a fixed momentum
 
 
-def find_shipped(task: Task) -> Path:
-    """Return the path of the task's weights in the package; raises `InputError` if there are none."""
+def find_shipped(task: Task, name: str = SHIPPED) -> Path:
+    """Return the path of the task's weights in the package; raises `InputError` if there are none.
+
+    name: of another network of the package, relative to the folder of the task's module.
+    """
     module = sys.modules.get(type(task).__module__)
-    path = Path(getattr(module, "__file__", None) or "").parent / SHIPPED
+    path = Path(getattr(module, "__file__", None) or "").parent / name
     if not path.is_file():
         raise InputError(f"--weights is missing: no weights for '{task.name}' come with the package, train some first")
     return path

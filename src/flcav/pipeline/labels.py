@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from flcav.config import InputError
+from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
-from flcav.fusion.road import RoadView, build_road_view
+from flcav.fusion.road import RoadView, build_road_view, label_ideally
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
 from flcav.perception.client import as_shared
@@ -33,11 +34,13 @@ class LabelSource:
 
     from_detections: bool = False  # pseudo-labels of the frozen stage I network
     from_poles: bool = False  # boxes of roadside sensors
+    trained: bool = False  # these boxes are a trained detector's, not an ideal one's
     caveat: str = ""  # stated with every result that depends on them
 
 
 LABEL_SOURCES: Mapping[str, LabelSource] = {
     "own-detections": LabelSource(from_detections=True),
+    "road": LabelSource(from_detections=True, from_poles=True, trained=True, caveat="trained road detector"),
     "ideal-road": LabelSource(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
     "annotated": LabelSource(caveat="ground truth as labels, upper bound"),
     "future": LabelSource(
@@ -87,15 +90,16 @@ def pseudo_label_samples(
     region: str,
     report: Report,
     book: Ledger | None = None,
+    trained: bool = False,
 ) -> dict[str, list[Sample]]:
     """Return each vehicle's sweeps with pseudo-labels, by "region/vehicle".
 
-    Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`, as
-    their messages have them, which enter `book` as downlinks; stage III passes none, since its labels are those of
-    stage II.
+    Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`, by
+    the package's road detector if `trained`, else by an ideal one, as their messages have them, which enter `book` as
+    downlinks; stage III passes none, since its labels are those of stage II.
     """
     data = split.data
-    views = _views(split, poles)
+    views = _views(split, poles, trained)
     samples: dict[str, list[Sample]] = {}
     for done, i in enumerate(frames):
         key, frame = data.keys[i], data.frame(i)
@@ -110,12 +114,14 @@ def pseudo_label_samples(
     return samples
 
 
-def _views(split: Frames, poles: Sequence[int]) -> dict[tuple[str, int], list[RoadView]]:
+def _views(split: Frames, poles: Sequence[int], trained: bool) -> dict[tuple[str, int], list[RoadView]]:
     views: dict[tuple[str, int], list[RoadView]] = {}
+    find = road_detector(split.data) if trained and poles else None
     for pole in poles:
         for i in split.poles.get(pole, ()):
             key, frame = split.data.keys[i], split.data.frame(i)
-            views.setdefault((key.scene, key.index), []).append(build_road_view(frame, choose_lidar(frame)))
+            boxes = label_ideally(frame) if find is None else find(i)
+            views.setdefault((key.scene, key.index), []).append(build_road_view(frame, boxes, choose_lidar(frame)))
     return views
 
 

@@ -477,7 +477,8 @@ def _label_samples(
     frozen = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
     threshold = Pretrained.load(work.inputs[steps["pretrain"]]).threshold
     assert threshold is not None  # fixed wherever labels come from detections
-    return pseudo_label_samples(frozen, threshold, split, frames, poles, region, work.report, book), poles
+    samples = pseudo_label_samples(frozen, threshold, split, frames, poles, region, work.report, book, kind.trained)
+    return samples, poles
 
 
 def _select_group(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[int, ...]:

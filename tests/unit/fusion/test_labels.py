@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 
 from flcav.fusion.labels import label_sample
-from flcav.fusion.road import RoadView, build_road_view
+from flcav.fusion.road import RoadView, build_road_view, label_ideally
 from flcav.geometry import Boxes, pose
 from flcav.perception.objects.model import second_tiny
 from flcav.sensors.frame import Annotations, Calibration, Frame
@@ -66,6 +66,10 @@ def scene():
     return ego, road, detections
 
 
+def ideal_view(road):
+    return build_road_view(road, label_ideally(road))
+
+
 def near(found, place):
     return bool((np.hypot(*(found.center[:, :2] - place).T) < 0.5).any())
 
@@ -83,7 +87,7 @@ def test_without_a_road_sensor_the_labels_are_the_vehicles_own():
 
 def test_the_road_adds_what_was_missed_and_drops_what_it_did_not_see():
     ego, road, detections = scene()
-    sample = label_sample(ego, detections, [build_road_view(road)], CONFIG)
+    sample = label_sample(ego, detections, [ideal_view(road)], CONFIG)
     assert near(sample.boxes, SEEN)
     assert near(sample.boxes, MISSED)
     assert not near(sample.boxes, GHOST)
@@ -94,7 +98,7 @@ def test_the_road_adds_what_was_missed_and_drops_what_it_did_not_see():
 
 def test_road_labels_without_a_return_from_the_vehicle_and_trucks_are_ignored():
     ego, road, detections = scene()
-    sample = label_sample(ego, detections, [build_road_view(road)], CONFIG)
+    sample = label_sample(ego, detections, [ideal_view(road)], CONFIG)
     assert near(sample.ignore, HIDDEN)
     assert near(sample.ignore, TRUCK)
     assert len(sample.ignore) == 2
@@ -102,7 +106,7 @@ def test_road_labels_without_a_return_from_the_vehicle_and_trucks_are_ignored():
 
 def test_what_nobody_saw_is_not_known_to_be_free():
     ego, road, detections = scene()
-    free = label_sample(ego, detections, [build_road_view(road)], CONFIG).free
+    free = label_sample(ego, detections, [ideal_view(road)], CONFIG).free
     assert free is not None
     known = {(round(float(x), 1), round(float(y), 1)) for x, y in free}
     assert any(abs(x - 40) < 1 and abs(y + 15) < 1 for x, y in known)  # only the road saw this ground
@@ -111,7 +115,7 @@ def test_what_nobody_saw_is_not_known_to_be_free():
 
 def test_two_poles_that_label_one_car_give_one_label():
     ego, road, detections = scene()
-    view = build_road_view(road)
+    view = ideal_view(road)
     once, twice = (label_sample(ego, detections, views, CONFIG) for views in ([view], [view, view]))
     assert len(once.boxes) == len(twice.boxes)
 
@@ -120,7 +124,7 @@ def test_an_ideal_detector_labels_what_its_own_lidar_has_ten_returns_from():
     _, road, _ = scene()
     truth = road.annotations
     fewer = replace(truth, returns=np.array([9, 10, 0, 30]))
-    view = build_road_view(replace(road, annotations=fewer))
+    view = ideal_view(replace(road, annotations=fewer))
     assert list(view.boxes.label) == ["van", "truck"]
 
 
@@ -132,7 +136,7 @@ def test_a_view_answers_outside_its_grid_and_weighs_what_it_sends():
 
 def test_a_vehicle_labels_by_the_message_as_by_the_view():
     ego, road, detections = scene()
-    view = build_road_view(road)
+    view = build_road_view(road, label_ideally(road))
     told = RoadView.from_message(view.message())
     assert (told.ground.shape, told.ground.sum()) == (view.ground.shape, view.ground.sum())
     assert told.ground.size % 8  # packed bits end within a byte
@@ -148,7 +152,7 @@ def test_a_vehicle_labels_by_the_message_as_by_the_view():
 def test_beside_a_road_sensor_only_its_boxes_are_to_be_learned_exactly():
     ego, road, detections = scene()
     unseen = RoadView(Boxes.empty(), np.array([500.0, 500.0]), np.zeros((1, 1), bool), np.zeros((1, 1), bool))
-    alone, helped, beside = (label_sample(ego, detections, v, CONFIG) for v in ([], [build_road_view(road)], [unseen]))
+    alone, helped, beside = (label_sample(ego, detections, v, CONFIG) for v in ([], [ideal_view(road)], [unseen]))
     assert alone.exact is None  # its own boxes are all there is
     assert helped.exact is not None
     assert helped.exact.all()  # both objects that the vehicle sees are labelled by the road

@@ -129,7 +129,7 @@ def test_a_kind_that_is_not_there_is_refused(recorded):
 
 def test_a_lidar_fits_by_its_height_and_not_by_its_carrier(recorded):
     truck = recorded(height_m=2.9)
-    with pytest.raises(InputError, match=r"no LiDAR is mounted 1.8 m .* \(cav0: 2.9 m, cav1: 2.9 m, pole3: 0 m\)"):
+    with pytest.raises(InputError, match=r"no LiDAR is mounted 1.8 m .* \(cav0: 2.9 m, cav1: 2.9 m, pole3: 6 m\)"):
         choose_frames(OBJECTS, tiny_config(), truck)
     assert len(choose_frames(OBJECTS, tiny_config(), truck, "vehicles").frames) == 4
     assert choose_frames(OBJECTS, tiny_config(ground_z_m=-3.0), truck).sentence.startswith("4 vehicle frames (2 pole")

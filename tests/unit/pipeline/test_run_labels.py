@@ -57,8 +57,10 @@ def test_groups_are_the_vehicles_within_range_of_a_sensor() -> None:
     assert select_frames_near(split, sites[:0], 1.0) == split.vehicles
 
 
-def test_every_kind_but_a_vehicles_own_says_that_it_is_an_upper_bound() -> None:
-    assert all("upper bound" in kind.caveat for name, kind in LABEL_SOURCES.items() if name != "own-detections")
+def test_every_kind_that_nobody_could_have_says_that_it_is_an_upper_bound() -> None:
+    measured = ("own-detections", "road")
+    assert all(("upper bound" in kind.caveat) != (name in measured) for name, kind in LABEL_SOURCES.items())
+    assert LABEL_SOURCES["road"].caveat != LABEL_SOURCES["ideal-road"].caveat  # reports show which it was
     assert choose_labels("objects", None) == "ideal-road"
     assert choose_labels("trajectory", None) == "future"
     with pytest.raises(InputError, match="labels of 'weather': 'ideal-road' is none of annotated"):

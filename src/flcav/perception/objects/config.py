@@ -59,6 +59,7 @@ class SecondConfig:
     bev_up_channels: tuple[Count, Count]  # of these two scales, brought to the head's grid
     ground_z_m: float = -1.8  # height of the ground that anchors stand on: minus the sensor's height
     intensity: bool = True  # whether intensity is an input
+    foreground: bool = False  # whether roadside sweeps come without their static background
     uncertainty: bool = False  # whether the network predicts a variance of each residual
     bfloat16: bool = False  # autocast in training where the hardware supports it: on a CPU in the 2D part alone
     calibration: tuple[tuple[float, float], ...] | None = None  # Platt scaling, per class: factor and summand of logits

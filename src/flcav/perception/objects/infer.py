@@ -14,6 +14,8 @@ from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.perception.images import CameraView, recorded_view, view_beside
 from flcav.perception.marks import CloudBoxes
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import ObjectsFound, boxes_to_rows, detect
 from flcav.perception.objects.samples import validate_points
@@ -37,19 +39,19 @@ def detect_objects(
     path: a KITTI .bin file, a folder of them, or a dataset folder, of which `frames` (None: all). Raises `InputError`
     as `read_point_clouds` does.
     """
-    for cloud in read_point_clouds(path, frames):
+    for cloud in read_point_clouds(path, frames, network.config):
         found = detect(network, cloud.points, score_threshold=threshold)
         yield Finding(cloud.path, cloud.points, ObjectsFound(boxes_to_rows(found)), (CloudBoxes(found),), cloud.view)
 
 
-def read_point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterator[Cloud]:
+def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[Cloud]:
     """Yield the point clouds of a KITTI .bin file, of a folder of them, or of `frames` (None: all) of a dataset folder.
 
-    Raises `InputError` where `path` is none of these, a frame has no LiDAR, or a cloud is empty, truncated or not of
-    finite numbers.
+    Those of a dataset are as a network of `config` sees them. Raises `InputError` where `path` is none of these, a
+    frame has no LiDAR, or a cloud is empty, truncated or not of finite numbers.
     """
     if (path / MANIFEST).is_file():
-        clouds = _recorded(path, frames)
+        clouds = _recorded(path, frames, config)
     elif path.is_dir():
         files = sorted(path.glob("*.bin"))
         if not files:
@@ -59,16 +61,20 @@ def read_point_clouds(path: Path, frames: Sequence[int] | None = None) -> Iterat
         clouds = map(_of_file, [path])
     else:
         raise InputError(f"{path}: no such file or folder")
-    return (cloud._replace(points=validate_points(cloud.points, cloud.path)) for cloud in clouds)
+    return clouds
 
 
 def _of_file(path: Path) -> Cloud:
-    return Cloud(path, read_points(path), partial(view_beside, path))
+    return Cloud(path, validate_points(read_points(path), path), partial(view_beside, path))
 
 
-def _recorded(folder: Path, frames: Sequence[int] | None) -> Iterator[Cloud]:
+def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[Cloud]:
     dataset = Dataset.open(folder)
+    read = frame_reader(dataset, config)
     for i in dataset.numbers(frames):
-        frame = dataset.frame(i)
-        lidar = choose_lidar(frame)
-        yield Cloud(folder / frame.key, frame.lidar[lidar], partial(recorded_view, dataset, i, lidar))
+        frame = read(i)
+        lidar, origin = choose_lidar(frame), folder / frame.key
+        points = frame.lidar[lidar]
+        if not config.foreground:  # a street may be empty before its background
+            validate_points(points, origin)
+        yield Cloud(origin, points, partial(recorded_view, dataset, i, lidar))

@@ -10,6 +10,7 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.intervals import REDRAWS
 from flcav.perception.metrics import Matches, match, orientation_similarity, right_headings, weighted_precision
+from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_frames
 from flcav.perception.objects.truth import select_class
@@ -35,7 +36,9 @@ class ObjectsOutcomes:
 
         Raises `InputError` where there are no frames, or one has no LiDAR.
         """
-        found, truths = detect_frames(network, map(data.frame, frames), total=len(frames), progress=progress)
+        found, truths = detect_frames(
+            network, map(frame_reader(data, network.config), frames), total=len(frames), progress=progress
+        )
         classes = network.config.classes
         if not truths:
             raise InputError("evaluation on 0 frames: at least one is wanted")

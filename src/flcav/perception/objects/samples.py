@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
+from flcav.perception.agents import POLE, kind_of
 from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.truth import choose_lidar, ground_truth
 from flcav.sensors.frame import Frame
 
@@ -60,21 +62,21 @@ class RecordedSweeps(Sequence[Sample]):
         data.check_labelled("objects")
         if blind := [data.name(number) for number in frames if not data.lidars(number)]:
             raise InputError(f"{data.folder}: no LiDAR in {len(blind)} of {len(frames)} frames, as in {blind[0]}")
-        self._data, self._config, self._frames = data, config, frames
+        self._read, self._config, self._frames = frame_reader(data, config), config, frames
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def __getitem__(self, index: Any) -> Any:
-        return sample_from_frame(self._data.frame(self._frames[index]), self._config)
+        return sample_from_frame(self._read(self._frames[index]), self._config)
 
 
 def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
     """Return the numbers of the frames whose first LiDAR is mounted within `HEIGHT_SLACK_M` of the height expected.
 
     The height is that of the calibration above the agent's origin, the expected one is -config.ground_z_m. A vehicle's
-    origin is on the ground, a pole's at its sensors, so that a pole's LiDAR does not fit. All frames are returned where
-    none has a LiDAR; reading them as samples then raises.
+    origin is on the ground, a pole's at its sensors, at their height in the world. All frames are returned where none
+    has a LiDAR; reading them as samples then raises.
 
     Raises `InputError` where there are LiDARs but none fits.
     """
@@ -82,14 +84,15 @@ def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
     for number, key in enumerate(data.keys):
         if lidars := data.lidars(number):
             mounts = data.calibrations[key.agent].true.agent_from_sensor
-            height_m[number] = float(mounts[lidars[0]][2, 3])
+            origin_m = data.world_from_agent(number)[2, 3] if kind_of(key.agent) == POLE else 0.0
+            height_m[number] = float(mounts[lidars[0]][2, 3] + origin_m)
     expected_m = -config.ground_z_m
     fitting = [number for number, height in height_m.items() if abs(height - expected_m) <= HEIGHT_SLACK_M]
     if height_m and not fitting:
         found = {data.keys[number].agent: height for number, height in height_m.items()}
         heights = ", ".join(f"{agent}: {height:g} m" for agent, height in found.items())
         raise InputError(
-            f"{data.folder}: no LiDAR is mounted {expected_m:g} m above its agent's origin, as the network expects "
+            f"{data.folder}: no LiDAR is mounted {expected_m:g} m above the ground, as the network expects "
             f"({heights}); --agents all takes them as they are"
         )
     return fitting or range(len(data))

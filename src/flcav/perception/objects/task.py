@@ -15,6 +15,7 @@ from flcav.perception.objects.calibrate import calibrate, measure_reliability
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.errors import find_errors
 from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, score_detections
+from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.infer import detect_objects
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.messages import pack_sweep, unpack_sweep
@@ -36,7 +37,7 @@ class ObjectsTask(ObjectsOutcomes):
     configurations = CONFIGURATIONS
     practice = Practice(batch=2, learning_rate=2e-3)
     recording: Mapping[str, Json] = {}
-    labels = ("ideal-road", "own-detections")
+    labels = ("ideal-road", "road", "own-detections")
     threshold = THRESHOLD
 
     def __init__(self) -> None:
@@ -102,7 +103,9 @@ class ObjectsTask(ObjectsOutcomes):
         """
         data.check_labelled("objects")
         numbers, classes = data.numbers(frames), network.config.classes
-        found, truths = detect_frames(network, map(data.frame, numbers), asked, total=len(numbers), progress=progress)
+        found, truths = detect_frames(
+            network, map(frame_reader(data, network.config), numbers), asked, total=len(numbers), progress=progress
+        )
         return ObjectsEvaluation(
             frames=len(truths),
             scenes=len({truth.scene for truth in truths}),
@@ -115,12 +118,13 @@ class ObjectsTask(ObjectsOutcomes):
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the Platt scaling of the network's scores, fitted on frames (None: all) it was not trained on."""
         data.check_labelled("objects")
-        calibrate(network, map(data.frame, data.numbers(frames)))
+        calibrate(network, map(frame_reader(data, network.config), data.numbers(frames)))
 
     def pack_samples(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> Iterator[bytes]:
         """Yield the message of each frame: its whole sweep and its boxes."""
         RecordedSweeps(data, config, frames)  # raises for frames without a LiDAR
-        return (pack_sweep(data.frame(i), config) for i in frames)
+        read = frame_reader(data, config)
+        return (pack_sweep(read(i), config) for i in frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: SecondConfig) -> list[Sample]:
         """Return the samples in messages of `pack_samples`."""
@@ -145,15 +149,15 @@ class ObjectsTask(ObjectsOutcomes):
         threshold: lowest score of a detection. See `flcav.perception.objects.errors`.
         """
         data.check_labelled("objects")
-        numbers = data.numbers(frames)
+        numbers, read = data.numbers(frames), frame_reader(data, network.config)
 
         def found() -> Iterator[Boxes]:
             for done, number in enumerate(numbers, start=1):
-                frame = data.frame(number)
+                frame = read(number)
                 yield detect(network, frame.lidar[choose_lidar(frame)], score_threshold=threshold)
                 progress(done, len(numbers), "")
 
-        each = find_errors(map(data.frame, numbers), found(), network.config, threshold)
+        each = find_errors(map(read, numbers), found(), network.config, threshold)
         return Registry.of(dict(zip(numbers, each, strict=True)))
 
 

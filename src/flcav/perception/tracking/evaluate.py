@@ -13,6 +13,7 @@ from flcav.perception.metrics import round_or_none
 from flcav.perception.metrics.matching import on_neutral
 from flcav.perception.metrics.tracks import TrackingFrame, amota, count_clear_mot
 from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
@@ -81,12 +82,12 @@ def evaluate_tracks(
     total = sum(map(len, numbers.values()))
     per_class: dict[str, list[list[TrackingFrame]]] = {name: [] for name in network.config.classes}
     speed_errors: dict[str, list[float]] = {name: [] for name in network.config.classes}
-    done = 0
+    read, done = frame_reader(data, network.config), 0
     for sequence in numbers.values():
         tracker = Tracker()
         story: list[tuple[Frame, Tracked]] = []
         for number in sequence:
-            frame = data.frame(number)
+            frame = read(number)
             lidar = choose_lidar(frame)
             found = detect(network, frame.lidar[lidar], score_threshold=SCORE)
             story.append((frame, tracker.step(found.transform(frame.world_from_sensor(lidar)), frame.time_s)))

@@ -1,0 +1,150 @@
+"""Fig. 3b of Wang et al. (IEEE Network 37(3), 2023): where a detector errs in a town, and which pole gets the sensor.
+
+Vehicles drive through `grid` with the detector of the package. Its errors are counted in zones around the candidate
+poles; the pole that covers most errors is compared with conventional placements, by visible objects and by traffic.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import parse_config
+from flcav.dataset.recording.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.optimization.placement.baselines import place_by_score
+from flcav.optimization.placement.solve import Candidates, Placement, find_candidates, place_count
+from flcav.perception.networks import resolve_network
+from flcav.perception.objects.task import OBJECTS
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.progress import Report, ignore_progress
+from flcav.records import LEFT_OUT, Record
+from flcav.report import style
+from flcav.report.charts.figures import town_map
+from flcav.report.pictures.maps import ErrorMap, poles_of
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+from flcav.world.line_of_sight import count_visible_actors
+from flcav.world.map.census import measure_traffic_density
+from flcav.world.map.town import Town
+
+RECIPE: Mapping[str, Any] = {
+    "town": "grid",
+    "seed": 8301,
+    "split": "registry",
+    "scenes": 8,
+    "spins_per_scene": 4,
+    "every_s": 4.0,
+    "cavs": 4,
+    "vehicle_rig": "kitti_lidar",
+}
+RANGE_M = 40.0  # within which a sensor covers an error
+ZONE_M = 30.0  # radius of a scenario zone around a candidate pole
+COUNTS = (1, 2, 3)  # sensors
+
+
+@dataclass(frozen=True)
+class Zone:
+    """The errors around one candidate pole."""
+
+    pole: int
+    kind: str  # straight, cross, tee or roundabout
+    errors: int
+    per_hectare: float
+    per_frame: float | None  # errors per vehicle frame taken in the zone; None without any
+    actors: float  # mean number of actors within `RANGE_M`
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The poles that one rule chooses, and the errors they cover."""
+
+    rule: str
+    count: int
+    poles: tuple[int, ...]
+    covered: int
+
+
+@dataclass(frozen=True)
+class Fig3b(Record):
+    """Errors by zone, and placements for 1, 2 and 3 sensors."""
+
+    frames: int
+    errors: int
+    zones: tuple[Zone, ...]  # densest in errors first
+    placed: tuple[Placed, ...]
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+
+    def sentences(self) -> list[str]:
+        """Return zones and placements in words."""
+        first = self.zones[0]
+        told = [
+            f"{self.errors} errors in {self.frames} frames; most per hectare around pole {first.pole} ({first.kind}): "
+            f"{first.per_hectare:.0f}"
+        ]
+        for count in COUNTS:
+            rules = [
+                f"{each.rule} {', '.join(map(str, each.poles))}: {each.covered}"
+                for each in self.placed
+                if each.count == count
+            ]
+            told.append(f"{count} sensor{'s' if count > 1 else ''}, errors covered by the poles of {'; '.join(rules)}")
+        return told
+
+
+def fig3b(out: Path, progress: Report = ignore_progress) -> tuple[Fig3b, dict[str, bytes]]:
+    """Record drives into `out`, register the detector's errors; return the numbers, and the map as PNG by file name."""
+    record(EmbeddedSource(parse_config(Recipe, dict(RECIPE), "fig3b")), out / "data")
+    data = Dataset.open(out / "data")
+    town = data.town()
+    assert town is not None  # one of the package's
+    network = resolve_network(OBJECTS, None)
+    found = OBJECTS.register_errors(network, data, progress=progress)
+    traces = [trace for scene in sorted({key.scene for key in data.keys}) if (trace := data.trace(scene)) is not None]
+    places = np.array([data.world_from_agent(number)[:2, 3] for number in range(len(data))])
+    candidates = find_candidates(found.positions, town.poles.position, [RANGE_M]).at_unit_cost()
+    density = measure_traffic_density(town.poles.position, traces, RANGE_M)
+    visible = count_visible_actors(town, traces, town.poles.position, [RANGE_M]).ravel()
+    results = Fig3b(
+        frames=len(data),
+        errors=len(found),
+        zones=_count_zones(town, found.positions, places, density),
+        placed=tuple(_place(candidates, town, {"visible objects": visible, "traffic density": density})),
+        provenance=provenance(),
+    )
+    return results, {"fig3b.png": _draw(town, found.positions, np.array(found.kinds, dtype=np.str_), results)}
+
+
+def _count_zones(
+    town: Town, errors: NDArray[np.float64], frames: NDArray[np.float64], density: NDArray[np.float64]
+) -> tuple[Zone, ...]:
+    hectares = np.pi * ZONE_M**2 / 1e4
+    zones = []
+    for number, at, kind, actors in zip(town.poles.id, town.poles.position, town.poles.kind, density, strict=True):
+        inside = int((np.linalg.norm(errors[:, :2] - at[:2], axis=1) <= ZONE_M).sum())
+        driven = int((np.linalg.norm(frames - at[:2], axis=1) <= ZONE_M).sum())
+        rate = inside / driven if driven else None
+        zones.append(Zone(int(number), kind, inside, inside / hectares, rate, float(actors)))
+    return tuple(sorted(zones, key=lambda zone: (-zone.errors, zone.pole)))
+
+
+def _place(candidates: Candidates, town: Town, scores: Mapping[str, NDArray[np.float64]]) -> Sequence[Placed]:
+    def tell(rule: str, count: int, placed: Placement) -> Placed:
+        return Placed(rule, count, tuple(int(town.poles.id[pole]) for pole in placed.chosen), placed.covered)
+
+    rows = []
+    for count in COUNTS:
+        rows.append(tell("VRCSP", count, place_count(candidates, count)))
+        rows += [tell(rule, count, place_by_score(candidates, score, count)) for rule, score in scores.items()]
+    return rows
+
+
+def _draw(town: Town, errors: NDArray[np.float64], kind: NDArray[np.str_], results: Fig3b) -> bytes:
+    (best,) = (each for each in results.placed if (each.rule, each.count) == ("VRCSP", 1))
+    (dense,) = (each for each in results.placed if (each.rule, each.count) == ("traffic density", 1))
+    chosen = {str(pole): RANGE_M for pole in best.poles}
+    scene = ErrorMap(town, errors, kind, poles_of(town), chosen, tuple(map(str, dense.poles)), heat=True)
+    return style.png(town_map(scene))

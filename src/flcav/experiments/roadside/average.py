@@ -1,0 +1,200 @@
+"""AP50 of the road average against errors of poses, clocks and radio: naive, weighted by uncertainty, pose graph.
+
+Labels are evaluated online: at a spin from the messages of the spins before that have arrived. AP sorts the labels of
+all scenes and spins together.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from flcav.config import parse_config
+from flcav.dataset.recording.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.experiments.roadside.errors import Errors, apply_errors
+from flcav.experiments.roadside.sightings import Scene, read_scenes
+from flcav.fusion.average import RoadAverage, average_boxes
+from flcav.fusion.map_context import MapContext, build_context, snap_to_map
+from flcav.fusion.pose_graph import Sighting, correct_poses, tell
+from flcav.fusion.posts import posts_of
+from flcav.geometry import Boxes, wrap_angle
+from flcav.perception.metrics import average_precision, match
+from flcav.perception.metrics.matching import assign_targets
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.progress import Report, ignore_progress
+from flcav.records import LEFT_OUT, Record
+from flcav.report import style
+from flcav.report.charts.roadside import draw_errors
+from flcav.seeds import stream
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+from flcav.world.map.lanes import map_layers
+
+RECIPE = {
+    "town": "grid",
+    "seed": 8101,
+    "split": "test",
+    "scenes": 3,
+    "spins_per_scene": 12,
+    "every_s": 0.5,
+    "cavs": 4,
+    "poles": "all",
+    "vehicle_rig": "kitti_lidar",
+}
+WINDOW_S = 1.5  # of the spins that are averaged
+SPINS = (3, 7, 11)  # at which labels are evaluated
+NAIVE, WEIGHTED, GRAPH = "naive", "weighted by uncertainty", "pose graph"
+ARMS = (NAIVE, WEIGHTED, GRAPH)
+SEEDS = 5
+BOTH = "position .5 m, heading 2°"
+KNOBS: Mapping[str, Mapping[float, Errors]] = {
+    "position, white [m]": {size: Errors(position_m=size) for size in (0.0, 0.25, 0.5, 1.0)},
+    "position, constant [m]": {size: Errors(constant_m=size) for size in (0.0, 0.5, 1.0)},
+    "heading [°]": {size: Errors(heading_deg=size) for size in (0.0, 2.0, 4.0)},
+    "latency [s]": {size: Errors(latency_s=size) for size in (0.0, 0.5, 1.0)},
+    "share of messages lost": {size: Errors(loss=size) for size in (0.0, 0.25, 0.5)},
+    "clock offset [s]": {size: Errors(clock_s=size) for size in (0.0, 0.2, 0.4)},
+}
+JOINT = Errors(position_m=0.5, heading_deg=2.0)
+
+
+@dataclass(frozen=True)
+class Point:
+    """AP50 of one arm at one size of an error."""
+
+    size: float
+    ap50: tuple[float, ...]  # by seed
+
+    @property
+    def mean(self) -> float:
+        """Return the mean over seeds."""
+        return float(np.mean(self.ap50))
+
+
+@dataclass(frozen=True)
+class Snapped:
+    """Labels without errors of poses before and after their headings are snapped to the map."""
+
+    matched: int  # labels of cars
+    heading_deg: tuple[float, float]  # mean error of their heading, before and after
+    reversed_: tuple[int, int]  # labels that face the wrong way, before and after
+    ap50: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class RoadAverageResult(Record):
+    """AP50 of the road average against each error, by arm."""
+
+    cars: int  # targets over all evaluated spins
+    knobs: Mapping[str, Mapping[str, tuple[Point, ...]]]  # by knob and arm
+    joint: Mapping[str, Point]  # at `JOINT`, by arm
+    clean: Mapping[str, float]  # without errors, by arm
+    snapped: Snapped
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+
+    @property
+    def won_back(self) -> float:
+        """Return the share of what naive averaging loses at `JOINT` that the pose graph wins back."""
+        lost = self.clean[NAIVE] - self.joint[NAIVE].mean
+        return (self.joint[GRAPH].mean - self.joint[NAIVE].mean) / lost
+
+    def sentences(self) -> list[str]:
+        """Return the main figures in words."""
+        clean = ", ".join(f"{arm} {self.clean[arm]:.3f}" for arm in ARMS)
+        joint = ", ".join(f"{arm} {self.joint[arm].mean:.3f}" for arm in ARMS)
+        return [
+            f"AP50 of the labels without errors: {clean}",
+            f"at {BOTH}, {SEEDS} seeds: {joint}; the pose graph wins back {self.won_back:.0%} of the loss",
+        ]
+
+    def pictures(self) -> dict[str, bytes]:
+        """Return the chart of all knobs as PNG, by file name."""
+        panels = {
+            knob: {arm: [(p.size, p.mean, min(p.ap50), max(p.ap50)) for p in self.knobs[knob][arm]] for arm in ARMS}
+            for knob in KNOBS
+        }
+        return {"knobs.png": style.png(draw_errors(panels))}
+
+
+def evaluate_road_average(out: Path, progress: Report = ignore_progress) -> tuple[RoadAverageResult, dict[str, bytes]]:
+    """Record scenes into `out`, detect in all frames; return AP50 of the averaged labels under each error, pictures."""
+    record(EmbeddedSource(parse_config(Recipe, RECIPE, "road-average")), out / "data")
+    data = Dataset.open(out / "data")
+    town = data.town()
+    assert town is not None  # one of the package's
+    scenes, posts = read_scenes(data), posts_of(town)
+    clean = {arm: _precision(scenes, Errors(), arm, posts, 0) for arm in ARMS}
+    jobs = [(knob, size, errors) for knob, sizes in KNOBS.items() for size, errors in sizes.items()]
+    knobs: dict[str, dict[str, list[Point]]] = {knob: {arm: [] for arm in ARMS} for knob in KNOBS}
+    for done, (knob, size, errors) in enumerate(jobs):
+        for arm in ARMS:
+            knobs[knob][arm].append(_point(scenes, size, errors, arm, posts, clean[arm]))
+        progress(done + 1, len(jobs) + 1, knob)
+    results = RoadAverageResult(
+        cars=sum(len(scene.truth[spin].targets) for scene in scenes.values() for spin in SPINS),
+        knobs={knob: {arm: tuple(points) for arm, points in arms.items()} for knob, arms in knobs.items()},
+        joint={arm: _point(scenes, 0.5, JOINT, arm, posts, clean[arm]) for arm in ARMS},
+        clean=clean,
+        snapped=_snap(scenes, build_context(map_layers(town))),
+        provenance=provenance(),
+    )
+    return results, results.pictures()
+
+
+def fuse(sightings: list[Sighting], posts: np.ndarray, at_s: float, arm: str) -> RoadAverage:
+    """Return the road average at `at_s` by one of `ARMS` from the sightings of a window."""
+    if arm == NAIVE:
+        sightings = [replace(each, navigation=None) for each in sightings]
+    elif arm == GRAPH:
+        sightings = correct_poses(sightings, posts, at_s)
+    return average_boxes([tell(each) for each in sightings], at_s)
+
+
+def _point(
+    scenes: Mapping[str, Scene], size: float, errors: Errors, arm: str, posts: np.ndarray, clean: float
+) -> Point:
+    if errors == Errors():
+        return Point(size, (clean,) * SEEDS)
+    return Point(size, tuple(_precision(scenes, errors, arm, posts, seed) for seed in range(SEEDS)))
+
+
+def _precision(scenes: Mapping[str, Scene], errors: Errors, arm: str, posts: np.ndarray, seed: int) -> float:
+    found, targets, neutral = [], [], []
+    for name, scene in scenes.items():
+        arrived = apply_errors(scene.sightings, errors, stream(seed, "road average", name))
+        for spin in SPINS:
+            at_s = scene.time_s[spin]
+            late_s = at_s - errors.latency_s
+            slack_s = 3 * errors.clock_s  # messages of the spins before bear other times where clocks are off
+            window = [s for s in arrived if at_s - WINDOW_S - slack_s - 1e-6 <= s.time_s <= late_s + slack_s + 1e-6]
+            found.append(fuse(window, posts, at_s, arm).boxes)
+            targets.append(scene.truth[spin].targets)
+            neutral.append(scene.truth[spin].neutral)
+    return average_precision(match(found, targets, neutral, 0.5, "bev"))
+
+
+def _snap(scenes: Mapping[str, Scene], context: MapContext) -> Snapped:
+    labels: tuple[list[Boxes], list[Boxes]] = ([], [])
+    targets, neutral, off = [], [], []
+    for scene in scenes.values():
+        for spin in SPINS:
+            at_s = scene.time_s[spin]
+            window = [s for s in scene.sightings if at_s - WINDOW_S - 1e-6 <= s.time_s <= at_s + 1e-6]
+            average = average_boxes([tell(each) for each in window], at_s)
+            after = snap_to_map(average.boxes, average.velocity, context)
+            truth = scene.truth[spin]
+            target = assign_targets(average.boxes, truth.targets, 0.5, "bev")
+            hit = target >= 0
+            yaw = truth.targets.yaw[target[hit]]
+            off.append([np.abs(wrap_angle(each.yaw[hit] - yaw)) for each in (average.boxes, after)])
+            for own, boxes in zip(labels, (average.boxes, after), strict=True):
+                own.append(boxes)
+            targets.append(truth.targets)
+            neutral.append(truth.neutral)
+    errors = np.degrees(np.concatenate(off, axis=1))
+    first, second = (average_precision(match(own, targets, neutral, 0.5, "bev")) for own in labels)
+    mean, turned = errors.mean(axis=1), (errors > 90).sum(axis=1)
+    return Snapped(errors.shape[1], (float(mean[0]), float(mean[1])), (int(turned[0]), int(turned[1])), (first, second))

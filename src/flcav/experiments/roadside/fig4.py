@@ -1,0 +1,190 @@
+"""Fig. 4 of Wang et al. (IEEE Network 37(3), 2023): LiDAR suites of a crossing and a street registered and fused.
+
+Two suites stand at a crossing of `grid`, on either side of it, a third on the straight street that leads away. Each is
+off from where its calibration says. The second and third are registered to the first by generalised ICP on the static
+background; then the road detector's boxes of all three are averaged.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import parse_config
+from flcav.dataset.recording.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.fusion.average import Told, average_boxes
+from flcav.fusion.detector import THRESHOLD, load_road_network
+from flcav.fusion.registration import Offset, measure_offset, register
+from flcav.fusion.road import MIN_RETURNS
+from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
+from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.objects.foreground import frame_reader, pole_backgrounds
+from flcav.perception.objects.predict import detect
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.progress import Report, ignore_progress
+from flcav.records import LEFT_OUT, Record
+from flcav.report import style
+from flcav.report.charts.suites import Shown, draw_suites
+from flcav.sensors.rig import RIGS
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
+
+CROSSING, STREET = "pole4", "pole2"
+ACROSS_M = 24.0  # from the first suite over the crossing to the second
+FIRST, SECOND = "lidar", "across"
+SUITES = ((CROSSING, FIRST), (CROSSING, SECOND), (STREET, FIRST))
+NAMES = ("crossing, near side", "crossing, far side", "straight street")
+LIDAR = RIGS["lidar_pole"].lidars["lidar"].model_dump(mode="json")
+RECIPE: dict[str, Any] = {
+    "town": "grid",
+    "seed": 8401,
+    "split": "test",
+    "scenes": 10,
+    "spins_per_scene": 2,
+    "every_s": 6.0,
+    "cavs": 0,
+    "poles": [2, 4],
+    "pole_rig": {"lidars": {FIRST: LIDAR, SECOND: {**LIDAR, "mount": {"x": ACROSS_M, "yaw_deg": 180.0}}}},
+    "calibration_error": {"position_m": 0.3, "rotation_deg": 1.5},
+}
+SWEEPS = 4  # of each suite, whose backgrounds are registered together
+EDGES_M = tuple(range(0, 91, 10))  # of distance from the first suite
+OVERLAP = 0.5  # bird's-eye IoU of a car that was found
+CARS = ("car", "van")
+ARMS = ("first suite alone", "three suites as calibrated", "three suites registered")
+REACHED = 0.8  # recall that makes a range
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A suite's pose in the frame of the first one: how far off before and after the registration."""
+
+    name: str
+    apart_m: float  # from the first suite
+    before: Offset
+    after: Offset
+
+
+@dataclass(frozen=True)
+class Fig4(Record):
+    """Residuals of registered suites, and the share of cars found against distance."""
+
+    suites: tuple[Suite, ...]  # the second and the third
+    cars: tuple[int, ...]  # seen by any suite, in each interval of `EDGES_M`
+    found: dict[str, tuple[int, ...]]  # of these, by arm
+    range_m: dict[str, float]  # within which an arm finds the share `REACHED` of the cars; 0 where nowhere
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+
+    def sentences(self) -> list[str]:
+        """Return residuals and ranges in words."""
+        told = [
+            f"{each.name}, {each.apart_m:.0f} m away: off by {each.before.position_cm:.0f} cm and "
+            f"{each.before.rotation_deg:.2f} degrees as calibrated, {each.after.position_cm:.1f} cm and "
+            f"{each.after.rotation_deg:.2f} degrees registered"
+            for each in self.suites
+        ]
+        return told + [f"{arm}: {REACHED:.0%} of the cars are found within {self.range_m[arm]:.0f} m" for arm in ARMS]
+
+
+def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str, bytes]]:
+    """Record the suites into `out`; return the numbers of the figure, and its picture as PNG by file name.
+
+    Raises `InputError` where small_gicp is not installed.
+    """
+    record(EmbeddedSource(parse_config(Recipe, RECIPE, "fig4")), out / "data", progress=progress)
+    data = Dataset.open(out / "data")
+    truth = [_pose(data, agent, lidar, assumed=False) for agent, lidar in SUITES]
+    calibrated = [_pose(data, agent, lidar, assumed=True) for agent, lidar in SUITES]
+    clouds = [_background(data, agent, lidar) for agent, lidar in SUITES]
+    guess = [inverse(calibrated[0]) @ each for each in calibrated]
+    exact = [inverse(truth[0]) @ each for each in truth]
+    registered = [np.eye(4), *(register(clouds[0], c, g) for c, g in zip(clouds[1:], guess[1:], strict=True))]
+    suites = tuple(
+        Suite(
+            NAMES[row],
+            float(np.linalg.norm(exact[row][:3, 3])),
+            measure_offset(exact[row], guess[row]),
+            measure_offset(exact[row], registered[row]),
+        )
+        for row in (1, 2)
+    )
+    placed = {ARMS[0]: guess[:1], ARMS[1]: guess, ARMS[2]: registered}
+    cars, found = _find_cars(data, truth[0], placed)
+    ranges = {arm: _range(cars, counts) for arm, counts in found.items()}
+    result = Fig4(suites, cars, found, ranges, provenance())
+    shown = [
+        Shown(
+            arm,
+            [transform_points(pose, cloud[:, :3]) for pose, cloud in zip(placed[arm], clouds, strict=True)],
+            [pose[:3, 3] for pose in placed[arm]],
+        )
+        for arm in ARMS[1:]
+    ]
+    shares = {arm: [f / c if c else None for f, c in zip(own, cars, strict=True)] for arm, own in found.items()}
+    return result, {"fig4.png": style.png(draw_suites(shown, NAMES, EDGES_M, shares))}
+
+
+def _pose(data: Dataset, agent: str, lidar: str, *, assumed: bool) -> NDArray[np.float64]:
+    """Return the (4, 4) `world_from_lidar` of a suite, by its calibration or the true one."""
+    number, both = data.select(agents={agent})[0], data.calibrations[agent]
+    mounts = both.assumed if assumed else both.true
+    return data.world_from_agent(number) @ mounts.agent_from_sensor[lidar]
+
+
+def _background(data: Dataset, agent: str, lidar: str) -> NDArray[np.float32]:
+    """Return the returns (N, 4) of the static background in a few sweeps of a suite, its own frame."""
+    behind = pole_backgrounds(data, agent)[lidar]
+    sweeps = [data.frame(number).lidar[lidar] for number in data.select(agents={agent})[:SWEEPS]]
+    return np.concatenate([sweep[~behind.in_front(sweep)] for sweep in sweeps])
+
+
+def _find_cars(
+    data: Dataset, world_from_first: NDArray[np.float64], placed: dict[str, list[NDArray[np.float64]]]
+) -> tuple[tuple[int, ...], dict[str, tuple[int, ...]]]:
+    """Return the cars in each interval of `EDGES_M` and those that each arm finds, over all spins.
+
+    A car counts where one of the suites has `MIN_RETURNS` from it. Boxes are compared in the first suite's frame.
+    """
+    network = load_road_network()
+    read = frame_reader(data, network.config)
+    cars = np.zeros(len(EDGES_M) - 1, dtype=np.int64)
+    hits = {arm: np.zeros_like(cars) for arm in placed}
+    frames = {(data.keys[n].scene, data.keys[n].index, data.keys[n].agent): n for n in range(len(data))}
+    for scene, spin in dict.fromkeys((key.scene, key.index) for key in data.keys):
+        numbers = [frames[scene, spin, agent] for agent, _ in SUITES]
+        boxes = [
+            detect(network, read(number).lidar[lidar], score_threshold=THRESHOLD)
+            for number, (_, lidar) in zip(numbers, SUITES, strict=True)
+        ]
+        targets = _targets(data, numbers).transform(inverse(world_from_first))
+        distance = np.linalg.norm(targets.center[:, :2], axis=1)
+        cars += np.histogram(distance, EDGES_M)[0]
+        for arm, poses in placed.items():
+            told = [Told(f"suite{row}", 0.0, boxes[row].transform(pose)) for row, pose in enumerate(poses)]
+            labels = average_boxes(told, 0.0).boxes
+            target = assign_targets(labels, targets, OVERLAP, "bev")
+            hits[arm] += np.histogram(distance[target[target >= 0]], EDGES_M)[0]
+    return tuple(cars.tolist()), {arm: tuple(counts.tolist()) for arm, counts in hits.items()}
+
+
+def _targets(data: Dataset, numbers: list[int]) -> Boxes:
+    """Return the cars of one spin with `MIN_RETURNS` of one of the suites, world frame."""
+    first = data.frame(numbers[0])
+    truth = first.annotations
+    most = np.zeros(len(truth), dtype=np.int64)
+    for number, (_, lidar) in zip(numbers, SUITES, strict=True):
+        frame = data.frame(number)
+        points = transform_points(frame.world_from_sensor(lidar), frame.lidar[lidar][:, :3].astype(np.float64))
+        most = np.maximum(most, points_in_boxes(points, truth.boxes).sum(axis=1))
+    seen = truth.boxes[np.isin(truth.boxes.label, CARS) & (most >= MIN_RETURNS)]
+    return replace(seen, label=np.full(len(seen), "Car"))
+
+
+def _range(cars: tuple[int, ...], found: tuple[int, ...]) -> float:
+    """Return the largest edge of `EDGES_M` within which the share `REACHED` of the cars is found."""
+    every, own = np.cumsum(cars), np.cumsum(found)
+    good = np.flatnonzero((own >= REACHED * every) & (every > 0))
+    return float(EDGES_M[good[-1] + 1]) if len(good) else 0.0

@@ -1,0 +1,88 @@
+"""Markdown tables of the road detector, the road average, and Fig. 4."""
+
+from itertools import pairwise
+
+from flcav.experiments.roadside.average import ARMS, BOTH, GRAPH, KNOBS, RoadAverageResult
+from flcav.experiments.roadside.detector import BINS_M, WITHIN_M, RoadDetectorResult
+from flcav.experiments.roadside.fig4 import ARMS as PLACED
+from flcav.experiments.roadside.fig4 import EDGES_M, Fig4
+from flcav.markdown import format_table
+
+
+def detector_tables(results: RoadDetectorResult) -> dict[str, str]:
+    """Return Markdown by name: towns, distances."""
+    towns = [
+        [
+            f"{each.town}{' (trained there)' if each.seen else ''}",
+            each.frames,
+            each.cars,
+            each.recall.describe(),
+            each.detections,
+            each.precision.describe(),
+        ]
+        for each in results.towns
+    ]
+    header = ("town", "frames", "cars", "recall", f"detections within {WITHIN_M:g} m", "precision")
+    near = [(low, high) for low, high in pairwise(BINS_M) if high <= WITHIN_M]
+    rows = [
+        [
+            each.town,
+            *(f"{found / cars:.2f} of {cars}" if cars else "none" for cars, found in each.by_distance[: len(near)]),
+        ]
+        for each in results.towns
+    ]
+    return {
+        "towns": format_table(header, towns),
+        "distances": format_table(("recall", *(f"{low} to {high} m" for low, high in near)), rows),
+    }
+
+
+def average_tables(results: RoadAverageResult) -> dict[str, str]:
+    """Return Markdown by name: joint, knobs, map."""
+    joint = [
+        [arm, f"{results.clean[arm]:.3f}", f"{point.mean:.3f} ({min(point.ap50):.3f} to {max(point.ap50):.3f})"]
+        for arm in ARMS
+        for point in (results.joint[arm],)
+    ]
+    rows = [
+        [knob, f"{point.size:g}", *(f"{results.knobs[knob][arm][row].mean:.3f}" for arm in ARMS)]
+        for knob in KNOBS
+        for row, point in enumerate(results.knobs[knob][GRAPH])
+    ]
+    snapped = results.snapped
+    context = [
+        ["without the map", f"{snapped.heading_deg[0]:.2f}", snapped.reversed_[0], f"{snapped.ap50[0]:.3f}"],
+        ["snapped to lanes", f"{snapped.heading_deg[1]:.2f}", snapped.reversed_[1], f"{snapped.ap50[1]:.3f}"],
+    ]
+    return {
+        "joint": format_table(("AP50", "no errors", f"{BOTH}: mean (range over seeds)"), joint),
+        "knobs": format_table(("error", "size", *ARMS), rows),
+        "map": format_table(("labels", "mean heading error [°]", f"reversed of {snapped.matched}", "AP50"), context),
+    }
+
+
+def fig4_tables(results: Fig4) -> dict[str, str]:
+    """Return Markdown by name: residuals, range."""
+    rows = [
+        [
+            each.name,
+            f"{each.apart_m:.0f}",
+            f"{each.before.position_cm:.0f} cm, {each.before.rotation_deg:.2f}°",
+            f"{each.after.position_cm:.2f} cm, {each.after.rotation_deg:.3f}°",
+        ]
+        for each in results.suites
+    ]
+    near = list(pairwise(EDGES_M))
+    found = [
+        [
+            arm,
+            *(f"{f / c:.2f}" if c else "" for f, c in zip(results.found[arm], results.cars)),
+            f"{results.range_m[arm]:.0f}",
+        ]
+        for arm in PLACED
+    ]
+    header = ("share of cars found", *(f"{low}–{high} m" for low, high in near), "range [m]")
+    return {
+        "residuals": format_table(("suite", "from the first [m]", "off as calibrated", "off as registered"), rows),
+        "range": format_table(header, [["cars", *results.cars, ""], *found]),
+    }

@@ -1,0 +1,175 @@
+"""The road average: boxes of road sensors and vehicles over a window of spins, averaged by their uncertainty.
+
+Boxes are associated with objects spin by spin: an object moves at constant velocity, a box belongs to it within a gate
+of Mahalanobis distance, and the Hungarian method settles which. What one agent tells of an object in several spins may
+be wrong in the same way each time (its pose, its clock), so that it is joined by covariance intersection, which stays
+consistent whatever the correlation (Julier and Uhlmann, ACC 1997), with the weights of Niehsen, "Information fusion
+based on fast covariance intersection filtering", FUSION 2002: in proportion to 1 / trace. What different agents tell is
+joined as independent, by inverse variance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from flcav.geometry import Boxes, wrap_angle
+
+Array = NDArray[np.float64]
+
+YAW = 6  # column of a box and of its variance
+GATE = 18.4  # largest squared Mahalanobis distance in x, y of a box from its object: 99.99 % of chi-squared, 2 dof
+FAR = 1e6  # cost of a pair outside the gate
+SPEED_MPS = 8.0  # standard deviation of an object's velocity, before it is observed
+LEAST_VARIANCE = np.array((0.05, 0.05, 0.05, 0.1, 0.05, 0.05, 0.03)) ** 2  # of a box, whatever its detector says
+UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of boxes without a predicted one
+
+
+@dataclass(frozen=True)
+class Told:
+    """What one agent tells of one spin."""
+
+    agent: str
+    time_s: float
+    boxes: Boxes  # world frame
+
+
+@dataclass(frozen=True)
+class RoadAverage:
+    """The K objects of a window of spins."""
+
+    boxes: Boxes  # (K,) world frame, at the time asked for, with scores and variances
+    velocity: Array  # (K, 2) along x and y of the world [m/s]
+    agents: NDArray[np.int64]  # (K,) number of agents that saw the object
+    member: tuple[NDArray[np.int64], ...]  # for each `Told` the object of each of its boxes
+
+
+def average_boxes(told: Sequence[Told], at_s: float) -> RoadAverage:
+    """Return the objects at `at_s` [s] that agents tell of in a window of spins.
+
+    An agent's score of an object is the mean over all its spins, zero where it does not tell of the object; the average
+    has the probability that not all agents err, 1 - product of (1 - score).
+    """
+    told = list(told)
+    member = _associate(told, at_s)
+    flat = np.concatenate([np.zeros(0, dtype=np.int64), *member])
+    count = int(flat.max(initial=-1)) + 1
+    names = sorted({one.agent for one in told})
+    spins = np.array([sum(one.agent == name for one in told) for name in names], dtype=np.float64)
+    lengths = [len(one.boxes) for one in told]
+    agent = np.repeat([names.index(one.agent) for one in told], lengths).astype(np.int64)
+    since = np.repeat([one.time_s - at_s for one in told], lengths)
+    rows = np.concatenate([np.zeros((0, 7)), *(one.boxes.array() for one in told)])
+    variance = np.concatenate([np.zeros((0, 7)), *(variance_of(one.boxes) for one in told)])
+    score = np.concatenate([np.zeros(0), *(_scores(one.boxes) for one in told)])
+    label = np.concatenate([np.zeros(0, dtype=np.str_), *(one.boxes.label for one in told)])
+
+    lines = _Lines(count)
+    lines.add(flat, rows[:, :2], variance[:, :2], since)
+    velocity = lines.solve(count)[1]
+    rows[:, :2] -= velocity[flat] * since[:, None]
+    axis = _mean_heading(flat, rows[:, YAW], variance[:, YAW], count)
+    rows[:, YAW] = (rows[:, YAW] - axis[flat] + np.pi / 2) % np.pi - np.pi / 2
+
+    pair, row = np.unique(flat * max(len(names), 1) + agent, return_inverse=True)
+    mean, information = _intersect(row, rows, variance, len(pair))
+    seen_by = pair % max(len(names), 1)
+    of = pair // max(len(names), 1)
+    total = _sums(of, information, count)
+    array = _sums(of, information * mean, count) / total
+    array[:, YAW] = wrap_angle(array[:, YAW] + axis)
+    own = np.bincount(row, score, len(pair)) / spins[seen_by] if len(pair) else np.zeros(0)
+    missed = np.exp(np.bincount(of, np.log1p(-np.minimum(own, 1 - 1e-9)), count)) if count else np.zeros(0)
+    first = np.unique(flat, return_index=True)[1]
+    boxes = Boxes(array[:, :3], array[:, 3:6], array[:, YAW], label[first], 1 - missed, 1 / total)
+    return RoadAverage(boxes, velocity, np.bincount(of, minlength=count), member)
+
+
+def variance_of(boxes: Boxes) -> Array:
+    """Return the variances (N, 7) of boxes, at least `LEAST_VARIANCE`; `UNKNOWN_VARIANCE` where there are none."""
+    known = np.tile(UNKNOWN_VARIANCE, (len(boxes), 1)) if boxes.variance is None else boxes.variance
+    return np.maximum(known, LEAST_VARIANCE)
+
+
+class _Lines:
+    """Straight lines x, y = place + velocity t of objects: weighted least squares with a prior of velocity."""
+
+    def __init__(self, most: int) -> None:
+        self._sums = np.zeros((5, most, 2))  # w, w t, w t^2, w x, w x t
+
+    def add(self, row: NDArray[np.int64], xy: Array, variance: Array, t: Array | float) -> None:
+        """Add boxes (N,) of the objects `row`, with x, y and their variance (N, 2), seen at `t` [s]."""
+        weight, t = 1 / variance, np.broadcast_to(np.reshape(t, (-1, 1)), xy.shape)
+        for number, value in enumerate((weight, weight * t, weight * t * t, weight * xy, weight * xy * t)):
+            np.add.at(self._sums[number], row, value)
+
+    def solve(self, count: int) -> tuple[Array, Array, Array]:
+        """Return place (count, 2) [m], velocity (count, 2) [m/s], covariance (3, count, 2): place, both, velocity."""
+        w, wt, wtt, wx, wxt = self._sums[:, :count]
+        wtt = wtt + 1 / SPEED_MPS**2
+        det = w * wtt - wt**2
+        return (wtt * wx - wt * wxt) / det, (w * wxt - wt * wx) / det, np.stack((wtt, -wt, w)) / det
+
+
+def _associate(told: Sequence[Told], at_s: float) -> tuple[NDArray[np.int64], ...]:
+    """Return for each `Told` the number of the object that each of its boxes belongs to, from 0."""
+    most = sum(len(one.boxes) for one in told)
+    lines, labels, count = _Lines(most), np.zeros(most, dtype=np.int64), 0
+    known: dict[str, int] = {}
+    member: dict[int, NDArray[np.int64]] = {}
+    for number in sorted(range(len(told)), key=lambda i: told[i].time_s):
+        boxes, t = told[number].boxes, told[number].time_s - at_s
+        xy, variance = boxes.center[:, :2], variance_of(boxes)[:, :2]
+        label = np.array([known.setdefault(str(name), len(known)) for name in boxes.label], dtype=np.int64)
+        own = np.full(len(boxes), -1)
+        if count and len(boxes):
+            place, velocity, (spread, both, speed) = lines.solve(count)
+            wide = (spread + 2 * t * both + t * t * speed)[None] + variance[:, None]
+            square = ((xy[:, None] - (place + velocity * t)[None]) ** 2 / wide).sum(axis=2)
+            fits = (square <= GATE) & (label[:, None] == labels[None, :count])
+            cost = np.where(fits, square + np.log(wide.prod(axis=2)), FAR)
+            some, to = linear_sum_assignment(cost)
+            paired = fits[some, to]
+            own[some[paired]] = to[paired]
+        new = np.flatnonzero(own < 0)
+        own[new] = count + np.arange(len(new))
+        labels[own[new]] = label[new]
+        count += len(new)
+        lines.add(own, xy, variance, t)
+        member[number] = own
+    return tuple(member[number] for number in range(len(told)))
+
+
+def _intersect(row: NDArray[np.int64], mean: Array, variance: Array, count: int) -> tuple[Array, Array]:
+    """Return mean (count, 7) and information (count, 7) of the covariance intersection of boxes with the same `row`.
+
+    mean, variance: (N, 7). With weights u_i = (1 / tr_i) / sum (1 / tr_j): information sum u_i / P_i, and mean
+    sum (u_i x_i / P_i) / information.
+    """
+    share = 1 / variance[:, :3].sum(axis=1)
+    share /= np.bincount(row, share, count)[row]
+    each = share[:, None] / variance
+    information = _sums(row, each, count)
+    return _sums(row, each * mean, count) / information, information
+
+
+def _mean_heading(row: NDArray[np.int64], yaw: Array, variance: Array, count: int) -> Array:
+    """Return the heading (count,) [rad] of each object: the mean axis of its boxes, and the way most of them face."""
+    weight = 1 / variance
+    sin, cos = (np.bincount(row, weight * wave(2 * yaw), count) for wave in (np.sin, np.cos))
+    axis = np.arctan2(sin, cos) / 2
+    ahead = np.bincount(row, weight * np.cos(yaw - axis[row]), count)
+    return wrap_angle(np.where(ahead >= 0, axis, axis + np.pi))
+
+
+def _sums(row: NDArray[np.int64], values: Array, count: int) -> Array:
+    """Return (count, 7) the sums of `values` (N, 7) over the rows of the same number."""
+    out = np.zeros((count, values.shape[1]))
+    np.add.at(out, row, values)
+    return out
+
+
+def _scores(boxes: Boxes) -> Array:
+    return np.ones(len(boxes)) if boxes.score is None else boxes.score

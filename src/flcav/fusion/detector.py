@@ -1,0 +1,62 @@
+"""The trained roadside detector: SECOND on the returns that stand before a pole's static background.
+
+Its weights come with the package (the network "road" of the task objects). It was trained in `suburb` and `arterial`;
+its score threshold was fixed there, on frames of other scenes. A sensor that stands still knows the map around it, and
+what it takes for a car off the drivable surface is none. How well it works elsewhere is in
+`reproductions/road-detector`.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import shapely
+from shapely.geometry import Polygon
+from shapely.geometry.base import BaseGeometry
+
+from flcav.dataset.store import Dataset
+from flcav.geometry import Boxes
+from flcav.perception.objects.foreground import frame_reader
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import choose_lidar
+from flcav.perception.weights import find_shipped, load_network
+
+ROAD = "shipped/road.safetensors"  # relative to the folder of the task objects
+THRESHOLD = 0.7  # lowest score of a label
+OFF_ROAD_M = 0.5  # farthest that the centre of a car may lie from the drivable surface of the map
+CATEGORY = {"Car": "car"}  # actor category by detection class
+
+
+@lru_cache(maxsize=1)
+def load_road_network() -> Second:
+    """Return the package's network for roadside sensors."""
+    return load_network(OBJECTS, find_shipped(OBJECTS, ROAD))
+
+
+def road_detector(data: Dataset, threshold: float = THRESHOLD) -> Callable[[int], Boxes]:
+    """Return the function that detects objects in a roadside frame of `data` by its number.
+
+    It returns boxes in the world frame with actor category, score of `threshold` or more, and variances. Without a map,
+    as of an imported dataset, boxes anywhere are returned.
+    """
+    network, town = load_road_network(), data.town()
+    read = frame_reader(data, network.config)
+    surface = None if town is None else shapely.union_all([Polygon(outline) for outline in town.roads])
+
+    def find(number: int) -> Boxes:
+        frame = read(number)
+        lidar = choose_lidar(frame)
+        found = detect(network, frame.lidar[lidar], score_threshold=threshold)
+        category = np.array([CATEGORY[str(name)] for name in found.label], dtype=np.str_)
+        told = replace(found, label=category).transform(frame.world_from_sensor(lidar))
+        return told if surface is None else keep_on_surface(told, surface)
+
+    return find
+
+
+def keep_on_surface(boxes: Boxes, surface: BaseGeometry) -> Boxes:
+    """Return the boxes, world frame, whose centres lie on the drivable `surface` or within `OFF_ROAD_M` of it."""
+    return boxes[shapely.distance(shapely.points(boxes.center[:, :2]), surface) <= OFF_ROAD_M]

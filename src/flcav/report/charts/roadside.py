@@ -1,0 +1,60 @@
+"""Charts of roadside perception: recall against distance, and accuracy of fused labels against errors."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from flcav.report import style
+
+ARM_COLOURS = (style.MUTED, style.SKY, style.BLUE)  # of the arms of a comparison, in their order
+
+
+@style.styled
+def draw_recall(
+    edges_m: Sequence[float], lines: Mapping[str, Sequence[float | None]], unseen: Sequence[str], within_m: float
+) -> Figure:
+    """Return recall against distance, a line per town: shares in the intervals between `edges_m`, None without cars.
+
+    Lines of the towns `unseen` are solid, others dotted; a rule marks `within_m`.
+    """
+    figure = style.canvas(6.4, 3.4)
+    axes = figure.subplots()
+    middle = (np.array(edges_m[:-1]) + np.array(edges_m[1:])) / 2
+    colours = iter(style.OTHER_COLOURS)
+    for town, shares in lines.items():
+        values = np.array([np.nan if share is None else share for share in shares])
+        own = style.TOWN_COLOURS.get(town) or next(colours)
+        solid = town in unseen
+        label = town if solid else f"{town} (trained there)"
+        axes.plot(middle, values, "o-" if solid else "o:", color=own, markersize=4, label=label)
+    axes.axvline(within_m, color=style.RULE, linewidth=1)
+    axes.set(xlim=(0, within_m + 1), ylim=(0, 1.02), xlabel="distance from the pole [m]", ylabel="recall")
+    axes.grid(axis="y")
+    style.key(figure, axes.get_lines()[: len(lines)])
+    return figure
+
+
+@style.styled
+def draw_errors(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float, float, float]]]]) -> Figure:
+    """Return AP50 against the size of an error, a panel per kind of error and a line per arm.
+
+    A point is (size, mean, lowest, highest over seeds).
+    """
+    columns = 3
+    rows = -(-len(panels) // columns)
+    figure = style.canvas(3.1 * columns, 2.4 * rows + 0.4)
+    drawn = np.atleast_1d(figure.subplots(rows, columns, sharey=True)).ravel()
+    for axes in drawn[len(panels) :]:
+        axes.remove()
+    for number, (axes, (title, arms)) in enumerate(zip(drawn, panels.items())):
+        for (arm, points), colour in zip(arms.items(), ARM_COLOURS, strict=True):
+            size, mean, low, high = np.array(points).T
+            axes.fill_between(size, low, high, color=colour, alpha=0.2, linewidth=0)
+            axes.plot(size, mean, "o-", color=colour, markersize=4, label=arm)
+        axes.set_xlabel(title)
+        axes.grid(axis="y")
+        if number % columns == 0:
+            axes.set_ylabel("AP50 of the labels")
+    style.key(figure, list(drawn[0].get_lines()))
+    return figure

@@ -1,0 +1,66 @@
+"""The static background of a LiDAR that stands still, and the returns in front of it.
+
+The background of a direction is the farthest return that was ever seen there: whatever is nearer at another time has
+come between. An object that stands at its place in every sweep, such as a car parked there all the time, becomes
+background. That sweeps of roadside LiDARs are filtered first: Zhao et al., "Detection and tracking of pedestrians and
+vehicles using roadside LiDAR sensors", Transportation Research Part C 100, 2019.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+STEP_DEG = 0.1  # edge of a direction's bin: smaller than the angle between two beams
+OFFSET_DEG = 0.037  # of the bins' edges, so that beams at round angles do not fall on an edge
+COLUMNS = round(360 / STEP_DEG)
+MARGIN_M = (
+    0.15  # a return must be this much nearer than the background: several standard deviations of the range's error
+)
+
+
+@dataclass(frozen=True)
+class Background:
+    """The range of the background by direction, of D directions that had a return; sensor frame."""
+
+    direction: NDArray[np.int64]  # (D,) ascending numbers of bins of STEP_DEG in azimuth and elevation
+    range_m: NDArray[np.float32]  # (D,) the farthest return
+
+    def in_front(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return (N,) whether each point (N, >= 3) lies before the background, or where none was ever seen."""
+        direction, range_m = _to_polar(points)
+        row = np.searchsorted(self.direction, direction)
+        row[row == len(self.direction)] = 0
+        known = self.direction[row] == direction if len(self.direction) else np.zeros(len(points), dtype=bool)
+        farthest = np.where(known, self.range_m[row] if len(self.range_m) else 0.0, np.inf)
+        return range_m < farthest - MARGIN_M
+
+
+def learn_background(sweeps: Iterable[NDArray[np.float32]]) -> Background:
+    """Return the background of a LiDAR from its sweeps (N, >= 3) x, y, z [m], sensor frame, all from the same pose.
+
+    With sweeps of eight scenes or more hardly any place is occupied in all of them.
+    """
+    found = Background(np.zeros(0, np.int64), np.zeros(0, np.float32))
+    for sweep in sweeps:
+        direction, range_m = _to_polar(sweep)
+        found = _farthest(np.append(found.direction, direction), np.append(found.range_m, range_m))
+    return found
+
+
+def _farthest(direction: NDArray[np.int64], range_m: NDArray[np.float32]) -> Background:
+    order = np.argsort(direction, kind="stable")
+    bins, first = np.unique(direction[order], return_index=True)
+    return Background(bins, np.maximum.reduceat(range_m[order], first) if len(first) else range_m)
+
+
+def _to_polar(points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the bins (N,) and ranges (N,) [m] of points (N, >= 3)."""
+    x, y, z = points[:, :3].astype(np.float64).T
+    flat = np.hypot(x, y)
+    azimuth = np.degrees(np.arctan2(y, x)) % 360 + OFFSET_DEG
+    elevation = np.degrees(np.arctan2(z, flat)) + 90 + OFFSET_DEG
+    column = np.floor(azimuth / STEP_DEG).astype(np.int64) % COLUMNS
+    row = np.floor(elevation / STEP_DEG).astype(np.int64)
+    return row * COLUMNS + column, np.hypot(flat, z).astype(np.float32)

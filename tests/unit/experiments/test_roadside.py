@@ -1,0 +1,99 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flcav.experiments.fig3b.run import ZONE_M, _count_zones
+from flcav.experiments.roadside.detector import _Frames, fit_threshold, score_town
+from flcav.experiments.roadside.errors import Errors, apply_errors
+from flcav.experiments.roadside.fig4 import EDGES_M, _range
+from flcav.fusion.pose_graph import Navigation, Sighting
+from flcav.geometry import Boxes, inverse, pose, yaw_of
+from flcav.world.map.town import load_town
+
+EXACT = Navigation(0.01, 0.001)
+
+
+def sightings(spins: int) -> list[Sighting]:
+    return [
+        Sighting(agent, 0.5 * spin, pose(10.0 * n, 0, 0, 0.3), Boxes.empty(), navigation=EXACT if n else None)
+        for spin in range(spins)
+        for n, agent in enumerate(("pole1", "cav0", "cav1"))
+    ]
+
+
+def offsets(errors: Errors, spins: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return offsets in position (S, 2), heading [deg] (S,) and time (S,) of cav0."""
+    told = sightings(spins)
+    arrived = apply_errors(told, errors, np.random.default_rng(3))
+    pairs = [(a, b) for a, b in zip(told, arrived) if a.agent == "cav0"]
+    place = np.array([b.world_from_agent[:2, 3] - a.world_from_agent[:2, 3] for a, b in pairs])
+    turn = np.degrees([yaw_of(inverse(a.world_from_agent) @ b.world_from_agent) for a, b in pairs])
+    return place, turn, np.array([b.time_s - a.time_s for a, b in pairs])
+
+
+def test_white_errors_are_drawn_anew_and_constant_ones_once() -> None:
+    place, turn, late = offsets(Errors(position_m=0.5, heading_deg=2.0))
+    np.testing.assert_allclose(place.std(axis=0), 0.5, rtol=0.1)
+    assert turn.std() == pytest.approx(2.0, rel=0.1)
+    assert not late.any()
+    place, turn, late = offsets(Errors(constant_m=0.5, clock_s=0.2))
+    assert place.std(axis=0).max() < 1e-9
+    assert np.abs(place[0]).min() > 0
+    assert late.std() < 1e-9
+    assert late[0] != 0
+
+
+def test_road_sensors_are_surveyed_and_messages_of_all_are_lost() -> None:
+    told = sightings(400)
+    arrived = apply_errors(told, Errors(position_m=0.5, clock_s=0.3), np.random.default_rng(0))
+    assert [each for each in arrived if each.navigation is None] == [each for each in told if each.navigation is None]
+    left = apply_errors(told, Errors(loss=0.25), np.random.default_rng(0))
+    assert len(left) / len(told) == pytest.approx(0.75, abs=0.04)
+    assert {each.agent for each in left} == {"pole1", "cav0", "cav1"}
+
+
+def cars(*places, score=None):
+    rows = np.array([[x, y, 0.8, 4.4, 1.8, 1.6, 0.0] for x, y in places]).reshape(-1, 7)
+    return Boxes.from_array(rows, "car", score)
+
+
+FRAMES = _Frames(
+    scene=["a", "b"],
+    found=[cars((5, 0), (20, 0), (45, 0), score=[0.9, 0.8, 0.95]), cars((5, 0.2), (12, 8), score=[0.75, 0.6])],
+    targets=[cars((5, 0), (12, 0)), cars((5, 0))],
+    neutral=[cars((20, 0)), Boxes.empty()],
+    place=[np.zeros(2), np.zeros(2)],
+)
+
+
+def test_recall_is_of_near_cars_and_neutral_and_far_detections_do_not_count() -> None:
+    score = score_town("t", False, FRAMES, threshold=0.5)
+    assert (score.cars, score.detections) == (3, 3)
+    assert score.recall.mean == pytest.approx(2 / 3)
+    assert score.precision.mean == pytest.approx(2 / 3)
+    stricter = score_town("t", False, FRAMES, threshold=0.7)
+    assert stricter.precision.mean == 1
+    assert sum(cars for cars, _ in stricter.by_distance) == 3
+
+
+def test_the_threshold_is_the_lowest_score_that_is_precise_enough() -> None:
+    assert fit_threshold([FRAMES]) == 0.75
+    assert fit_threshold([replace(FRAMES, targets=[Boxes.empty()] * 2)]) == 1.0
+
+
+def test_zones_count_errors_around_poles_per_hectare_and_per_frame() -> None:
+    town = load_town("suburb")
+    at = town.poles.position[0]
+    east = np.array((1.0, 0.0, 0.0))
+    errors = np.stack((at, at + (ZONE_M - 1) * east, at + (ZONE_M + 1) * east))
+    zones = _count_zones(town, errors, at[None, :2], np.zeros(len(town.poles.id)))
+    assert (zones[0].pole, zones[0].errors, zones[0].per_frame) == (int(town.poles.id[0]), 2, 2.0)
+    assert zones[0].per_hectare == pytest.approx(2 / (np.pi * 0.09))
+    assert zones[-1].per_frame is None
+
+
+def test_a_range_ends_where_too_few_cars_are_found_in_all() -> None:
+    cars = (10,) * (len(EDGES_M) - 1)
+    assert _range(cars, (10, 8, 6) + (0,) * (len(EDGES_M) - 4)) == EDGES_M[3]
+    assert _range(cars, (0,) * (len(EDGES_M) - 1)) == 0.0
