@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import Trainable
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.card import CARD_KEY
-from flcav.perception.client import TaskClient
+from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.device import select_device
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task, build_network, find_configuration
@@ -83,6 +83,29 @@ def called(*arguments: object) -> int:
 def test_samples_are_those_of_the_frames_asked_for(task, data, samples):
     assert len(samples[task.name]) == len(data) == 6
     assert len(task.samples(data, small(task), data.select(scenes=["fog"]))) == 2
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Return whether two samples are of one type, and all their fields are the same."""
+    if is_dataclass(one) or isinstance(one, tuple):
+        parts = [list(each if isinstance(each, tuple) else vars(each).values()) for each in (one, other)]
+        return type(one) is type(other) and all(map(alike, *parts))
+    kinds = [np.asarray(each).dtype.kind for each in (one, other)]
+    return kinds[0] == kinds[1] and np.array_equal(one, other)
+
+
+@each_task
+def test_samples_are_the_same_on_the_other_side_of_a_link(task, data):
+    config = small(task)
+    frames = range(1, len(data))
+    messages = list(as_shared(task).pack_samples(data, config, frames))
+    assert all(type(message) is bytes for message in messages)
+    assert len(messages) == len(frames)
+    received = as_shared(task).unpack_samples([bytes(bytearray(message)) for message in messages], config)
+    sent = task.samples(data, config, frames)
+    assert received is not None
+    assert len(received) == len(sent) > 0
+    assert all(alike(received[i], sent[i]) for i in range(len(sent)))
 
 
 @each_task

@@ -90,13 +90,12 @@ def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) ->
         for task in ("weather", "trajectory"):  # what a message weighs was known beforehand
             assert spent[task] == pytest.approx(getattr(main.plan.tasks[task], f"{link}_mb"), rel=0.3)
     pool = Frames.open(folder / "work/suburb-pool-trajectory")
-    weighs: dict[tuple[str, int], set[int]] = {}
-    for i, size in zip(
-        pool.vehicles, TRAJECTORY.sample_bytes(pool.data, CONFIGURATIONS["tiny"], pool.vehicles), strict=True
-    ):
-        weighs.setdefault((pool.data.keys[i].scene, pool.data.keys[i].index), set()).add(size)
-    assert all(len(sizes) == 1 for sizes in weighs.values())  # all four vehicles of an instant would send it
-    assert any(sizes != {0} for sizes in weighs.values())
+    sent = [*TRAJECTORY.pack_samples(pool.data, CONFIGURATIONS["tiny"], pool.vehicles)]
+    told: dict[tuple[str, int], set[bytes]] = {}
+    for i, message in zip(pool.vehicles, sent, strict=True):
+        told.setdefault((pool.data.keys[i].scene, pool.data.keys[i].index), set()).add(message)
+    assert all(len(messages) == 1 for messages in told.values())  # all four vehicles of an instant would send it
+    assert len(TRAJECTORY.unpack_samples(sent, CONFIGURATIONS["tiny"])) > 0
     read = Run.load(folder, RESULTS)
     assert page(read) == page(result)  # in the recipe's order, not in that of the alphabet
     assert "trajectory" in write_report(read, folder).read_text()

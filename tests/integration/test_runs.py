@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
 from flwr.common.serde import recorddict_to_proto
 from PIL import Image
 from safetensors.numpy import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
@@ -27,11 +29,16 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.arms.run import ARMS, ArmsResult, compare_arms
 from flcav.experiments.fig6a.results import AllocationResult
 from flcav.experiments.fig6a.run import compare_plans
+from flcav.federation.privacy import account_epsilon
+from flcav.federation.rules import Rules
+from flcav.network.clock.records import load_rounds
 from flcav.network.ledger import LINKS, Ledger
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import find_configuration
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, load_run_recipe
-from flcav.pipeline.results import Placed, Pretrained, Run, StageResult, Watched
+from flcav.pipeline.results import ErrorRegistry, FederatedRound, Placed, Pretrained, Run, StageResult, Watched
 from flcav.pipeline.running import RESULTS, SUMMARY, run, run_seeds
 from flcav.pipeline.seeds.comparing import compare
 from flcav.report.pages.run_page import write_report
@@ -144,7 +151,7 @@ def test_every_message_is_booked_in_the_bytes_that_flower_sends(finished: Path, 
     metrics = MetricRecord({"num-examples": 2, "loss": 0.5})
     message = len(recorddict_to_proto(RecordDict({"arrays": record, "metrics": metrics})).SerializeToString())
     book = Ledger.load(finished / "ledgers/main.parquet")
-    ups = [e.bytes for e in book.entries if (e.stage, e.direction) == ("edge", "up")]
+    ups = [e.bytes for e in book.entries if (e.stage, e.direction) == ("edge", "up") and e.round]
     assert len(ups) == 2 * 3  # rounds x vehicles
     assert all(abs(size - message) <= 16 for size in ups)
     assert message / 1e6 == pytest.approx(result.arms[MAIN].plan.tasks["objects"].model_mb, rel=1e-4)
@@ -157,21 +164,32 @@ def test_road_labels_are_booked_as_downlink(finished: Path) -> None:
         entries = Ledger.load(finished / f"work/{step}/ledger.parquet").entries
         return [e.bytes for e in entries if (e.stage, e.direction, e.round) == ("edge", "down", 0)]
 
-    held = StageResult.load(finished / "work/grid-edge-fl-objects").samples
-    assert len(told("grid-edge-fl-objects")) == held > 0
-    assert min(told("grid-edge-fl-objects")) > 100
-    assert told("grid-edge-fl-objects-no_pole") == []
+    held, released = StageResult.load(finished / "work/grid-edge-fl-objects").samples, told("grid-errors-objects")
+    labels = told("grid-edge-fl-objects")[len(released) :]
+    assert len(labels) == held > 0
+    assert min(labels) > 100
+    assert told("grid-edge-fl-objects-no_pole") == released
 
 
 def test_the_ledger_is_what_crossed_the_links(finished: Path, result: Run) -> None:
     book, pool = Ledger.load(finished / "ledgers/main.parquet"), Frames.open(finished / "work/suburb-pool-objects")
-    uploaded = result.pretrained[0].uploaded["suburb"]
-    samples = sum(pool.data.payload_bytes(i) for i in uploaded) / 1e6
+    uploaded, config = result.pretrained[0].uploaded["suburb"], find_configuration(OBJECTS, "tiny")
+    samples = sum(map(len, OBJECTS.pack_samples(pool.data, config, uploaded))) / 1e6
+    points = sum(pool.data.frame(i).lidar["lidar"].nbytes for i in uploaded) / 1e6
+    assert points < samples < 1.02 * points  # a message is its points, and little else
+    books = [Ledger.load(finished / f"work/{region}-errors-objects/ledger.parquet") for region in ("grid", "ring")]
+    reported = sum(each.used_mb("wireless", stage="edge") for each in books)
+    counted = [ErrorRegistry.load(finished / f"work/{region}-errors-objects").counts for region in ("grid", "ring")]
+    assert sum(sum(each.values()) for each in counted) * 50 < reported * 1e6 < 100_000
+    for each in books:  # the pretrained network went down by wireline and to each vehicle before
+        down = [(e.link, e.bytes) for e in each.entries if e.direction == "down"]
+        assert [link for link, _ in down] == ["wireline", "wireless", "wireless"]
+        assert len({size for _, size in down}) == 1
     main, model = result.arms[MAIN], result.arms[MAIN].plan.tasks["objects"].model_mb
     for (link, stage), spent in {
         ("wireless", "pretrain"): samples,
         ("wireline", "pretrain"): samples,
-        ("wireless", "edge"): 2 * 3 * model,
+        ("wireless", "edge"): 2 * 3 * model + reported,
         ("wireline", "edge"): 0.0,
         ("wireless", "cloud"): 3 * model,
         ("wireline", "cloud"): 2 * model,
@@ -180,9 +198,77 @@ def test_the_ledger_is_what_crossed_the_links(finished: Path, result: Run) -> No
     for link in LINKS:
         use = main.links[link]
         assert use.used_mb == sum(e.bytes for e in book.entries if (e.link, e.direction) == (link, "up")) / 1e6
-        assert use.used_mb == pytest.approx(use.planned_mb, rel=1e-3)
+        assert use.used_mb == pytest.approx(use.planned_mb + reported * (link == "wireless"), rel=1e-3)
         assert use.used_mb <= use.budget_mb == getattr(RECIPE.budgets_mb, link)
         assert sum(spent.mb for spent in main.spent if spent.link == link) == pytest.approx(use.used_mb)
+
+
+def rounds_of(result: Run, arm: str, stage: str, server: str) -> list[FederatedRound]:
+    records = [record for each in result.arms[arm].stages if each.stage == stage for record in each.records or ()]
+    return [record for record in records if record.server == server]
+
+
+def test_every_round_is_in_the_results_with_its_bytes_and_its_loss(finished: Path, result: Run) -> None:
+    book = Ledger.load(finished / "ledgers/main.parquet")
+    both = ("grid/cav0", "grid/cav1")
+    edge, inner, cloud = (rounds_of(result, MAIN, *at) for at in ((EDGE, "grid"), (CLOUD, "grid"), (CLOUD, "cloud")))
+    assert [(each.round, each.clients) for each in (*edge, *inner)] == [(1, both), (2, both), (1, both)]
+    assert [(each.clients, each.failed) for each in cloud] == [(("grid", "ring"), {})]
+    assert tuple(each.loss for each in edge) == result.arms[MAIN].stages[0].losses
+    for link, stage, records in (("wireless", EDGE, edge), ("wireless", CLOUD, inner), ("wireline", CLOUD, cloud)):
+        for direction in ("up", "down"):
+            sent = [
+                e.bytes
+                for e in book.entries
+                if (e.link, e.stage, e.direction) == (link, stage, direction)
+                and e.round
+                and e.client.startswith("grid/" if link == "wireless" else ("grid", "ring"))
+            ]
+            assert sum(getattr(each, f"{direction}_bytes") for each in records) == sum(sent) > 0
+    table = pq.read_table(finished / "rounds.parquet").to_pylist()
+    assert {row["loss"] for row in table if (row["arm"], row["stage"]) == (MAIN, EDGE)} >= {each.loss for each in edge}
+    curves = EventAccumulator(str(finished / "events/main/edge/objects/grid"))
+    curves.Reload()
+    assert [(event.step, event.value) for event in curves.Scalars("loss")] == [
+        (each.round, pytest.approx(each.loss)) for each in edge
+    ]
+    assert "Rounds of federated learning" in (finished / "report.html").read_text()
+
+
+def test_noise_and_masks_hold_in_a_whole_run(finished: Path, result: Run) -> None:
+    arms = {MAIN: "", "masked": "-masked", "densest": "-densest"}  # the last with noise
+    folders = {arm: finished / f"work/grid-edge-fl-objects{suffix}" for arm, suffix in arms.items()}
+    start = load_file(finished / "work/pretrain-objects/weights.safetensors")
+    ends = {arm: load_file(folder / "round1.safetensors") for arm, folder in folders.items()}
+    for name in [name for name in start if name.endswith("weight") and start[name].size > 1000]:
+        np.testing.assert_allclose(ends["masked"][name], ends[MAIN][name], atol=1e-4)
+        assert np.std(ends["densest"][name] - start[name]) == pytest.approx(1 / 2, rel=0.1)  # of the sum of two
+    told = {arm: [record.epsilon for record in rounds_of(result, arm, EDGE, "grid")] for arm in arms}
+    assert told[MAIN] == told["masked"] == [None, None]
+    rules = Rules.model_validate({"privacy": {"clip": 1.0, "noise": 1.0}})
+    assert rules.privacy is not None
+    names = ["grid/cav0", "grid/cav1"]
+    epsilon = [account_epsilon(rules.privacy, rules.selection, names, rounds) for rounds in (1, 2)]
+    assert told["densest"] == pytest.approx(epsilon)
+    book = Ledger.load(folders["masked"] / "ledger.parquet").entries
+    ups = [entry.client for entry in book if (entry.round, entry.direction) == (1, "up")]
+    assert [ups.count(name) for name in names] == [4, 4]  # keys, shares, update, unmasking
+    assert not any("state" in path.name for path in folders["masked"].iterdir())  # nothing of a vehicle is kept
+
+
+def test_the_network_takes_time_and_loses_vehicles_by_name(finished: Path, result: Run) -> None:
+    lost, cloud = rounds_of(result, "equal", EDGE, "grid"), rounds_of(result, "equal", CLOUD, "cloud")
+    clock = load_rounds(finished / "work/grid-edge-fl-objects-equal/clock-grid.parquet")
+    assert [each.seconds for each in lost] == pytest.approx([each.end_s - each.start_s for each in clock])
+    for record, timed in zip(lost, clock, strict=True):
+        named = {f"grid/{client.client}": client.dropped for client in timed.clients}
+        assert record.failed == {name: why for name, why in named.items() if why}
+        assert record.clients == tuple(name for name, why in named.items() if not why)
+        assert record.seconds is not None
+        assert 0 < record.seconds <= 3
+    slowest = max(rounds_of(result, "equal", CLOUD, region)[0].seconds or 0.0 for region in ("grid", "ring"))
+    assert cloud[0].seconds == pytest.approx(slowest + 2 * (0.01 + 8 * 1337440 / 1e9), rel=1e-3)
+    assert all(record.seconds is None for record in rounds_of(result, MAIN, EDGE, "grid"))
 
 
 def test_no_two_splits_share_a_scene(finished: Path) -> None:

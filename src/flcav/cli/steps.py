@@ -8,6 +8,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from flcav.pipeline.steps import FINISHED, Notify
 
+EPSILON = "epsilon"  # in the notes of rounds with differential privacy
+
 
 @contextlib.contextmanager
 def live_steps(title: str) -> Iterator[Notify]:
@@ -29,6 +31,8 @@ def live_steps(title: str) -> Iterator[Notify]:
             if step not in rows:
                 rows[step] = bars.add_task(f"  {step}", total=None, note="")
             bars.update(rows[step], completed=done, total=max(total, 1), note=note)
+            if EPSILON in note:  # what a round cost stays on the terminal
+                console.print(f"{title}: {step}, round {done} of {total}: {note}", highlight=False)
             if note in FINISHED:
                 finished += 1
                 bars.update(rows[step], visible=False)

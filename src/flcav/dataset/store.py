@@ -36,10 +36,8 @@ from flcav.sensors.frame import LONGEST_NAME, CameraImage, Frame, format_key
 from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
 
-POINT_BYTES = 16  # four float32
 KINDS = ("lidar", "radar", "cameras", "infrared")  # columns of `frames` that list sensors
 NAME = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")  # of a frame, scene, agent or sensor
-NOT_IN_SAMPLE = ("ax", "ay", "az")  # columns of `annotations` that are no part of a training sample
 
 Value = TypeVar("Value")
 
@@ -194,10 +192,6 @@ class Dataset:
             return load_town(kept if name and kept.is_dir() else name)
         except InputError:
             return None
-
-    def payload_bytes(self, i: int) -> int:
-        """Return the size of frame `i` as a labelled sample [bytes]: its point clouds and annotation rows."""
-        return sum(self._lidar[i].values()) * POINT_BYTES + self._rows("annotations", i).drop(NOT_IN_SAMPLE).nbytes
 
     def check_labelled(self, what: str) -> None:
         """Raise `InputError` where `what`, "objects" or "signs", is not labelled in an imported dataset."""

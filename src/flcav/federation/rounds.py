@@ -184,7 +184,8 @@ class Rounds(FlowerStrategy):
         if self._rules.privacy is not None:
             rounds, names = self._earlier + number, [*self._names.values()]
             epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
-        self._state.records.append(RoundRecord(number, tuple(received.samples), self._failed, epsilon))
+        about = (number, tuple(received.samples), self._failed, epsilon)
+        self._state.records.append(RoundRecord(*about, loss, sum(received.samples.values())))
         self._on_round(number, weights, loss)
         return to_arrays(weights), MetricRecord({SAMPLES: sum(received.samples.values()), LOSS: loss})
 
@@ -215,7 +216,7 @@ class Rounds(FlowerStrategy):
                 node = awaited.popleft()
                 found, name = early.pop(node, None), self._names[node]
                 if found is None:
-                    self._failed[name] = "no answer"
+                    self._failed.setdefault(name, "no answer")  # or what it failed by before
                 elif found.has_error():
                     self._failed[name] = str(found.error.reason)
                 else:

@@ -2,10 +2,11 @@
 
 from pydantic import Field
 
-from flcav.config import Config
+from flcav.config import Config, InputError
 from flcav.federation.privacy import Privacy
 from flcav.federation.selection import Selection
-from flcav.federation.upload import Upload
+from flcav.federation.trainable import Weights, learned_names
+from flcav.federation.upload import Patterns, Upload, name_like
 
 
 class SecureAggregation(Config):
@@ -26,6 +27,7 @@ class Rules(Config):
     upload: Upload = Upload()  # form of the updates
     privacy: Privacy | None = None  # clipping and noise; default: none
     secure: SecureAggregation | None = None  # default: the server sees every update
+    personal: Patterns = ()  # arrays that every edge server keeps for its region, as in `head.*`
     least_clients: int | None = Field(default=None, ge=1, le=10**6)  # whose updates a round needs; default: all chosen
 
     def of_servers(self) -> "Rules":
@@ -33,4 +35,14 @@ class Rules(Config):
 
         All take part, and send in the same form; noise is the vehicles', and all that comes after it is as private.
         """
-        return Rules(upload=self.upload)
+        return Rules(upload=self.upload.model_copy(update={"kept": self.personal}))
+
+    def check_personal(self, weights: Weights) -> None:
+        """Raise `InputError` where a pattern of `personal` matches no array, or nothing that is learned is left."""
+        for pattern in self.personal:
+            if not name_like(weights, (pattern,)):
+                raise InputError(
+                    f"personal: '{pattern}' matches none of {len(weights)} arrays, such as '{next(iter(weights))}'"
+                )
+        if not {*learned_names(weights)} & {*self.of_servers().upload.exchanged(weights)}:
+            raise InputError(f"personal: {', '.join(self.personal)} leave nothing for the regions to average")

@@ -6,10 +6,11 @@ server is k rounds of federation with the vehicles of its region (Wang et al., I
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
 from flwr.app import ArrayRecord
 from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Result
@@ -22,11 +23,13 @@ from flcav.federation.rounds import OnRound, Rounds
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
 from flcav.federation.state import ClientStates, FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.federation.upload import name_like
 from flcav.seeds import derive_seed
 
 if TYPE_CHECKING:
@@ -124,7 +127,8 @@ def federate(
             on_round(round_, aggregated, loss)
 
         app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep)
-        results.append(app.start(MeteredGrid(grid, account, nodes), to_arrays(weights), rounds - done))
+        lossy = LossyGrid(grid, account, nodes) if account.outages else grid
+        results.append(app.start(MeteredGrid(lossy, account, nodes), to_arrays(weights), rounds - done))
 
     keeps = isinstance(strategy, Exchanges) or rules.upload.compression == "top-k"  # something on the clients
     make_app = partial(client_app, strategy=strategy, rules=rules)
@@ -207,6 +211,13 @@ def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_ro
     return afforded
 
 
+def edge_seeds(schedule: Schedule, cloud_round: int, region: str, edge_rounds: int) -> list[int]:
+    """Return the seeds of a region's edge rounds in a cloud round of `schedule`, as `EdgeServer` derives them."""
+    seed, done = derive_seed(schedule.work(cloud_round).seed, region), (cloud_round - 1) * edge_rounds
+    own = Schedule(done + edge_rounds, 0, 1.0, 1.0, seed)
+    return [own.work(done + number).seed for number in range(1, edge_rounds + 1)]
+
+
 @dataclass
 class EdgeServer:
     """A region's edge server as a client of the cloud: its local training is k edge rounds with its vehicles."""
@@ -228,14 +239,15 @@ class EdgeServer:
         """Return the update of the region after k edge rounds from the cloud's `weights`; raises as `federate` does.
 
         The first cloud round starts from the server's own stage II model instead: the cloud has not averaged yet, and
-        its model is older. Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the
-        rules, which vehicles keep to.
+        its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are.
+        Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles
+        keep to.
         """
-        start = weights if self.cloud_rounds_done else self.own
+        start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
         self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
-        return federate(
+        found = federate(
             self.vehicles,
             start,
             schedule,
@@ -247,3 +259,6 @@ class EdgeServer:
             earlier=self.earlier,
             runtime=self.runtime,
         )
+        names = name_like(found.weights, self.rules.personal)
+        self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
+        return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody

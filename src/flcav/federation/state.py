@@ -11,17 +11,19 @@ from flcav.records import Record
 Arrays = dict[str, NDArray[np.number]]  # by name
 ClientStates = dict[str, dict[str, Arrays]]  # by client and kind
 
-SERVER, CLIENT = "server", "client"
+SERVER, CLIENT, PERSONAL = "server", "client", "personal"
 
 
 @dataclass(frozen=True)
 class RoundRecord(Record):
-    """One round: whose updates were combined, and who failed."""
+    """One round: whose updates were combined, who failed, and what the updates say of themselves."""
 
     round: int  # from 1
     clients: tuple[str, ...]  # whose updates were combined, by name
     failed: Mapping[str, str] = field(default_factory=dict)  # by client what was wrong
     epsilon: float | None = None  # of differential privacy, of all rounds so far; None: without noise
+    loss: float = 0.0  # mean training loss, weighted by samples
+    samples: int = 0  # of the clients together
 
 
 @dataclass
@@ -34,10 +36,12 @@ class FederationState:
     server: Arrays = field(default_factory=dict)
     clients: ClientStates = field(default_factory=dict)
     records: list[RoundRecord] = field(default_factory=list)
+    personal: Arrays = field(default_factory=dict)  # arrays of an edge server's region alone
 
     def to_arrays(self) -> Arrays:
         """Return server's and clients' arrays in one mapping, for a safetensors file."""
         found = {f"{SERVER}|{name}": array for name, array in self.server.items()}
+        found |= {f"{PERSONAL}|{name}": array for name, array in self.personal.items()}
         for client, kinds in self.clients.items():
             for kind, arrays in kinds.items():
                 found |= {f"{CLIENT}|{client}|{kind}|{name}": array for name, array in arrays.items()}
@@ -45,11 +49,11 @@ class FederationState:
 
     def restore(self, arrays: Mapping[str, NDArray[np.number]], records: Sequence[RoundRecord]) -> None:
         """Set the state, in place, to what `to_arrays` returned and to the records."""
-        self.server, self.clients = {}, {}
+        self.server, self.clients, self.personal = {}, {}, {}
         for key, array in arrays.items():
             owner, _, rest = key.partition("|")
-            if owner == SERVER:
-                self.server[rest] = array
+            if owner in (SERVER, PERSONAL):
+                (self.server if owner == SERVER else self.personal)[rest] = array
             else:
                 client, kind, name = rest.split("|", 2)
                 self.clients.setdefault(client, {}).setdefault(kind, {})[name] = array

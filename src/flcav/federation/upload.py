@@ -19,6 +19,14 @@ INDICES, VALUES, SCALES = "#indices", "#values", "#scales"  # arrays of a compre
 LEVELS = 127  # of int8, on either side of 0
 
 
+Patterns = tuple[Annotated[str, Field(min_length=1)], ...]  # of names of arrays, as of files in a shell
+
+
+def name_like(weights: Weights, patterns: Patterns) -> list[str]:
+    """Return the names that match one of the patterns."""
+    return [name for name in weights if any(fnmatchcase(name, pattern) for pattern in patterns)]
+
+
 class Upload(Config):
     """Form of an update: `layers` named by patterns alone, and a `compression` of their change in the round.
 
@@ -28,10 +36,11 @@ class Upload(Config):
     of batch normalisation and integers are sent as they are.
     """
 
-    layers: tuple[Annotated[str, Field(min_length=1)], ...] = ()  # as in `head.*`; default: all
+    layers: Patterns = ()  # as in `head.*`; default: all
     compression: Literal["none", "fp16", "int8", "top-k"] = "none"
     fraction: float = Field(default=0.01, gt=0, le=1)  # of top-k
     error_feedback: bool = True  # of top-k: what was left out is kept for the next round
+    kept: Patterns = ()  # arrays that are not sent, whatever `layers` are; set by `Rules.of_servers`
 
     def check_layers(self, weights: Weights) -> None:
         """Raise `InputError` where a pattern matches no array, or all of them together none that is learned."""
@@ -45,9 +54,8 @@ class Upload(Config):
 
     def exchanged(self, weights: Weights) -> list[str]:
         """Return the names of the arrays that are sent."""
-        if not self.layers:
-            return [*weights]
-        return [name for name in weights if any(fnmatchcase(name, layer) for layer in self.layers)]
+        kept = set(name_like(weights, self.kept))
+        return [name for name in (name_like(weights, self.layers) if self.layers else weights) if name not in kept]
 
 
 def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | None, seed: int) -> tuple[Arrays, Arrays]:

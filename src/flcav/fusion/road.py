@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors.numpy import save
 from scipy.ndimage import binary_dilation
 
 from flcav.geometry import Boxes, transform_points
+from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.sensors.frame import Frame
 
 MIN_RETURNS = 10  # an object with fewer returns from the roadside LiDAR is not labelled
@@ -42,15 +42,27 @@ class RoadView:
         return out
 
     def message(self) -> bytes:
-        """Return the view serialised for the radio link (safetensors): boxes as float32, grids as one bit per cell."""
+        """Return the view as the message to a vehicle: boxes, and grids with one bit per cell."""
         arrays = {
-            "boxes": self.boxes.array().astype(np.float32),
-            "category": np.frombuffer("\n".join(self.boxes.label).encode() or b"\n", dtype=np.uint8),
+            "boxes": self.boxes.array(),
+            "category": from_names(self.boxes.label.tolist()),
             "origin": self.origin,
+            "shape": np.array(self.ground.shape, dtype=np.int32),
             "ground": np.packbits(self.ground),
             "occupied": np.packbits(self.occupied),
         }
-        return save(arrays)
+        return pack(arrays)
+
+    @classmethod
+    def from_message(cls, message: bytes) -> "RoadView":
+        """Return the view in a message: the inverse of `message`."""
+        arrays = unpack(message)
+        x, y = arrays["shape"].tolist()
+        ground, occupied = (
+            np.unpackbits(arrays[name], count=x * y).reshape(x, y).astype(bool) for name in ("ground", "occupied")
+        )
+        boxes = Boxes.from_array(arrays["boxes"], to_names(arrays["category"]))
+        return cls(boxes, arrays["origin"], ground, occupied)
 
 
 def label_ideally(frame: Frame) -> Boxes:

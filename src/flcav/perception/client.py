@@ -1,6 +1,6 @@
-"""Client of a federated task: recording settings, sources of labels, bytes of a sample, and local training."""
+"""Client of a federated task: recording settings, sources of labels, messages of samples, and local training."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any, Generic, Protocol, runtime_checkable
@@ -13,6 +13,8 @@ from torch import nn
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.files import Json
+from flcav.network.messages import from_names, pack
+from flcav.perception.images import pack_pictures
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 from flcav.perception.training import train_steps
 from flcav.perception.weights import from_arrays, to_arrays
@@ -22,7 +24,7 @@ ANNOTATED = "annotated"  # kind of labels: the ground truth of the recording
 
 @runtime_checkable
 class Shared(Protocol):
-    """A task with its own settings for federated training: recording, kinds of labels, bytes of a sample."""
+    """A task with its own settings for federated training: recording, kinds of labels, messages of samples."""
 
     @property
     def recording(self) -> Mapping[str, Json]:
@@ -34,8 +36,15 @@ class Shared(Protocol):
         """Return the kinds of labels that clients can train on, the default first: see `flcav.pipeline.labels`."""
         ...
 
-    def sample_bytes(self, data: Dataset, config: Any, frames: Sequence[int]) -> list[int]:
-        """Return the uplink size [B] of each frame as a labelled sample."""
+    def pack_samples(self, data: Dataset, config: Any, frames: Sequence[int]) -> Iterator[bytes]:
+        """Yield the message by which a vehicle uploads each frame with its labels.
+
+        Raises `InputError` for frames that have no samples of the task.
+        """
+        ...
+
+    def unpack_samples(self, messages: Sequence[bytes], config: Any) -> Sequence[Any] | None:
+        """Return the training samples in messages of `pack_samples`; None where they are taken from the recording."""
         ...
 
 
@@ -45,9 +54,13 @@ class WholeFrames:
     recording: Mapping[str, Json] = {}
     labels = (ANNOTATED,)
 
-    def sample_bytes(self, data: Dataset, config: Any, frames: Sequence[int]) -> list[int]:
-        """Return the size [B] of each frame's point clouds, images and annotations."""
-        return [data.payload_bytes(i) + picture_bytes(data, i) for i in frames]
+    def pack_samples(self, data: Dataset, config: Any, frames: Sequence[int]) -> Iterator[bytes]:
+        """Yield the message of each frame: its point clouds, images and boxes."""
+        return (pack_frame(data, i) for i in frames)
+
+    def unpack_samples(self, messages: Sequence[bytes], config: Any) -> None:
+        """Return None: what a task makes of a whole frame it reads from the recording."""
+        return
 
 
 def as_shared(task: Task) -> Shared:
@@ -55,9 +68,14 @@ def as_shared(task: Task) -> Shared:
     return task if isinstance(task, Shared) else WholeFrames()
 
 
-def picture_bytes(data: Dataset, i: int) -> int:
-    """Return the size [B] of a frame's images as recorded (PNG)."""
-    return sum(data.plane_path(i, camera, "rgb").stat().st_size for camera in data.cameras(i))
+def pack_frame(data: Dataset, i: int) -> bytes:
+    """Return a whole frame as a message: point clouds, image files as recorded, and annotated boxes in the world."""
+    frame = data.frame(i)
+    boxes = frame.annotations.boxes
+    labels = {"boxes": boxes.array(), "boxes.label": from_names(boxes.label.tolist())}
+    return pack(
+        {**{f"lidar.{name}": points for name, points in frame.lidar.items()}, **pack_pictures(data, i), **labels}
+    )
 
 
 def camera_ahead(width: int, height: int, fov_deg: float) -> Mapping[str, Json]:

@@ -4,7 +4,7 @@ Sensors are placed by it. The `errors.py` of each task defines what a mistake is
 duplicates, and reads and writes files.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.exchange import write_table
+from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.progress import Report, ignore_progress
 
 if TYPE_CHECKING:
@@ -53,6 +54,22 @@ class Registry:
     errors: tuple[PerceptionError, ...]
     dropped: int = 0  # number of false positives without a position in the town
     chosen: "FrameSelection | None" = None  # the frames that were tested, if known
+    found: Mapping[int, Sequence[PerceptionError]] | None = None  # by frame, with duplicates; None: not known
+    standing: bool = False  # whether what is missed stands in the town, the same in every scene
+
+    @classmethod
+    def of(
+        cls, found: Mapping[int, Sequence[PerceptionError]], *, dropped: int = 0, standing: bool = False
+    ) -> "Registry":
+        """Return the registry of the mistakes of each frame, in the order of `found`, each registered once."""
+        every = [error for errors in found.values() for error in errors]
+        if standing:
+            missed: dict[str, PerceptionError] = {}
+            for error in every:
+                if error.kind == MISS:
+                    missed.setdefault(error.track, error)
+            every = [*missed.values(), *(error for error in every if error.kind != MISS)]
+        return cls(keep_first(every), dropped, found=found, standing=standing)
 
     def __len__(self) -> int:
         return len(self.errors)
@@ -129,6 +146,22 @@ def load_errors(path: Path) -> tuple[PerceptionError, ...]:
     """Return the mistakes in a Parquet file that `save_errors` wrote."""
     rows = pq.read_table(path).to_pylist()
     return tuple(PerceptionError(**{("label" if name == CLASS else name): row[name] for name in row}) for row in rows)
+
+
+def pack_errors(errors: Sequence[PerceptionError]) -> bytes:
+    """Return mistakes as the message by which a vehicle reports them."""
+    arrays: dict[str, NDArray] = {}
+    for name, kind in PerceptionError.__annotations__.items():
+        values = [getattr(error, name) for error in errors]
+        arrays[name] = from_names(values) if kind is str else np.array(values, dtype=kind)
+    return pack(arrays)
+
+
+def unpack_errors(message: bytes) -> tuple[PerceptionError, ...]:
+    """Return the mistakes in a message: the inverse of `pack_errors`."""
+    arrays, kinds = unpack(message), PerceptionError.__annotations__
+    columns = ((to_names(arrays[name]) if kind is str else arrays[name]).tolist() for name, kind in kinds.items())
+    return tuple(PerceptionError(*row) for row in zip(*columns, strict=True))
 
 
 def _distance(a: PerceptionError, b: PerceptionError) -> float:

@@ -4,7 +4,8 @@ A `CameraView` is the image of a camera beside a LiDAR, with the calibration tha
 and corners of boxes into it.
 """
 
-from collections.abc import Iterator, Sequence
+import io
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from flcav.dataset.formats.kitti import Calibration, read_calibration
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, transform_points
+from flcav.network.messages import from_names, to_names
 from flcav.sensors.camera.lens import project_points
 from flcav.sensors.frame import Frame
 
@@ -62,6 +64,19 @@ def read_recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterato
             yield frame, camera, check_picture(rgb, f"{data.folder} {frame.key}/{camera}")
     if not seen:
         raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
+
+
+def pack_pictures(data: Dataset, number: int) -> dict[str, NDArray[np.uint8]]:
+    """Return the image files of a frame, as recorded, and the names of its cameras as arrays of a message."""
+    files = {f"picture.{camera}": data.plane_path(number, camera, "rgb") for camera in data.cameras(number)}
+    arrays = {name: np.frombuffer(path.read_bytes(), dtype=np.uint8) for name, path in files.items()}
+    return {"cameras": from_names(data.cameras(number)), **arrays}
+
+
+def unpack_pictures(arrays: Mapping[str, NDArray[np.uint8]]) -> dict[str, Picture]:
+    """Return the images in the arrays of a message by camera: the inverse of `pack_pictures`."""
+    cameras = to_names(arrays["cameras"]).tolist()
+    return {each: np.asarray(Image.open(io.BytesIO(arrays[f"picture.{each}"].tobytes()))) for each in cameras}
 
 
 def read_picture(path: Path) -> Picture:

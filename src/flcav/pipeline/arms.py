@@ -112,6 +112,13 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
     """
     for setting in settings:
         edge, cloud = find_strategies(setting.federation)
+        selection = setting.federation.selection
+        if setting.federation.network is not None and selection.rule == "importance":
+            raise InputError("federation.network: importance selection draws the clients after they have trained")
+        if setting.federation.network is not None and selection.rule == "deadline" and setting.federation.privacy:
+            raise InputError(
+                "federation.network: a deadline leaves other numbers of clients, and noise is for one number"
+            )
         for region in setting.regions:
             if recipe.regions[region].data is None:
                 check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])
@@ -174,9 +181,9 @@ class Names:
             return self.cloud(arm, task)
         return {EDGE: self.edge, MORE_EDGE: self.more_edge, CENTRAL: self.central}[stage](arm, region, task)
 
-    def test(self, trained: str, region: str) -> str:
-        """Return the test of a step's network in a region."""
-        return f"test-{trained}-{region}"
+    def test(self, trained: str, region: str, model: str | None = None) -> str:
+        """Return the test of a step's network, or of the own model of the region `model`, in a region."""
+        return f"test-{trained}-{region}" if model is None else f"test-{trained}-of-{model}-{region}"
 
     def rounds(self, trained: str, region: str) -> str:
         """Return the validation of a step's network after each of its rounds in a region."""

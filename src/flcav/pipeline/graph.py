@@ -33,6 +33,7 @@ from flcav.pipeline.work import (
     deal_step,
     edge_step,
     errors_step,
+    list_speeds,
     look_step,
     place_step,
     plan_step,
@@ -105,6 +106,10 @@ class Graph:
                 where = tuple(self.recipe.regions) if stage == CLOUD else arm.regions
                 tests += [(stage, region, task) for region in where]
         return tests
+
+    def models(self, arm: Setting, stage: str) -> tuple[str | None, ...]:
+        """Return whose models a stage ends with: None for the federation's, and regions that keep arrays."""
+        return (None, *arm.regions) if stage == CLOUD and arm.federation.personal else (None,)
 
     def watched(self) -> list[tuple[str, str, str]]:
         """Return stage, region and task of what is validated in each federating region: the main arm's stages."""
@@ -228,8 +233,9 @@ class Graph:
         for task in arm.placement.tasks:
             pretrained, registry = names.pretrain(arm.name, task), names.recording(region, "registry", task)
             errors[task] = names.errors(arm.name, region, task)
-            arguments = {"task": task, "region": region, "pretrained": pretrained, "registry": registry}
-            self._add(_step(errors[task], errors_step, arguments, [pretrained, registry]))
+            plan, own = names.plan(arm.name), {"vehicles": self._vehicles(), "budget_mb": self._budget_mb}
+            arguments = {"task": task, "region": region, "pretrained": pretrained, "registry": registry, "plan": plan}
+            self._add(_step(errors[task], errors_step, arguments | own, [pretrained, registry, plan]))
         first = (self.recipe.placement.tasks or tuple(self.recipe.tasks))[0]
         registry = names.recording(region, "registry", first)
         edge = names.recording(region, EDGE, first) if self.recipe.regions[region].data is not None else None
@@ -251,7 +257,8 @@ class Graph:
         """Return the steps and settings that a stage and its labelled samples depend on, see `flcav.pipeline.work`."""
         names = self.names
         helped = any(LABEL_SOURCES[each.labels[task]].from_poles for each in self.settings.values())
-        return {
+        reported = {"errors": names.errors(arm.name, region, task)} if task in arm.placement.tasks else {}
+        return reported | {
             "plan": names.plan(arm.name, stage),
             "pretrain": names.pretrain(arm.name, task),
             "frames": names.recording(region, EDGE, task),
@@ -265,6 +272,8 @@ class Graph:
         """Return the settings that all federated stages of a task have in common."""
         federation = arm.federation.model_dump(mode="json")
         own = {"labels": arm.labels[task], "federation": federation, "budget_mb": self._budget_mb}
+        if arm.federation.network is not None:
+            own |= {"train_s": self.recipe.tasks[task].train_s, "speeds": list_speeds(self.recipe)}
         return self._learning(arm, task) | own
 
     def _add_edge(self, arm: Setting) -> None:
@@ -327,8 +336,10 @@ class Graph:
             trained = self.names.stage(arm.name, stage, region, task)
             frames = self.names.recording(region, "test", task)
             arguments = {"task": task, "region": region, "trained": trained, "frames": frames}
-            step = self.names.test(trained, region)
-            self._add(_step(step, test_step, arguments | {"seed": self.recipe.seed}, [trained, frames]))
+            arguments |= {"seed": self.recipe.seed}
+            for model in self.models(arm, stage):
+                step = self.names.test(trained, region, model)
+                self._add(_step(step, test_step, arguments | {"model": model}, [trained, frames]))
         if arm.name == MAIN:
             if self.shown is not None:
                 region, stage = self.shown
@@ -347,5 +358,5 @@ def _step(name: str, function: Callable[..., None], arguments: Mapping[str, Any]
 
 def _named_in(steps: Mapping[str, Any]) -> list[str]:
     """Return the names of the steps in what `Graph._rests_on` returned; for stage III also that of stage II."""
-    one = [steps[key] for key in ("plan", "pretrain", "frames", "place", "edge") if key in steps]
+    one = [steps[key] for key in ("plan", "pretrain", "errors", "frames", "place", "edge") if key in steps]
     return [*one, *steps["sites"]]

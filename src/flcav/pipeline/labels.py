@@ -10,7 +10,8 @@ from flcav.config import InputError
 from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
-from flcav.network.ledger import Ledger, LedgerEntry
+from flcav.network.ledger import Ledger
+from flcav.network.messages import send
 from flcav.perception.client import as_shared
 from flcav.perception.metrics import match
 from flcav.perception.objects.model import Second
@@ -21,6 +22,7 @@ from flcav.perception.objects.truth import asked_of, choose_lidar
 from flcav.perception.task import Task
 from flcav.perception.tasks import task_named
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.recipe import EDGE
 from flcav.progress import Report
 
 PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
@@ -93,8 +95,8 @@ def pseudo_label_samples(
     """Return each vehicle's sweeps with pseudo-labels, by "region/vehicle".
 
     Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`, by
-    the package's road detector if `trained`, else by an ideal one.
-    Messages of the sensors enter `book` as downlinks; stage III passes none, since its labels are those of stage II.
+    the package's road detector if `trained`, else by an ideal one, as their messages have them, which enter `book` as
+    downlinks; stage III passes none, since its labels are those of stage II.
     """
     data = split.data
     views = _views(split, poles, trained)
@@ -103,12 +105,11 @@ def pseudo_label_samples(
         key, frame = data.keys[i], data.frame(i)
         lidar = choose_lidar(frame)
         detections = detect_all(network, [frame.lidar[lidar]], score_threshold=threshold)[0]
-        told = views.get((key.scene, key.index), [])
-        name = f"{region}/{key.agent}"
-        samples.setdefault(name, []).append(label_sample(frame, detections, told, network.config, lidar))
+        told, name = views.get((key.scene, key.index), []), f"{region}/{key.agent}"
         if book is not None:
-            for view in told:
-                book.enter(LedgerEntry("edge", OBJECTS.name, "wireless", "down", 0, name, len(view.message())))
+            about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
+            told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
+        samples.setdefault(name, []).append(label_sample(frame, detections, told, network.config, lidar))
         report(done, len(frames), "labels")
     return samples
 

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.rules import Rules
+from flcav.network.clock.rounds import NetworkSettings
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.world.scenarios.scenario import Scenario
@@ -174,6 +175,7 @@ class Federation(Rules):
         None  # of the cloud; default: `strategy`, or fedavg where that one corrects local steps
     )
     edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)  # in every region
+    network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
 
 
 class Arm(Config):

@@ -149,6 +149,22 @@ class Round:
 
 
 @dataclass(frozen=True)
+class FederatedRound(Record):
+    """One round of a federation: whose updates were combined, who failed and why, what was sent, loss and epsilon."""
+
+    server: str  # region of the edge server, or "cloud"
+    round: int  # from 1 in its stage
+    clients: tuple[str, ...]  # whose updates were combined
+    failed: Mapping[str, str]  # by client what was wrong
+    samples: int  # of the clients together
+    loss: float  # mean training loss, weighted by samples
+    up_bytes: int  # of all clients' messages, on their link
+    down_bytes: int
+    epsilon: float | None  # of differential privacy, of all rounds so far; None: without noise
+    seconds: float | None = None  # of the simulated network; None: without one
+
+
+@dataclass(frozen=True)
 class StageResult(Saved):
     """Result of a federated stage of a task, or of centralised training; the weights are in the same folder."""
 
@@ -160,6 +176,7 @@ class StageResult(Saved):
     clients: int
     poles: tuple[int, ...]  # whose sensors contributed labels
     losses: tuple[float, ...] = ()  # mean training loss of each round
+    records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
 
 
 @dataclass(frozen=True)
@@ -208,6 +225,17 @@ class Test:
     estimate: Estimate  # the interval is over scenes and, where the spread is known, over retrainings
     spread: Spread | None  # over retrainings: of this run's own, or of the recipe's table; None: not known
     retrained: tuple[float, ...] = ()  # the measure of each retraining of the arm, on the same frames
+
+
+@dataclass(frozen=True)
+class RegionalTest:
+    """A test of the model that a region keeps for itself, by `federation.personal`."""
+
+    model: str  # region whose model it is
+    region: str  # whose test frames
+    task: str
+    measure: str
+    estimate: Estimate  # the interval is over scenes
 
 
 @dataclass(frozen=True)
@@ -284,6 +312,7 @@ class ArmResult:
     stages: tuple[StageResult, ...]
     links: Mapping[str, LinkUse]
     spent: tuple[Spent, ...]
+    regional: Annotated[tuple[RegionalTest, ...] | None, LEFT_OUT] = None  # of stage III, where regions keep arrays
     earlier: Annotated[tuple[Plan, ...] | None, LEFT_OUT] = None  # plans that others took the place of, oldest first
 
     @property

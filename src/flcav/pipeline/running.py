@@ -10,6 +10,7 @@ from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting, check_federations, name_repeat
+from flcav.pipeline.federations.records import save_rounds
 from flcav.pipeline.findings import findings, name_stage
 from flcav.pipeline.graph import Graph
 from flcav.pipeline.labels import LABEL_SOURCES
@@ -25,6 +26,7 @@ from flcav.pipeline.results import (
     Placed,
     Plan,
     Pretrained,
+    RegionalTest,
     Run,
     Spent,
     StageResult,
@@ -52,7 +54,9 @@ def run(
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> Run:
-    """Run or finish a recipe in the folder `out`; write results.json and history.csv there, and return the results.
+    """Run or finish a recipe in the folder `out`; write its results there, and return them.
+
+    The files are results.json, history.csv, ledgers, rounds.parquet, and TensorBoard's event files.
 
     Towns, datasets and histories are looked for in `beside` (None: the working directory). `jobs` workers compute, of
     one thread each; `engine` and `stale` are those of `run_steps`. Raises `InputError` where a part of the recipe
@@ -143,6 +147,7 @@ def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float, name
     append_records(history, make_history_points(result, name))
     if graph.recipe.retrainings:
         append_records(history.with_name(SPREAD), list_spreads(result, name))
+    save_rounds(result, out)
     result.save(out, RESULTS)
     return result
 
@@ -245,7 +250,19 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
             for link in LINKS
         ),
         earlier=tuple(earlier) or None,
+        regional=_regional_tests(graph, work, arm) or None,
     )
+
+
+def _regional_tests(graph: Graph, work: Path, arm: Setting) -> tuple[RegionalTest, ...]:
+    found = []
+    for stage, region, task in graph.tested(arm):
+        trained = graph.names.stage(arm.name, stage, region, task)
+        for model in graph.models(arm, stage):
+            if model is not None:
+                tested = Tested.load(work / graph.names.test(trained, region, model))
+                found.append(RegionalTest(model, region, task, tested.measure, tested.estimate))
+    return tuple(found)
 
 
 def _differences(graph: Graph, work: Path) -> list[Difference]:

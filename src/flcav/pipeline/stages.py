@@ -15,17 +15,19 @@ import numpy as np
 
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.choice import open_runtime
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Trainable, Weights
-from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.network.ledger import Budget, Ledger
+from flcav.network.messages import send
 from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.training import Checkpointing, Validation, train, train_steps
-from flcav.perception.weights import load_network, save_network, to_arrays
+from flcav.perception.weights import from_arrays, load_network, save_network, to_arrays
 from flcav.pipeline.federations.checkpoint import LAST
 from flcav.pipeline.federations.rounds import FederationCheckpoints, load_round_network
 from flcav.pipeline.frames import Frames
@@ -83,13 +85,21 @@ def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) 
     return {region: tuple(frames) for region, frames in chosen.items()}
 
 
-def book_uploads(book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int]) -> None:
-    """Enter each sample in the ledger twice: vehicle to edge server (wireless), edge server to cloud (wireline)."""
-    sizes = as_shared(task).sample_bytes(pool.data, config, chosen)
-    for frame, size in zip(chosen, sizes, strict=True):
+def upload_samples(
+    book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int]
+) -> Sequence[Any]:
+    """Return the samples of frames as they reach the cloud: from vehicle to edge server (wireless), then by wireline.
+
+    Samples of a task without messages of its own are read from the recording, each on access.
+    """
+    shared, received = as_shared(task), []
+    about: Any = {"stage": PRETRAIN, "task": task.name, "direction": "up"}
+    for frame, message in zip(chosen, shared.pack_samples(pool.data, config, chosen), strict=True):
         key = pool.data.keys[frame]
-        book.enter(LedgerEntry(PRETRAIN, task.name, "wireless", "up", 0, f"{key.scene}/{key.agent}", size))
-        book.enter(LedgerEntry(PRETRAIN, task.name, "wireline", "up", 0, region, size))
+        at_edge = send(book, message, **about, link="wireless", client=f"{key.scene}/{key.agent}")
+        received.append(send(book, at_edge, **about, link="wireline", client=region))
+    samples = shared.unpack_samples(received, config)
+    return task.samples(pool.data, config, chosen) if samples is None else samples
 
 
 def pretrain(
@@ -195,6 +205,7 @@ def federate_edge(
     book: Ledger,
     folder: Path,
     report: Report,
+    outages: Mapping[tuple[int, str], Outage] = {},
     validation: Mapping[str, Frames] = {},
     processes: int = 1,
     runtime: str = "embedded",
@@ -204,6 +215,7 @@ def federate_edge(
     A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
     After each round the network that a federation of so many rounds ends with is scored on `validation`, frames by
     region. Vehicles train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights.
+    The vehicles that `outages` name by round are lost in it.
     """
     state, task, averaged = FederationState(), learning.task, learning.training.average_rounds
     share = 0.0 if earlier else learning.training.start_share
@@ -216,7 +228,7 @@ def federate_edge(
     scored = score if validation else None
     federating = FederationCheckpoints(task, folder, book, report, {EDGE: state}, identity, scored)
     start, done = federating.resume(to_arrays(network))
-    account = Account(book, EDGE, task.name, "wireless")
+    account = Account(book, EDGE, task.name, "wireless", outages)
     keep = federating.make_saver(schedule.rounds)
     how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
     with open_runtime(runtime, clients, processes) as where:
@@ -236,11 +248,13 @@ def federate_cloud(
     book: Ledger,
     folder: Path,
     report: Report,
+    outages: Mapping[tuple[int, str], Outage] = {},
 ) -> tuple[float, ...]:
     """Run stage III from `network`; `regions`: where each edge server starts.
 
-    An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers.
-    Writes weights and ledger, returns each round's loss.
+    An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers, and
+    an edge round loses the vehicles that `outages` names. Writes weights and ledger, returns each round's loss. Where
+    rules make arrays personal, the weights have the mean of the regions' own, and each region's model is beside them.
     """
     state, own_states = FederationState(), {region: FederationState() for region in regions}
     states = {CLOUD: state, **{f"{EDGE}/{region}": own for region, own in own_states.items()}}
@@ -249,8 +263,10 @@ def federate_cloud(
     federating = FederationCheckpoints(
         learning.task, folder, book, report, states, describe_federation(strategies, rules)
     )
+    rules.check_personal(to_arrays(network))
     start, done = federating.resume(to_arrays(network))
-    wireless, wireline = (Account(book, CLOUD, learning.task.name, link) for link in ("wireless", "wireline"))
+    wireless = Account(book, CLOUD, learning.task.name, "wireless", outages)
+    wireline = Account(book, CLOUD, learning.task.name, "wireline")
     servers: dict[str, Trainable] = {
         region: EdgeServer(
             own.clients,
@@ -268,9 +284,18 @@ def federate_cloud(
     earlier = max(own.earlier for own in regions.values())
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier)
     keep = federating.make_saver(rounds)
+
+    def keep_whole(round_: int, weights: Weights, loss: float) -> None:
+        personal = [own.personal for own in own_states.values() if own.personal]
+        keep(round_, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
+
     how: Any = {"strategy": strategies.cloud, "rules": rules.of_servers(), "state": state}
-    federate(servers, start, schedule, wireline, **how, done=done, on_round=keep)
+    federate(servers, start, schedule, wireline, **how, done=done, on_round=keep_whole)
     federating.finish(network, rounds, learning.training.average_rounds)
+    for region, own in own_states.items() if rules.personal else ():
+        model = load_stage_network(learning.task, folder)
+        from_arrays(model, {**to_arrays(model), **own.personal})
+        save_network(learning.task, model, folder / regional_weights(region))
     return tuple(federating.losses)
 
 
@@ -293,6 +318,11 @@ def region_budget(stage_one: Ledger, vehicles: Mapping[str, int], region: str) -
     return Budget(share * stage_one.left_mb("wireless"), 0.0)
 
 
-def load_stage_network(task: Task, folder: Path) -> Any:
-    """Return the trained network of the stage in `folder`."""
-    return load_network(task, folder / WEIGHTS)
+def regional_weights(region: str) -> str:
+    """Return the name of the file of a region's own model, of a stage III with personal arrays."""
+    return f"weights-{region}.safetensors"
+
+
+def load_stage_network(task: Task, folder: Path, region: str | None = None) -> Any:
+    """Return the trained network of the stage in `folder`; with a `region` its own model."""
+    return load_network(task, folder / (WEIGHTS if region is None else regional_weights(region)))

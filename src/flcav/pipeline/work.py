@@ -11,6 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from flcav.config import InputError, read_config
+from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.stages import edge_seeds
 from flcav.files import write_json
 from flcav.intervals import Estimate
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Budget, Ledger, LedgerEntry, Link
@@ -24,6 +26,9 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import PlanRule, find_strategies
 from flcav.pipeline.before_after import detect_before_after
+from flcav.pipeline.federations.messages import release_network, report_errors
+from flcav.pipeline.federations.network import drive_region, join_regions
+from flcav.pipeline.federations.records import read_rounds
 from flcav.pipeline.federations.rounds import load_round_network
 from flcav.pipeline.frames import Frames, deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.labels import (
@@ -76,7 +81,6 @@ from flcav.pipeline.stages import (
     Learning,
     RegionStart,
     Strategies,
-    book_uploads,
     choose_uploads,
     federate_cloud,
     federate_edge,
@@ -86,6 +90,7 @@ from flcav.pipeline.stages import (
     region_budget,
     share_budget,
     train_centrally,
+    upload_samples,
 )
 from flcav.pipeline.steps import Work
 
@@ -135,10 +140,10 @@ def plan_step(
         task, network = task_named(name), asked_for.tasks[name].network
         config = find_configuration(task, network)
         sizes = [
-            size
+            len(message)
             for step in pools[name]
             for split in (Frames.open(work.inputs[step]),)
-            for size in as_shared(task).sample_bytes(split.data, config, split.vehicles)
+            for message in as_shared(task).pack_samples(split.data, config, split.vehicles)
         ]
         messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network, forms))
         own = asked_for.tasks[name]
@@ -205,8 +210,7 @@ def pretrain_step(
     samples: list[Any] = []
     for region, frames in chosen.items():
         if frames:
-            book_uploads(book, learning.task, config, region, opened[region], frames)
-            samples += _each(learning.task.samples(opened[region].data, config, frames))
+            samples += _each(upload_samples(book, learning.task, config, region, opened[region], frames))
     book.save(work.folder / LEDGER)
     validated = pretrain(learning, samples, watched, work.folder, work.report)
     trained = load_stage_network(learning.task, work.folder)
@@ -220,8 +224,17 @@ def pretrain_step(
     ).save(work.folder)
 
 
-def errors_step(work: Work, task: str, region: str, pretrained: str, registry: str) -> None:
-    """Register the errors of the pretrained network in a region.
+def errors_step(
+    work: Work,
+    task: str,
+    region: str,
+    pretrained: str,
+    registry: str,
+    plan: str,
+    vehicles: Mapping[str, int],
+    budget_mb: tuple[float, float],
+) -> None:
+    """Register the errors of the pretrained network in a region, as its vehicles report them to the edge server.
 
     Raises `InputError` for a task whose errors have no position.
     """
@@ -229,10 +242,13 @@ def errors_step(work: Work, task: str, region: str, pretrained: str, registry: s
     if not isinstance(learned, RegistersErrors):
         raise InputError(f"placement.tasks: the errors of '{task}' have no place in a town")
     drive = Frames.open(work.inputs[registry])
-    network = load_stage_network(learned, work.inputs[pretrained])
+    book = _region_book(work, task, region, plan, pretrained, vehicles, budget_mb)
+    network = release_network(book, learned, load_stage_network(learned, work.inputs[pretrained]), region, drive)
     threshold = Pretrained.load(work.inputs[pretrained]).threshold
     lowest = THRESHOLD if threshold is None else threshold
     found = learned.register_errors(network, drive.data, drive.vehicles, lowest, work.report)
+    found = report_errors(book, learned, found, region, drive)
+    book.save(work.folder / LEDGER)
     save_errors(found.errors, work.folder / ERRORS)
     kinds = sorted({error.kind for error in found.errors})
     counts = {kind: sum(error.kind == kind for error in found.errors) for kind in kinds}
@@ -271,26 +287,30 @@ def edge_step(
     labels: str,
     federation: Fields,
     steps: Mapping[str, Any],
+    train_s: float = 0.0,
+    speeds: Mapping[str, float] = {},
     validation: Mapping[str, str] = {},
     processes: int = 1,
     runtime: str = "embedded",
 ) -> None:
     """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`.
 
-    With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III. Each round is
-    scored on the frames of the steps `validation`, by region. Vehicles train in so many `processes` of a `runtime`.
+    With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III. On a network,
+    a vehicle trains `train_s` / speed in a round [s]. Each round is scored on the frames of the steps `validation`, by
+    region. Vehicles train in so many `processes` of a `runtime`.
     """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
     own = plan.tasks[task]
-    stage_one = Ledger.load(work.inputs[steps["pretrain"]] / LEDGER)
-    budget = region_budget(Ledger(_share_budget(plan, budget_mb, task), stage_one.entries), vehicles, region)
+    book = _region_book(work, task, region, steps["plan"], steps["pretrain"], vehicles, budget_mb)
+    if "errors" in steps:
+        book = Ledger(book.budget, _entries(work, steps["errors"]))
     if "edge" in steps:
         stage, rounds = MORE_EDGE, own.cloud_rounds * how.edge_rounds_per_cloud_round
-        book = Ledger(budget, Ledger.load(work.inputs[steps["edge"]] / LEDGER).entries)
+        book = Ledger(book.budget, _entries(work, steps["edge"]))
         samples, poles = _label_samples(work, learning, region, labels, steps)
     else:
-        stage, rounds, book = EDGE, own.edge_rounds, Ledger(budget)
+        stage, rounds = EDGE, own.edge_rounds
         samples, poles = _label_samples(work, learning, region, labels, steps, book)
     start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
     clients = make_clients(learning, start.config, samples)
@@ -298,11 +318,15 @@ def edge_step(
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region, earlier=earlier)
     strategy, _ = find_strategies(how)
     rules = follow_plan(how, own, earlier)
+    before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
+    seeds = [schedule.work(number).seed for number in range(1, rounds + 1)]
+    driven = drive_region(work, learning, how, rules, region, [*clients], steps, seeds, earlier, train_s, speeds)
     watched = {name: Frames.open(work.inputs[step]) for name, step in validation.items()}
-    where: Any = (book, work.folder, work.report, watched, processes, runtime)
-    losses = federate_edge(learning, start, clients, schedule, strategy, rules, earlier, *where)
+    where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
+    losses = federate_edge(*asked, driven.rules, earlier, *where)
     held = sum(len(client.samples) for client in clients.values())
-    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses).save(work.folder)
+    records = read_rounds(work.folder, region, before, {region: driven.seconds})
+    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses, records).save(work.folder)
 
 
 def cloud_step(
@@ -315,6 +339,8 @@ def cloud_step(
     labels: str,
     federation: Fields,
     regions: Mapping[str, Mapping[str, Any]],
+    train_s: float = 0.0,
+    speeds: Mapping[str, float] = {},
 ) -> None:
     """Run stage III of a task: the edge servers of `regions` federate with the cloud, vehicles with edge servers."""
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
@@ -335,8 +361,21 @@ def cloud_step(
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
     federating = Strategies(*find_strategies(how))
     rules = follow_plan(how, own.tasks[task], own.tasks[task].edge_rounds)
-    losses = federate_cloud(learning, start, servers, rounds, k, federating, rules, book, work.folder, work.report)
-    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses).save(work.folder)
+    before, schedule = len(book.entries), learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
+    seeds = {
+        name: [seed for n in range(1, rounds + 1) for seed in edge_seeds(schedule, n, name, k)] for name in servers
+    }
+    driven = {
+        name: drive_region(
+            work, learning, how, rules, name, [*at.clients], regions[name], seeds[name], at.earlier, train_s, speeds
+        )
+        for name, at in servers.items()
+    }
+    rules, lost, seconds = join_regions(driven, k, how.network, update_bytes(to_arrays(start)))
+    asked = (learning, start, servers, rounds, k, federating, rules)
+    losses = federate_cloud(*asked, book, work.folder, work.report, lost)
+    records = read_rounds(work.folder, None, before, seconds)
+    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses, records).save(work.folder)
 
 
 def central_step(
@@ -371,13 +410,13 @@ def central_step(
     StageResult(CENTRAL, task, region, rounds, len(samples), 1, (), losses).save(work.folder)
 
 
-def test_step(work: Work, task: str, region: str, trained: str, frames: str, seed: int) -> None:
-    """Test the network of the step `trained` on a region's test frames.
+def test_step(work: Work, task: str, region: str, trained: str, frames: str, seed: int, model: str | None) -> None:
+    """Test the network of the step `trained`, or the own model of a region, `model`, on a region's test frames.
 
     Raises `InputError` where the frames hold no target, so that the measure is undefined.
     """
     learned, split = task_named(task), Frames.open(work.inputs[frames])
-    network, how = load_stage_network(learned, work.inputs[trained]), as_measurable(learned)
+    network, how = load_stage_network(learned, work.inputs[trained], model), as_measurable(learned)
     outcomes = how.outcomes(network, split.data, split.vehicles, work.report)
     outcomes.save(work.folder / OUTCOMES)
     mean = compute_measure(learned, outcomes)
@@ -473,6 +512,20 @@ def list_speeds(recipe: RunRecipe) -> dict[str, float]:
 def _edge_groups(recipe: RunRecipe) -> tuple[int, ...]:
     """Return the number of vehicles of each federating region's edge server."""
     return tuple(recipe.vehicles(region) for region in recipe.with_role("federate"))
+
+
+def _region_book(
+    work: Work,
+    task: str,
+    region: str,
+    plan: str,
+    pretrained: str,
+    vehicles: Mapping[str, int],
+    budget_mb: tuple[float, float],
+) -> Ledger:
+    """Return an empty ledger of a region's stage II, with its share of what stage I left."""
+    whole = _share_budget(Plan.load(work.inputs[plan]), budget_mb, task)
+    return Ledger(region_budget(Ledger(whole, _entries(work, pretrained)), vehicles, region))
 
 
 def _share_budget(plan: Plan, budget_mb: tuple[float, float], task: str) -> Budget:

@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from flcav.cli.main import run
+from flcav.cli.steps import live_steps
 
 NAME = "cars [3D] :car:"
 RECIPE = Path(__file__).parents[3] / "recipes" / "allocation" / "objects.yaml"
@@ -28,3 +29,14 @@ def test_a_task_s_name_is_no_markup(
         told = capsys.readouterr()
         assert not ended.value.code, told.err
         assert told.out.count(NAME) >= times
+
+
+def test_what_a_round_cost_in_privacy_stays_on_the_terminal(capsys: pytest.CaptureFixture[str]):
+    with live_steps("run") as notify:
+        notify("grid-edge-fl-weather", 1, 6, "loss 0.512")
+        notify("grid-edge-fl-weather", 2, 6, "loss 0.480, epsilon 3.21")
+        notify("grid-edge-fl-weather", 1, 1, "done")
+    assert capsys.readouterr().err.splitlines() == [
+        "run: grid-edge-fl-weather, round 2 of 6: loss 0.480, epsilon 3.21",
+        "run: grid-edge-fl-weather done",
+    ]

@@ -134,6 +134,21 @@ def test_a_view_answers_outside_its_grid_and_weighs_what_it_sends():
     assert 7 * 4 < len(view.message()) < 1000
 
 
+def test_a_vehicle_labels_by_the_message_as_by_the_view():
+    ego, road, detections = scene()
+    view = build_road_view(road, label_ideally(road))
+    told = RoadView.from_message(view.message())
+    assert (told.ground.shape, told.ground.sum()) == (view.ground.shape, view.ground.sum())
+    assert told.ground.size % 8  # packed bits end within a byte
+    one, other = (label_sample(ego, detections, [each], CONFIG) for each in (view, told))
+    assert np.array_equal(one.boxes.array(), other.boxes.array())
+    assert one.boxes.label.tolist() == other.boxes.label.tolist()
+    assert np.array_equal(one.ignore.array(), other.ignore.array())
+    assert one.free is not None
+    assert other.free is not None
+    assert np.array_equal(one.free, other.free)
+
+
 def test_beside_a_road_sensor_only_its_boxes_are_to_be_learned_exactly():
     ego, road, detections = scene()
     unseen = RoadView(Boxes.empty(), np.array([500.0, 500.0]), np.zeros((1, 1), bool), np.zeros((1, 1), bool))

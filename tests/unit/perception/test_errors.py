@@ -11,7 +11,17 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.perception.errors import FALSE_POSITIVE, FINAL_ERROR, MISS, PerceptionError, keep_first, save_errors
+from flcav.perception.errors import (
+    FALSE_POSITIVE,
+    FINAL_ERROR,
+    MISS,
+    PerceptionError,
+    Registry,
+    keep_first,
+    pack_errors,
+    save_errors,
+    unpack_errors,
+)
 from flcav.perception.signs import errors as sign_errors
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
 from flcav.perception.signs.model import SignDetector
@@ -127,6 +137,22 @@ def test_each_mistake_is_kept_once():
     assert [(error.track, error.x, error.scene) for error in kept] == [
         ("veh1", 0.0, "a"), ("veh1", 0.0, "b"), ("false_positive0", 0.0, "a"), ("false_positive1", 5.0, "a"),
     ]  # fmt: skip
+
+
+def test_a_server_registers_what_vehicles_report_as_if_it_had_seen_it():
+    frames = {
+        4: [made(MISS, "veh1"), made(FALSE_POSITIVE, "", 0.0)],
+        5: [made(FALSE_POSITIVE, "", 1.5), made(MISS, "veh1", 9.0)],
+        9: [made(FALSE_POSITIVE, "", 3.0), made(MISS, "veh1", 2.0, scene="b")],
+    }
+    received = {frame: unpack_errors(pack_errors(errors)) for frame, errors in frames.items()}
+    assert [list(errors) for errors in received.values()] == list(frames.values())
+    every = [error for errors in frames.values() for error in errors]
+    assert Registry.of(received).errors == keep_first(every)
+    standing = Registry.of(received, dropped=2, standing=True)  # signs: the same one in every scene
+    assert [(error.track, error.scene) for error in standing if error.kind == MISS] == [("veh1", "a")]
+    assert (len(standing), standing.dropped) == (3, 2)
+    assert unpack_errors(pack_errors([])) == ()
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet"])

@@ -14,8 +14,8 @@ from scipy.integrate import solve_ivp
 from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
 from flcav.geometry import heading_vectors, wrap_angle
-from flcav.perception.trajectory import samples, tracks
-from flcav.perception.trajectory.config import PAST, CrossView, Patch
+from flcav.perception.trajectory import messages, samples, tracks
+from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.roads import RoadMap, road_map
 from flcav.perception.trajectory.samples import extract_columns, find_near, find_pictured, surround
 from flcav.perception.trajectory.tracks import OFFSETS_S, extrapolate, tracks_around, tracks_at
@@ -244,3 +244,32 @@ def test_the_network_with_cameras_sees_earlier_pictures(monkeypatch):
     monkeypatch.setattr(samples, "_kept", lambda _: read)
     surround(spins(60.0, 60.5, 61.0), 4, np.zeros(3), CrossView())
     assert asked == [2]
+
+
+def test_pictures_cross_a_link_once_a_frame_with_the_views_of_all_its_road_users(monkeypatch):
+    rng = np.random.default_rng(2)
+    data, settings = spins(60.0, 60.5, 61.0), TrajectoryConfig(cameras=CrossView(width_px=32, height_px=32))
+    seen = rng.integers(0, 255, (2, 32, 32, 3), np.uint8), rng.normal(size=(2, 3, 3)), rng.normal(size=(2, 4, 4))
+    monkeypatch.setattr(samples, "_kept", lambda _: lambda data, number: seen)
+    count, frame = 5, np.array([4, 4, 5, 5, 5])
+    columns = samples.Columns(
+        past=rng.normal(size=(count, 21, 4)).astype(np.float32),
+        future=rng.normal(size=(count, 30, 2)).astype(np.float32),
+        raster=rng.integers(0, 255, (count, 3, 8, 1), np.uint8),
+        pose=rng.normal(size=(count, 3)),
+        actor=np.arange(count),
+        at_junction=rng.random(count) < 0.5,
+        scene=np.full(count, "a"),
+        frame=frame,
+    )
+    asked = samples.Samples(data, columns, settings.cameras)
+    monkeypatch.setattr(messages, "samples_of", lambda data, config, frames: asked)
+    sent = list(messages.pack_frames(data, settings, [4, 5]))
+    assert abs(len(sent[1]) - len(sent[0])) < 1500  # a road user more, and the same pictures
+    received = messages.unpack_frames(sent)
+    assert len(received) == count
+    for one, other in zip(received, asked, strict=True):
+        assert all(np.array_equal(getattr(one, name), getattr(other, name)) for name in samples.Columns._fields)
+        assert one.surround is not None
+        assert other.surround is not None
+        assert all(np.array_equal(*each) for each in zip(one.surround, other.surround, strict=True))

@@ -22,7 +22,16 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
 from flcav.pipeline.planning import UpdateForm, model_mb, update_forms
 from flcav.pipeline.recipe import Federation, RunRecipe, Training
-from flcav.pipeline.stages import Learning, RegionStart, Strategies, federate_cloud, federate_edge, make_clients
+from flcav.pipeline.stages import (
+    Learning,
+    RegionStart,
+    Strategies,
+    federate_cloud,
+    federate_edge,
+    load_stage_network,
+    make_clients,
+)
+from flcav.progress import ignore_progress
 
 PRIVACY = {"clip": 1.0, "noise": 4.0}
 
@@ -120,6 +129,24 @@ class LineTask:
     def loss(self, network, samples):
         x = torch.tensor(np.array(samples))[:, None]
         return ((network(x) - 2 * x) ** 2).mean()
+
+
+def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2, average_rounds=1), 3)
+    network = learning.build_network()
+    starts = {}
+    for region, x in (("a", 1.0), ("b", 4.0)):
+        clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
+        starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
+    strategies, where = Strategies(FEDAVG, FEDAVG), (Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    federate_cloud(learning, network, starts, 2, 1, strategies, Rules(personal=("bias",)), *where)
+    found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
+    assert np.array_equal(found["a"]["weight"], found["b"]["weight"])
+    assert np.array_equal(found["a"]["weight"], found[None]["weight"])
+    assert found["a"]["bias"] != found["b"]["bias"]
+    assert found[None]["bias"] == pytest.approx((found["a"]["bias"] + found["b"]["bias"]) / 2)
+    with pytest.raises(InputError, match="personal: 'head' matches none of 2 arrays"):
+        federate_cloud(learning, network, starts, 2, 1, strategies, Rules(personal=("head",)), *where)
 
 
 def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:

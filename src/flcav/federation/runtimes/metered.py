@@ -1,7 +1,7 @@
 """A Flower grid that enters every message in a ledger and enforces the budgets; it wraps any other grid."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from flwr.app import Message, RecordDict
 from flwr.serverapp import Grid
@@ -12,13 +12,22 @@ from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link
 
 
 @dataclass(frozen=True)
+class Outage:
+    """A client that the network loses in a round."""
+
+    reason: str  # e.g. "out of coverage"
+    sent_bytes: int | None = None  # of its update, until it broke off; None: it was not there when the round began
+
+
+@dataclass(frozen=True)
 class Account:
-    """The ledger, stage, task and link that messages are entered under."""
+    """The ledger, stage, task and link that messages are entered under, and what the link loses."""
 
     ledger: Ledger
     stage: str  # of training, as in the ledger's entries
     task: str  # its name
     link: Link  # wireless or wireline
+    outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by round and client
 
 
 class MeteredGrid(Grid):

@@ -5,6 +5,7 @@ detection on no annotated object with at least one LiDAR return in its box. Both
 """
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 
 import numpy as np
 
@@ -27,17 +28,18 @@ def register_errors(
     the first of them, see `flcav.perception.errors`. Raises ValueError where `detections` and `frames` differ in
     length.
     """
-    return keep_first(_all_errors(frames, detections, config, threshold))
+    return keep_first(chain.from_iterable(find_errors(frames, detections, config, threshold)))
 
 
-def _all_errors(
-    frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float
-) -> Iterator[PerceptionError]:
+def find_errors(
+    frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float = THRESHOLD
+) -> Iterator[list[PerceptionError]]:
+    """Yield the mistakes of each frame, with those that repeat over frames, see `register_errors`."""
     for frame, found in zip(frames, detections, strict=True):
         found = found[np.flatnonzero(found.score >= threshold)] if found.score is not None else found
         matched = np.zeros(len(found), dtype=bool)
-        yield from _misses(frame, found, matched, config)
-        yield from _false_positives(frame, found[~matched], config)
+        missed = _misses(frame, found, matched, config)
+        yield [*missed, *_false_positives(frame, found[~matched], config)]
 
 
 def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[PerceptionError]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +41,15 @@ def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = No
 
     lidar: name of the LiDAR; None: the frame's first. Raises `InputError` where the frame has none of that name.
     """
+    whole = label_sweep(frame, config, lidar)
+    return replace(whole, points=crop_to_range(whole.points, config))
+
+
+def label_sweep(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Sample:
+    """Return the frame's sweep, whole, with its ground truth as labels, see `sample_from_frame`."""
     truth = ground_truth(frame, config, lidar)
     ignored = (truth.returns > 0) & ((truth.known & ~truth.enough) | truth.lookalike)
-    points = crop_to_range(frame.lidar[choose_lidar(frame, lidar)], config)
-    return Sample(points, truth.boxes[truth.enough], truth.boxes[ignored])
+    return Sample(frame.lidar[choose_lidar(frame, lidar)], truth.boxes[truth.enough], truth.boxes[ignored])
 
 
 class RecordedSweeps(Sequence[Sample]):

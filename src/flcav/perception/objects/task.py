@@ -13,11 +13,12 @@ from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
 from flcav.perception.objects.calibrate import calibrate, measure_reliability
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.errors import register_errors
+from flcav.perception.objects.errors import find_errors
 from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, score_detections
 from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.infer import detect_objects
 from flcav.perception.objects.loss import batch_loss
+from flcav.perception.objects.messages import pack_sweep, unpack_sweep
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.outcomes import ObjectsOutcomes
 from flcav.perception.objects.predict import detect, detect_frames
@@ -119,9 +120,15 @@ class ObjectsTask(ObjectsOutcomes):
         data.check_labelled("objects")
         calibrate(network, map(frame_reader(data, network.config), data.numbers(frames)))
 
-    def sample_bytes(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> list[int]:
-        """Return the size of each frame's sweep with its annotation rows [bytes]."""
-        return [data.payload_bytes(i) for i in frames]
+    def pack_samples(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> Iterator[bytes]:
+        """Yield the message of each frame: its whole sweep and its boxes."""
+        RecordedSweeps(data, config, frames)  # raises for frames without a LiDAR
+        read = frame_reader(data, config)
+        return (pack_sweep(read(i), config) for i in frames)
+
+    def unpack_samples(self, messages: Sequence[bytes], config: SecondConfig) -> list[Sample]:
+        """Return the samples in messages of `pack_samples`."""
+        return [unpack_sweep(message, config) for message in messages]
 
     def infer(
         self, network: Second, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
@@ -150,7 +157,8 @@ class ObjectsTask(ObjectsOutcomes):
                 yield detect(network, frame.lidar[choose_lidar(frame)], score_threshold=threshold)
                 progress(done, len(numbers), "")
 
-        return Registry(register_errors(map(read, numbers), found(), network.config, threshold))
+        each = find_errors(map(read, numbers), found(), network.config, threshold)
+        return Registry.of(dict(zip(numbers, each, strict=True)))
 
 
 OBJECTS = ObjectsTask()

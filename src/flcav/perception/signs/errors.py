@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.rectangles import CLASSES, HALF_PX, select_rectangles
 from flcav.dataset.store import Dataset
-from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry, keep_first
+from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry
 from flcav.perception.images import check_picture
 from flcav.perception.ops.rectangles import iou
 from flcav.perception.signs.config import SignsConfig
@@ -47,8 +47,7 @@ def register_errors(
     pairs = [(number, camera) for number in frames for camera in data.cameras(number)]
     if not pairs:
         raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
-    missed: dict[str, PerceptionError] = {}
-    invented: list[PerceptionError] = []
+    mistakes: dict[int, list[PerceptionError]] = {}
     dropped = 0
     for done, (number, camera) in enumerate(pairs, start=1):
         frame = data.frame(number)
@@ -56,13 +55,12 @@ def register_errors(
         found = detect(network, picture, threshold=threshold)
         height, width = picture.shape[:2]
         misses, false = _mistakes(frame, camera, found, (width, height), network.config)
-        for error in _misses(frame, camera, misses, things):
-            missed.setdefault(error.track, error)
         meets = list(_meets(frame, camera, found, false, solid, network.config))
         dropped += sum(error is None for error in meets)
-        invented += [error for error in meets if error is not None]
+        own = mistakes.setdefault(number, [])
+        own += [*_misses(frame, camera, misses, things), *(error for error in meets if error is not None)]
         progress(done, len(pairs), "")
-    return Registry(keep_first([*missed.values(), *invented]), dropped)
+    return Registry.of(mistakes, dropped=dropped, standing=True)
 
 
 def _mistakes(

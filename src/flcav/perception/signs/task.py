@@ -9,7 +9,7 @@ from torch import Tensor
 
 from flcav.dataset.store import Dataset
 from flcav.files import Json
-from flcav.perception.client import ANNOTATED, camera_ahead, picture_bytes
+from flcav.perception.client import ANNOTATED, camera_ahead
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
@@ -17,14 +17,13 @@ from flcav.perception.signs.errors import register_errors
 from flcav.perception.signs.evaluate import SignsEvaluation, mean_average_precision
 from flcav.perception.signs.infer import detect_signs
 from flcav.perception.signs.loss import batch_loss
+from flcav.perception.signs.messages import pack_frame, unpack_frame
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.outcomes import SignsOutcomes, by_picture
 from flcav.perception.signs.samples import RecordedPictures, Sample
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.progress import Report, ignore_progress
-
-BOX_BYTES = 4 * 4 + 1  # [B] of a label: a box in float32, and its class
 
 
 class SignsTask(SignsOutcomes):
@@ -77,11 +76,14 @@ class SignsTask(SignsOutcomes):
         result = mean_average_precision(found, truths, network.config.classes, network.config.smallest_px)
         return replace(result, scenes=len(set(kept.scene.tolist())))
 
-    def sample_bytes(self, data: Dataset, config: SignsConfig, frames: Sequence[int]) -> list[int]:
-        """Return the size [B] of each frame's images with their boxes: four float32 and a class."""
-        return [
-            picture_bytes(data, i) + BOX_BYTES * sum(map(len, data.frame(i).annotations.signs.values())) for i in frames
-        ]
+    def pack_samples(self, data: Dataset, config: SignsConfig, frames: Sequence[int]) -> Iterator[bytes]:
+        """Yield the message of each frame: its images with their boxes."""
+        RecordedPictures(data, config, frames)  # raises for frames without cameras
+        return (pack_frame(data, i, config) for i in frames)
+
+    def unpack_samples(self, messages: Sequence[bytes], config: SignsConfig) -> list[Sample]:
+        """Return the samples in messages of `pack_samples`."""
+        return [sample for message in messages for sample in unpack_frame(message)]
 
     def infer(
         self, network: SignDetector, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None

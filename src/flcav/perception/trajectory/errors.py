@@ -3,7 +3,7 @@
 import numpy as np
 
 from flcav.dataset.store import Dataset
-from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry, keep_first
+from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry
 from flcav.perception.trajectory.evaluate import MISS_M
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import find_medoid, predict
@@ -24,13 +24,13 @@ def register_errors(
     said = paths[np.arange(len(paths)), find_medoid(paths, probabilities), -1]
     wrong = np.linalg.norm(said - columns.future[:, -1], axis=1) > MISS_M
     traces: dict[str, Trace | None] = {scene: data.trace(scene) for scene in np.unique(columns.scene).tolist()}
-    errors = []
+    found: dict[int, list[PerceptionError]] = {}
     for row in np.flatnonzero(wrong):
         scene, actor = str(columns.scene[row]), int(columns.actor[row])
         trace = traces[scene]
         assert trace is not None  # the samples come from it
         x, y, _ = columns.pose[row]
-        errors.append(
+        found.setdefault(int(columns.frame[row]), []).append(
             PerceptionError(
                 x=float(x),
                 y=float(y),
@@ -44,4 +44,4 @@ def register_errors(
                 track=str(trace.actor[actor]),
             )
         )
-    return Registry(keep_first(errors))
+    return Registry.of(found)

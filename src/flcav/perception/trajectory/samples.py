@@ -52,11 +52,16 @@ def surround(data: Dataset, number: int, present: Array, settings: CrossView) ->
     They are those of `find_pictured`. `present` is x, y, yaw in the world; poses and intrinsics of the cameras are the
     agent's assumed calibration.
     """
-    pictured = find_pictured(data, number)
-    assert pictured is not None
-    pictures, intrinsics, camera_from_world = _kept(settings)(data, pictured)
+    pictures, intrinsics, camera_from_world = pictures_at(data, number, settings)
     world_from_frame = pose(float(present[0]), float(present[1]), yaw=float(present[2]))
     return Surround(pictures, intrinsics, camera_from_world @ world_from_frame)
+
+
+def pictures_at(data: Dataset, number: int, settings: CrossView) -> Pictured:
+    """Return the resized images seen at frame `number`, their intrinsics and camera_from_world, of `find_pictured`."""
+    pictured = find_pictured(data, number)
+    assert pictured is not None
+    return _kept(settings)(data, pictured)
 
 
 def find_pictured(data: Dataset, number: int) -> int | None:

@@ -1,6 +1,5 @@
 """The trajectory task: trajectory prediction of vehicles as a `Task`."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from flcav.perception.trajectory.errors import register_errors
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
 from flcav.perception.trajectory.infer import forecast_frames
 from flcav.perception.trajectory.loss import batch_loss
+from flcav.perception.trajectory.messages import pack_frames, unpack_frames
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.outcomes import TrajectoryOutcomes
 from flcav.perception.trajectory.predict import predict
@@ -77,16 +77,13 @@ class TrajectoryTask(TrajectoryOutcomes):
         seen = samples.columns
         return evaluate_paths(paths, probabilities, seen.past, seen.future, seen.at_junction, seen.scene)
 
-    def sample_bytes(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> list[int]:
-        """Return the size [B] of each frame's samples: past and future in float32; the map is not sent.
+    def pack_samples(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> Iterator[bytes]:
+        """Yield the message of each frame: its samples, see `flcav.perception.trajectory.messages`."""
+        return pack_frames(data, config, frames)
 
-        With rasters, each agent that observes an instant sends all samples of the instant.
-        """
-        columns = samples_of(data, config, frames).columns
-        each = 4 * int(np.prod(columns.past.shape[1:]) + np.prod(columns.future.shape[1:]))
-        keys = [i if config.cameras else (data.keys[i].scene, data.keys[i].index) for i in range(len(data))]
-        counts = Counter(keys[i] for i in columns.frame.tolist())
-        return [each * counts[keys[i]] for i in frames]
+    def unpack_samples(self, messages: Sequence[bytes], config: TrajectoryConfig) -> list[Sample]:
+        """Return the samples in messages of `pack_samples`, each once."""
+        return unpack_frames(messages)
 
     def infer(
         self, network: TrajectoryNetwork, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from flcav.dataset.store import Dataset
 from flcav.files import Json
-from flcav.perception.client import ANNOTATED, camera_ahead, picture_bytes
+from flcav.perception.client import ANNOTATED, camera_ahead
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.perception.weather.augment import augment
@@ -16,6 +16,7 @@ from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
 from flcav.perception.weather.evaluate import Classification, evaluate_samples
 from flcav.perception.weather.infer import classify_pictures
 from flcav.perception.weather.loss import batch_loss
+from flcav.perception.weather.messages import pack_frame, unpack_frame
 from flcav.perception.weather.model import Classifier, LeNet
 from flcav.perception.weather.outcomes import WeatherOutcomes
 from flcav.perception.weather.samples import Sample, label_pictures
@@ -69,9 +70,14 @@ class WeatherTask(WeatherOutcomes):
         """Return accuracy, recall per class and the confusion matrix, see `evaluate_classes`."""
         return evaluate_samples(network, self.samples(data, network.config, frames), progress)
 
-    def sample_bytes(self, data: Dataset, config: LeNetConfig, frames: Sequence[int]) -> list[int]:
-        """Return the size [B] of each frame's images, plus one byte for the class."""
-        return [picture_bytes(data, i) + 1 for i in frames]
+    def pack_samples(self, data: Dataset, config: LeNetConfig, frames: Sequence[int]) -> Iterator[bytes]:
+        """Yield the message of each frame: its images and their class."""
+        label_pictures(data, config.classes, frames)  # raises for frames that cannot be used
+        return (pack_frame(data, i) for i in frames)
+
+    def unpack_samples(self, messages: Sequence[bytes], config: LeNetConfig) -> list[Sample]:
+        """Return the samples in messages of `pack_samples`."""
+        return [sample for message in messages for sample in unpack_frame(message, config.classes)]
 
     def infer(
         self, network: Classifier, path: Path, threshold: float = 0.0, frames: Sequence[int] | None = None

@@ -1,1 +1,1 @@
-"""Federations of a run: the records of their rounds, as results, tables and curves."""
+"""Federations of a run: stage II alone, checkpoints, messages and network of the rounds, their records."""

@@ -5,13 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from flcav.dataset.store import Dataset
 from flcav.files import write_bytes
 from flcav.geometry import Boxes
+from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.arms import Names, resolve_settings
+from flcav.pipeline.federations.network import CLOCK
+from flcav.pipeline.federations.records import list_rounds
 from flcav.pipeline.findings import WORDS
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph import LOOK
@@ -22,11 +26,13 @@ from flcav.pipeline.running import WORK
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.charts.runs import STAGES, Row
+from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
 from flcav.report.pictures import clouds, maps
 
 CHART_NAMES: dict[str, str] = dict(zip((PRETRAIN, EDGE, CLOUD), STAGES, strict=True))
 OBJECTS = "objects"
+SHOWN_ROUNDS = 3  # of a region's timeline
 
 
 def write_report(run: Run, out: Path | str) -> Path:
@@ -62,6 +68,11 @@ def page(run: Run) -> dict[str, Any]:
         }
         for test in run.tested
     ]
+    rounds = [
+        {**vars(record), "stage": WORDS[stage.stage], "task": stage.task}
+        for arm, stage, record in list_rounds(run)
+        if arm == MAIN
+    ]
     return {
         "seed": recipe.seed,
         "retrained": recipe.retrainings,
@@ -76,7 +87,11 @@ def page(run: Run) -> dict[str, Any]:
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},
         "links": main.links,
         "sent": {link: [main.sent_mb(task, link) for task in recipe.tasks] for link in main.links},
+        "regional": [(arm, test) for arm, result in run.arms.items() for test in result.regional or ()],
         "gap_closed": run.gap_closed,
+        "rounds": rounds,
+        "private": any(row["epsilon"] is not None for row in rounds),
+        "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
         "caveats": run.caveats,
         "elapsed_s": run.elapsed_s,
@@ -93,6 +108,7 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
     charts = {task: (*_chart(run, task), _measure(run, task)) for task in run.recipe.tasks}
     for task, chart in charts.items():
         drawn[f"rounds_{_file_name(task)}"] = figures.by_round(*chart)
+    drawn |= _timelines(run, work)
     drawn["megabytes"] = figures.megabytes(_sent(run), {link: use.budget_mb for link, use in main.links.items()})
     sweep = _sweep(work, _names(run), run) if (work / LOOK).is_dir() else None
     if sweep is not None:
@@ -100,6 +116,18 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
         if scenes:
             drawn["overview"] = figures.overview(scenes[0][1], sweep, *charts[OBJECTS])
     return {name: style.png(figure) for name, figure in drawn.items()}
+
+
+def _timelines(run: Run, work: Path) -> dict[str, Figure]:
+    """Return the first rounds of stage II on the network, by region, of the first task; none without a network."""
+    main, task, names = run.arms[MAIN], next(iter(run.recipe.tasks)), _names(run)
+    drawn = {}
+    for region in dict.fromkeys(stage.region for stage in main.stages if stage.stage == EDGE and stage.region):
+        path = work / names.edge(MAIN, region, task) / f"{CLOCK}-{region}.parquet"
+        records = load_rounds(path)[:SHOWN_ROUNDS] if path.exists() else ()
+        if records:
+            drawn[f"timeline_{region}"] = timeline_of_rounds(records)
+    return drawn
 
 
 def _file_name(task: str) -> str:

@@ -1,0 +1,180 @@
+"""The network of a run's vehicles: who ends a round and how long it takes, by their places in recorded traffic.
+
+Round n of a region is driven in one of the scenes of its training data, in turn, from the scene's first instant. The
+roadside units are on the poles of its sensors.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from flcav.config import InputError
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.runtimes.metered import Outage
+from flcav.federation.selection import Selection
+from flcav.federation.strategies import exchanges_more
+from flcav.network.clock.records import ClientTiming, RoundRecord, save_rounds
+from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
+from flcav.network.clock.work import ClientWork
+from flcav.network.radio.links import RadioLinks
+from flcav.network.radio.recorded import link_scene
+from flcav.perception.weights import to_arrays
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.recipe import CLOUD, Federation
+from flcav.pipeline.results import Placed
+from flcav.pipeline.stages import Learning
+from flcav.pipeline.steps import Work
+
+CLOCK = "clock"  # begins the names of the files of rounds on the network, by region
+AWAY, TOO_SLOW = "not in the town", "predicted past the deadline"
+PATIENT = RoundRules()  # by which a round is predicted: without a deadline
+
+
+@dataclass(frozen=True)
+class DrivenRounds:
+    """The rounds of a region on the network: by which rules, who is lost and why, and how long each takes."""
+
+    rules: Rules
+    outages: Mapping[tuple[int, str], Outage]  # by round, from 1, and client
+    records: tuple[RoundRecord, ...]  # on the clock of the region's rounds, from 0 s
+
+    @property
+    def seconds(self) -> list[float]:
+        """Return how long each round takes [s]."""
+        return [record.end_s - record.start_s for record in self.records]
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """The vehicles of a region in a round: what each downloads, computes and uploads."""
+
+    region: str
+    clients: tuple[str, ...]  # "region/vehicle"
+    download_bytes: int
+    upload_bytes: int
+    train_s: float  # of a vehicle of speed 1 in a round
+    speeds: Mapping[str, float]  # by client; others have 1
+
+    def work(self, client: str) -> ClientWork:
+        """Return the work of a client in a round, by the name of its vehicle in the traffic."""
+        vehicle = client.removeprefix(f"{self.region}/")
+        return ClientWork(vehicle, self.download_bytes, self.train_s / self.speeds.get(client, 1.0), self.upload_bytes)
+
+
+def link_scenes(split: Frames, placed: Placed, settings: NetworkSettings, most: int, seed: int) -> list[RadioLinks]:
+    """Return the links of the vehicles in the first `most` scenes of a split to the units on a region's chosen poles.
+
+    Without chosen poles, the unit is on the pole with most traffic. Raises `InputError` where there is no pole, and as
+    `link_scene`.
+    """
+    if not placed.poles:
+        raise InputError(f"federation.network: '{placed.region}' has no poles for roadside units")
+    scenes = list(dict.fromkeys(split.data.keys[i].scene for i in split.vehicles))[:most]
+    poles = placed.chosen or (placed.densest,)
+    return [link_scene(split.data, settings.radio, poles, scene, seed).links for scene in scenes]
+
+
+def drive_rounds(
+    fleet: Fleet,
+    scenes: Sequence[RadioLinks],
+    settings: NetworkSettings,
+    rules: Rules,
+    seeds: Sequence[int],
+    earlier: int,
+) -> DrivenRounds:
+    """Return what the network makes of rounds by `rules`, after `earlier` ones in the scenes before.
+
+    seeds: of each round, which its clients are drawn by. Under deadline selection without given `seconds`
+    those take part whose round is predicted to end in time, with all that are in the town at once. A round goes on
+    without the vehicles that it loses, however many they are, unless the rules say how many it needs.
+    """
+    outages: dict[tuple[int, str], Outage] = {}
+    records, joins, now = [], dict.fromkeys(fleet.clients, ()), 0.0
+    predicts = rules.selection.rule == "deadline" and not rules.selection.seconds
+    for number, seed in enumerate(seeds, start=1):
+        links = scenes[(earlier + number - 1) % len(scenes)]
+        present = {name for name, here in zip(links.vehicle, links.present[0].tolist(), strict=True) if here}
+        chosen = rules.selection.choose(fleet.clients, number, seed)
+        outages |= {(number, each): Outage(AWAY) for each in chosen if fleet.work(each).client not in present}
+        there = [each for each in chosen if (number, each) not in outages]
+        if predicts:
+            slow = _find_slow(fleet, links, there, number, rules.selection.deadline_s or 0.0)
+            outages |= {(number, each): Outage(TOO_SLOW) for each in slow}
+            there = [each for each in there if each not in slow]
+            joins |= {each: (*joins[each], number) for each in there}
+        timings = _time(fleet, links, there, number, settings.rounds)
+        shift = now - float(links.time_s[0])
+        for client, timing in timings.items():
+            if timing.dropped:
+                outages[number, client] = Outage(timing.dropped, timing.uploaded_bytes)
+        clients = tuple(replace(t, start_s=t.start_s + shift, end_s=t.end_s + shift) for t in timings.values())
+        ends = max((timing.end_s for timing in clients), default=now)
+        records.append(RoundRecord(number, now, ends, 0.0, 0.0, clients))
+        now = ends
+    least = 0 if rules.least_clients is None else rules.least_clients
+    selection = Selection(rule="planned", joins=joins) if predicts else rules.selection
+    changed = rules.model_copy(update={"least_clients": least, "selection": selection})
+    return DrivenRounds(changed, outages, tuple(records))
+
+
+def _time(
+    fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: int, rules: RoundRules
+) -> dict[str, ClientTiming]:
+    if not clients:
+        return {}
+    work = [fleet.work(each) for each in clients]
+    return dict(zip(clients, time_clients(links, work, number, float(links.time_s[0]), rules), strict=True))
+
+
+def _find_slow(fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: int, deadline_s: float) -> set[str]:
+    """Return the clients whose update is not predicted to arrive within `deadline_s` [s] of the round's start."""
+    timings = _time(fleet, links, clients, number, PATIENT)
+    return {name for name, t in timings.items() if t.dropped or t.end_s - t.start_s > deadline_s}
+
+
+def drive_region(
+    work: Work,
+    learning: Learning,
+    how: Federation,
+    rules: Rules,
+    region: str,
+    clients: Sequence[str],
+    steps: Mapping[str, Any],
+    seeds: Sequence[int],
+    earlier: int,
+    train_s: float,
+    speeds: Mapping[str, float],
+) -> DrivenRounds:
+    """Return what the network makes of a region's rounds, and write them; without a network nobody is lost."""
+    if how.network is None:
+        return DrivenRounds(rules, {}, ())
+    weights = to_arrays(learning.build_network())
+    sizes = update_bytes(weights), update_bytes(weights, rules.upload, exchanging=exchanges_more(how.strategy))
+    fleet = Fleet(region, tuple(clients), *sizes, train_s, speeds)
+    split, placed = Frames.open(work.inputs[steps["frames"]]), Placed.load(work.inputs[steps["place"]])
+    scenes = link_scenes(split, placed, how.network, earlier + len(seeds), learning.seed)
+    driven = drive_rounds(fleet, scenes, how.network, rules, seeds, earlier)
+    save_rounds(driven.records, work.folder / f"{CLOCK}-{region}.parquet")
+    return driven
+
+
+def join_regions(
+    driven: Mapping[str, DrivenRounds], k: int, settings: NetworkSettings | None, model_bytes: int
+) -> tuple[Rules, dict[tuple[int, str], Outage], dict[str, list[float]]]:
+    """Return the rules of all regions in stage III, whom they lose, and the seconds of each round, by server.
+
+    A cloud round is `k` edge rounds of the slowest region, and a model of `model_bytes` down and up by wireline.
+    """
+    rules = next(iter(driven.values())).rules
+    if settings is None:
+        return rules, {}, {}
+    if all(each.rules.selection.rule == "planned" for each in driven.values()):
+        joins = {name: rounds for each in driven.values() for name, rounds in each.rules.selection.joins.items()}
+        rules = rules.model_copy(update={"selection": Selection(rule="planned", joins=joins)})
+    seconds = {region: each.seconds for region, each in driven.items()}
+    ways = 2 * settings.wireline.seconds(model_bytes)
+    rounds = range(0, len(next(iter(seconds.values()))), k)
+    cloud = [ways + max(sum(own[first : first + k]) for own in seconds.values()) for first in rounds]
+    outages = {key: outage for each in driven.values() for key, outage in each.outages.items()}
+    return rules, outages, {**seconds, CLOUD: cloud}

@@ -1,0 +1,146 @@
+"""What a socket carries in all three stages is what the ledger has, message by message."""
+
+import socket
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flwr.app import Message, RecordDict
+from flwr.common.serde import recorddict_from_proto, recorddict_to_proto
+from flwr.proto.recorddict_pb2 import RecordDict as Serialised
+from flwr.serverapp import Grid
+from task_drives import Drives
+
+from flcav.dataset.recording.recorder import record
+from flcav.dataset.store import Dataset
+from flcav.federation import stages
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.fusion.road import RoadView
+from flcav.geometry import Boxes
+from flcav.network import messages
+from flcav.network.ledger import Budget, Ledger
+from flcav.perception.errors import MISS, PerceptionError, Registry
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import build_network, find_configuration
+from flcav.perception.weights import to_arrays
+from flcav.pipeline.federations.messages import release_network, report_errors
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.stages import upload_samples
+
+
+class Wire:
+    """A socket, and how many bytes came out of it by message."""
+
+    def __init__(self) -> None:
+        self.near, self.far = socket.socketpair()
+        self.arrived: list[int] = []
+
+    def carry(self, message: bytes) -> bytes:
+        sender = threading.Thread(target=self.near.sendall, args=(message,))
+        sender.start()
+        received = bytearray()
+        while len(received) < len(message):
+            received += self.far.recv(1 << 20)
+        sender.join()
+        self.arrived.append(len(received))
+        return bytes(received)
+
+    def carry_content(self, content: RecordDict) -> RecordDict:
+        """Send the content of a message of Flower; return it as it was received."""
+        received = Serialised.FromString(self.carry(recorddict_to_proto(content).SerializeToString()))
+        return recorddict_from_proto(received)
+
+
+class WiredGrid(Grid):
+    """A grid whose messages and replies go through a socket, one by one."""
+
+    def __init__(self, grid: Grid, wire: Wire) -> None:
+        self.grid, self.wire = grid, wire
+
+    def carried(self, message: Message) -> Message:
+        if message.has_content():
+            message.content = self.wire.carry_content(message.content)
+        return message
+
+    def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
+        return self.grid.push_messages([self.carried(message) for message in messages])
+
+    def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]:
+        return [self.carried(reply) for reply in self.grid.pull_messages(message_ids)]
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
+        sent = (self.carried(message) for message in messages)
+        return (self.carried(reply) for reply in self.grid.send_and_receive(sent, timeout=timeout))
+
+    def get_node_ids(self) -> Iterable[int]:
+        return self.grid.get_node_ids()
+
+    def create_message(self, *arguments: Any, **named: Any) -> Message:
+        return self.grid.create_message(*arguments, **named)
+
+    def set_run(self, run: Any) -> None:
+        self.grid.set_run(run)
+
+    @property
+    def run(self) -> Any:
+        return self.grid.run
+
+
+class Walk:
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        drawn = np.random.default_rng(seed).normal(size=weights["w"].shape).astype(np.float32)
+        return LocalUpdate({"w": weights["w"] + drawn}, 3, 0.5)
+
+
+@pytest.fixture
+def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
+    found = Wire()
+    monkeypatch.setattr(messages, "carry", found.carry)
+    monkeypatch.setattr(
+        stages, "MeteredGrid", lambda grid, account, names: MeteredGrid(WiredGrid(grid, found), account, names)
+    )
+    return found
+
+
+def test_the_ledger_has_what_a_socket_carried_in_every_stage(wire: Wire, tmp_path: Path) -> None:
+    record(Drives(spins=2), tmp_path / "data")
+    data, config = Dataset.open(tmp_path / "data"), find_configuration(OBJECTS, "tiny")
+    split, book = Frames(data, tuple(range(len(data))), {}), Ledger(Budget(100.0, 100.0))
+
+    received = upload_samples(book, OBJECTS, config, "suburb", split, [0, 3])
+    assert all(
+        np.array_equal(one.points, other.points)
+        for one, other in zip(received, OBJECTS.samples(data, config, [0, 3]), strict=True)
+    )
+    network = build_network(OBJECTS, config, 1)
+    before = {name: array.copy() for name, array in to_arrays(network).items()}
+    after = to_arrays(release_network(book, OBJECTS, network, "grid", split))
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+    missed = PerceptionError(1.0, 2.0, 3.0, 1.0, MISS, "Car", 7, 0.5, "a", "veh1")
+    assert report_errors(book, OBJECTS, Registry.of({0: [missed], 3: [missed]}), "grid", split).errors == (missed,)
+    assert report_errors(book, OBJECTS, Registry((missed,)), "grid", split).errors == (missed,)
+    view = RoadView(Boxes.empty(), np.zeros(2), np.ones((3, 5), bool), np.zeros((3, 5), bool))
+    about: Any = {"stage": "edge", "task": "objects", "link": "wireless", "direction": "down", "client": "grid/cav0"}
+    assert RoadView.from_message(messages.send(book, view.message(), **about)).ground.all()
+
+    start, schedule = {"w": np.zeros(300, np.float32)}, Schedule(2, 1, 0.1, 0.1, 3)
+    vehicles: dict[str, Trainable] = {f"grid/cav{i}": Walk() for i in range(3)}
+    wireless, wireline = (Account(book, "cloud", "objects", link) for link in ("wireless", "wireline"))
+    for rules in ({}, {"secure": {}}, {"selection": {"rule": "importance", "clients": 2}, "least_clients": 1}):
+        how = Rules.model_validate(rules)
+        federate(vehicles, start, schedule, Account(book, "edge", "objects", "wireless"), rules=how)
+    server: dict[str, Trainable] = {"grid": EdgeServer(vehicles, 2, wireless, start)}
+    federate(server, start, schedule, wireline)
+
+    assert sorted(entry.bytes for entry in book.entries) == sorted(wire.arrived)
+    assert sum(wire.arrived) == sum(
+        book.used_bytes(link, direction=direction) for link in ("wireless", "wireline") for direction in ("up", "down")
+    )
+    kinds = {(entry.stage, entry.link, entry.direction) for entry in book.entries}
+    assert len(kinds) == 2 + 3 + 4  # samples up; network, mistakes, views and rounds; edge and cloud rounds

@@ -1,0 +1,177 @@
+"""Rounds on a network: who takes part, who is lost, by name and in bytes, and how long a round takes."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from moving import made_links
+
+from flcav.config import InputError
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account, Outage
+from flcav.federation.stages import EdgeServer, Schedule, edge_seeds, federate
+from flcav.federation.state import FederationState
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.network.clock.rounds import NetworkSettings, RoundRules
+from flcav.network.ledger import Budget, Ledger
+from flcav.network.radio.links import RadioLinks
+from flcav.network.radio.wireline import Wireline
+from flcav.pipeline.federations.network import DrivenRounds, Fleet, drive_rounds, join_regions
+from flcav.pipeline.recipe import CLOUD
+
+GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
+MB = 1_000_000
+NAN = np.nan
+NAMES = tuple(f"grid/cav{i}" for i in range(3))
+FLEET = Fleet("grid", NAMES, 5 * MB, 10 * MB, 1.0, {"grid/cav2": 0.25})
+TIMES = np.arange(0.0, 60.0)
+
+
+def drive(
+    scenes: list[RadioLinks],
+    rules: Any = None,
+    rounds: int = 1,
+    earlier: int = 0,
+    deadline_s: float | None = None,
+) -> DrivenRounds:
+    settings = NetworkSettings(rounds=RoundRules(deadline_s=deadline_s))
+    return drive_rounds(FLEET, scenes, settings, Rules.model_validate(rules or {}), range(1, rounds + 1), earlier)
+
+
+def test_a_round_takes_download_training_and_upload_of_all_that_share_the_band() -> None:
+    driven = drive([made_links(TIMES, {"cav0": GOOD, "cav2": GOOD})])
+    assert driven.outages == {(1, "grid/cav1"): Outage("not in the town")}  # the recording has no such vehicle
+    # both download 5 MB at 10 Mbit/s: 4 s; cav0 trains 1 s, cav2 4 s; cav0 uploads alone from 5 s to 8 s, 7.5 of 10 MB,
+    # the rest shared until 10 s; cav2 has 2.5 MB by then and sends 7.5 MB alone, in 3 s
+    assert driven.seconds == pytest.approx([13.0])
+    assert [client.end_s for client in driven.records[0].clients] == pytest.approx([10.0, 13.0])
+    assert driven.rules == Rules().model_copy(update={"least_clients": 0})
+
+
+def test_rounds_are_driven_in_the_scenes_in_turn_one_after_another() -> None:
+    alone = [made_links(TIMES + 100, {"cav0": GOOD}), made_links(TIMES, {"cav1": GOOD})]
+    driven = drive(alone, rounds=3, earlier=1)
+    assert [[client.client for client in record.clients] for record in driven.records] == [["cav1"], ["cav0"], ["cav1"]]
+    assert [(record.start_s, record.end_s) for record in driven.records] == [
+        pytest.approx((7.0 * n, 7.0 * (n + 1)))
+        for n in range(3)  # 2 s down, 1 s training, 4 s up
+    ]
+
+
+def test_vehicles_that_are_lost_have_sent_what_came_before() -> None:
+    leaves = np.where(TIMES < 5, GOOD, NAN)  # 2 s down, 1 s training: 2 s of sending, 5 MB
+    driven = drive([made_links(TIMES, {"cav0": leaves})])
+    assert driven.outages[1, "grid/cav0"] == Outage("left the town", 5 * MB)
+    silent = np.where(TIMES < 4, GOOD, NONE)
+    driven = drive([made_links(TIMES, {"cav0": silent})])
+    assert driven.outages[1, "grid/cav0"] == Outage("out of coverage", int(2.5 * MB))
+    assert driven.seconds == pytest.approx([5.0])  # a second without a rate
+    late = drive([made_links(TIMES, {"cav0": GOOD})], deadline_s=6.0)
+    assert late.outages[1, "grid/cav0"] == Outage("past the deadline", int(7.5 * MB))
+
+
+def test_deadline_selection_asks_those_whose_round_is_predicted_to_end_in_time() -> None:
+    scene = made_links(TIMES, {"cav0": GOOD, "cav2": GOOD})
+    rules = {"selection": {"rule": "deadline", "deadline_s": 12.0}}
+    driven = drive([scene, made_links(TIMES, {"cav2": GOOD})], rules, rounds=2)
+    assert driven.outages == {
+        (1, "grid/cav1"): Outage("not in the town"),
+        (1, "grid/cav2"): Outage("predicted past the deadline"),  # its round ends at 13 s
+        (2, "grid/cav0"): Outage("not in the town"),
+        (2, "grid/cav1"): Outage("not in the town"),
+    }
+    assert driven.rules.selection.rule == "planned"
+    assert driven.rules.selection.joins == {"grid/cav0": (1,), "grid/cav1": (), "grid/cav2": (2,)}
+    assert driven.seconds == pytest.approx([7.0, 10.0])  # alone, and so faster
+    given = {"selection": {"rule": "deadline", "deadline_s": 12.0, "seconds": {"grid/cav0": 13.0}}}
+    assert drive([scene], given).rules.selection.rule == "deadline"
+
+
+class Walk:
+    def __init__(self) -> None:
+        self.trained = 0
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        self.trained += 1
+        return LocalUpdate({"w": weights["w"] + np.float32(1 + seed % 7)}, 3, 0.5)
+
+
+START = {"w": np.zeros(1000, np.float32)}
+OUTAGES = {(1, "grid/cav1"): Outage("out of coverage", 999), (2, "grid/cav2"): Outage("not in the town")}
+LEAST = Rules().model_copy(update={"least_clients": 0})
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_round_goes_on_without_those_that_the_network_loses(masked: bool) -> None:
+    clients = {name: Walk() for name in NAMES}
+    book, state = Ledger(Budget(1.0, 0.0)), FederationState()
+    rules = Rules.model_validate({"secure": {}}).model_copy(update={"least_clients": 0}) if masked else LEAST
+    account = Account(book, "edge", "t", "wireless", OUTAGES)
+    federate({**clients}, START, Schedule(2, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
+    assert [record.clients for record in state.records] == [(NAMES[0], NAMES[2]), NAMES[:2]]
+    assert [record.failed for record in state.records] == [
+        {"grid/cav1": "out of coverage"},
+        {"grid/cav2": "not in the town"},
+    ]
+    assert [clients[name].trained for name in NAMES] == [2, 2, 1]
+    ups = [(e.round, e.client, e.bytes) for e in book.entries if e.direction == "up" and e.bytes > 3000]
+    assert [each[:2] for each in ups] == [(1, NAMES[0]), (1, NAMES[2]), (2, NAMES[0]), (2, NAMES[1])]
+    assert [e.bytes for e in book.entries if (e.round, e.client, e.direction) == (1, NAMES[1], "up")][-1] == 999
+
+
+def test_a_round_that_loses_everybody_leaves_the_weights() -> None:
+    book, state = Ledger(Budget(1.0, 1.0)), FederationState()
+    lost = {(1, name): Outage("not in the town") for name in NAMES}
+    clients: dict[str, Trainable] = {name: Walk() for name in NAMES}
+    server = EdgeServer(clients, 1, Account(book, CLOUD, "t", "wireless", lost), START, rules=LEAST, state=state)
+    schedule = Schedule(1, 1, 0.1, 0.1, 3)
+    end = federate({"grid": server}, START, schedule, Account(book, CLOUD, "t", "wireline"))
+    assert np.array_equal(end.weights["w"], START["w"])
+    assert (state.records[0].clients, state.records[0].loss, len(state.records[0].failed)) == ((), 0.0, 3)
+
+
+def test_the_network_knows_whom_an_edge_server_will_draw() -> None:
+    names = [f"grid/cav{i}" for i in range(6)]
+    rules, state = Rules.model_validate({"selection": {"rule": "uniform", "clients": 2}}), FederationState()
+    book, schedule = Ledger(Budget(1.0, 1.0)), Schedule(3, 1, 0.1, 0.1, 3)
+    clients: dict[str, Trainable] = {name: Walk() for name in names}
+    server = EdgeServer(clients, 2, Account(book, CLOUD, "t", "wireless"), START, rules=rules, state=state)
+    federate({"grid": server}, START, schedule, Account(book, CLOUD, "t", "wireline"))
+    seeds = [seed for number in (1, 2, 3) for seed in edge_seeds(schedule, number, "grid", 2)]
+    drawn = [tuple(rules.selection.choose(names, number, seed)) for number, seed in enumerate(seeds, start=1)]
+    assert [record.clients for record in state.records] == drawn
+    assert len(set(drawn)) > 1
+
+
+def test_a_cloud_round_waits_for_the_slowest_region_and_the_wireline() -> None:
+    grid = drive([made_links(TIMES, {"cav0": GOOD})], rounds=4)
+    two = drive([made_links(TIMES, {"cav0": GOOD}), made_links(TIMES, {"cav0": GOOD, "cav2": GOOD})], rounds=4)
+    settings = NetworkSettings(wireline=Wireline(rate_mbps=8.0, latency_s=0.5))
+    rules, outages, seconds = join_regions({"grid": grid, "ring": two}, 2, settings, 2 * MB)
+    assert rules == grid.rules
+    assert seconds[CLOUD] == pytest.approx([2 * 2.5 + 7 + 13] * 2)
+    assert seconds["grid"] == pytest.approx([7.0] * 4)
+    assert set(outages) == set(grid.outages) | set(two.outages)
+
+
+def test_importance_cannot_be_driven() -> None:
+    from flcav.pipeline.arms import check_federations, resolve_settings
+    from flcav.pipeline.recipe import RunRecipe
+
+    for federation, said in (
+        ({"selection": {"rule": "importance", "clients": 1}}, "importance selection draws the clients after"),
+        (
+            {"selection": {"rule": "deadline", "deadline_s": 9}, "privacy": {"clip": 1, "noise": 1}},
+            "noise is for one number",
+        ),
+    ):
+        recipe = RunRecipe.model_validate(
+            {
+                "tasks": {"objects": {"history": "objects"}},
+                "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate", "vehicles": 3}},
+                "budgets_mb": {"wireless": 100, "wireline": 80},
+                "federation": {"network": {}, **federation},
+            }
+        )
+        with pytest.raises(InputError, match=f"federation.network: .*{said}"):
+            check_federations(recipe, resolve_settings(recipe, {"objects": "ideal-road"}).values())

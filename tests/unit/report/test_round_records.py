@@ -1,0 +1,87 @@
+"""Records of rounds: from a federation's checkpoint and ledger, as a table and as curves."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from made_up_run import run as made_up_run
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from flcav.federation.state import RoundRecord
+from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
+from flcav.pipeline.federations.checkpoint import Checkpoint
+from flcav.pipeline.federations.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
+from flcav.pipeline.results import LEDGER, FederatedRound, Run, StageResult
+from flcav.report.pages import html
+from flcav.report.pages.run_page import page
+
+
+def entry(link: Link, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:
+    return LedgerEntry(EDGE, "t", link, direction, round_, client, size)
+
+
+def checkpoint(folder: Path, entries: list[LedgerEntry], **records: RoundRecord) -> None:
+    Ledger(Budget(1.0, 1.0), entries).save(folder / LEDGER)
+    told = {name.replace("_", "/"): (each,) for name, each in records.items()}
+    Checkpoint(1, len(entries), (0.25,), "FedAvg()", {}, told).keep(folder)
+
+
+def test_a_round_has_the_bytes_of_its_own_messages(tmp_path: Path) -> None:
+    earlier = [entry("wireless", "up", 1, "grid/cav0", 10_000), entry("wireless", "down", 0, "grid/cav0", 900)]
+    own = [
+        entry("wireless", "down", 1, "grid/cav0", 50),
+        entry("wireless", "up", 1, "grid/cav0", 7),
+        entry("wireless", "up", 1, "grid/cav1", 8),
+        entry("wireless", "up", 2, "grid/cav1", 600),
+        entry("wireless", "up", 1, "ring/cav1", 90),
+        entry("wireline", "up", 1, "grid", 3),
+        entry("wireline", "up", 1, "ring", 4),
+    ]
+    record = RoundRecord(1, ("grid/cav0",), {"grid/cav1": "no power"}, 2.5, 0.25, 6)
+    checkpoint(tmp_path, [*earlier, *own], edge=record)
+    (found,) = read_rounds(tmp_path, "grid", len(earlier))
+    assert found == FederatedRound("grid", 1, ("grid/cav0",), {"grid/cav1": "no power"}, 6, 0.25, 15, 50, 2.5)
+    checkpoint(tmp_path, [*earlier, *own], cloud=RoundRecord(1, ("grid", "ring")), edge_grid=record, edge_ring=record)
+    sizes = {each.server: (each.up_bytes, each.down_bytes) for each in read_rounds(tmp_path, None, len(earlier))}
+    assert sizes == {CLOUD: (7, 0), "grid": (15, 50), "ring": (90, 0)}
+    assert read_rounds(tmp_path / "none", "grid", 0) == ()
+
+
+def with_rounds(*records: FederatedRound) -> Run:
+    result = made_up_run()
+    stage = StageResult(EDGE, "objects", "grid", 2, 9, 2, (), (0.5, 0.25), records)
+    return replace(result, arms={MAIN: replace(result.arms[MAIN], stages=(stage,))})
+
+
+def test_rounds_are_a_table_curves_and_rows_of_the_page(tmp_path: Path) -> None:
+    first = FederatedRound("grid", 1, ("grid/cav0",), {"grid/cav1": "no power"}, 6, 0.5, 2_000_000, 50, 3.5, 12.5)
+    run = with_rounds(first, replace(first, round=2, failed={}, loss=0.25, epsilon=5.0))
+    save_rounds(run, tmp_path)
+    save_rounds(run, tmp_path)  # a run that is collected again leaves one set of curves
+    rows = pq.read_table(tmp_path / ROUNDS).to_pylist()
+    assert rows == rounds_table(run).to_pylist()
+    assert [(row["arm"], row["stage"], row["task"], row["round"]) for row in rows] == [
+        (MAIN, EDGE, "objects", number) for number in (1, 2)
+    ]
+    assert rows[0]["failed"] == ["grid/cav1: no power"]
+    curves = EventAccumulator(str(tmp_path / EVENTS / "main/edge/objects/grid"))
+    curves.Reload()
+    drawn = {name: [event.value for event in curves.Scalars(name)] for name in curves.Tags()["scalars"]}
+    assert drawn == {
+        "loss": [0.5, 0.25],
+        "clients": [1, 1],
+        "failed": [1, 0],
+        "uplink_mb": [2.0, 2.0],
+        "downlink_mb": pytest.approx([5e-5, 5e-5]),
+        "epsilon": [3.5, 5.0],
+        "seconds": [12.5, 12.5],
+    }
+    text = html.render(page(run), {})
+    for shown in ("<th>ε so far</th><th>seconds</th>", "<td>grid/cav1: no power</td><td>2.0</td>", "<td>3.500</td>"):
+        assert shown in text
+    plain = html.render(page(with_rounds(replace(first, epsilon=None, seconds=None))), {})
+    assert "<td>grid/cav1: no power</td>" in plain
+    assert "<th>ε so far</th>" not in plain
+    assert "Rounds of federated learning" not in html.render(page(made_up_run()), {})
