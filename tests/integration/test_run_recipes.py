@@ -78,7 +78,7 @@ def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) ->
     folder, result = three_tasks
     main = result.arms[MAIN]
     assert list(main.plan.tasks) == ["objects", "weather", "trajectory"]
-    assert [plan.predicted is None for plan in main.plan.tasks.values()] == [False, True, True]
+    assert [plan.predicted is None for plan in main.plan.tasks.values()] == [False, False, True]
     tested = {(test.task, test.region, test.stage) for test in result.tested}
     assert {(task, region, PRETRAIN) for task in recipe.tasks for region in recipe.regions} <= tested
     assert {(task, "grid", stage) for task in recipe.tasks for stage in (EDGE, CLOUD)} <= tested
