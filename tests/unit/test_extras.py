@@ -5,6 +5,7 @@ import shlex
 import sys
 import tomllib
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import pytest
 from packaging.requirements import Requirement
@@ -36,5 +37,5 @@ def test_ray_says_how_to_get_it(monkeypatch, tmp_path):
 def test_importing_towns_says_how_to_get_netconvert(monkeypatch, tmp_path):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError) as told:
-        importing.split_map(tmp_path / "map.xodr", tmp_path / "parts")
+        importing.split_map(Element("OpenDRIVE"), tmp_path / "parts", tmp_path / "map.xodr", left_hand=False)
     assert str(told.value).endswith(format_install_command("towns"))
