@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device
+from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device
 from flcav.cli.terminal import print_json
 from flcav.threads import use_threads
 
@@ -23,6 +23,7 @@ def evaluate(
     device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
     tracks: bool = typer.Option(False, "--tracks", help="objects: also MOTA, AMOTA and id switches of their tracks."),
     agents: str | None = AGENTS,
+    around: bool = AROUND,
     within: str | None = typer.Option(
         None,
         "--range",
@@ -45,7 +46,15 @@ def evaluate(
     learned = task_named(task)
     with progress.show_progress(f"evaluate {learned.name}") as report:
         found = networks.evaluate(
-            learned, data, weights, agents=agents, within=within, tracks=tracks, device=device, progress=report
+            learned,
+            data,
+            weights,
+            agents=agents,
+            within=within,
+            around=around,
+            tracks=tracks,
+            device=device,
+            progress=report,
         )
     origin = networks.origin_of(learned, weights)
     if as_json:

@@ -51,6 +51,7 @@ CATEGORIES = {  # a bicycle of flcav's has a rider; Argoverse 2's without one ke
 }
 SPLITS = ("train", "val", "test")  # folders of logs
 AXLE_M = 0.33  # height of the rear axle above the ground, which in the log 7fab2350 lies 0.33 to 0.37 m below it
+BEAMS = 64  # of both LiDARs: the lasers 0 to 63 of a sweep
 LIDAR, MOUNT = "lidar", "up_lidar"  # our name of both LiDARs, where they are taken to be
 LATE_NS = 50_000_000  # most time between a sweep and the picture of a camera that goes with it: it runs at 20 Hz
 TEXT = ("sensor_name", "track_uuid", "category")  # columns, of which all others are numbers
@@ -99,6 +100,7 @@ class Argoverse2Source:
             "imported": "argoverse2",
             "from": str(self._folder.resolve()),
             "split": self._split or "",
+            "beams": BEAMS,
             "labels": ["objects"] if self._labelled else [],
             "splits": name_splits({scene: log.split for scene, log in self._logs.items()}),
         }

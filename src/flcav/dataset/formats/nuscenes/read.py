@@ -58,6 +58,8 @@ OCCLUSION = {
     "4": 0.1,
 }  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
 TOP = "LIDAR_TOP"
+BEAMS = 32  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders of the format do not say
+VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # nuScenes' own tables
 NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of so many numbers
 FARTHEST = 1e9
 POINT = 5  # float32 of a point: x, y, z, intensity 0 to 255, ring
@@ -216,6 +218,7 @@ class NuscenesSource:
             "split": self._split or "",
             "labels": ["objects"] if self._labelled else [],
             "splits": name_splits(self._split_of),
+            **({"beams": BEAMS} if self._tables.name in VERSIONS else {}),
         }
 
     def scenes(self) -> list[str]:
