@@ -19,6 +19,7 @@ from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, count_beams
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
+from flcav.perception.objects.benchmark import evaluate_kitti, is_kitti
 from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.predict import look_around
 from flcav.perception.objects.task import ObjectsTask
@@ -119,7 +120,8 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a network on recorded frames by the metrics of its task.
 
-    For the task `objects` alone, `within` ("AHEAD,SIDE" in metres) limits the range, `around` looks to all four sides,
+    For the task `objects`, data may also be a folder in KITTI's layout, which is evaluated as its benchmark counts. For
+    that task alone, `within` ("AHEAD,SIDE" in metres) limits the range, `around` looks to all four sides,
     and `tracks` adds the tracking metrics MOTA and AMOTA. Raises `InputError` if task, data, weights, device, agents or
     range are unusable.
 
@@ -134,6 +136,11 @@ def evaluate(
     if within is not None and not isinstance(learned, ObjectsTask):
         raise InputError(f"--range: only objects lie in a range, not '{learned.name}'")
     _check_around(learned, around)
+    if isinstance(learned, ObjectsTask) and not isinstance(data, Dataset) and is_kitti(Path(data)):
+        given = {"agents": agents, "range": within, "around": around, "tracks": tracks}
+        if odd := [name for name, value in given.items() if value]:
+            raise InputError(f"{data}: KITTI's benchmark has no use for --{odd[0]}; import the folder for that")
+        return _evaluate_benchmark(learned, Path(data), network, device, progress)
     dataset = open_data(data)
     tested = _turned(learned, resolve_network(learned, network, device), around)
     chosen = choose_frames(learned, tested.config, dataset, agents, beams=count_trained_beams(learned, network))
@@ -145,6 +152,12 @@ def evaluate(
         followed = evaluate_tracks(tested, dataset, chosen.frames, **narrow, progress=progress)
         found = replace(found, tracks=followed)
     return Evaluation(learned.name, found.score, chosen, found.as_json(), tuple(found.lines()))
+
+
+def _evaluate_benchmark(task: ObjectsTask, folder: Path, network: Weights, device: str, progress: Report) -> Evaluation:
+    found = evaluate_kitti(resolve_network(task, network, device), folder, progress)
+    chosen = FrameSelection(tuple(range(found.frames)), ("ego",), {"vehicle": found.frames}, {})
+    return Evaluation(task.name, found.score, chosen, found.as_json(), tuple(found.lines()))
 
 
 def infer(

@@ -16,7 +16,7 @@ def register(app: typer.Typer) -> None:
 
 def evaluate(
     task: str = typer.Argument(metavar="TASK", help=f"What was learned: {ANY_TASK}."),
-    data: Path = typer.Option(..., "--data", help="Dataset folder."),
+    data: Path = typer.Option(..., "--data", help="Dataset folder; objects: or one in KITTI's layout."),
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
@@ -36,7 +36,8 @@ def evaluate(
 ) -> None:
     """Evaluate a network on recorded frames.
 
-    Accuracy of weather, mAP of signs, average precision of objects, errors of predicted paths.
+    Accuracy of weather, mAP of signs, average precision of objects, errors of predicted paths. Objects in a folder of
+    KITTI are counted as its benchmark does: easy, moderate, hard.
     """
     use_threads(threads)
     from flcav import progress
