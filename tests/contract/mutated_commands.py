@@ -185,7 +185,7 @@ def calls() -> list[Call]:
             found.append(Call(f"errors {task} {options}", (*DATASET, weights), draws / 2))
     weights = "weights/objects.safetensors"
     found += [
-        Call(f"import {name} {folder}/ --out OUT", (f"{folder}/**/*",), seconds)
+        Call(f"import {name} {folder}/ --out OUT", (f"{folder}/**/*",), seconds, kept=("out/.recording",))
         for name, folder, seconds in (
             *(("kitti", "real", 0.05), ("argoverse2", "argoverse2", 0.06)),
             *(("nuscenes", "nuscenes", 0.1), ("opv2v", "opv2v", 0.1)),

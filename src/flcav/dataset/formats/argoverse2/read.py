@@ -159,7 +159,7 @@ class Argoverse2Source:
                     labels.track[own].tolist() if labels else (),
                     boxes,
                     {LIDAR: (points, city_from_ego @ at[LIDAR])},
-                    {name: view_boxes(boxes, picture) for name, picture in pictures.items()},
+                    view_boxes(boxes, pictures),
                     velocity=labels.velocity[own] if labels else None,
                 ),
                 images=read_pictures(files),

@@ -275,7 +275,7 @@ class NuscenesSource:
                 self._track[own].tolist(),
                 boxes,
                 {name: (cloud, poses[name] @ mounts[name]) for name, cloud in clouds.items()},
-                {name: view_boxes(boxes, picture) for name, picture in pictures.items()},
+                view_boxes(boxes, pictures),
                 velocity=self._velocity[own],
                 occlusion=self._occlusion[own],
             ),

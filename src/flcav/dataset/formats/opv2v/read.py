@@ -139,7 +139,7 @@ class Opv2vSource:
                 [names.get(str(number), str(number)) for number in about["vehicles"]],
                 boxes,
                 {LIDAR: (points, world_from_lidar)},
-                {name: view_boxes(boxes, picture) for name, picture in pictures.items()},
+                view_boxes(boxes, pictures),
                 velocity=velocity,
             ),
             images=read_pictures(files),
