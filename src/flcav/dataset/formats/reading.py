@@ -135,6 +135,13 @@ def unseen_views(amodal: Array, truncation: Array, occlusion: Array | None = Non
     )
 
 
+def check_finite(points: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
+    """Return the points (N, C) of the file at `path`; raises `InputError` where one is not finite."""
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: point {int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])} is not finite")
+    return points
+
+
 def pinhole(intrinsics: Array, width: int, height: int) -> Lens:
     """Return the lens of a (3, 3) camera matrix."""
     fx, fy, cx, cy = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()

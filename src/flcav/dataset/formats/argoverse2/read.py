@@ -20,6 +20,7 @@ from flcav.dataset.formats.reading import (
     AgentNames,
     Picture,
     annotate,
+    check_finite,
     choose_split,
     difference_tracks,
     name_splits,
@@ -225,7 +226,8 @@ def _read_sweep(path: Path, origin: Array) -> NDArray[np.float32]:
     """Return (N, 4) x, y, z [m] from `origin` in the ego frame, and intensity [0, 1]."""
     table = _read_feather(path, ("x", "y", "z", "intensity"))
     x, y, z, intensity = (table[name].to_numpy().astype(np.float32) for name in ("x", "y", "z", "intensity"))
-    return np.column_stack((np.column_stack((x, y, z)) - origin.astype(np.float32), intensity / np.float32(255)))
+    xyz = np.column_stack((x, y, z)) - origin.astype(np.float32)
+    return check_finite(np.column_stack((xyz, intensity / np.float32(255))), path)
 
 
 def _read_mounts(folder: Path) -> dict[str, Array]:

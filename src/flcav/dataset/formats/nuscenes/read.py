@@ -21,6 +21,7 @@ from flcav.dataset.formats.reading import (
     AgentNames,
     Picture,
     annotate,
+    check_finite,
     choose_split,
     difference_tracks,
     name_splits,
@@ -295,7 +296,8 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     if len(data) % POINT or path.stat().st_size % 4 or not len(data):
         raise InputError(f"{path}: truncated; {path.stat().st_size} bytes are no whole points of {4 * POINT} bytes")
     right, ahead, up, intensity, _ = data.reshape(-1, POINT).T
-    return np.stack((ahead, -right, up, intensity / np.float32(255)), axis=1).astype(np.float32, copy=False)
+    cloud = np.stack((ahead, -right, up, intensity / np.float32(255)), axis=1).astype(np.float32, copy=False)
+    return check_finite(cloud, path)
 
 
 def _find_tables(folder: Path) -> Path:
