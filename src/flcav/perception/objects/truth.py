@@ -32,7 +32,7 @@ DETECTION_CLASS = {
 LOOKALIKE = {"truck": "Car", "bus": "Car"}  # neutral: a detection on one is neither true nor false
 MIN_RETURNS = 5  # LiDAR returns that make an object a target
 QUARTERS = 4  # quarter turns of a whole spin
-LEVEL_M = 0.1  # difference of a mount's height from the one of the training that training itself covers
+LEVEL_M = 0.15  # difference of a mount's height from the one of the training that needs no correction
 LEVEL_RAD = 0.05  # the same of its direction
 
 Mask = NDArray[np.bool_]
