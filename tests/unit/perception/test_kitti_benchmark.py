@@ -61,7 +61,7 @@ def test_detections_below_the_height_are_ignored():
     assert detection_states("Car", labels, height, LEVELS["hard"]).tolist() == [COUNTS, COUNTS, OTHER, IGNORED]
 
 
-def frame(score: list[float], label: list[int], overlap: list[list[float]], **changes: Any) -> ClassFrame:
+def frame(score: Any, label: Any, overlap: Any, **changes: Any) -> ClassFrame:
     count = len(score)
     return ClassFrame(
         score=np.array(score),
@@ -132,7 +132,8 @@ def test_boxes_are_projected_into_the_image():
 
 def test_the_benchmark_has_no_use_for_other_options(tmp_path: Path):
     (tmp_path / "training" / "velodyne").mkdir(parents=True)
-    for option in ({"agents": "all"}, {"within": "40,20"}, {"around": True}, {"tracks": True}):
+    options: list[dict[str, Any]] = [{"agents": "all"}, {"within": "40,20"}, {"around": True}, {"tracks": True}]
+    for option in options:
         with pytest.raises(InputError, match="KITTI's benchmark has no use for --"):
             evaluate("objects", tmp_path, **option)
     with pytest.raises(InputError, match="no frames to evaluate"):
