@@ -127,7 +127,7 @@ def evaluate(
 
     >>> from flcav import evaluate
     >>> found = evaluate("objects", "data")  # the network of the package
-    >>> found.chosen.used, 0 <= found.score <= 1
+    >>> dict(found.chosen.used), 0 <= found.score <= 1
     ({'vehicle': 4}, True)
     """
     learned = resolve_task(task)
