@@ -19,7 +19,7 @@ from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, count_beams
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
-from flcav.perception.objects.benchmark import evaluate_kitti, is_kitti
+from flcav.perception.metrics.benchmark import evaluate_kitti, is_kitti
 from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.predict import look_around
 from flcav.perception.objects.task import ObjectsTask

@@ -13,6 +13,7 @@ import pytest
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration
 from flcav.geometry import Boxes
+from flcav.perception.metrics.benchmark import project_boxes
 from flcav.perception.metrics.kitti import (
     COUNTS,
     IGNORED,
@@ -25,7 +26,6 @@ from flcav.perception.metrics.kitti import (
     label_states,
 )
 from flcav.perception.networks import evaluate
-from flcav.perception.objects.benchmark import project_boxes
 
 SHARED = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
 PEER = SHARED / "peers/OpenPCDet/pcdet/datasets/kitti/kitti_object_eval_python/eval.py"
