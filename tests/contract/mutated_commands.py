@@ -184,6 +184,14 @@ def calls() -> list[Call]:
             options = f"--data data/ --weights {weights} --out OUT.csv {SCORED[task]}"
             found.append(Call(f"errors {task} {options}", (*DATASET, weights), draws / 2))
     weights = "weights/objects.safetensors"
+    found += [
+        Call(f"import {name} {folder}/ --out OUT", (f"{folder}/**/*",), seconds, kept=("out/.recording",))
+        for name, folder, seconds in (
+            *(("kitti", "real", 0.05), ("argoverse2", "argoverse2", 0.06)),
+            *(("nuscenes", "nuscenes", 0.1), ("opv2v", "opv2v", 0.1)),
+        )
+    ]
+    found.append(Call(f"evaluate objects --data real/ --weights {weights}", ("real/training/*/*", weights), 0.15))
     tracks = f"evaluate objects --data data/ --weights {weights} --tracks"
     return [*found, Call(f"{tracks} --agents vehicles --range #30,#20", DATASET, 0.2)]
 

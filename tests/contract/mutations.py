@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.feather as feather
 import pyarrow.parquet as pq
 import yaml
 from PIL import Image
@@ -206,6 +207,12 @@ def _mutate_parquet(path: Path, data: bytes, rng: Rng) -> str:
     return done
 
 
+def _mutate_feather(path: Path, data: bytes, rng: Rng) -> str:
+    table, done = _mutate_table(feather.read_table(pa.BufferReader(data)).combine_chunks(), rng)
+    feather.write_feather(table, path)
+    return done
+
+
 def _mutate_table(table: pa.Table, rng: Rng) -> tuple[pa.Table, str]:
     draw, column = rng.random(), int(rng.integers(table.num_columns))
     field = table.schema.field(column)
@@ -353,6 +360,7 @@ MUTATIONS: dict[str, Callable[[Path, bytes, Rng], str]] = {
     ".json": _mutate_json,
     ".csv": _mutate_csv,
     ".parquet": _mutate_parquet,
+    ".feather": _mutate_feather,
     ".safetensors": _mutate_safetensors,
     ".bin": _mutate_numbers,
     ".png": _mutate_picture,

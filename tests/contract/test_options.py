@@ -69,12 +69,20 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--seed": ALWAYS,
         **RUNS,
     },
-    "evaluate": {"--data": ALWAYS, "--weights": ALWAYS, "--tracks": ("objects",), "--range": ("objects",), **RUNS},
-    "infer": {"--weights": ALWAYS, "--threshold": SCORED, "--pictures": ALWAYS, **RUNS},
+    "evaluate": {
+        "--data": ALWAYS,
+        "--weights": ALWAYS,
+        "--tracks": ("objects",),
+        "--range": ("objects",),
+        "--around": ("objects",),
+        **RUNS,
+    },
+    "infer": {"--weights": ALWAYS, "--threshold": SCORED, "--around": ("objects",), "--pictures": ALWAYS, **RUNS},
     "errors": {
         "--data": ALWAYS,
         "--weights": ALWAYS,
         "--threshold": SCORED,
+        "--around": ("objects",),
         "--map": ALWAYS,
         **RUNS,
     },
@@ -127,6 +135,7 @@ VALUES = {
     "--calibration": "assumed",
     "--scale": "quick",
     "--tracks": None,
+    "--around": None,
 }  # else 0.5 or 1
 
 

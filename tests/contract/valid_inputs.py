@@ -10,11 +10,15 @@ import numpy as np
 import pyarrow.csv
 import pyarrow.parquet as pq
 import yaml
+from argoverse2_log import write_log
 from PIL import Image
 from task_drives import HEIGHT, WIDTH, Drives
 
 import flcav.world
+from flcav.dataset.formats.export import export
+from flcav.dataset.formats.exporter import ExportOptions
 from flcav.dataset.recording.recorder import record
+from flcav.dataset.store import Dataset
 from flcav.geometry import pose
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import build_network, find_configuration
@@ -227,6 +231,9 @@ def make_inputs(folder: Path) -> None:
         Image.fromarray(pixels).save(folder / f"picture.{suffix}")
     shutil.copy(next((folder / "data" / "top").glob("*.bin")), folder / "cloud.bin")
     _make_kitti(folder / "real" / "training")
+    write_log(folder / "argoverse2" / "log")
+    for name in ("nuscenes", "opv2v"):
+        export(Dataset.open(folder / "data"), name, folder / name, ExportOptions(validation=0.0))
 
 
 def _make_kitti(folder: Path) -> None:

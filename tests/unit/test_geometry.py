@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from flcav.geometry import (
     Boxes,
+    count_points_in_boxes,
     inverse,
     is_rigid,
     points_in_boxes,
@@ -78,3 +79,17 @@ def test_variances_of_the_centre_turn_with_the_boxes():
         covariance = turn[:3, :3] @ np.diag(before[:3]) @ turn[:3, :3].T
         np.testing.assert_allclose(after[:3], np.diag(covariance))
         np.testing.assert_array_equal(after[3:], before[3:])
+
+
+def test_points_in_boxes_are_counted_as_they_are_found():
+    rng = np.random.default_rng(5)
+    cloud = np.pad(rng.uniform(-20, 20, (4000, 3)), ((0, 0), (0, 1))).astype(np.float32)
+    moved = pose(200, -80, 3, yaw=1.1, pitch=0.05, roll=-0.02)
+    rows = np.c_[rng.uniform(-20, 20, (30, 3)), rng.uniform(0.5, 9, (30, 3)), rng.uniform(-3, 3, 30)]
+    boxes = Boxes.from_array(rows, "Car").transform(moved)
+    found = points_in_boxes(transform_points(moved, cloud[:, :3].astype(np.float64)), boxes)
+    counts = count_points_in_boxes(cloud, boxes, moved)
+    assert counts.tolist() == found.sum(axis=1).tolist()
+    assert counts.sum() > 100
+    assert len(count_points_in_boxes(cloud, boxes[:0], moved)) == 0
+    assert count_points_in_boxes(cloud[:0], boxes, moved).tolist() == [0] * 30

@@ -25,6 +25,9 @@ AGENTS = typer.Option(
     help="Whose frames of a dataset: vehicles, poles, all, or names with commas between them. By default those whose "
     "sensors stand as the network expects: docs/tasks.md.",
 )
+AROUND = typer.Option(
+    False, "--around", help="objects: look to all four sides, by quarter turns of the sweep, and not ahead alone."
+)
 JOBS = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each.")
 
 

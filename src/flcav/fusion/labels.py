@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from flcav.fusion.road import CELL_M, GROUND_M, TOP_M, RoadView, find_free_cells
 from flcav.geometry import Boxes, concatenate, inverse, points_in_boxes, transform_points
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.samples import Sample, crop_to_range
-from flcav.perception.objects.truth import detection_labels, is_lookalike
+from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
+from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
 from flcav.sensors.frame import Frame
 
 CONTRADICTED = 0.5  # a detection is dropped where the roadside sensors observed more than this share of its footprint
@@ -28,7 +28,7 @@ SAME_OBJECT_M = 1.0  # boxes of roadside sensors with centres at most this far a
 def label_sample(
     frame: Frame, detections: Boxes, views: Sequence[RoadView], config: SecondConfig, lidar: str = "lidar"
 ) -> Sample:
-    """Return a training sample of a vehicle's `frame`, labelled without ground truth; LiDAR frame.
+    """Return a training sample of a vehicle's `frame`, labelled without ground truth; network's frame.
 
     `detections`: those of the frozen network above its score threshold, LiDAR frame. `views`: of the roadside sensors
     at the same spin, world frame; without any, the detections are the only labels. Boxes to find are the roadside boxes
@@ -46,7 +46,7 @@ def label_sample(
     ignored = ((label != "") & ~targets) | is_lookalike(told.label, config.classes)
 
     cells = _cell_centers(config)
-    height = float(world_from_lidar[2, 3])
+    height = float(frame.agent_from_sensor[lidar][2, 3])
     cells_world = transform_points(world_from_lidar, np.c_[cells, np.full(len(cells), -height)])[:, :2]
     looked = np.zeros(len(cells), dtype=bool)
     for view in views:
@@ -55,7 +55,8 @@ def label_sample(
     known = _free_ground(points, height, cells) | looked
     boxes = concatenate([road[targets], own])
     exact = np.arange(len(boxes)) < targets.sum() if views else None
-    return Sample(points, boxes, road[ignored], cells[known].astype(np.float32), exact)
+    sample = Sample(points, boxes, road[ignored], cells[known].astype(np.float32), exact)
+    return move_sample(sample, network_from_lidar(frame, config, lidar))
 
 
 def _distinct(boxes: Boxes) -> NDArray[np.int64]:

@@ -1,6 +1,6 @@
 """Rigid transforms and oriented 3D boxes."""
 
-from flcav.geometry.boxes import Boxes, concatenate, points_in_boxes, segments_meet_boxes
+from flcav.geometry.boxes import Boxes, concatenate, count_points_in_boxes, points_in_boxes, segments_meet_boxes
 from flcav.geometry.poses import (
     angles_of,
     heading_vectors,
@@ -21,6 +21,7 @@ __all__ = [
     "Boxes",
     "angles_of",
     "concatenate",
+    "count_points_in_boxes",
     "heading_vectors",
     "inverse",
     "is_rigid",

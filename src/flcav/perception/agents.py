@@ -8,7 +8,7 @@ from typing import Any
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.files import Json
-from flcav.perception.task import RigBound, Task
+from flcav.perception.task import KnowsRig, RigBound, Task
 
 POLE = "pole"  # prefix of the names of roadside agents; all other agents are vehicles
 
@@ -21,24 +21,28 @@ class FrameSelection:
     agents: tuple[str, ...]  # names of their agents, in the order of the frames
     used: Mapping[str, int]  # kind of agent, vehicle or pole -> number of selected frames
     left_out: Mapping[str, int]  # the same of the frames that are not selected
+    rig: str = ""  # how their sensors differ from those of the network's training, in words; "" where they do not
 
     @property
     def sentence(self) -> str:
         """Return the counts in words: "24 vehicle frames (8 pole frames left out)"."""
         left = f" ({_frames(self.left_out)} left out)" if self.left_out else ""
-        return _frames(self.used) + left
+        return _frames(self.used) + left + (f"; {self.rig}" if self.rig else "")
 
     def summary(self) -> dict[str, Json]:
-        """Return the agents and the counts of selected frames as JSON values."""
-        return {"agents": list(self.agents), "used": dict(self.used), "left_out": dict(self.left_out)}
+        """Return the agents and the counts of selected frames as JSON values, and `rig` where the sensors differ."""
+        counts = {"agents": list(self.agents), "used": dict(self.used), "left_out": dict(self.left_out)}
+        return counts | ({"rig": self.rig} if self.rig else {})
 
 
-def choose_frames(task: Task, config: Any, data: Dataset, wanted: str | None = None) -> FrameSelection:
+def choose_frames(
+    task: Task, config: Any, data: Dataset, wanted: str | None = None, *, beams: int | None = None
+) -> FrameSelection:
     """Select the frames of the agents `wanted`: "all", "vehicles", "poles" or names, separated by commas.
 
     None selects the frames whose sensors are mounted as a network of `config` expects them (`RigBound.fitting`), and
-    all frames if the task is not bound to a rig. Raises `InputError` for an agent that the dataset lacks, and what
-    `RigBound.fitting` raises.
+    all frames if the task is not bound to a rig. beams: of the LiDAR that the network was trained with; None: not
+    known. Raises `InputError` for an agent that the dataset lacks, and what `RigBound.fitting` raises.
     """
     if wanted is not None:
         frames = data.select(agents=_agents(data, wanted))
@@ -46,7 +50,8 @@ def choose_frames(task: Task, config: Any, data: Dataset, wanted: str | None = N
         frames = task.fitting(data, config) if isinstance(task, RigBound) else range(len(data))
     every, own = ([data.keys[i].agent for i in numbers] for numbers in (range(len(data)), frames))
     used = Counter(map(kind_of, own))
-    return FrameSelection(tuple(frames), tuple(dict.fromkeys(own)), used, Counter(map(kind_of, every)) - used)
+    rig = task.compare_rig(data, config, frames, beams) if isinstance(task, KnowsRig) else ""
+    return FrameSelection(tuple(frames), tuple(dict.fromkeys(own)), used, Counter(map(kind_of, every)) - used, rig)
 
 
 def kind_of(agent: str) -> str:

@@ -28,6 +28,7 @@ RECIPE_FIELDS = (
     "cavs",
     "poles",
     "weather",
+    "beams",
 )
 FACTS = ("parameters", "seed", "samples", "licence", "flcav", "torch", "threads", "processor")
 RIG_FIELDS = ("vehicle_rig", "pole_rig")
@@ -112,6 +113,20 @@ def data_entry(data: Dataset, chosen: FrameSelection) -> DataEntry:
 def write_card(card: Card, path: Path) -> None:
     """Write the card as Markdown, atomically."""
     write_bytes(path, card.markdown().encode())
+
+
+def count_beams(recipe: Mapping[str, Json]) -> int | None:
+    """Return the beams of the vehicles' first LiDAR by the recipe of a recording, or as an import counted them.
+
+    recipe: of a manifest, or of a card's entry, which names the rig. None where it does not say.
+    """
+    rig: Any = recipe.get("vehicle_rig")
+    known: Any = RIGS[rig].model_dump(mode="json") if isinstance(rig, str) and rig in RIGS else rig
+    try:
+        beams = next(iter(known["lidars"].values()))["settings"]["channels"]
+    except (TypeError, KeyError, AttributeError, StopIteration):
+        beams = recipe.get("beams")
+    return beams if isinstance(beams, int) else None
 
 
 def _rig_name(rig: Any) -> str | None:

@@ -7,7 +7,7 @@ its folder, and a network is one in memory, a file of weights, or None for the t
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from torch import nn
 
@@ -16,10 +16,12 @@ from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import Json
 from flcav.perception.agents import FrameSelection, choose_frames
-from flcav.perception.card import Card
+from flcav.perception.card import Card, count_beams
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
+from flcav.perception.metrics.benchmark import evaluate_kitti, is_kitti
 from flcav.perception.objects.evaluate import ObjectsEvaluation
+from flcav.perception.objects.predict import look_around
 from flcav.perception.objects.task import ObjectsTask
 from flcav.perception.objects.truth import narrow_range
 from flcav.perception.task import ConfigT, Finding, NetworkT, SampleT, Scores, Task
@@ -111,28 +113,37 @@ def evaluate(
     *,
     agents: str | None = None,
     within: str | None = None,
+    around: bool = False,
     tracks: bool = False,
     device: str = "auto",
     progress: Report = ignore_progress,
 ) -> Evaluation:
     """Evaluate a network on recorded frames by the metrics of its task.
 
-    For the task `objects` alone, `within` ("AHEAD,SIDE" in metres) limits the range, and `tracks` adds the tracking
-    metrics MOTA and AMOTA. Raises `InputError` if task, data, weights, device, agents or range are unusable.
+    For the task `objects`, data may also be a folder in KITTI's layout, which is evaluated as its benchmark counts. For
+    that task alone, `within` ("AHEAD,SIDE" in metres) limits the range, `around` looks to all four sides,
+    and `tracks` adds the tracking metrics MOTA and AMOTA. Raises `InputError` if task, data, weights, device, agents or
+    range are unusable.
 
     >>> from flcav import evaluate
     >>> found = evaluate("objects", "data")  # the network of the package
-    >>> found.chosen.sentence, 0 <= found.score <= 1
-    ('4 vehicle frames', True)
+    >>> dict(found.chosen.used), 0 <= found.score <= 1
+    ({'vehicle': 4}, True)
     """
     learned = resolve_task(task)
     if tracks and not isinstance(learned, ObjectsTask):
         raise InputError(f"--tracks: only objects have tracks, not '{learned.name}'")
     if within is not None and not isinstance(learned, ObjectsTask):
         raise InputError(f"--range: only objects lie in a range, not '{learned.name}'")
+    _check_around(learned, around)
+    if isinstance(learned, ObjectsTask) and not isinstance(data, Dataset) and is_kitti(Path(data)):
+        given = {"agents": agents, "range": within, "around": around, "tracks": tracks}
+        if odd := [name for name, value in given.items() if value]:
+            raise InputError(f"{data}: KITTI's benchmark has no use for --{odd[0]}; import the folder for that")
+        return _evaluate_benchmark(learned, Path(data), network, device, progress)
     dataset = open_data(data)
-    tested = resolve_network(learned, network, device)
-    chosen = choose_frames(learned, tested.config, dataset, agents)
+    tested = _turned(learned, resolve_network(learned, network, device), around)
+    chosen = choose_frames(learned, tested.config, dataset, agents, beams=count_trained_beams(learned, network))
     narrow = {} if within is None else {"asked": narrow_range(tested.config, within)}
     if tracks:
         group_sequences(dataset, chosen.frames)  # said before the long work
@@ -143,19 +154,27 @@ def evaluate(
     return Evaluation(learned.name, found.score, chosen, found.as_json(), tuple(found.lines()))
 
 
+def _evaluate_benchmark(task: ObjectsTask, folder: Path, network: Weights, device: str, progress: Report) -> Evaluation:
+    found = evaluate_kitti(resolve_network(task, network, device), folder, progress)
+    chosen = FrameSelection(tuple(range(found.frames)), ("ego",), {"vehicle": found.frames}, {})
+    return Evaluation(task.name, found.score, chosen, found.as_json(), tuple(found.lines()))
+
+
 def infer(
     task: Named,
     inputs: Path | str | Sequence[Path | str],
     network: Weights = None,
     *,
     threshold: float | None = None,
+    around: bool = False,
     agents: str | None = None,
     device: str = "auto",
 ) -> Inference:
     """Run a network on files, folders of files, or dataset folders: point clouds or images, by task.
 
-    Detections that score below `threshold` are left out (None: the task's default). Raises `InputError` if task,
-    weights, device or agents are unusable; for a bad file, when the iteration reaches it.
+    Detections that score below `threshold` are left out (None: the task's default). For the task `objects` alone,
+    `around` looks to all four sides. Raises `InputError` if task, weights, device or agents are unusable; for a bad
+    file, when the iteration reaches it.
 
     >>> from flcav import infer
     >>> first = next(iter(infer("objects", "data", threshold=0.5)))
@@ -163,12 +182,16 @@ def infer(
     ('grid-0-000_0000_cav0', 'Boxes')
     """
     learned = resolve_task(task)
+    _check_around(learned, around)
     paths = [Path(inputs)] if isinstance(inputs, Path | str) else list(map(Path, inputs))
-    looking = resolve_network(learned, network, device)
+    looking = _turned(learned, resolve_network(learned, network, device), around)
     recorded = [path for path in paths if (path / MANIFEST).is_file()]
     if agents is not None and not recorded:
         raise InputError(f"--agents {agents}: only datasets have agents, and none is among the inputs")
-    chosen = {path: choose_frames(learned, looking.config, Dataset.open(path), agents) for path in recorded}
+    beams = count_trained_beams(learned, network)
+    chosen = {
+        path: choose_frames(learned, looking.config, Dataset.open(path), agents, beams=beams) for path in recorded
+    }
     frames = {path: choice.frames for path, choice in chosen.items()}
     lowest = threshold_of(learned, threshold)
     return Inference(chosen, (f for path in paths for f in learned.infer(looking, path, lowest, frames.get(path))))
@@ -180,13 +203,15 @@ def register_errors(
     network: Weights = None,
     *,
     threshold: float | None = None,
+    around: bool = False,
     agents: str | None = None,
     device: str = "auto",
     progress: Report = ignore_progress,
 ) -> Registry:
     """Return the mistakes of a network on recorded frames with their positions in the town, each once.
 
-    Detections that score below `threshold` are ignored (None: the task's default). Raises `InputError` for a task whose
+    Detections that score below `threshold` are ignored (None: the task's default). For the task `objects` alone,
+    `around` looks to all four sides. Raises `InputError` for a task whose
     mistakes have no position, and if data, weights, device or agents are unusable.
 
     >>> from flcav import register_errors
@@ -196,12 +221,14 @@ def register_errors(
     >>> set(errors.kinds) <= {"miss", "false_positive"}
     True
     """
-    learned, dataset = resolve_task(task), open_data(data)
+    learned = resolve_task(task)
+    _check_around(learned, around)
+    dataset = open_data(data)
     if not isinstance(learned, RegistersErrors):
         able = [name for name in TASKS if isinstance(task_named(name), RegistersErrors)]
         raise InputError(f"task '{learned.name}': its mistakes have no place in a town; choose {', '.join(able)}")
-    tested = resolve_network(learned, network, device)
-    chosen = choose_frames(learned, tested.config, dataset, agents)
+    tested = _turned(learned, resolve_network(learned, network, device), around)
+    chosen = choose_frames(learned, tested.config, dataset, agents, beams=count_trained_beams(learned, network))
     lowest = threshold_of(learned, threshold)
     return replace(learned.register_errors(tested, dataset, chosen.frames, lowest, progress), chosen=chosen)
 
@@ -224,6 +251,28 @@ def resolve_network(task: Task[ConfigT, NetworkT, SampleT], network: Weights, de
     if isinstance(network, nn.Module):
         return cast(NetworkT, network)  # the caller answers for its type
     return load_network(task, Path(network or find_shipped(task))).to(select_device(device))
+
+
+def _turned(task: Task, network: Any, around: bool) -> Any:
+    """Return the network of `task`, looking to all four sides with `around`."""
+    return look_around(network) if around and isinstance(task, ObjectsTask) else network
+
+
+def _check_around(task: Task, around: bool) -> None:
+    if around and not isinstance(task, ObjectsTask):
+        raise InputError(f"--around: only objects are looked for to all sides, not '{task.name}'")
+
+
+def count_trained_beams(task: Task, network: Weights) -> int | None:
+    """Return the beams of the LiDAR that a network was trained with, by its card; None where that does not say."""
+    if isinstance(network, nn.Module):
+        return None
+    try:
+        card = read_card(Path(network or find_shipped(task)))
+    except InputError:
+        return None
+    beams = {count_beams(entry.recipe) for entry in card.data}
+    return beams.pop() if len(beams) == 1 else None
 
 
 def threshold_of(task: Task, threshold: float | None) -> float:

@@ -170,6 +170,18 @@ class RigBound(Protocol):
         ...
 
 
+@runtime_checkable
+class KnowsRig(Protocol):
+    """A task whose networks know the sensor rig that they were trained for."""
+
+    def compare_rig(self, data: Dataset, config: Any, frames: Sequence[int], beams: int | None) -> str:
+        """Return how the rig of these frames differs from that of a network of `config`, in words, "" for not at all.
+
+        beams: of the LiDAR that the network was trained with; None: not known.
+        """
+        ...
+
+
 def find_configuration(task: Task[ConfigT, NetworkT, SampleT], name: str | None) -> ConfigT:
     """Return the configuration of that name (None: the default); raises `InputError` for an unknown name."""
     known = task.configurations

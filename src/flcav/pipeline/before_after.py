@@ -6,9 +6,9 @@ import numpy as np
 
 from flcav.geometry import Boxes
 from flcav.perception.metrics.matching import assign_targets, on_neutral
-from flcav.perception.objects.predict import detect
+from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.truth import FrameTruth, asked_of, choose_lidar
+from flcav.perception.objects.truth import FrameTruth, asked_of
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.results import SweepComparison, SweepDetections
 from flcav.pipeline.stages import load_stage_network
@@ -26,9 +26,8 @@ def detect_before_after(before: Path, after: Path, split: Frames) -> SweepCompar
     truths = [asked_of(split.data.frame(i), config) for i in split.vehicles]
     best = int(np.argmax([len(truth.targets) for truth in truths]))
     frame, truth = split.data.frame(split.vehicles[best]), truths[best]
-    points = frame.lidar[choose_lidar(frame)]
     seen = {
-        name: _matched(detect(network, points, score_threshold=SHOWN_SCORE), truth)
+        name: _matched(detect_in(network, [frame], score_threshold=SHOWN_SCORE)[0], truth)
         for name, network in networks.items()
     }
     return SweepComparison(split.vehicles[best], _rows(truth.targets), seen["before"], seen["after"])

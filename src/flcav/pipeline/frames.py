@@ -1,5 +1,6 @@
 """Data splits of a run: recorded in a town, or divided by scenes out of a recorded dataset."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,6 +96,15 @@ def deal_frames(path: Path, split: SplitName, role: Role, seed: int, whole: bool
         raise InputError(f"{path}: {len(scenes)} scenes; at least {least} are wanted to deal to a region to {role}")
     order = stream(seed, "deal").permutation(len(scenes))
     return group_frames(data, str(path), {scenes[number] for number in order[_own_part(split, role, len(scenes))]})
+
+
+def count_training_frames(path: Path, seed: int, whole: bool) -> dict[str, int]:
+    """Return vehicle -> number of its training frames, for a region to federate of the dataset at `path`.
+
+    Raises `InputError` as `deal_frames` does.
+    """
+    dealt, keys = deal_frames(path, "edge", "federate", seed, whole), Dataset.open(path).keys
+    return dict(sorted(Counter(keys[i].agent for i in dealt.vehicles).items()))
 
 
 def _own_part(split: SplitName, role: Role, scenes: int) -> slice:

@@ -9,7 +9,7 @@ from typing import Any
 
 from flcav.config import InputError, shorten
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
-from flcav.pipeline.frames import hash_manifest, hash_town, recording_fields
+from flcav.pipeline.frames import count_training_frames, hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
 from flcav.pipeline.planning import UpdateForm, read_history, update_forms
 from flcav.pipeline.recipe import (
@@ -65,6 +65,7 @@ class Graph:
         self.names = Names(self.settings)
         self.spreads = read_spreads(recipe.spread, self.beside) if recipe.spread is not None else {}
         self.federating = recipe.with_role("federate")
+        self.recorded = {name: self._count_frames(name) for name in self.federating if recipe.regions[name].data}
         self._steps: dict[str, Step] = {}
         self._add_recordings()
         for arm in self.settings.values():
@@ -162,6 +163,10 @@ class Graph:
         arguments = {"fields": fields, "beside": beside, "places": seen, "version": version}
         return _step(name, record_step, arguments, seen)
 
+    def _count_frames(self, region: str) -> dict[str, int]:
+        own = self.recipe.regions[region]
+        return count_training_frames(self._folder_of(own, EDGE), self.recipe.seed, isinstance(own.data, Mapping))
+
     def _folder_of(self, region: Region, split: SplitName) -> Path:
         named = region.data[split] if isinstance(region.data, Mapping) else str(region.data)
         found = find_path(named, self.beside)
@@ -201,6 +206,8 @@ class Graph:
         planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "histories": self._histories()}
         if (forms := update_forms(self.settings.values())) != [UpdateForm()]:
             planned["updates"] = [form.model_dump(mode="json") for form in forms]
+        if self.recorded:
+            planned["recorded"] = self.recorded
         plan = names.plan(arm.name)
         self._add(_step(plan, plan_step, planned, [step for steps in pools.values() for step in steps]))
         for task in recipe.tasks:
@@ -329,7 +336,8 @@ class Graph:
         return (main.regions[0], main.stages[-1]) if OBJECTS in self.recipe.tasks else None
 
     def _vehicles(self) -> dict[str, int]:
-        return {region: self.recipe.vehicles(region) for region in self.federating}
+        known = {region: len(vehicles) for region, vehicles in self.recorded.items()}
+        return {region: known.get(region) or self.recipe.vehicles(region) for region in self.federating}
 
     def _add_tests(self, arm: Setting) -> None:
         for stage, region, task in self.tested(arm):

@@ -15,7 +15,7 @@ from flcav.network.messages import send
 from flcav.perception.client import as_shared
 from flcav.perception.metrics import match
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.predict import detect_all
+from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import asked_of, choose_lidar
@@ -64,7 +64,7 @@ def fit_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
     """
     frames = [split.data.frame(i) for split in splits for i in split.vehicles]
     truths = [asked_of(frame, network.config) for frame in frames]
-    found = detect_all(network, [frame.lidar[choose_lidar(frame)] for frame in frames])
+    found = detect_in(network, frames)
     matches = match(found, [t.targets for t in truths], [t.neutral for t in truths], 0.5)
     precision = np.cumsum(matches.hit) / np.arange(1, len(matches.hit) + 1)
     good = np.flatnonzero(precision >= PRECISION)
@@ -104,7 +104,7 @@ def pseudo_label_samples(
     for done, i in enumerate(frames):
         key, frame = data.keys[i], data.frame(i)
         lidar = choose_lidar(frame)
-        detections = detect_all(network, [frame.lidar[lidar]], score_threshold=threshold)[0]
+        (detections,) = detect_in(network, [frame], score_threshold=threshold)
         told, name = views.get((key.scene, key.index), []), f"{region}/{key.agent}"
         if book is not None:
             about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}

@@ -127,15 +127,16 @@ def plan_step(
     pools: Mapping[str, Sequence[str]],
     histories: Mapping[str, str],
     updates: Sequence[Fields] = (),
+    recorded: Mapping[str, Mapping[str, int]] | None = None,
 ) -> None:
     """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables.
 
     `updates` are the forms of the arms' updates, of which the largest is planned with; default: whole updates.
+    `recorded`: of federating regions of recorded data, the vehicles with their numbers of training frames.
     """
     asked_for = RunRecipe.model_validate(recipe)
-    asked, groups, each = [], _edge_groups(asked_for), asked_for.sized_splits.edge
+    asked, held = [], _held_frames(asked_for, recorded or {})
     forms = tuple(UpdateForm.model_validate(update) for update in updates) or (UpdateForm(),)
-    held = tuple(vehicles * each.scenes * each.spins for vehicles in groups)
     for name in asked_for.tasks:
         task, network = task_named(name), asked_for.tasks[name].network
         config = find_configuration(task, network)
@@ -151,8 +152,9 @@ def plan_step(
         asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan, own.train_s))
     budgets = Price(asked_for.budgets_mb.wireless, asked_for.budgets_mb.wireline)
     k = asked_for.federation.edge_rounds_per_cloud_round
-    speeds = list_speeds(asked_for)
-    frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k, held, asked_for.horizon_s, speeds)
+    speeds = list_speeds(asked_for, held)
+    groups, samples = tuple(map(len, held.values())), tuple(sum(own.values()) for own in held.values())
+    frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k, samples, asked_for.horizon_s, speeds)
     plan, problem = make_plan(tuple(asked), frame, rule)
     if problem is not None:
         write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
@@ -500,18 +502,25 @@ def _select_group(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[
     return near
 
 
-def list_speeds(recipe: RunRecipe) -> dict[str, float]:
-    """Return the speed of every vehicle by its name in a federation; empty where no region gives any."""
-    federating = recipe.with_role("federate")
-    if not any(recipe.regions[name].speed for name in federating):
+def list_speeds(recipe: RunRecipe, held: Mapping[str, Mapping[str, int]]) -> dict[str, float]:
+    """Return the speed of every vehicle by its name in a federation; empty where no region gives any.
+
+    held: the vehicles of each federating region with their numbers of training frames.
+    """
+    if not any(recipe.regions[region].speed for region in held):
         return {}
-    names = [(name, f"cav{number}") for name in federating for number in range(recipe.vehicles(name))]
-    return {f"{name}/{vehicle}": recipe.regions[name].speed.get(vehicle, 1.0) for name, vehicle in names}
+    names = [(region, vehicle) for region, vehicles in held.items() for vehicle in vehicles]
+    return {f"{region}/{vehicle}": recipe.regions[region].speed.get(vehicle, 1.0) for region, vehicle in names}
 
 
-def _edge_groups(recipe: RunRecipe) -> tuple[int, ...]:
-    """Return the number of vehicles of each federating region's edge server."""
-    return tuple(recipe.vehicles(region) for region in recipe.with_role("federate"))
+def _held_frames(recipe: RunRecipe, recorded: Mapping[str, Mapping[str, int]]) -> dict[str, Mapping[str, int]]:
+    """Return the vehicles of each federating region with their numbers of training frames."""
+    each = recipe.sized_splits.edge
+    return {
+        region: recorded.get(region)
+        or {f"cav{number}": each.scenes * each.spins for number in range(recipe.vehicles(region))}
+        for region in recipe.with_role("federate")
+    }
 
 
 def _region_book(

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,13 @@ from flcav.dataset.formats.importing import READABLE, import_dataset
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, wrap_angle
+from flcav.network.ledger import Ledger
 from flcav.pipeline.frames import group_frames
+from flcav.pipeline.graph import Graph
+from flcav.pipeline.recipe import EDGE, SPLITS_OF, RunRecipe
+from flcav.pipeline.results import LEDGER, Plan
+from flcav.pipeline.steps import Step, Work
+from flcav.progress import ignore_progress
 from flcav.sensors.frame import Frame
 
 SCENES = 2
@@ -165,10 +172,33 @@ def test_links_are_made_where_nothing_is_to_be_converted(imported: dict[str, Dat
     assert imported["nuscenes"].plane_path(0, "CAM_FRONT", "rgb").is_symlink()
 
 
-def test_vehicles_of_an_import_are_clients_of_a_region(imported: dict[str, Dataset]):
-    data = imported["opv2v"]
-    grouped = group_frames(data, "imported")
-    assert {data.keys[i].agent for i in grouped.vehicles} == {"cav0"}
+def _in_order(steps: Mapping[str, Step], last: str) -> list[str]:
+    """Return the names of what the step `last` needs, and its own, each after those it needs."""
+    return list(dict.fromkeys([*(name for each in steps[last].needs for name in _in_order(steps, each)), last]))
+
+
+def test_vehicles_of_an_import_are_clients_of_a_region(imported: dict[str, Dataset], tmp_path: Path):
+    data = {split: str(imported["opv2v"].folder) for split in ("pool", *SPLITS_OF["federate"])}
+    recipe = RunRecipe.model_validate(
+        {
+            "training": {"steps": 1, "local_steps": 1},
+            "splits": {name: {"scenes": 2, "spins": 1, "cavs": 3} for name in data},  # three vehicles if not known
+            "tasks": {"objects": {"plan": {"samples": 2, "edge_rounds": 1, "cloud_rounds": 0}}},
+            "regions": {"first": {"role": "pretrain", "data": data}, "streets": {"role": "federate", "data": data}},
+            "budgets_mb": {"wireless": 3, "wireline": 3},
+        }
+    )
+    steps = {step.name: step for step in Graph(recipe, tmp_path).steps}
+    for name in _in_order(steps, "streets-edge-fl-objects"):
+        (tmp_path / name).mkdir()
+        inputs = {each: tmp_path / each for each in steps[name].needs}
+        steps[name].run(Work(tmp_path / name, inputs, ignore_progress), **steps[name].arguments)
+    entries = Ledger.load(tmp_path / "streets-edge-fl-objects" / LEDGER).entries
+    (sent,) = (entry for entry in entries if (entry.link, entry.direction) == ("wireless", "up"))
+    plan = Plan.load(tmp_path / "plan").tasks["objects"]
+    assert (sent.stage, sent.client) == (EDGE, "streets/cav0")
+    assert plan.wireless_mb == pytest.approx(plan.samples * plan.sample_mb + sent.bytes / 1e6)  # of one vehicle
+    grouped = group_frames(imported["opv2v"], "imported")
     assert grouped.poles.keys() == {3}
 
 

@@ -37,9 +37,10 @@ class Street:
     agents: tuple[str, ...] = ("cav0", "cav1", "pole3")
     scene: tuple[str, ...] = ("a", "b")
     height_m: float = 1.8
+    beams: int | None = None
 
     def describe(self) -> dict[str, Any]:
-        return {"town": "none", "split": "train", "seed": 0, "agents": self.agents}
+        return {"town": "none", "split": "train", "seed": 0, "agents": self.agents, "beams": self.beams}
 
     def scenes(self) -> list[str]:
         return list(self.scene)
@@ -133,6 +134,18 @@ def test_a_lidar_fits_by_its_height_and_not_by_its_carrier(recorded):
         choose_frames(OBJECTS, tiny_config(), truck)
     assert len(choose_frames(OBJECTS, tiny_config(), truck, "vehicles").frames) == 4
     assert choose_frames(OBJECTS, tiny_config(ground_z_m=-3.0), truck).sentence.startswith("4 vehicle frames (2 pole")
+
+
+def test_a_rig_unlike_the_network_s_is_said_and_its_height_corrected(recorded):
+    taller = recorded(height_m=2.1)
+    chosen = choose_frames(OBJECTS, tiny_config(), taller, "all")
+    assert chosen.rig == "unlike in the network's training the LiDAR is 2.10 m above the ground, not 1.8 m (corrected)"
+    assert chosen.sentence == f"4 vehicle and 2 pole frames; {chosen.rig}"
+    assert chosen.summary()["rig"] == chosen.rig
+    assert choose_frames(OBJECTS, tiny_config(), taller, "poles").rig == ""
+    beams = choose_frames(OBJECTS, tiny_config(), recorded(beams=32), beams=64)
+    assert beams.rig == "unlike in the network's training the LiDAR has 32 beams, not 64"
+    assert choose_frames(OBJECTS, tiny_config(), recorded(beams=64), beams=64).rig == ""
 
 
 def test_cameras_of_vehicles_and_poles_are_used_alike_and_paths_are_those_of_vehicles(street):

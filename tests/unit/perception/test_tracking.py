@@ -186,7 +186,7 @@ def drive(steps=8):
 
 def test_what_is_found_everywhere_is_followed_without_a_mistake(monkeypatch):
     seen = iter(detections((40 - 2 * i, 3, 0.9), (30 - 2 * i, -6, 0.8)) for i in range(8))
-    monkeypatch.setattr(tracking_evaluation, "detect", lambda network, points, score_threshold: next(seen))
+    monkeypatch.setattr(tracking_evaluation, "detect_in", lambda network, frames, score_threshold: [next(seen)])
     said = evaluate_tracks(second_tiny(), cast(Dataset, Recording(drive())))
     (row,) = said.scores
     assert (row.objects, row.misses, row.false_positives, row.id_switches) == (8, 0, 0, 0)

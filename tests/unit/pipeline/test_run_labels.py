@@ -38,7 +38,7 @@ def test_own_labels_start_where_nine_of_ten_are_right(
     misses = [(-10.0 * i, score) for i, score in enumerate(scores_of_misses, start=1)]
     truth = FrameTruth("s", cars(*hits), Boxes.empty(), Boxes.empty())
     monkeypatch.setattr(labels, "asked_of", lambda frame, config: truth)
-    monkeypatch.setattr(labels, "detect_all", lambda network, clouds: [cars(*hits, *misses)])
+    monkeypatch.setattr(labels, "detect_in", lambda network, frames: [cars(*hits, *misses)])
     data = SimpleNamespace(frame=lambda i: SimpleNamespace(lidar={"lidar": None}, key="k"))
     split = Frames(cast(Any, data), (0,), {})
     assert fit_label_threshold(cast(Any, SimpleNamespace(config=None)), [split]) == threshold

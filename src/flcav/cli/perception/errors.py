@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device, check_finite, refuse_unused
+from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device, check_finite, refuse_unused
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def errors(
     ),
     map_: Path | None = typer.Option(None, "--map", help="PNG file: the errors in the dataset's town."),
     agents: str | None = AGENTS,
+    around: bool = AROUND,
     threads: int = THREADS,
     device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
 ) -> None:
@@ -56,12 +57,15 @@ def errors(
     from flcav.files import check_writable, write_bytes
     from flcav.perception import networks
     from flcav.perception.errors import save_errors
+    from flcav.perception.objects.task import ObjectsTask
     from flcav.perception.task import Scores
     from flcav.perception.tasks import task_named
 
     learned = task_named(task)
     if not isinstance(learned, Scores):
         refuse_unused(f"errors {task}", "threshold")
+    if not isinstance(learned, ObjectsTask):
+        refuse_unused(f"errors {task}", "around")
     check_ending(out)
     for path in (out, map_):
         if path is not None:
@@ -72,7 +76,7 @@ def errors(
         raise InputError(f"{data}: its town is not known, so that there is no map of it")
     with progress.show_progress(f"errors of {learned.name}") as report:
         found = networks.register_errors(
-            learned, dataset, weights, threshold=threshold, agents=agents, device=device, progress=report
+            learned, dataset, weights, threshold=threshold, around=around, agents=agents, device=device, progress=report
         )
     save_errors(found.errors, out)
     if map_ is not None and town is not None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device
+from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device
 from flcav.cli.terminal import print_json
 from flcav.threads import use_threads
 
@@ -16,13 +16,14 @@ def register(app: typer.Typer) -> None:
 
 def evaluate(
     task: str = typer.Argument(metavar="TASK", help=f"What was learned: {ANY_TASK}."),
-    data: Path = typer.Option(..., "--data", help="Dataset folder."),
+    data: Path = typer.Option(..., "--data", help="Dataset folder; objects: or one in KITTI's layout."),
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."
     ),
     device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
     tracks: bool = typer.Option(False, "--tracks", help="objects: also MOTA, AMOTA and id switches of their tracks."),
     agents: str | None = AGENTS,
+    around: bool = AROUND,
     within: str | None = typer.Option(
         None,
         "--range",
@@ -35,7 +36,8 @@ def evaluate(
 ) -> None:
     """Evaluate a network on recorded frames.
 
-    Accuracy of weather, mAP of signs, average precision of objects, errors of predicted paths.
+    Accuracy of weather, mAP of signs, average precision of objects, errors of predicted paths. Objects in a folder of
+    KITTI are counted as its benchmark does: easy, moderate, hard.
     """
     use_threads(threads)
     from flcav import progress
@@ -45,7 +47,15 @@ def evaluate(
     learned = task_named(task)
     with progress.show_progress(f"evaluate {learned.name}") as report:
         found = networks.evaluate(
-            learned, data, weights, agents=agents, within=within, tracks=tracks, device=device, progress=report
+            learned,
+            data,
+            weights,
+            agents=agents,
+            within=within,
+            around=around,
+            tracks=tracks,
+            device=device,
+            progress=report,
         )
     origin = networks.origin_of(learned, weights)
     if as_json:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device, check_finite, refuse_unused
+from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device, check_finite, refuse_unused
 from flcav.cli.terminal import print_json
 from flcav.threads import use_threads
 
@@ -37,6 +37,7 @@ def infer(
     device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
     pictures: Path | None = typer.Option(None, "--pictures", help="Folder for a picture of each input with findings."),
     agents: str | None = AGENTS,
+    around: bool = AROUND,
     threads: int = THREADS,
     as_json: bool = typer.Option(False, "--json", help="One JSON object on stdout."),
 ) -> None:
@@ -57,7 +58,7 @@ def infer(
     learned = task_named(task)
     if not isinstance(learned, Scores):
         refuse_unused(f"infer {task}", "threshold")
-    found = networks.infer(learned, inputs, weights, threshold=threshold, agents=agents, device=device)
+    found = networks.infer(learned, inputs, weights, threshold=threshold, around=around, agents=agents, device=device)
     findings = []
     for number, finding in enumerate(found):
         findings.append((str(finding.path), finding.result))

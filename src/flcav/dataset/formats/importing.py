@@ -10,7 +10,7 @@ from flcav.dataset.formats.kitti.read import KittiSource
 from flcav.dataset.formats.nuscenes.read import NuscenesSource
 from flcav.dataset.formats.opv2v.read import Opv2vSource
 from flcav.dataset.formats.reading import LogSource
-from flcav.dataset.recording.recorder import record
+from flcav.dataset.recording.recorder import drop_unbegun, record
 from flcav.progress import Report, ignore_progress
 
 
@@ -36,7 +36,8 @@ def import_dataset(
 
     Points and pictures that are in an encoding of flcav's are linked to, others are rewritten. Only the scenes of
     `split` are taken, all for None. Returns sentences on what the files do not have. Raises `InputError` where `folder`
-    is missing, of another format or damaged, and as `record` does.
+    is missing, of another format or damaged, and as `record` does; scenes that were complete by then stay in `out`, and
+    the same call goes on from there.
     """
     if name not in READABLE:
         raise InputError(f"format '{name}': cannot be imported; known formats: {', '.join(READABLE)}")
@@ -49,8 +50,10 @@ def import_dataset(
         source = READABLE[name].read(folder, split)
         record(source, out, progress=progress)
     except InputError:
+        drop_unbegun(out)
         raise
     except ValueError as error:  # of names that a dataset cannot hold, or numbers that no measurement has
+        drop_unbegun(out)
         raise InputError(f"{folder}: cannot be imported ({error})") from None
     return source.notes
 

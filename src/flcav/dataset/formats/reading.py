@@ -16,7 +16,7 @@ from PIL import Image
 from flcav.config import InputError
 from flcav.dataset.payloads import read_image
 from flcav.dataset.store import LazyMapping
-from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
+from flcav.geometry import Boxes, count_points_in_boxes, inverse, transform_points
 from flcav.sensors.camera.lens import Lens, project
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, SignViews, Views
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncation
@@ -59,7 +59,7 @@ def annotate(
     """
     count = len(boxes)
     points = {
-        name: points_in_boxes(transform_points(world_from_lidar, cloud[:, :3].astype(np.float64)), boxes).sum(axis=1)
+        name: count_points_in_boxes(cloud, boxes, world_from_lidar)
         for name, (cloud, world_from_lidar) in clouds.items()
     }
     return Annotations(
@@ -98,19 +98,26 @@ def difference_tracks(track: NDArray[np.str_], time_s: Array, center: Array) -> 
     return velocity
 
 
-def view_boxes(boxes: Boxes, picture: Picture) -> Views:
-    """Return the rectangles that `boxes` (world frame) fill in an image, with the share outside it.
+def view_boxes(boxes: Boxes, pictures: Mapping[str, Picture]) -> dict[str, Views]:
+    """Return the rectangles that `boxes` (world frame) fill in each image, with the share outside it.
 
     They are those of the boxes and not of what is in them, so somewhat larger than of a simulated actor. Which pixels
     show is unknown.
     """
-    amodal = np.full((len(boxes), 4), np.nan)
-    camera_from_world = inverse(picture.world_from_camera)
-    for row, corners in enumerate(boxes.corners()):
-        seen = clip_in_front(transform_points(camera_from_world, corners), EDGES, NEAR_M)
-        if len(seen):
-            pixels = project(picture.lens, seen)
-            amodal[row] = *pixels.min(axis=0), *pixels.max(axis=0)
+    corners = boxes.corners()
+    return {name: _view_corners(corners, picture) for name, picture in pictures.items()}
+
+
+def _view_corners(corners: Array, picture: Picture) -> Views:
+    amodal = np.full((len(corners), 4), np.nan)
+    corners = transform_points(inverse(picture.world_from_camera), corners.reshape(-1, 3)).reshape(-1, 8, 3)
+    ahead = (corners[:, :, 2] >= NEAR_M).sum(axis=1)
+    whole = ahead == 8
+    pixels = project(picture.lens, corners[whole].reshape(-1, 3)).reshape(-1, 8, 2)
+    amodal[whole] = np.concatenate((pixels.min(axis=1), pixels.max(axis=1)), axis=1)
+    for row in np.flatnonzero((ahead > 0) & ~whole):  # the others are behind the camera
+        pixels = project(picture.lens, clip_in_front(corners[row], EDGES, NEAR_M))
+        amodal[row] = *pixels.min(axis=0), *pixels.max(axis=0)
     truncation = compute_truncation(amodal, picture.lens)
     amodal[truncation == 1] = np.nan
     return unseen_views(amodal, truncation)
@@ -126,6 +133,13 @@ def unseen_views(amodal: Array, truncation: Array, occlusion: Array | None = Non
         truncation=truncation,
         occlusion=np.full(count, np.nan) if occlusion is None else occlusion,
     )
+
+
+def check_finite(points: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
+    """Return the points (N, C) of the file at `path`; raises `InputError` where one is not finite."""
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: point {int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])} is not finite")
+    return points
 
 
 def pinhole(intrinsics: Array, width: int, height: int) -> Lens:

@@ -77,7 +77,11 @@ def perform(source: Source, task: Job, work: Path, wrote_frame: Callable[[], Non
     part = task.folder(work).with_suffix(".part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
-    _write(_frames(source, task, work), task.scene, part, wrote_frame)
+    try:
+        _write(_frames(source, task, work), task.scene, part, wrote_frame)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
     if not isinstance(source, Replayable) and (trace := source.trace(task.scene)) is not None:
         trace.save(work / task.scene / TRAFFIC)
     part.rename(task.folder(work))

@@ -84,6 +84,15 @@ def record(
     return True
 
 
+def drop_unbegun(out: Path) -> None:
+    """Remove what a failed recording left in `out` where no part of it was completed; otherwise it can be resumed."""
+    work = out / WORK
+    if work.is_dir() and not any(path.is_dir() for path in work.glob("*/*")):
+        shutil.rmtree(work)
+        if not any(out.iterdir()):
+            out.rmdir()
+
+
 def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report) -> None:
     """Record all remaining parts below `.recording`."""
     total = sum(source.frame_count(scene) for scene in source.scenes())

@@ -62,6 +62,7 @@ class SecondConfig:
     foreground: bool = False  # whether roadside sweeps come without their static background
     uncertainty: bool = False  # whether the network predicts a variance of each residual
     bfloat16: bool = False  # autocast in training where the hardware supports it: on a CPU in the 2D part alone
+    around: bool = False  # whether it is asked to look to all four sides, by quarter turns of the sweep
     calibration: tuple[tuple[float, float], ...] | None = None  # Platt scaling, per class: factor and summand of logits
     augmentation: Augmentation = Augmentation()  # of training samples
 

@@ -17,9 +17,9 @@ from flcav.perception.marks import CloudBoxes
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.predict import ObjectsFound, boxes_to_rows, detect
+from flcav.perception.objects.predict import ObjectsFound, boxes_to_rows, detect_moved
 from flcav.perception.objects.samples import validate_points
-from flcav.perception.objects.truth import choose_lidar
+from flcav.perception.objects.truth import choose_lidar, network_from_lidar
 from flcav.perception.task import Finding
 
 
@@ -28,6 +28,7 @@ class Cloud(NamedTuple):
 
     path: Path  # of the file; of a dataset, folder / key of the frame
     points: NDArray[np.float32]  # (N, 4) x, y, z [m], intensity [0, 1]
+    move: NDArray[np.float64] | None  # (4, 4) brings it to the frame that the network was trained in; None: it is there
     view: Callable[[], CameraView | None]  # reads the view of a camera with the same direction, None without one
 
 
@@ -40,7 +41,7 @@ def detect_objects(
     as `read_point_clouds` does.
     """
     for cloud in read_point_clouds(path, frames, network.config):
-        found = detect(network, cloud.points, score_threshold=threshold)
+        (found,) = detect_moved(network, [cloud.points], [cloud.move], score_threshold=threshold)
         yield Finding(cloud.path, cloud.points, ObjectsFound(boxes_to_rows(found)), (CloudBoxes(found),), cloud.view)
 
 
@@ -65,7 +66,7 @@ def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondCo
 
 
 def _of_file(path: Path) -> Cloud:
-    return Cloud(path, validate_points(read_points(path), path), partial(view_beside, path))
+    return Cloud(path, validate_points(read_points(path), path), None, partial(view_beside, path))
 
 
 def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[Cloud]:
@@ -77,4 +78,4 @@ def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) 
         points = frame.lidar[lidar]
         if not config.foreground:  # a street may be empty before its background
             validate_points(points, origin)
-        yield Cloud(origin, points, partial(recorded_view, dataset, i, lidar))
+        yield Cloud(origin, points, network_from_lidar(frame, config), partial(recorded_view, dataset, i, lidar))

@@ -1,5 +1,7 @@
 """Inference of SECOND: decoding of anchors, score calibration, non-maximum suppression; detections as JSON records."""
 
+import copy
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -8,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from flcav.geometry import Boxes, concatenate
+from flcav.geometry import Boxes, concatenate, inverse, pose
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import LOG_VARIANCES, HeadOutput, Second
+from flcav.perception.objects.samples import move_points
 from flcav.perception.objects.targets import anchor_boxes, anchor_classes, decode, decode_variance
-from flcav.perception.objects.truth import FrameTruth, asked_of, choose_lidar, in_range
+from flcav.perception.objects.truth import QUARTERS, FrameTruth, asked_of, choose_lidar, in_range, network_from_lidar
 from flcav.perception.ops.rotated import nms
 from flcav.perception.task import Result
 from flcav.progress import Report, ignore_progress
@@ -63,13 +66,79 @@ def detect(network: Second, points: NDArray[np.float32], *, score_threshold: flo
     return detect_all(network, [points], score_threshold=score_threshold)[0]
 
 
+def detect_in(network: Second, frames: Sequence[Frame], *, score_threshold: float = 0.1) -> list[Boxes]:
+    """Return the boxes detected in the sweep of each frame's first LiDAR as `detect` does, LiDAR frame.
+
+    Sweeps are moved to the height and direction that the network was trained for, see `network_from_lidar`. Raises
+    `InputError` where a frame has no LiDAR.
+    """
+    clouds = [frame.lidar[choose_lidar(frame)] for frame in frames]
+    moves = [network_from_lidar(frame, network.config) for frame in frames]
+    return detect_moved(network, clouds, moves, score_threshold=score_threshold)
+
+
+def detect_moved(
+    network: Second,
+    clouds: Sequence[NDArray[np.float32]],
+    moves: Sequence[NDArray[np.float64] | None],
+    *,
+    score_threshold: float = 0.1,
+) -> list[Boxes]:
+    """Return the boxes detected in each point cloud as `detect` does, in the frame of its points.
+
+    A cloud's move (4, 4) brings it to the frame that the network was trained in; None: it is there.
+    """
+    moved = [move_points(cloud, move) for cloud, move in zip(clouds, moves, strict=True)]
+    found = detect_all(network, moved, score_threshold=score_threshold)
+    return [boxes if move is None else boxes.transform(inverse(move)) for boxes, move in zip(found, moves, strict=True)]
+
+
 def detect_all(
     network: Second, clouds: Sequence[NDArray[np.float32]], *, score_threshold: float = 0.1, batch: int = 4
 ) -> list[Boxes]:
     """Return the boxes detected in each point cloud as `detect` does, `batch` clouds at a time.
 
-    The network runs in evaluation mode; its mode is restored.
+    With `around` in its configuration the network looks at each cloud four times, turned by quarters, and what two
+    looks found is suppressed as within one. It runs in evaluation mode; its mode is restored.
     """
+    if not network.config.around:
+        return _detect_ahead(network, clouds, score_threshold, batch)
+    looks = []
+    for turns in range(QUARTERS):
+        found = _detect_ahead(network, [_turn(cloud, -turns) for cloud in clouds], score_threshold, batch)
+        looks.append([boxes.transform(pose(0, 0, yaw=turns * math.pi / 2)) for boxes in found])
+    return [_suppress(concatenate(parts), network.config.classes) for parts in zip(*looks, strict=True)]
+
+
+def look_around(network: Second) -> Second:
+    """Return a network of the same weights that looks to all four sides, see `detect_all`."""
+    turning = copy.copy(network)
+    turning.config = replace(network.config, around=True)
+    return turning
+
+
+def _turn(points: NDArray[np.float32], quarters: int) -> NDArray[np.float32]:
+    """Return the points turned by so many quarters to the left about the sensor, exactly."""
+    x, y = points[:, 0], points[:, 1]
+    for _ in range(quarters % QUARTERS):
+        x, y = -y, x
+    return np.column_stack((x, y, points[:, 2:]))
+
+
+def _suppress(boxes: Boxes, classes: Sequence[str]) -> Boxes:
+    """Return the boxes left by non-maximum suppression, class by class, highest score first."""
+    assert boxes.score is not None
+    kept = []
+    for name in classes:
+        own = np.flatnonzero(boxes.label == name)
+        own = own[np.argsort(-boxes.score[own], kind="stable")]
+        kept.append(own[nms(torch.from_numpy(boxes.array()[own]), torch.from_numpy(boxes.score[own])).numpy()])
+    return boxes[np.concatenate(kept)]
+
+
+def _detect_ahead(
+    network: Second, clouds: Sequence[NDArray[np.float32]], score_threshold: float, batch: int
+) -> list[Boxes]:
     training = network.training
     network.eval()
     found: list[Boxes] = []
@@ -106,7 +175,7 @@ def detect_frames(
     detections: list[Boxes] = []
     for done, frame in enumerate(frames, start=1):
         truths.append(asked_of(frame, asked or network.config))
-        (found,) = detect_all(network, [frame.lidar[choose_lidar(frame)]], score_threshold=LOWEST_SCORE)
+        (found,) = detect_in(network, [frame], score_threshold=LOWEST_SCORE)
         detections.append(found if asked is None else found[in_range(found, asked)])
         progress(done, max(total, done), "")
     return detections, truths

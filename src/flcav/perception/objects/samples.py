@@ -11,11 +11,20 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, transform_points
 from flcav.perception.agents import POLE, kind_of
+from flcav.perception.card import count_beams
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.foreground import frame_reader
-from flcav.perception.objects.truth import choose_lidar, ground_truth
+from flcav.perception.objects.truth import (
+    LEVEL_M,
+    LEVEL_RAD,
+    choose_lidar,
+    ground_truth,
+    level_mount,
+    network_from_lidar,
+    turn_of,
+)
 from flcav.sensors.frame import Frame
 
 HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one that a network expects
@@ -39,6 +48,8 @@ def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = No
     lookalikes with any; objects without a return are background. Objects out of range are kept, since augmentation may
     move them in; points that it cannot move into the range of `config` are left out.
 
+    The sweep is moved to the height and direction that the network expects, see `network_from_lidar`.
+
     lidar: name of the LiDAR; None: the frame's first. Raises `InputError` where the frame has none of that name.
     """
     whole = label_sweep(frame, config, lidar)
@@ -49,7 +60,33 @@ def label_sweep(frame: Frame, config: SecondConfig, lidar: str | None = None) ->
     """Return the frame's sweep, whole, with its ground truth as labels, see `sample_from_frame`."""
     truth = ground_truth(frame, config, lidar)
     ignored = (truth.returns > 0) & ((truth.known & ~truth.enough) | truth.lookalike)
-    return Sample(frame.lidar[choose_lidar(frame, lidar)], truth.boxes[truth.enough], truth.boxes[ignored])
+    whole = Sample(frame.lidar[choose_lidar(frame, lidar)], truth.boxes[truth.enough], truth.boxes[ignored])
+    return move_sample(whole, network_from_lidar(frame, config, lidar))
+
+
+def move_sample(sample: Sample, move: NDArray[np.float64] | None) -> Sample:
+    """Return the sample in the target frame of the rigid (4, 4) transform `move`; None: as it is."""
+    if move is None:
+        return sample
+    free = sample.free
+    if free is not None:
+        free = transform_points(move, np.pad(free, ((0, 0), (0, 1))))[:, :2].astype(np.float32)
+    return replace(
+        sample,
+        points=move_points(sample.points, move),
+        boxes=sample.boxes.transform(move),
+        ignore=sample.ignore.transform(move),
+        free=free,
+    )
+
+
+def move_points(points: NDArray[np.float32], move: NDArray[np.float64] | None) -> NDArray[np.float32]:
+    """Return the points (N, 4) x, y, z [m], intensity in the target frame of the rigid (4, 4) `move`; None: as is."""
+    return (
+        points
+        if move is None
+        else np.column_stack((transform_points(move, points[:, :3]).astype(np.float32), points[:, 3]))
+    )
 
 
 class RecordedSweeps(Sequence[Sample]):
@@ -96,6 +133,32 @@ def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
             f"({heights}); --agents all takes them as they are"
         )
     return fitting or range(len(data))
+
+
+def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], beams: int | None) -> str:
+    """Return how the LiDAR of the vehicles' frames differs from the one of the network's training, in words.
+
+    That is by its number of beams, its height above the ground and its direction, of which the last two are corrected
+    (see `flcav.perception.objects.truth.network_from_lidar`). "" where it does not differ, or does by nothing known.
+    """
+    agents = {data.keys[i].agent: data.lidars(i)[0] for i in frames if data.lidars(i)}
+    mounts = [
+        data.calibrations[agent].assumed.agent_from_sensor[lidar]
+        for agent, lidar in agents.items()
+        if kind_of(agent) != POLE
+    ]
+    moved = [mount for mount in mounts if level_mount(mount, config) is not None]
+    heights = dict.fromkeys(f"{mount[2, 3]:.2f}" for mount in moved if abs(mount[2, 3] + config.ground_z_m) > LEVEL_M)
+    turned = dict.fromkeys(f"{math.degrees(angle):.0f}" for mount in moved if (angle := turn_of(mount)) > LEVEL_RAD)
+    here = count_beams(data.manifest.recipe)
+    differences = []
+    if mounts and beams is not None and here is not None and here != beams:
+        differences.append(f"has {here} beams, not {beams}")
+    if heights:
+        differences.append(f"is {', '.join(heights)} m above the ground, not {-config.ground_z_m:g} m (corrected)")
+    if turned:
+        differences.append(f"is turned by {', '.join(turned)} degrees (corrected)")
+    return f"unlike in the network's training the LiDAR {' and '.join(differences)}" if differences else ""
 
 
 def crop_to_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:

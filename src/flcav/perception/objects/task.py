@@ -21,9 +21,9 @@ from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.messages import pack_sweep, unpack_sweep
 from flcav.perception.objects.model import CONFIGURATIONS, Second, second
 from flcav.perception.objects.outcomes import ObjectsOutcomes
-from flcav.perception.objects.predict import detect, detect_frames
-from flcav.perception.objects.samples import RecordedSweeps, Sample, select_fitting_frames
-from flcav.perception.objects.truth import choose_lidar, target_criteria
+from flcav.perception.objects.predict import detect_frames, detect_in
+from flcav.perception.objects.samples import RecordedSweeps, Sample, compare_rig, select_fitting_frames
+from flcav.perception.objects.truth import target_criteria
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.progress import Report, ignore_progress
@@ -66,6 +66,13 @@ class ObjectsTask(ObjectsOutcomes):
         See `flcav.perception.objects.samples`. Raises `InputError` where there are LiDARs but none fits.
         """
         return select_fitting_frames(data, config)
+
+    def compare_rig(self, data: Dataset, config: SecondConfig, frames: Sequence[int], beams: int | None) -> str:
+        """Return how the frames' LiDAR differs from that of the network's training, in words.
+
+        See `flcav.perception.objects.samples`.
+        """
+        return compare_rig(data, config, frames, beams)
 
     def draw(self, samples: Sequence[Sample], index: int, config: SecondConfig, rng: np.random.Generator) -> Sample:
         """Return sample `index` augmented as `config.augmentation` says, ground-truth sampling first.
@@ -153,8 +160,7 @@ class ObjectsTask(ObjectsOutcomes):
 
         def found() -> Iterator[Boxes]:
             for done, number in enumerate(numbers, start=1):
-                frame = read(number)
-                yield detect(network, frame.lidar[choose_lidar(frame)], score_threshold=threshold)
+                yield from detect_in(network, [read(number)], score_threshold=threshold)
                 progress(done, len(numbers), "")
 
         each = find_errors(map(read, numbers), found(), network.config, threshold)

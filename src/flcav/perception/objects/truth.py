@@ -8,6 +8,7 @@ definition; how each treats the kinds is in docs/tasks.md.
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.geometry import Boxes, inverse
 from flcav.intervals import CONFIDENCE
+from flcav.perception.agents import POLE, kind_of
 from flcav.perception.objects.config import SecondConfig
+from flcav.records import LEFT_OUT
 from flcav.sensors.frame import Frame
 from flcav.world.weather import classify_weather
 
@@ -28,6 +31,9 @@ DETECTION_CLASS = {
 }
 LOOKALIKE = {"truck": "Car", "bus": "Car"}  # neutral: a detection on one is neither true nor false
 MIN_RETURNS = 5  # LiDAR returns that make an object a target
+QUARTERS = 4  # quarter turns of a whole spin
+LEVEL_M = 0.15  # difference of a mount's height from the one of the training that needs no correction
+LEVEL_RAD = 0.05  # the same of its direction
 
 Mask = NDArray[np.bool_]
 
@@ -85,10 +91,40 @@ def ground_truth(frame: Frame, config: SecondConfig, lidar: str | None = None) -
 
 
 def in_range(boxes: Boxes, config: SecondConfig) -> Mask:
-    """Return (N,) whether the centre of each box (LiDAR frame) lies in the range of `config` in bird's-eye view."""
+    """Return (N,) whether the centre of each box (LiDAR frame) lies in the range of `config` in bird's-eye view.
+
+    With `config.around` that is the range ahead, to the left, behind, or to the right.
+    """
     x, y = boxes.center[:, 0], boxes.center[:, 1]
     x0, y0, _, x1, y1, _ = config.range_m
-    return (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+    inside = np.zeros(len(boxes), bool)
+    for _ in range(QUARTERS if config.around else 1):
+        inside |= (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+        x, y = y, -x
+    return inside
+
+
+def network_from_lidar(frame: Frame, config: SecondConfig, lidar: str | None = None) -> NDArray[np.float64] | None:
+    """Return the (4, 4) transform from a LiDAR's frame to the one that a network of `config` was trained in.
+
+    That one is level, its x axis points ahead of the vehicle, and the ground is at `config.ground_z_m`. The mount is
+    the one that the agent assumes. None where the mount is within `LEVEL_M` and `LEVEL_RAD` of that, and for poles,
+    whose height above the ground is not known. lidar: its name; None: the frame's first.
+    """
+    mount = frame.assumed.agent_from_sensor[choose_lidar(frame, lidar)]
+    return None if kind_of(frame.agent) == POLE else level_mount(mount, config)
+
+
+def level_mount(mount: NDArray[np.float64], config: SecondConfig) -> NDArray[np.float64] | None:
+    """Return the (4, 4) transform of `network_from_lidar` for a vehicle's LiDAR with this (4, 4) mount, or None."""
+    levelled = np.eye(4)
+    levelled[:3, :3], levelled[2, 3] = mount[:3, :3], mount[2, 3] + config.ground_z_m
+    return None if turn_of(mount) <= LEVEL_RAD and abs(levelled[2, 3]) <= LEVEL_M else levelled
+
+
+def turn_of(mount: NDArray[np.float64]) -> float:
+    """Return the angle of the rotation in a rigid (4, 4) transform [rad], in [0, pi]."""
+    return math.acos(min(1.0, max(-1.0, (float(np.trace(mount[:3, :3])) - 1) / 2)))
 
 
 def detection_labels(category: NDArray[np.str_], classes: tuple[str, ...]) -> NDArray[np.str_]:
@@ -172,11 +208,13 @@ class TargetCriteria:
     range_m: tuple[float, ...]  # of its centre, LiDAR frame: minima x, y, z, then maxima [m]
     min_returns: int  # LiDAR returns from it
     confidence: float  # in (0, 1)
+    around: Annotated[bool | None, LEFT_OUT] = None  # whether the range is also that to the sides and behind
 
     def lines(self) -> list[str]:
         """Return the criteria in words: a line on targets, a line on intervals."""
         return [
-            f"targets: centre {_extent(self.range_m)}, {self.min_returns} LiDAR returns or more; "
+            f"targets: centre {_extent(self.range_m)}{', or as far to another side' if self.around else ''}, "
+            f"{self.min_returns} LiDAR returns or more; "
             "others are neutral, and so are trucks and buses beside cars",
             f"intervals: {100 * self.confidence:g} %, over scenes",
         ]
@@ -184,7 +222,7 @@ class TargetCriteria:
 
 def target_criteria(config: SecondConfig) -> TargetCriteria:
     """Return the target criteria of an evaluation of a network of `config`."""
-    return TargetCriteria(tuple(config.range_m), MIN_RETURNS, CONFIDENCE)
+    return TargetCriteria(tuple(config.range_m), MIN_RETURNS, CONFIDENCE, config.around or None)
 
 
 def _extent(range_m: tuple[float, ...]) -> str:

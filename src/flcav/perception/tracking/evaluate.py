@@ -15,7 +15,7 @@ from flcav.perception.metrics.tracks import TrackingFrame, amota, count_clear_mo
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.predict import detect
+from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
 from flcav.perception.task import Result
 from flcav.perception.tracking.tracker import Tracked, Tracker
@@ -89,7 +89,7 @@ def evaluate_tracks(
         for number in sequence:
             frame = read(number)
             lidar = choose_lidar(frame)
-            found = detect(network, frame.lidar[lidar], score_threshold=SCORE)
+            (found,) = detect_in(network, [frame], score_threshold=SCORE)
             story.append((frame, tracker.step(found.transform(frame.world_from_sensor(lidar)), frame.time_s)))
             done += 1
             progress(done, total, "")

@@ -131,7 +131,8 @@ def _frame_from_above(axes: Axes, marks: Iterable[Mark]) -> None:
     corners = [on_page(each.corners()[..., :2]).reshape(-1, 2) for each in boxes]
     across, up = np.concatenate([np.zeros((0, 2)), *corners]).T
     aside, ahead = (float(np.max(ends, initial=least) + 2) for ends, least in ((np.abs(across), 28), (up, 52)))
-    axes.set(xlim=(-aside, aside), ylim=(-6, ahead), aspect="equal")
+    behind = float(np.min(up - 2, initial=-6))
+    axes.set(xlim=(-aside, aside), ylim=(behind, ahead), aspect="equal")
     style.scale_bar(axes, 10)
 
 

@@ -20,6 +20,7 @@ from flcav.dataset.formats.reading import (
     AgentNames,
     Picture,
     annotate,
+    check_finite,
     choose_split,
     difference_tracks,
     name_splits,
@@ -51,6 +52,7 @@ CATEGORIES = {  # a bicycle of flcav's has a rider; Argoverse 2's without one ke
 }
 SPLITS = ("train", "val", "test")  # folders of logs
 AXLE_M = 0.33  # height of the rear axle above the ground, which in the log 7fab2350 lies 0.33 to 0.37 m below it
+BEAMS = 64  # of both LiDARs: the lasers 0 to 63 of a sweep
 LIDAR, MOUNT = "lidar", "up_lidar"  # our name of both LiDARs, where they are taken to be
 LATE_NS = 50_000_000  # most time between a sweep and the picture of a camera that goes with it: it runs at 20 Hz
 TEXT = ("sensor_name", "track_uuid", "category")  # columns, of which all others are numbers
@@ -99,6 +101,7 @@ class Argoverse2Source:
             "imported": "argoverse2",
             "from": str(self._folder.resolve()),
             "split": self._split or "",
+            "beams": BEAMS,
             "labels": ["objects"] if self._labelled else [],
             "splits": name_splits({scene: log.split for scene, log in self._logs.items()}),
         }
@@ -157,7 +160,7 @@ class Argoverse2Source:
                     labels.track[own].tolist() if labels else (),
                     boxes,
                     {LIDAR: (points, city_from_ego @ at[LIDAR])},
-                    {name: view_boxes(boxes, picture) for name, picture in pictures.items()},
+                    view_boxes(boxes, pictures),
                     velocity=labels.velocity[own] if labels else None,
                 ),
                 images=read_pictures(files),
@@ -223,7 +226,8 @@ def _read_sweep(path: Path, origin: Array) -> NDArray[np.float32]:
     """Return (N, 4) x, y, z [m] from `origin` in the ego frame, and intensity [0, 1]."""
     table = _read_feather(path, ("x", "y", "z", "intensity"))
     x, y, z, intensity = (table[name].to_numpy().astype(np.float32) for name in ("x", "y", "z", "intensity"))
-    return np.column_stack((np.column_stack((x, y, z)) - origin.astype(np.float32), intensity / np.float32(255)))
+    xyz = np.column_stack((x, y, z)) - origin.astype(np.float32)
+    return check_finite(np.column_stack((xyz, intensity / np.float32(255))), path)
 
 
 def _read_mounts(folder: Path) -> dict[str, Array]:

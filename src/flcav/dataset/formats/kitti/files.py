@@ -5,7 +5,7 @@ bottom face, and the rotation about y is zero along x. Records of this module ar
 y left, z up).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -75,13 +75,14 @@ def read_calibration(path: Path) -> Calibration:
 
 @dataclass(frozen=True)
 class Objects:
-    """The N labelled objects of a frame, without DontCare regions."""
+    """The N labelled objects of a frame, and its K DontCare regions."""
 
     boxes: Boxes  # (N,) LiDAR frame, KITTI's class names
     truncation: NDArray[np.float64]  # (N,) share outside the image
     occlusion: NDArray[np.int64]  # (N,) 0 fully visible, 1 partly and 2 largely occluded, 3 unknown
     alpha: NDArray[np.float64]  # (N,) observation angle [rad]
     rectangle: NDArray[np.float64]  # (N, 4) left, top, right, bottom [px]
+    unlabelled: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))  # (K, 4) of DontCare regions [px]
 
     @classmethod
     def none(cls) -> "Objects":
@@ -96,7 +97,7 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
     orientation, but not in their position. Scores are kept where every row has one. Raises `InputError` where the file
     is missing or a line is not a label.
     """
-    label, rows = [], []
+    label, rows, unlabelled = [], [], []
     for number, line in enumerate(_lines(path), 1):
         kind, *fields = line.split()
         try:
@@ -105,7 +106,9 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
             values = []
         if len(values) + 1 not in (LABEL_FIELDS, LABEL_FIELDS + 1) or not np.isfinite(values).all():
             raise InputError(f"{path}: line {number} is no KITTI label: a class and {LABEL_FIELDS - 1} numbers or 15")
-        if kind != "DontCare":
+        if kind == "DontCare":
+            unlabelled.append(values[3:7])
+        else:
             label.append(kind)
             rows.append(values)
     scores = np.array([row[14] for row in rows]) if rows and all(len(row) == LABEL_FIELDS for row in rows) else None
@@ -124,6 +127,7 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
         occlusion=numbers[:, 1].astype(np.int64),
         alpha=numbers[:, 2],
         rectangle=numbers[:, 3:7],
+        unlabelled=np.array(unlabelled).reshape(-1, 4),
     )
 
 

@@ -21,6 +21,7 @@ from flcav.dataset.formats.reading import (
     AgentNames,
     Picture,
     annotate,
+    check_finite,
     choose_split,
     difference_tracks,
     name_splits,
@@ -58,6 +59,8 @@ OCCLUSION = {
     "4": 0.1,
 }  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
 TOP = "LIDAR_TOP"
+BEAMS = 32  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders of the format do not say
+VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # nuScenes' own tables
 NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of so many numbers
 FARTHEST = 1e9
 POINT = 5  # float32 of a point: x, y, z, intensity 0 to 255, ring
@@ -216,6 +219,7 @@ class NuscenesSource:
             "split": self._split or "",
             "labels": ["objects"] if self._labelled else [],
             "splits": name_splits(self._split_of),
+            **({"beams": BEAMS} if self._tables.name in VERSIONS else {}),
         }
 
     def scenes(self) -> list[str]:
@@ -272,7 +276,7 @@ class NuscenesSource:
                 self._track[own].tolist(),
                 boxes,
                 {name: (cloud, poses[name] @ mounts[name]) for name, cloud in clouds.items()},
-                {name: view_boxes(boxes, picture) for name, picture in pictures.items()},
+                view_boxes(boxes, pictures),
                 velocity=self._velocity[own],
                 occlusion=self._occlusion[own],
             ),
@@ -292,7 +296,8 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     if len(data) % POINT or path.stat().st_size % 4 or not len(data):
         raise InputError(f"{path}: truncated; {path.stat().st_size} bytes are no whole points of {4 * POINT} bytes")
     right, ahead, up, intensity, _ = data.reshape(-1, POINT).T
-    return np.stack((ahead, -right, up, intensity / np.float32(255)), axis=1).astype(np.float32, copy=False)
+    cloud = np.stack((ahead, -right, up, intensity / np.float32(255)), axis=1).astype(np.float32, copy=False)
+    return check_finite(cloud, path)
 
 
 def _find_tables(folder: Path) -> Path:

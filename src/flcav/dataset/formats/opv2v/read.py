@@ -19,6 +19,7 @@ from flcav.dataset.formats.reading import (
     AgentNames,
     Picture,
     annotate,
+    check_finite,
     choose_split,
     measure_picture,
     name_splits,
@@ -139,7 +140,7 @@ class Opv2vSource:
                 [names.get(str(number), str(number)) for number in about["vehicles"]],
                 boxes,
                 {LIDAR: (points, world_from_lidar)},
-                {name: view_boxes(boxes, picture) for name, picture in pictures.items()},
+                view_boxes(boxes, pictures),
                 velocity=velocity,
             ),
             images=read_pictures(files),
@@ -156,7 +157,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     except ValueError:
         raise InputError(f"{path}: not a point cloud of OPV2V, which has the fields x, y, z, rgb") from None
     red = (np.ascontiguousarray(colour).view("<u4") >> 16) & 255
-    return np.stack((x, -y, z, red / np.float32(255)), axis=1).astype(np.float32)
+    return check_finite(np.stack((x, -y, z, red / np.float32(255)), axis=1).astype(np.float32), path)
 
 
 def _calibrate(stem: Path) -> Calibration:

@@ -2,14 +2,12 @@
 
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.feather as feather
 import pytest
-from PIL import Image
-from scipy.spatial.transform import Rotation
+from argoverse2_log import START, UP_LIDAR, write_log
 
 from flcav.config import InputError
 from flcav.dataset.checks.validate import validate
@@ -18,64 +16,12 @@ from flcav.dataset.formats.reading import difference_tracks
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, transform_points
 
-REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[4] / "shared" / "data")) / "argoverse2"
-START, STEP = 315_966_265_000_000_000, 100_000_000  # [ns]
-SPEED = 5.0  # of the ego vehicle, north [m/s]; it heads north, and the car ahead of it stands
-NORTH = Rotation.from_euler("z", 90, degrees=True)
-UP_LIDAR = (1.35, 0.0, 1.64)
-
-
-def _write(path: Path, **columns: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    feather.write_feather(pa.table(columns), path)
-
-
-def _placed(rotation: Rotation, places: np.ndarray) -> dict[str, Any]:
-    x, y, z, w = np.broadcast_to(rotation.as_quat(), (len(places), 4)).T.tolist()
-    columns = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    return dict[str, Any](zip(columns, (w, x, y, z, *places.T.tolist()), strict=True))
-
-
-def _write_log(folder: Path, *, annotated: bool = True) -> None:
-    """Write two sweeps with a car 20 m ahead on the first, and a picture 20 ms after each."""
-    sweeps = [START, START + STEP]
-    times = [*sweeps, *(sweep + 20_000_000 for sweep in sweeps)]
-    north = np.array([(time - START) / 1e9 * SPEED for time in times])
-    places = np.column_stack((np.full(4, 100.0), 200 + north, np.full(4, 60.0)))
-    _write(folder / "city_SE3_egovehicle.feather", timestamp_ns=times, **_placed(NORTH, places))
-    optical = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    mounts = [_placed(Rotation.identity(), np.array([UP_LIDAR])), _placed(optical, np.array([[1.6, 0.0, 1.4]]))]
-    both = {name: [*mounts[0][name], *mounts[1][name]] for name in mounts[0]}
-    _write(
-        folder / "calibration" / "egovehicle_SE3_sensor.feather", sensor_name=["up_lidar", "ring_front_center"], **both
-    )
-    lens = {"fx_px": [100.0], "fy_px": [100.0], "cx_px": [79.5], "cy_px": [47.5], "width_px": [160], "height_px": [96]}
-    _write(folder / "calibration" / "intrinsics.feather", sensor_name=["ring_front_center"], **lens)
-    for sweep, ahead in zip(sweeps, (20.0, 20.0 - SPEED * 0.1)):
-        xyz = np.array([[ahead, 0.0, 0.5], [ahead + 1, 0.5, 0.2], [0.0, 9.0, -0.3]]).astype(np.float16)
-        columns = dict(zip("xyz", xyz.T))
-        path = folder / "sensors" / "lidar" / f"{sweep}.feather"
-        _write(path, **columns, intensity=np.array([0, 51, 255], np.uint8))
-        path = folder / "sensors" / "cameras" / "ring_front_center" / f"{sweep + 20_000_000}.jpg"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (160, 96), (200, 30, 30)).save(path)
-    if annotated:
-        in_ego = np.array([[20.0, 0.0, 0.4], [20.0 - SPEED * 0.1, 0.0, 0.4], [5.0, 5.0, 0.0]])
-        _write(
-            folder / "annotations.feather",
-            timestamp_ns=[*sweeps, sweeps[0]],
-            track_uuid=["car", "car", "cone"],
-            category=["REGULAR_VEHICLE", "REGULAR_VEHICLE", "CONSTRUCTION_CONE"],
-            length_m=[4.0, 4.0, 0.4],
-            width_m=[1.8, 1.8, 0.4],
-            height_m=[1.5, 1.5, 0.7],
-            **_placed(Rotation.from_euler("z", 180, degrees=True), in_ego),
-        )
+REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[3] / "shared" / "data")) / "argoverse2"
 
 
 def test_a_log_is_imported_with_poses_boxes_and_linked_pictures(tmp_path: Path):
     log = tmp_path / "logs" / "val" / "one"
-    _write_log(log)
+    write_log(log)
     assert import_dataset("argoverse2", tmp_path / "logs", tmp_path / "out", split="val") == ()
     assert validate(tmp_path / "out") == []
     data = Dataset.open(tmp_path / "out")
@@ -107,7 +53,7 @@ def test_a_log_is_imported_with_poses_boxes_and_linked_pictures(tmp_path: Path):
 
 
 def test_a_log_without_annotations_has_no_boxes_and_says_so(tmp_path: Path):
-    _write_log(tmp_path / "log", annotated=False)
+    write_log(tmp_path / "log", annotated=False)
     notes = import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")
     assert notes == ("no annotations.feather in 1 of 1 logs, so no boxes",)
     with pytest.raises(InputError, match="imported from argoverse2 without labels of objects"):
@@ -120,7 +66,7 @@ def test_a_log_without_annotations_has_no_boxes_and_says_so(tmp_path: Path):
     ["city_SE3_egovehicle", "calibration/intrinsics", "calibration/egovehicle_SE3_sensor", f"sensors/lidar/{START}"],
 )
 def test_a_file_of_a_log_names_itself(name: str, how: str, tmp_path: Path):
-    _write_log(tmp_path / "log")
+    write_log(tmp_path / "log")
     path = tmp_path / "log" / f"{name}.feather"
     if how == "missing":
         path.unlink()

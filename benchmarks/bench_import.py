@@ -1,0 +1,141 @@
+"""Decoding of a nuScenes-like scene from the page cache: MB/s of point payload, and memory against length, one thread.
+
+A key frame has 34,720 points of 20 bytes in `LIDAR_TOP`, five radars of 125 echoes, six pictures and 35 boxes, about
+as many as nuScenes has. Clouds are decoded alone, and in whole frames, in which points in boxes are counted and boxes
+are projected into pictures. Pictures themselves are not decoded: they are linked.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cpu_time import cpu_ms
+
+from flcav.dataset.formats.nuscenes.files import encode_radar
+from flcav.dataset.formats.nuscenes.read import NuscenesSource, read_cloud
+
+POINTS, ECHOES, BOXES = 34_720, 125, 35
+CAMERAS = tuple(f"CAM_{side}" for side in ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"))
+RADARS = tuple(f"RADAR_{side}" for side in ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK_LEFT", "BACK_RIGHT"))
+LENS = [[1266.0, 0.0, 816.0], [0.0, 1266.0, 491.0], [0.0, 0.0, 1.0]]
+SAMPLES, LONGER = 40, 8  # key frames of a scene, and how many times as many the long one has
+MODALITY = {**dict.fromkeys(CAMERAS, "camera"), **dict.fromkeys(RADARS, "radar"), "LIDAR_TOP": "lidar"}
+
+
+def write_scene(folder: Path, samples: int) -> None:
+    """Write tables and files of one scene."""
+    rng = np.random.default_rng(0)
+    placed = {"translation": [0.0, 0.0, 1.8], "rotation": [1.0, 0.0, 0.0, 0.0]}
+    tables: dict[str, list[dict[str, Any]]] = {
+        "scene": [{"token": "scene", "name": "scene-0001", "log_token": "log", "first_sample_token": "0"}],
+        "log": [{"token": "log", "logfile": "n000", "vehicle": "n000"}],
+        "sensor": [{"token": name, "channel": name, "modality": kind} for name, kind in MODALITY.items()],
+        "calibrated_sensor": [
+            {"token": name, "sensor_token": name, **placed, "camera_intrinsic": LENS if name in CAMERAS else []}
+            for name in MODALITY
+        ],
+        "category": [{"token": "car", "name": "vehicle.car"}],
+        "attribute": [],
+        "instance": [{"token": f"car{number}", "category_token": "car"} for number in range(BOXES)],
+        "sample": [],
+        "sample_data": [],
+        "ego_pose": [],
+        "sample_annotation": [],
+    }
+    places = rng.uniform(-50, 50, (BOXES, 2))
+    for sample in range(samples):
+        time = 1_500_000_000_000_000 + 500_000 * sample
+        tables["sample"].append({"token": str(sample), "timestamp": time, "scene_token": "scene"})
+        tables["ego_pose"].append({"token": str(sample), "translation": [sample, 0.0, 0.0], "rotation": [1.0, 0, 0, 0]})
+        for name in MODALITY:
+            path = folder / "samples" / name / f"{sample}.{'jpg' if name in CAMERAS else 'bin'}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(_payload(name, places, rng))
+            row = {"token": f"{sample} {name}", "sample_token": str(sample), "ego_pose_token": str(sample)}
+            row |= {"calibrated_sensor_token": name, "is_key_frame": True, "timestamp": time}
+            size = {"width": 1600, "height": 900}
+            tables["sample_data"].append(row | size | {"filename": str(path.relative_to(folder))})
+        tables["sample_annotation"] += [
+            {
+                "token": f"{sample} {number}",
+                "sample_token": str(sample),
+                "instance_token": f"car{number}",
+                "translation": [float(x) + sample, float(y), 0.8],
+                "size": [1.8, 4.4, 1.6],
+                "rotation": [1.0, 0.0, 0.0, 0.0],
+            }
+            for number, (x, y) in enumerate(places)
+        ]
+    (folder / "v1.0-mini").mkdir()
+    for name, rows in tables.items():
+        (folder / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows))
+
+
+def _payload(name: str, places: np.ndarray, rng: np.random.Generator) -> bytes:
+    if name in CAMERAS:
+        return b"a picture"
+    if name in RADARS:
+        echoes = rng.uniform([5, -0.8, 0, -10, -5], [60, 0.8, 0.01, 10, 20], (ECHOES, 5)).astype(np.float32)
+        return encode_radar(echoes, np.zeros(3))
+    distance, azimuth = 2 + rng.exponential(12, POINTS), rng.uniform(-np.pi, np.pi, POINTS)
+    around = np.column_stack((distance * np.cos(azimuth), distance * np.sin(azimuth), rng.uniform(-1.8, 2, POINTS)))
+    around[:2000, :2] = places[rng.integers(0, BOXES, 2000)] + rng.uniform(-0.9, 0.9, (2000, 2))
+    cloud = np.column_stack((-around[:, 1], around[:, 0], around[:, 2], rng.uniform(0, 255, (POINTS, 2))))
+    return cloud.astype("<f4").tobytes()
+
+
+def peak_mb(folder: Path) -> float:
+    """Return the peak memory [MB] of a process that decodes the scene in `folder`."""
+    done = subprocess.run([sys.executable, __file__, "--decode", str(folder)], capture_output=True, check=True)
+    return float(done.stdout)
+
+
+def decode(folder: Path) -> None:
+    """Decode all frames of a scene, one at a time."""
+    for _ in NuscenesSource(folder).frames("scene-0001"):
+        pass
+
+
+def main() -> None:
+    """Print the figures as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--decode", type=Path, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.decode:
+        decode(asked.decode)
+        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        short, long = Path(scratch) / "short", Path(scratch) / "long"
+        write_scene(short, SAMPLES)
+        write_scene(long, SAMPLES * LONGER)
+        clouds = sorted((short / "samples" / "LIDAR_TOP").iterdir())
+        megabytes = sum(path.stat().st_size for path in clouds) / 1e6
+        source = NuscenesSource(short)
+        works = [
+            lambda: [read_cloud(path) for path in clouds],
+            lambda: [frame.key for frame in source.frames("scene-0001")],
+            lambda: NuscenesSource(short),
+        ]
+        turns = np.array([cpu_ms(works, 1) for _ in range(asked.repeats)])
+        alone, whole, tables = turns.min(axis=0)  # the fastest turn: other load only slows
+        figures = {
+            "point_payload_mb": round(megabytes, 1),
+            "clouds_mb_per_s": round(float(megabytes / alone * 1e3)),
+            "whole_frames_mb_per_s": round(float(megabytes / whole * 1e3)),
+            "tables_ms": round(float(tables), 1),
+            "peak_mb": {name: round(peak_mb(folder)) for name, folder in (("short", short), ("long", long))},
+            "key_frames": {"short": SAMPLES, "long": SAMPLES * LONGER},
+        }
+    print(json.dumps(figures, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""Evaluation on a folder of KITTI as its benchmark counts, by the rules of `flcav.perception.metrics.kitti`."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.formats.kitti import Calibration, KittiFolder, KittiFrame
+from flcav.dataset.formats.reading import EDGES
+from flcav.geometry import Boxes, pose, transform_points
+from flcav.perception.metrics.kitti import (
+    COUNTS,
+    LEVELS,
+    ClassFrame,
+    average_precision_r40,
+    detection_states,
+    label_states,
+)
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import LOWEST_SCORE, detect_moved
+from flcav.perception.objects.truth import level_mount
+from flcav.perception.ops.rotated import iou
+from flcav.perception.task import Evaluated
+from flcav.progress import Report, ignore_progress
+from flcav.records import Class
+from flcav.sensors.labels.outlines import NEAR_M, clip_in_front
+
+Array = NDArray[np.float64]
+BenchmarkKind = Literal["image", "bev", "3d"]  # rectangles in the image, footprints, boxes
+
+LIMITS = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}  # IoU above which a detection is of an object
+LIDAR_M = 1.73  # height of KITTI's LiDAR above the ground
+VALIDATION = "val"  # list of the frames that are evaluated, where there is one
+
+
+@dataclass(frozen=True)
+class BenchmarkScore:
+    """AP|R40 of one class by one kind of overlap, in [0, 1]; None where no object counts at a level."""
+
+    label: Class
+    kind: BenchmarkKind
+    iou: float  # above which a detection is of an object
+    easy: float | None
+    moderate: float | None
+    hard: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkEvaluation(Evaluated):
+    """Evaluation of an object detector on frames of KITTI by the rules of its benchmark."""
+
+    frames: int
+    split: str | None  # list of `ImageSets` that names the frames; None: all that have labels
+    targets: Mapping[str, Mapping[str, int]]  # class -> level -> number of objects that count
+    benchmark: tuple[BenchmarkScore, ...]  # class by class
+
+    @property
+    def score(self) -> float:
+        """Return the mean over classes of the moderate AP in 3D, 0 where there is none."""
+        known = [row.moderate for row in self.benchmark if row.kind == "3d" and row.moderate is not None]
+        return float(np.mean(known)) if known else 0.0
+
+    def lines(self) -> list[str]:
+        """Return a line on the frames and one for each class and kind."""
+        which = f"of ImageSets/{self.split}.txt" if self.split else "with labels"
+        lines = [f"{self.frames} frames {which}, AP R40 as KITTI's benchmark counts it: easy, moderate, hard"]
+        for row in self.benchmark:
+            each = "  ".join("    -" if ap is None else f"{ap:.3f}" for ap in (row.easy, row.moderate, row.hard))
+            counted = ", ".join(str(number) for number in self.targets[row.label].values())
+            lines.append(f"{row.label:<11}{row.kind:>6} IoU {row.iou}  {each}  (objects: {counted})")
+        return lines
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a frame's evaluation needs of its detections and objects: G objects, D detections."""
+
+    boxes: Boxes  # (D,)
+    rectangle: Array  # (D, 4) [px]
+    frame: KittiFrame
+    overlap: Mapping[BenchmarkKind, Array]  # (D, G) IoU
+    unlabelled: Array  # (D,) share of the rectangle in a DontCare region
+
+
+def is_kitti(path: Path) -> bool:
+    """Return whether `path` is a folder in KITTI's layout and no dataset of flcav's."""
+    return (path / "training" / "velodyne").is_dir()
+
+
+def evaluate_kitti(network: Second, path: Path, progress: Report = ignore_progress) -> BenchmarkEvaluation:
+    """Return the AP|R40 of each class on the frames of `ImageSets/val.txt`, or of all, of the KITTI folder `path`.
+
+    Raises `InputError` where a file is missing, truncated or malformed.
+    """
+    split = VALIDATION if (path / "ImageSets" / f"{VALIDATION}.txt").is_file() else None
+    folder = KittiFolder.open(path, split)
+    if not len(folder):
+        raise InputError(f"{path}: no frames to evaluate")
+    found = list(_detect(network, folder, progress))
+    classes = [name for name in network.config.classes if name in LIMITS]
+    return BenchmarkEvaluation(
+        frames=len(found),
+        split=split,
+        targets={name: {level: _count(found, name, level) for level in LEVELS} for name in classes},
+        benchmark=tuple(_score(found, name, kind) for name, kind in product(classes, ("image", "bev", "3d"))),
+    )
+
+
+def _detect(network: Second, folder: KittiFolder, progress: Report) -> Iterator[_Found]:
+    move = level_mount(pose(0, 0, LIDAR_M), network.config)
+    for number in range(len(folder)):
+        frame = folder.frame(number)
+        (boxes,) = detect_moved(network, [frame.points], [move], score_threshold=LOWEST_SCORE)
+        yield _compare(boxes, replace(frame, points=frame.points[:0], image=frame.image[:0]), frame.image.shape[:2])
+        progress(number + 1, len(folder), "")
+
+
+def _compare(boxes: Boxes, frame: KittiFrame, size: tuple[int, ...]) -> _Found:
+    """Return the detections of a frame with their overlaps; `size`: height and width of the image [px]."""
+    rectangle = project_boxes(boxes, frame.calibration, size)
+    found, labelled = torch.from_numpy(boxes.array()), torch.from_numpy(frame.objects.boxes.array())
+    shared = _intersect(rectangle, frame.objects.rectangle)
+    area, other = _area(rectangle)[:, None], _area(frame.objects.rectangle)
+    inside = _intersect(rectangle, frame.objects.unlabelled) / np.maximum(area, 1e-9)
+    return _Found(
+        boxes,
+        rectangle,
+        frame,
+        {
+            "image": shared / np.maximum(area + other - shared, 1e-9),
+            "bev": iou(found, labelled, "bev").numpy(),
+            "3d": iou(found, labelled, "3d").numpy(),
+        },
+        inside.max(axis=1, initial=0.0),
+    )
+
+
+def project_boxes(boxes: Boxes, calibration: Calibration, size: Sequence[int]) -> Array:
+    """Return (D, 4) rectangles [px] of boxes (LiDAR frame) within an image of `size` (height, width); 0 outside it."""
+    height, width = size
+    rectangles = np.zeros((len(boxes), 4))
+    for row, corners in enumerate(boxes.corners()):
+        seen = clip_in_front(transform_points(calibration.camera_from_lidar, corners), EDGES, NEAR_M)
+        if len(seen):
+            pixels = np.c_[seen, np.ones(len(seen))] @ calibration.image_from_camera.T
+            pixels = pixels[:, :2] / pixels[:, 2:]
+            edges = np.concatenate((pixels.min(axis=0), pixels.max(axis=0)))
+            rectangles[row] = np.clip(edges, 0, [width - 1, height - 1, width - 1, height - 1])
+    return rectangles
+
+
+def _score(found: Sequence[_Found], name: str, kind: BenchmarkKind) -> BenchmarkScore:
+    limit = LIMITS[name]
+    ap = [average_precision_r40([_of_class(one, name, level, kind) for one in found], limit) for level in LEVELS]
+    return BenchmarkScore(name, kind, limit, *(None if value is None else round(value, 6) for value in ap))
+
+
+def _of_class(found: _Found, name: str, level: str, kind: BenchmarkKind) -> ClassFrame:
+    assert found.boxes.score is not None
+    excused = found.unlabelled > LIMITS[name] if kind == "image" else np.zeros(len(found.boxes), bool)
+    return ClassFrame(
+        score=found.boxes.score,
+        detection=detection_states(name, found.boxes.label, _height(found.rectangle), LEVELS[level]),
+        label=_label(found, name, level),
+        overlap=found.overlap[kind],
+        excused=excused,
+    )
+
+
+def _label(found: _Found, name: str, level: str) -> NDArray[np.int64]:
+    known = found.frame.objects
+    heights = _height(known.rectangle)
+    return label_states(name, known.boxes.label, heights, known.occlusion, known.truncation, LEVELS[level])
+
+
+def _count(found: Sequence[_Found], name: str, level: str) -> int:
+    return sum(int((_label(one, name, level) == COUNTS).sum()) for one in found)
+
+
+def _height(rectangle: Array) -> Array:
+    return rectangle[:, 3] - rectangle[:, 1]
+
+
+def _area(rectangle: Array) -> Array:
+    return (rectangle[:, 2:] - rectangle[:, :2]).prod(axis=1)
+
+
+def _intersect(one: Array, other: Array) -> Array:
+    """Return (D, K) areas that rectangles (D, 4) and (K, 4) share."""
+    low, high = np.maximum(one[:, None, :2], other[None, :, :2]), np.minimum(one[:, None, 2:], other[None, :, 2:])
+    return np.clip(high - low, 0, None).prod(axis=2)
