@@ -17,7 +17,7 @@ from shapely.geometry.base import BaseGeometry
 
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
-from flcav.perception.objects.foreground import frame_reader
+from flcav.perception.foreground import frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.task import OBJECTS

@@ -33,7 +33,6 @@ from flcav.pipeline.work import (
     deal_step,
     edge_step,
     errors_step,
-    list_speeds,
     look_step,
     place_step,
     plan_step,
@@ -280,7 +279,9 @@ class Graph:
         federation = arm.federation.model_dump(mode="json")
         own = {"labels": arm.labels[task], "federation": federation, "budget_mb": self._budget_mb}
         if arm.federation.network is not None:
-            own |= {"train_s": self.recipe.tasks[task].train_s, "speeds": list_speeds(self.recipe)}
+            given = {name: self.recipe.regions[name].speed for name in self.recipe.with_role("federate")}
+            speeds = {f"{region}/{vehicle}": speed for region in given for vehicle, speed in given[region].items()}
+            own |= {"train_s": self.recipe.tasks[task].train_s, "speeds": speeds}
         return self._learning(arm, task) | own
 
     def _add_edge(self, arm: Setting) -> None:

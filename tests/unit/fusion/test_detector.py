@@ -10,7 +10,7 @@ from flcav.experiments.roadside.detector import detect_frames, score_town
 from flcav.fusion.detector import OFF_ROAD_M, ROAD, keep_on_surface, load_road_network, road_detector
 from flcav.geometry import Boxes
 from flcav.perception.card import LICENCE
-from flcav.perception.objects.foreground import frame_reader
+from flcav.perception.foreground import frame_reader
 from flcav.perception.objects.samples import select_fitting_frames
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import find_shipped, read_card

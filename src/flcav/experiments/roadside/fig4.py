@@ -20,8 +20,8 @@ from flcav.fusion.detector import THRESHOLD, load_road_network
 from flcav.fusion.registration import Offset, measure_offset, register
 from flcav.fusion.road import MIN_RETURNS
 from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
+from flcav.perception.foreground import frame_reader, pole_backgrounds
 from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.foreground import frame_reader, pole_backgrounds
 from flcav.perception.objects.predict import detect
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.progress import Report, ignore_progress

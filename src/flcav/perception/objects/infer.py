@@ -12,10 +12,10 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti import read_points
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
+from flcav.perception.foreground import frame_reader
 from flcav.perception.images import CameraView, recorded_view, view_beside
 from flcav.perception.marks import CloudBoxes
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import ObjectsFound, boxes_to_rows, detect_moved
 from flcav.perception.objects.samples import validate_points

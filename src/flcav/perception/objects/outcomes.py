@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.intervals import REDRAWS
+from flcav.perception.foreground import frame_reader
 from flcav.perception.metrics import Matches, match, orientation_similarity, right_headings, weighted_precision
-from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_frames
 from flcav.perception.objects.truth import select_class

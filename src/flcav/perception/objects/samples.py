@@ -14,8 +14,8 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.card import count_beams
+from flcav.perception.foreground import frame_reader
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.truth import (
     LEVEL_M,
     LEVEL_RAD,

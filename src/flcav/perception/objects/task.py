@@ -10,12 +10,12 @@ from flcav.dataset.store import Dataset
 from flcav.files import Json
 from flcav.geometry import Boxes
 from flcav.perception.errors import THRESHOLD, Registry
+from flcav.perception.foreground import frame_reader
 from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
 from flcav.perception.objects.calibrate import calibrate, measure_reliability
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.errors import find_errors
 from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, score_detections
-from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.infer import detect_objects
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.messages import pack_sweep, unpack_sweep

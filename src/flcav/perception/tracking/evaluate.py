@@ -9,11 +9,11 @@ import numpy as np
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse
+from flcav.perception.foreground import frame_reader
 from flcav.perception.metrics import round_or_none
 from flcav.perception.metrics.matching import on_neutral
 from flcav.perception.metrics.tracks import TrackingFrame, amota, count_clear_mot
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.foreground import frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
