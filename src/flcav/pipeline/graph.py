@@ -27,21 +27,11 @@ from flcav.pipeline.recipe import (
 )
 from flcav.pipeline.seeds.spread import read_spreads
 from flcav.pipeline.steps import Step
-from flcav.pipeline.work import (
-    central_step,
-    cloud_step,
-    deal_step,
-    edge_step,
-    errors_step,
-    look_step,
-    place_step,
-    plan_step,
-    pretrain_step,
-    record_step,
-    replan_step,
-    rounds_step,
-    test_step,
-)
+from flcav.pipeline.work.placing import errors_step, place_step
+from flcav.pipeline.work.planning import plan_step, replan_step
+from flcav.pipeline.work.recording import deal_step, record_step
+from flcav.pipeline.work.testing import look_step, rounds_step, test_step
+from flcav.pipeline.work.training import central_step, cloud_step, edge_step, pretrain_step
 from flcav.seeds import derive_seed
 
 LOOK, OBJECTS = "look", "objects"

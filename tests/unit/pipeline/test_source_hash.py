@@ -12,8 +12,8 @@ import pytest
 
 from flcav.experiments.splits import record_split
 from flcav.experiments.studies import STUDIES, study_named
-from flcav.pipeline import work
 from flcav.pipeline.steps.source_hash import PACKAGES, Sources, find_definitions
+from flcav.pipeline.work import recording, testing, training
 
 TOY = {
     "__init__.py": """
@@ -148,11 +148,11 @@ def test_one_constant_of_a_module_is_reached_or_all_where_the_module_is_passed_o
 
 STEPS = {
     "recording": record_split,
-    "frames": work.record_step,
-    "pretraining": work.pretrain_step,
-    "evaluation": work.test_step,
-    "stage II": work.edge_step,
-    "stage III": work.cloud_step,
+    "frames": recording.record_step,
+    "pretraining": training.pretrain_step,
+    "evaluation": testing.test_step,
+    "stage II": training.edge_step,
+    "stage III": training.cloud_step,
 } | {f"{name}, {part}": getattr(study_named(name), part) for name in STUDIES for part in ("learn", "test")}
 
 

@@ -1,0 +1,120 @@
+"""Steps that plan a run, and plan the rest of it anew."""
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from flcav.config import read_config
+from flcav.files import write_json
+from flcav.network.ledger import BYTES_PER_MB, LINKS, Link
+from flcav.network.plan import MessageSizes, Price
+from flcav.optimization.problem import Problem
+from flcav.perception.client import as_shared
+from flcav.perception.task import find_configuration
+from flcav.perception.tasks import task_named
+from flcav.pipeline.arms import PlanRule
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.planning import (
+    PlanRequest,
+    PlanSettings,
+    UpdateForm,
+    make_plan,
+    model_mb,
+    parse_history,
+    remake_plan,
+)
+from flcav.pipeline.recipe import RunRecipe
+from flcav.pipeline.results import Plan, Watched, average_regions
+from flcav.pipeline.steps import Work
+from flcav.pipeline.work import Fields
+from flcav.pipeline.work.budgets import read_entries
+
+PROBLEM = "problem.json"
+
+
+def plan_step(
+    work: Work,
+    recipe: Fields,
+    rule: PlanRule,
+    pools: Mapping[str, Sequence[str]],
+    histories: Mapping[str, str],
+    updates: Sequence[Fields] = (),
+    recorded: Mapping[str, Mapping[str, int]] | None = None,
+) -> None:
+    """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables.
+
+    `updates` are the forms of the arms' updates, of which the largest is planned with; default: whole updates.
+    `recorded`: of federating regions of recorded data, the vehicles with their numbers of training frames.
+    """
+    asked_for = RunRecipe.model_validate(recipe)
+    asked, held = [], _held_frames(asked_for, recorded or {})
+    forms = tuple(UpdateForm.model_validate(update) for update in updates) or (UpdateForm(),)
+    for name in asked_for.tasks:
+        task, network = task_named(name), asked_for.tasks[name].network
+        config = find_configuration(task, network)
+        sizes = [
+            len(message)
+            for step in pools[name]
+            for split in (Frames.open(work.inputs[step]),)
+            for message in as_shared(task).pack_samples(split.data, config, split.vehicles)
+        ]
+        messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network, forms))
+        own = asked_for.tasks[name]
+        history = parse_history(name, histories[name], name) if name in histories else None
+        asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan, own.train_s))
+    budgets = Price(asked_for.budgets_mb.wireless, asked_for.budgets_mb.wireline)
+    k = asked_for.federation.edge_rounds_per_cloud_round
+    speeds = _list_speeds(asked_for, held)
+    groups, samples = tuple(map(len, held.values())), tuple(sum(own.values()) for own in held.values())
+    frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k, samples, asked_for.horizon_s, speeds)
+    plan, problem = make_plan(tuple(asked), frame, rule)
+    if problem is not None:
+        write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
+    plan.save(work.folder)
+
+
+def replan_step(
+    work: Work,
+    first: str,
+    plan: str,
+    stage: Literal["pretrain", "edge"],
+    watched: Mapping[str, Sequence[str]],
+    books: Mapping[str, Sequence[str]],
+) -> None:
+    """Plan the rest of the run anew after `stage`: by task, `watched` are its validations, `books` its ledgers.
+
+    `first` is the step of the first plan, `plan` that of the one carried out in `stage`.
+    """
+    problem = read_config(Problem, work.inputs[first] / PROBLEM)
+    done = Plan.load(work.inputs[plan])
+    reached: dict[str, float] = {}
+    used: dict[Link, int] = dict.fromkeys(LINKS, 0)
+    for task in problem.tasks:
+        last = average_regions([Watched.load(work.inputs[step]) for step in watched[task.name]])[-1]
+        reached[task.name] = last.score
+        for entry in read_entries(work, *books[task.name]):
+            used[entry.link] += entry.bytes * (entry.direction == "up")
+    used_mb = Price(used["wireless"] / BYTES_PER_MB, used["wireline"] / BYTES_PER_MB)
+    remake_plan(done, problem, stage, reached, used_mb).save(work.folder)
+
+
+def _list_speeds(recipe: RunRecipe, held: Mapping[str, Mapping[str, int]]) -> dict[str, float]:
+    """Return the speed of every vehicle by its name in a federation; empty where no region gives any.
+
+    held: the vehicles of each federating region with their numbers of training frames.
+    """
+    if not any(recipe.regions[region].speed for region in held):
+        return {}
+    names = [(region, vehicle) for region, vehicles in held.items() for vehicle in vehicles]
+    return {f"{region}/{vehicle}": recipe.regions[region].speed.get(vehicle, 1.0) for region, vehicle in names}
+
+
+def _held_frames(recipe: RunRecipe, recorded: Mapping[str, Mapping[str, int]]) -> dict[str, Mapping[str, int]]:
+    """Return the vehicles of each federating region with their numbers of training frames."""
+    each = recipe.sized_splits.edge
+    return {
+        region: recorded.get(region)
+        or {f"cav{number}": each.scenes * each.spins for number in range(recipe.vehicles(region))}
+        for region in recipe.with_role("federate")
+    }

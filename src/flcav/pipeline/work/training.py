@@ -1,0 +1,264 @@
+"""Steps of the three stages of training, and of centralised training in place of stage II."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.stages import edge_seeds
+from flcav.network.ledger import Ledger
+from flcav.perception.tasks import task_named
+from flcav.perception.weights import save_network, to_arrays
+from flcav.pipeline.arms import find_strategies
+from flcav.pipeline.federations.network import drive_region, join_regions
+from flcav.pipeline.federations.records import read_rounds
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.labels import (
+    LABEL_SOURCES,
+    annotated_samples,
+    fit_label_threshold,
+    pseudo_label_samples,
+    select_frames_near,
+)
+from flcav.pipeline.placing import find_sites
+from flcav.pipeline.planning import follow_plan
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MORE_EDGE, Federation, Role, Training
+from flcav.pipeline.results import LEDGER, WEIGHTS, Placed, Plan, Pretrained, StageResult
+from flcav.pipeline.stages import (
+    Learning,
+    RegionStart,
+    Strategies,
+    choose_uploads,
+    federate_cloud,
+    federate_edge,
+    load_stage_network,
+    make_clients,
+    pretrain,
+    train_centrally,
+    upload_samples,
+)
+from flcav.pipeline.steps import Work
+from flcav.pipeline.work import Fields
+from flcav.pipeline.work.budgets import open_region_book, read_entries, share_plan_budget
+
+
+def pretrain_step(
+    work: Work,
+    task: str,
+    network: str | None,
+    training: Fields,
+    seed: int,
+    upload_seed: int,
+    budget_mb: tuple[float, float],
+    plan: str,
+    pools: Mapping[str, str],
+    validation: Sequence[str],
+    thresholded: bool,
+) -> None:
+    """Run stage I of a task: upload the planned samples, train on them, fix the score threshold of pseudo-labels."""
+    learning = Learning(task_named(task), network, Training.model_validate(training), seed)
+    own = Plan.load(work.inputs[plan])
+    opened = {region: Frames.open(work.inputs[step]) for region, step in pools.items()}
+    watched = [Frames.open(work.inputs[step]) for step in validation]
+    config = learning.config
+    chosen = choose_uploads(
+        {region: split.vehicles for region, split in opened.items()}, own.tasks[task].samples, upload_seed
+    )
+    book = Ledger(share_plan_budget(own, budget_mb, task))
+    samples: list[Any] = []
+    for region, frames in chosen.items():
+        if frames:
+            samples += _each(upload_samples(book, learning.task, config, region, opened[region], frames))
+    book.save(work.folder / LEDGER)
+    validated = pretrain(learning, samples, watched, work.folder, work.report)
+    trained = load_stage_network(learning.task, work.folder)
+    Pretrained(
+        task=task,
+        network=network or next(iter(learning.task.configurations)),
+        uploaded=chosen,
+        validated=validated,
+        steps=learning.training.steps,
+        threshold=fit_label_threshold(trained, watched) if thresholded else None,
+    ).save(work.folder)
+
+
+def edge_step(
+    work: Work,
+    task: str,
+    network: str | None,
+    training: Fields,
+    seed: int,
+    budget_mb: tuple[float, float],
+    region: str,
+    vehicles: Mapping[str, int],
+    labels: str,
+    federation: Fields,
+    steps: Mapping[str, Any],
+    train_s: float = 0.0,
+    speeds: Mapping[str, float] = {},
+    validation: Mapping[str, str] = {},
+    processes: int = 1,
+    runtime: str = "embedded",
+) -> None:
+    """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`.
+
+    With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III. On a network,
+    a vehicle trains `train_s` / speed in a round [s]. Each round is scored on the frames of the steps `validation`, by
+    region. Vehicles train in so many `processes` of a `runtime`.
+    """
+    learning = Learning(task_named(task), network, Training.model_validate(training), seed)
+    plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
+    own = plan.tasks[task]
+    book = open_region_book(work, task, region, steps["plan"], steps["pretrain"], vehicles, budget_mb)
+    if "errors" in steps:
+        book = Ledger(book.budget, read_entries(work, steps["errors"]))
+    if "edge" in steps:
+        stage, rounds = MORE_EDGE, own.cloud_rounds * how.edge_rounds_per_cloud_round
+        book = Ledger(book.budget, read_entries(work, steps["edge"]))
+        samples, poles = _label_samples(work, learning, region, labels, steps)
+    else:
+        stage, rounds = EDGE, own.edge_rounds
+        samples, poles = _label_samples(work, learning, region, labels, steps, book)
+    start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
+    clients = make_clients(learning, start.config, samples)
+    earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
+    schedule = learning.schedule(rounds, learning.training.local_steps, stage, region, earlier=earlier)
+    strategy, _ = find_strategies(how)
+    rules = follow_plan(how, own, earlier)
+    before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
+    seeds = [schedule.work(number).seed for number in range(1, rounds + 1)]
+    driven = drive_region(work, learning, how, rules, region, [*clients], steps, seeds, earlier, train_s, speeds)
+    watched = {name: Frames.open(work.inputs[step]) for name, step in validation.items()}
+    where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
+    losses = federate_edge(*asked, driven.rules, earlier, *where)
+    held = sum(len(client.samples) for client in clients.values())
+    records = read_rounds(work.folder, region, before, {region: driven.seconds})
+    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses, records).save(work.folder)
+
+
+def cloud_step(
+    work: Work,
+    task: str,
+    network: str | None,
+    training: Fields,
+    seed: int,
+    budget_mb: tuple[float, float],
+    labels: str,
+    federation: Fields,
+    regions: Mapping[str, Mapping[str, Any]],
+    train_s: float = 0.0,
+    speeds: Mapping[str, float] = {},
+) -> None:
+    """Run stage III of a task: the edge servers of `regions` federate with the cloud, vehicles with edge servers."""
+    learning = Learning(task_named(task), network, Training.model_validate(training), seed)
+    first = next(iter(regions.values()))
+    own, how = Plan.load(work.inputs[first["plan"]]), Federation.model_validate(federation)
+    start = load_stage_network(learning.task, work.inputs[first["pretrain"]])
+    book = Ledger(
+        share_plan_budget(own, budget_mb, task),
+        read_entries(work, first["pretrain"], *(s["edge"] for s in regions.values())),
+    )
+    servers, held, count, helped = {}, 0, 0, []
+    for region, steps in regions.items():
+        samples, poles = _label_samples(work, learning, region, labels, steps)
+        clients = make_clients(learning, start.config, samples)
+        weights = to_arrays(load_stage_network(learning.task, work.inputs[steps["edge"]]))
+        servers[region] = RegionStart(clients, weights, StageResult.load(work.inputs[steps["edge"]]).rounds)
+        held += sum(len(client.samples) for client in clients.values())
+        count, helped = count + len(clients), [*helped, *poles]
+    rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
+    federating = Strategies(*find_strategies(how))
+    rules = follow_plan(how, own.tasks[task], own.tasks[task].edge_rounds)
+    before, schedule = len(book.entries), learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
+    seeds = {
+        name: [seed for n in range(1, rounds + 1) for seed in edge_seeds(schedule, n, name, k)] for name in servers
+    }
+    driven = {
+        name: drive_region(
+            work, learning, how, rules, name, [*at.clients], regions[name], seeds[name], at.earlier, train_s, speeds
+        )
+        for name, at in servers.items()
+    }
+    rules, lost, seconds = join_regions(driven, k, how.network, update_bytes(to_arrays(start)))
+    asked = (learning, start, servers, rounds, k, federating, rules)
+    losses = federate_cloud(*asked, book, work.folder, work.report, lost)
+    records = read_rounds(work.folder, None, before, seconds)
+    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses, records).save(work.folder)
+
+
+def central_step(
+    work: Work,
+    task: str,
+    network: str | None,
+    training: Fields,
+    seed: int,
+    region: str,
+    vehicles: int,
+    source: Role,
+    steps: Mapping[str, Any],
+) -> None:
+    """Continue training centrally on ground truth, for as many optimiser steps as stage II takes in the region.
+
+    `source` "pretrain": on the uploaded samples. "federate": on the training frames of the region's vehicles.
+    """
+    learning = Learning(task_named(task), network, Training.model_validate(training), seed)
+    trained = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
+    if source == "pretrain":
+        uploaded = Pretrained.load(work.inputs[steps["pretrain"]]).uploaded
+        parts = [(Frames.open(work.inputs[steps["pools"][name]]), frames) for name, frames in uploaded.items()]
+    else:
+        split = Frames.open(work.inputs[steps["frames"]])
+        parts = [(split, _select_group(work, split, steps))]
+    samples = [
+        sample for split, frames in parts for sample in _each(learning.task.samples(split.data, trained.config, frames))
+    ]
+    rounds = Plan.load(work.inputs[steps["plan"]]).tasks[task].edge_rounds
+    losses = train_centrally(learning, trained, samples, rounds, vehicles, source)
+    save_network(learning.task, trained, work.folder / WEIGHTS)
+    StageResult(CENTRAL, task, region, rounds, len(samples), 1, (), losses).save(work.folder)
+
+
+def _label_samples(
+    work: Work, learning: Learning, region: str, labels: str, steps: Mapping[str, Any], book: Ledger | None = None
+) -> tuple[Mapping[str, Sequence[Any]], tuple[int, ...]]:
+    """Return each vehicle's labelled samples, and the poles that contributed labels.
+
+    `steps`: "pretrain", the recorded "frames", the arm's "place", and "sites", the placements of all arms.
+    """
+    split, kind = Frames.open(work.inputs[steps["frames"]]), LABEL_SOURCES[labels]
+    frames = _select_group(work, split, steps)
+    if not kind.from_detections:
+        config = load_stage_network(learning.task, work.inputs[steps["pretrain"]]).config
+        return annotated_samples(learning.task, config, split, frames, region), ()
+    poles = Placed.load(work.inputs[steps["place"]]).chosen if kind.from_poles else ()
+    frozen = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
+    threshold = Pretrained.load(work.inputs[steps["pretrain"]]).threshold
+    assert threshold is not None  # fixed wherever labels come from detections
+    samples = pseudo_label_samples(frozen, threshold, split, frames, poles, region, work.report, book, kind.trained)
+    return samples, poles
+
+
+def _select_group(work: Work, split: Frames, steps: Mapping[str, Any]) -> tuple[int, ...]:
+    """Return the vehicles' frames near a roadside sensor of any arm, so that all arms have the same frames.
+
+    Raises `InputError` where there are none.
+    """
+    placed = [Placed.load(work.inputs[step]) for step in steps["sites"]]
+    numbers = {pole for each in placed for pole in each.chosen}
+    if not numbers:
+        return split.vehicles
+    sites = find_sites(split, split if steps["recorded"] else None)
+    near = select_frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], steps["group_range_m"])
+    if not near:
+        raise InputError(
+            f"{split.data.folder.parent.name}: no vehicle comes within {steps['group_range_m']:g} m "
+            f"(placement.group_range_m) of a sensor, so that none can take part"
+        )
+    return near
+
+
+def _each(samples: Sequence[Any]) -> list[Any]:
+    """Load all samples into memory: each is drawn many times."""
+    return [samples[number] for number in range(len(samples))]
