@@ -239,8 +239,8 @@ def test_half_a_sweep(folder: Path):
     assert any("is no whole spin" in problem for problem in validate(folder))
 
 
-@pytest.mark.parametrize(("number", "advice"), [(1, "record it again"), (3, "update flcav")])
+@pytest.mark.parametrize(("number", "advice"), [(1, "record it again"), (4, "update flcav")])
 def test_a_dataset_of_another_version(folder: Path, number: int, advice: str):
     (folder / "manifest.json").write_text(json.dumps({"format": number}))
-    with pytest.raises(InputError, match=f"dataset format {number}, this version of flcav reads format 2; {advice}"):
+    with pytest.raises(InputError, match=f"format {number}, this version of flcav reads formats 2 and 3; {advice}"):
         validate(folder)
