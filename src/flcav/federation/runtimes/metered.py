@@ -3,11 +3,12 @@
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from flwr.app import Message, RecordDict
+from flwr.app import Message
 from flwr.serverapp import Grid
 
 from flcav.federation.records import CONFIG
 from flcav.federation.runtimes.embedded import wire_bytes
+from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link
 
 
@@ -30,7 +31,7 @@ class Account:
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by round and client
 
 
-class MeteredGrid(Grid):
+class MeteredGrid(WrappedGrid):
     """Grid that meters another one: a downlink entry for each message to a node, an uplink entry for each reply."""
 
     def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:
@@ -98,25 +99,6 @@ class MeteredGrid(Grid):
             yield reply
         for node, about in waiting.items():
             self._enter("down", *about, node)
-
-    def get_node_ids(self) -> list[int]:
-        """Return the node ids of the metered grid."""
-        return list(self._grid.get_node_ids())
-
-    def create_message(
-        self, content: RecordDict, message_type: str, dst_node_id: int, group_id: str, ttl: float | None = None
-    ) -> Message:
-        """Return a message of the metered grid."""
-        return self._grid.create_message(content, message_type, dst_node_id, group_id, ttl)
-
-    def set_run(self, run) -> None:
-        """Set Flower's record of the run, in the metered grid."""
-        self._grid.set_run(run)
-
-    @property
-    def run(self):
-        """Return Flower's record of the run."""
-        return self._grid.run
 
 
 def _round(message: Message) -> int:

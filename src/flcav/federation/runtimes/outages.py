@@ -2,16 +2,17 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from flwr.app import Error, Message, RecordDict
+from flwr.app import Error, Message
 from flwr.serverapp import Grid
 
 from flcav.federation.records import ARRAYS, CONFIG
 from flcav.federation.runtimes.embedded import CLIENT_APP_RAISED, wire_bytes
 from flcav.federation.runtimes.metered import Account, Outage
+from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.network.ledger import LedgerEntry
 
 
-class LossyGrid(Grid):
+class LossyGrid(WrappedGrid):
     """Grid that answers for the nodes which `account.outages` has lost in a round, with the reason as an error.
 
     Nothing reaches a node that is not there. The bytes of an update that broke off are entered as far as they came;
@@ -87,22 +88,3 @@ class LossyGrid(Grid):
         for reply in self._grid.send_and_receive(reachable(), timeout=timeout):
             yield self._cut(reply, asked[reply.metadata.src_node_id])
         yield from map(self._fail, away)
-
-    def get_node_ids(self) -> list[int]:
-        """Return the node ids of the grid."""
-        return list(self._grid.get_node_ids())
-
-    def create_message(
-        self, content: RecordDict, message_type: str, dst_node_id: int, group_id: str, ttl: float | None = None
-    ) -> Message:
-        """Return a message of the grid."""
-        return self._grid.create_message(content, message_type, dst_node_id, group_id, ttl)
-
-    def set_run(self, run) -> None:
-        """Set Flower's record of the run, in the grid."""
-        self._grid.set_run(run)
-
-    @property
-    def run(self):
-        """Return Flower's record of the run."""
-        return self._grid.run

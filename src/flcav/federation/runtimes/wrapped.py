@@ -1,0 +1,29 @@
+"""A Flower grid around another one: what a grid adds to is overridden, all else is the inner grid's."""
+
+from flwr.app import Message, RecordDict
+from flwr.serverapp import Grid
+
+
+class WrappedGrid(Grid):
+    """Grid that passes on nodes, messages and the run of the grid `_grid`."""
+
+    _grid: Grid
+
+    def get_node_ids(self) -> list[int]:
+        """Return the node ids of the inner grid."""
+        return list(self._grid.get_node_ids())
+
+    def create_message(
+        self, content: RecordDict, message_type: str, dst_node_id: int, group_id: str, ttl: float | None = None
+    ) -> Message:
+        """Return a message of the inner grid."""
+        return self._grid.create_message(content, message_type, dst_node_id, group_id, ttl)
+
+    def set_run(self, run) -> None:
+        """Set Flower's record of the run, in the inner grid."""
+        self._grid.set_run(run)
+
+    @property
+    def run(self):
+        """Return Flower's record of the run."""
+        return self._grid.run
