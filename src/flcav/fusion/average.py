@@ -29,7 +29,7 @@ UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of bo
 
 @dataclass(frozen=True)
 class Told:
-    """What one agent tells of one spin."""
+    """Boxes that one agent sends of one spin, in the world frame."""
 
     agent: str
     time_s: float

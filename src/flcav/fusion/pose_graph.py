@@ -41,7 +41,7 @@ class Navigation:
 
 @dataclass(frozen=True)
 class Sighting:
-    """What one agent observed in one spin."""
+    """Observation of one agent in one spin: its pose by navigation, boxes and posts."""
 
     agent: str
     time_s: float  # by its clock

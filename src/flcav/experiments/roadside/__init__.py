@@ -1,1 +1,1 @@
-"""What road sensors see and tell: the trained detector, the road average of labels, and registered suites."""
+"""Experiments on roadside perception: the trained detector, the road average of labels, registered LiDAR suites."""

@@ -1,4 +1,4 @@
-"""What vehicles and road sensors observed in recorded scenes, and what there was to be found."""
+"""Observations of vehicles and road sensors in recorded scenes, and the ground truth of these."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,1 +1,1 @@
-"""Where clients train: in this process, in several, in Flower's simulation on Ray; and metering of their messages."""
+"""Runtimes of a federation: this process, several, or Flower's simulation on Ray; and metering of its messages."""

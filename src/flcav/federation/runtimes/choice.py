@@ -1,4 +1,4 @@
-"""Where the clients of a federation train, by name."""
+"""Choice of the runtime that clients train in, by its name."""
 
 import contextlib
 from collections.abc import Iterator, Mapping

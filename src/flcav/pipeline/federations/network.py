@@ -146,7 +146,7 @@ def drive_region(
     train_s: float,
     speeds: Mapping[str, float],
 ) -> DrivenRounds:
-    """Return what the network makes of a region's rounds, and write them; without a network nobody is lost."""
+    """Simulate a region's rounds over the radio network and write their clock; without a network no client is lost."""
     if how.network is None:
         return DrivenRounds(rules, {}, ())
     weights = to_arrays(learning.build_network())
