@@ -10,7 +10,7 @@ from flcav.experiments.studies.run import Study, StudyResult, describe_limits, l
 from flcav.markdown import format_bullets, format_table
 from flcav.perception.objects.evaluate import BreakdownRow, ObjectsEvaluation, Score
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.study import TRACKS
+from flcav.perception.objects.study import STREETS_STUDY, TRACKS
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.tracking import evaluate_tracks
 from flcav.report import style
@@ -80,7 +80,8 @@ def _slices(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
 
 def _tracks(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
     rows = []
-    for seeds in zip(*(found.tracks.scores for found in results.tested("tracks") if found.tracks)):
+    tested = results.tested(TRACKS) if TRACKS in results.recipes.tests else []
+    for seeds in zip(*(found.tracks.scores for found in tested if found.tracks)):
         numbers = zip(*((row.mota, row.amota, row.id_switches, row.velocity_error_mps) for row in seeds))
         rows.append([seeds[0].label, *map(_mean, numbers)])
     return rows
@@ -127,3 +128,4 @@ def _bar(name: str, rows: Sequence[Score | BreakdownRow]) -> Bar:
 
 
 STUDY = Study(OBJECTS, OBJECTS.study(), draw=_draw, extra={TRACKS: add_tracks}, is_share=_is_share)
+STREETS = Study(OBJECTS, STREETS_STUDY, draw=_draw, is_share=_is_share)
