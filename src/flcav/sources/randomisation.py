@@ -166,7 +166,7 @@ def _draw_lidar(lidar: MountedLidar, draw: Draw) -> MountedLidar:
 
 
 def _draw_beams(pattern: str, draw: Draw) -> tuple[tuple[float, ...], int]:
-    """Return the elevations [deg] and the azimuth steps of a pattern of `PATTERNS`; each unit's beams are a little off."""
+    """Return the elevations [deg] and the azimuth steps of one of `PATTERNS`; each unit's beams are a little off."""
     if pattern == "even":
         elevations = np.linspace(draw.uniform(2, 15), draw.uniform(-25, -16), int(draw.integers(40, 97)))
         steps = int(draw.integers(1000, 2001))

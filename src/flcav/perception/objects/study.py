@@ -26,7 +26,7 @@ STUDY = StudyRecipe(
     patience=8,
 )
 
-# Training in drawn streets beside the authored ones: half of the sweeps of `STUDY`, and three street scenes of each town.
+# Training in drawn streets, three of each town, beside the authored ones with half of the sweeps of `STUDY`.
 DRAWN = read_recipe("streets")
 DRAWN_TEST = {**DRAWN, "split": "test", "scenes": 6}
 STREETS_STUDY = StudyRecipe(

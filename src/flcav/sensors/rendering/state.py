@@ -67,7 +67,7 @@ def collect_lamps(scene: Scene, state: LampState) -> Lamps:
     places, beams = [street], [np.zeros_like(street)]
     for actor in np.flatnonzero(state.head[1:] > 0.5):
         body = scene.world_from_actor(int(actor))
-        heads, _ = lamp_places(*scene.trace.model(actor))
+        heads, _ = lamp_places(*scene.trace.model(int(actor)))
         if len(heads):
             places.append(transform_points(body, heads))
             beams.append(np.tile(body[:3, 0] - (0, 0, 0.012), (len(heads), 1)))

@@ -6,11 +6,11 @@ Each is `length` along x, `width` along y and `height` [m], about its foot.
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from flcav.seeds import stream
 from flcav.world.materials import Material
-from flcav.world.meshes.mesh import Mesh, box, join_meshes, sheet, tube
+from flcav.world.meshes.mesh import Mesh, box, fit_to_size, join_meshes, sheet, tube
 
 UNEVEN = 0.12  # standard deviation of foliage's surface, over its half extent
 LEAVES_PER_M2 = 14.0  # loose clusters of leaves on a surface of foliage
@@ -63,7 +63,7 @@ def make_bin(length: float, width: float, height: float) -> Mesh:
 
 def make_post(length: float, width: float, height: float) -> Mesh:
     """Return a round post or bollard."""
-    return tube((0, 0, 0), (0, 0, height), (length + width) / 4, Material.METAL, sides=8)
+    return fit_to_size(tube((0, 0, 0), (0, 0, 1), 0.5, Material.METAL, sides=8), length, width, height)
 
 
 def _barrier(length: float, width: float, height: float, pitch_m: float, full: float, material: Material) -> Mesh:
@@ -77,11 +77,13 @@ def _barrier(length: float, width: float, height: float, pitch_m: float, full: f
         )
         for x in front.tolist()
     ]
-    rails = [box((0, 0, share * height), (length, width / 2, 0.06), material) for share in (0.2, 0.85)]
+    rails = [box((0, 0, share * height), (length, width, 0.06), material) for share in (0.2, 0.85)]
     return join_meshes((*parts, *rails))
 
 
-def _leafy(grid: np.ndarray, size: ArrayLike, rng: np.random.Generator, closed: bool = False) -> Mesh:
+def _leafy(
+    grid: NDArray[np.float64], size: tuple[float, float, float], rng: np.random.Generator, closed: bool = False
+) -> Mesh:
     """Return the surface through a grid (A, B, 3) of unit extents, made uneven, scaled to `size`, with loose leaves.
 
     With `closed` the last column of the grid continues in the first.
@@ -93,7 +95,7 @@ def _leafy(grid: np.ndarray, size: ArrayLike, rng: np.random.Generator, closed: 
     points = grid * np.asarray(size) * np.concatenate((uneven, uneven, uneven), axis=2)
     points[..., 0] += grid[..., 0] * np.asarray(size)[0] * (1 - uneven[..., 0]) * (not closed)  # ends stay in place
     surface = sheet(points, Material.LEAF)
-    length, width, height = np.asarray(size)
+    length, width, height = size
     count = round(LEAVES_PER_M2 * (length * width + 2 * height * (length + width)))
     at = points.reshape(-1, 3)[rng.integers(points[..., 0].size, size=count)]
     at = at + rng.normal(0, 0.15, (count, 3)) * (1, 1, 0.6)
@@ -101,7 +103,7 @@ def _leafy(grid: np.ndarray, size: ArrayLike, rng: np.random.Generator, closed: 
     corners[..., 2] = np.abs(corners[..., 2])
     faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
     leaves = Mesh(corners.reshape(-1, 3).astype(np.float32), faces, np.full(count, Material.LEAF, np.uint8))
-    return join_meshes((surface, leaves))
+    return fit_to_size(join_meshes((surface, leaves)), length, width, height)
 
 
 MAKERS: Mapping[str, Callable[[float, float, float], Mesh]] = {
