@@ -94,16 +94,14 @@ def _leafy(
         uneven[0] = uneven[0, 0]
     points = grid * np.asarray(size) * np.concatenate((uneven, uneven, uneven), axis=2)
     points[..., 0] += grid[..., 0] * np.asarray(size)[0] * (1 - uneven[..., 0]) * (not closed)  # ends stay in place
-    surface = sheet(points, Material.LEAF)
     length, width, height = size
+    surface = fit_to_size(sheet(points, Material.LEAF), length, width, height)
     count = round(LEAVES_PER_M2 * (length * width + 2 * height * (length + width)))
-    at = points.reshape(-1, 3)[rng.integers(points[..., 0].size, size=count)]
-    at = at + rng.normal(0, 0.15, (count, 3)) * (1, 1, 0.6)
-    corners = at[:, None] + rng.normal(0, LEAF_M / 2, (count, 3, 3))
-    corners[..., 2] = np.abs(corners[..., 2])
+    at = surface.vertices[rng.integers(len(surface.vertices), size=count)] + rng.normal(0, 0.15, (count, 3))
+    corners = (at[:, None] + rng.normal(0, LEAF_M / 2, (count, 3, 3))).reshape(-1, 3)
+    corners = corners.clip((-length / 2, -width / 2, 0), (length / 2, width / 2, height)).astype(np.float32)
     faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
-    leaves = Mesh(corners.reshape(-1, 3).astype(np.float32), faces, np.full(count, Material.LEAF, np.uint8))
-    return fit_to_size(join_meshes((surface, leaves)), length, width, height)
+    return join_meshes((surface, Mesh(corners, faces, np.full(count, Material.LEAF, np.uint8))))
 
 
 MAKERS: Mapping[str, Callable[[float, float, float], Mesh]] = {
