@@ -80,7 +80,7 @@ def _slices(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
 
 def _tracks(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
     rows = []
-    tested = results.tested(TRACKS) if TRACKS in results.recipes.tests else []
+    tested = results.tested(TRACKS) if all(TRACKS in seed.tests for seed in results.seeds) else []
     for seeds in zip(*(found.tracks.scores for found in tested if found.tracks)):
         numbers = zip(*((row.mota, row.amota, row.id_switches, row.velocity_error_mps) for row in seeds))
         rows.append([seeds[0].label, *map(_mean, numbers)])
