@@ -27,8 +27,9 @@ MEASURES = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
 
 
 def tables(results: StudyResult[ObjectsEvaluation]) -> dict[str, str]:
-    """Return Markdown by name: findings (a list), classes, slices, training, tracks."""
+    """Return Markdown by name: findings (a list), classes, slices, training, and tracks where these were tested."""
     heads = [f"{kind} at {overlap}" for kind, overlap in MEASURES]
+    tracked = format_table(("class", "MOTA", "AMOTA", "id switches", "velocity error [m/s]"), _tracks(results))
     return {
         "findings": format_bullets(_findings(results)),
         "classes": format_table(
@@ -39,7 +40,7 @@ def tables(results: StudyResult[ObjectsEvaluation]) -> dict[str, str]:
             ("seed", "sweeps", "steps", "validation, mean AP3D@0.5 of the classes, after each epoch; the best is kept"),
             training_rows(results),
         ),
-        "tracks": format_table(("class", "MOTA", "AMOTA", "id switches", "velocity error [m/s]"), _tracks(results)),
+        **({"tracks": tracked} if TRACKS in results.summary else {}),
     }
 
 
@@ -80,7 +81,7 @@ def _slices(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
 
 def _tracks(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
     rows = []
-    tested = results.tested(TRACKS) if all(TRACKS in seed.tests for seed in results.seeds) else []
+    tested = results.tested(TRACKS) if TRACKS in results.summary else []
     for seeds in zip(*(found.tracks.scores for found in tested if found.tracks)):
         numbers = zip(*((row.mota, row.amota, row.id_switches, row.velocity_error_mps) for row in seeds))
         rows.append([seeds[0].label, *map(_mean, numbers)])
