@@ -230,8 +230,8 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
             told = (
                 f"{checked['runs']} runs held out, {checked['points']} points: mean error of the prediction "
                 f"{checked['mean_error']:.4f}, rank correlation {checked['rank_correlation']:.3f}",
-                f"runs differ by {checked['between_runs']:.4f}, points of a run by {checked['within_runs']:.4f} (standard "
-                f"deviations): the true curve would reach a rank correlation of {checked['attainable']:.3f}",
+                f"runs differ by {checked['between_runs']:.4f}, their points by {checked['within_runs']:.4f} (standard"
+                f" deviations): the true curve would reach a rank correlation of {checked['attainable']:.3f}",
             )
             for line in told:
                 console.print(f"{answer['task']}: {line}")
