@@ -11,7 +11,7 @@ from scipy.stats import spearmanr
 from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.optimization.curves.fitting import fit
-from flcav.optimization.curves.held_out import hold_out_runs
+from flcav.optimization.curves.held_out import attainable_correlation, hold_out_runs, noise_of_runs
 from flcav.optimization.curves.history import History
 
 COUNTS = np.array([(s, e, 0) for s in (40, 80, 160, 320) for e in range(4)], dtype=float)
@@ -45,6 +45,7 @@ def test_an_exact_curve_predicts_exactly() -> None:
     found = hold_out_runs(history(0.0), fit)
     assert found.mean_error < 2e-3
     assert found.rank_correlation == pytest.approx(1.0)
+    assert found.attainable == pytest.approx(1.0, abs=1e-2)
 
 
 def test_two_runs_are_too_few() -> None:
@@ -65,3 +66,17 @@ def test_the_command_tells_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit, match="0"):
         command(["fit", str(table), "--held-out"])
     assert "4 runs held out, 16 points" in " ".join(capsys.readouterr().out.split())
+
+
+def test_noise_of_runs_and_what_it_leaves_attainable() -> None:
+    runs = np.repeat([f"r{number}" for number in range(200)], 12)
+    draw = np.random.default_rng(2)
+    residual = np.repeat(draw.normal(0, 0.03, 200), 12) + draw.normal(0, 0.01, 2400)
+    assert noise_of_runs(residual, runs) == pytest.approx((0.03, 0.01), rel=0.1)
+    assert noise_of_runs(np.tile([0.01, -0.01], 1200), runs)[0] == 0
+    expected = draw.normal(0, 0.04, 2400)  # independent normals correlate by r, their ranks by 6/pi asin(r/2)
+    normal = 0.04 / np.sqrt(0.04**2 + 0.03**2 + 0.01**2)
+    assert attainable_correlation(expected, runs, 0.03, 0.01) == pytest.approx(
+        6 / np.pi * np.arcsin(normal / 2), abs=0.02
+    )
+    assert attainable_correlation(expected, runs, 0, 0) == pytest.approx(1)

@@ -10,7 +10,7 @@ from flcav.geometry import Boxes
 from flcav.perception.errors import load_errors, save_errors
 from flcav.perception.objects import sample_from_frame, second_paper, second_tiny
 from flcav.perception.objects.errors import register_errors
-from flcav.perception.objects.evaluate import Score, score_detections
+from flcav.perception.objects.evaluate import ObjectsEvaluation, Score, score_detections
 from flcav.perception.objects.samples import validate_points
 from flcav.perception.objects.truth import asked_of, ground_truth
 
@@ -68,6 +68,15 @@ def test_scores_count_targets_and_hidden_objects():
     )
     nothing = score_detections([Boxes.empty()], [asked_of(frame([]), CONFIG)], ("Car",))
     assert nothing[0].ap is None
+
+
+def test_a_class_of_which_nothing_is_found_lowers_the_score_and_one_without_targets_does_not():
+    def row(label, ap):
+        return Score(label, "3d", 0.5, ap, None, None, None, None, targets=0 if ap is None else 3, hidden=0)
+
+    rows = (row("Car", 0.8), row("Pedestrian", 0.0), row("Cyclist", None))
+    assert ObjectsEvaluation(frames=1, scenes=1, scores=rows, slices=(), trust=()).score == pytest.approx(0.4)
+    assert ObjectsEvaluation(frames=1, scenes=1, scores=rows[2:], slices=(), trust=()).score == 0
 
 
 def test_evaluating_nothing_is_said():

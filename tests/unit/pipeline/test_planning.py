@@ -230,6 +230,8 @@ def test_runs_of_the_package_s_history_are_predicted_from_the_others() -> None:
     assert (found.runs, found.points) == (7, 91)
     assert found.mean_error <= 0.02
     assert (found.mean_error, found.rank_correlation) == pytest.approx((0.0191, 0.642), abs=5e-4)  # docs/runs.md
+    assert (found.between_runs, found.within_runs) == pytest.approx((0.0132, 0.0143), abs=5e-5)
+    assert found.attainable == pytest.approx(0.774, abs=5e-4)
 
 
 def test_a_small_pool_limits_the_samples() -> None:

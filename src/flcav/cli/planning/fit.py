@@ -227,9 +227,13 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
             console.print(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}")
         if "held_out" in answer:
             checked = answer["held_out"]
-            console.print(
-                f"{answer['task']}: {checked['runs']} runs held out, {checked['points']} points: mean error of the "
-                f"prediction {checked['mean_error']:.4f}, rank correlation {checked['rank_correlation']:.3f}"
+            told = (
+                f"{checked['runs']} runs held out, {checked['points']} points: mean error of the prediction "
+                f"{checked['mean_error']:.4f}, rank correlation {checked['rank_correlation']:.3f}",
+                f"runs differ by {checked['between_runs']:.4f}, their points by {checked['within_runs']:.4f} (standard"
+                f" deviations): the true curve would reach a rank correlation of {checked['attainable']:.3f}",
             )
+            for line in told:
+                console.print(f"{answer['task']}: {line}")
         for warning in answer["warnings"]:
             console.print(f"{answer['task']}: {warning}")

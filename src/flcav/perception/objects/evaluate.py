@@ -79,8 +79,8 @@ class ObjectsEvaluation(Evaluated):
 
     @property
     def score(self) -> float:
-        """Return the mean AP in 3D at IoU 0.5 over the classes with an AP above 0; 0 where there is none."""
-        known = [row.ap for row in self.scores if (row.kind, row.iou) == ("3d", 0.5) and row.ap]
+        """Return the mean AP in 3D at IoU 0.5 over the classes with targets; 0 where there are none."""
+        known = [row.ap for row in self.scores if (row.kind, row.iou) == ("3d", 0.5) and row.ap is not None]
         return float(np.mean(known)) if known else 0.0
 
     def numbers(self) -> Mapping[str, float]:
