@@ -49,7 +49,8 @@ class EmbeddedSource:
         if not self.agents:
             raise InputError("fields 'cavs' = 0 and 'poles' = []: nobody observes; give at least one of them")
         self.vehicle_rigs = [self._vehicle_rig(i) for i in range(recipe.cavs)]
-        _check_mounts("vehicle_rig", recipe.vehicle_rig, "a vehicle", 0.0)
+        for rig in self.vehicle_rigs or [recipe.vehicle_rig]:
+            _check_mounts("vehicle_rig", rig, "a vehicle", 0.0)
         for pole in self.poles:
             x, y, z = self.town.poles.position[known.index(pole)].tolist()
             mount_m = z - self.town.ground(x, y)

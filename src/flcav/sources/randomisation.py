@@ -19,7 +19,7 @@ from shapely.geometry import Polygon
 from flcav.sensors.lidar.beams import BEAMS
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.rig import MountedLidar, Rig
-from flcav.world.map.parameters import BOUNDARIES, CLUTTER, KERBSIDE, StreetParameters, TownParameters
+from flcav.world.map.parameters import BOUNDARIES, CLUTTER, KERBSIDE, MOST, StreetParameters, TownParameters
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import HEIGHTS, Town, furnish_town, lift_town
@@ -62,8 +62,8 @@ def _draw_parameters(town: TownParameters, draw: Draw) -> TownParameters:
     others = draw.uniform(0.15, 0.5)
     values = town.model_dump() | {
         "seed": int(draw.integers(2**31)),
-        "vehicles": round(town.vehicles * draw.uniform(0.7, 1.4)),
-        "pedestrians": round(town.pedestrians * draw.uniform(0.7, 1.6)),
+        "vehicles": min(round(town.vehicles * draw.uniform(0.7, 1.4)), MOST),
+        "pedestrians": min(round(town.pedestrians * draw.uniform(0.7, 1.6)), MOST),
         "mix": {"car": 1 - others} | {kind: others * share for kind, share in mix.items()},
         "shapes": shapes,
         "streets": {kind: _draw_street(street, draw).model_dump() for kind, street in town.streets.items()},

@@ -5,13 +5,15 @@ import pytest
 import shapely
 from shapely.geometry import Polygon
 
+from flcav.config import InputError
+from flcav.geometry import inverse
 from flcav.perception.card import count_beams
 from flcav.seeds import stream
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.randomisation import draw_terrain, randomise_rig, randomise_sizes, randomise_town, town_files
 from flcav.sources.recipe import Recipe
-from flcav.world.map.parameters import BOUNDARIES, KERBSIDE
+from flcav.world.map.parameters import BOUNDARIES
 from flcav.world.map.relief import Relief
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import Town, load_town
@@ -43,7 +45,6 @@ def test_plots_are_enclosed_beside_roads_and_houses(source: EmbeddedSource):
 def test_small_objects_stand_at_the_kerb(source: EmbeddedSource):
     pieces = footprints(source.town, ("bollard", "post"))
     kerbs = shapely.union_all([shapely.LineString(line) for line in source.town.kerbs])
-    assert KERBSIDE
     away = shapely.distance([piece.centroid for piece in pieces], kerbs)
     assert (away < 0.6).mean() > 0.3  # others are drawn as clutter behind the sidewalk
 
@@ -72,7 +73,7 @@ def test_a_folder_of_its_files_is_the_drawn_town(source: EmbeddedSource, tmp_pat
     for own, drawn in zip(found.clutter, source.town.clutter):
         np.testing.assert_array_equal(own[1], drawn[1])
     assert isinstance(found.relief, Relief)
-    assert source.town.relief
+    assert source.town.relief is not None
     np.testing.assert_array_equal(found.relief.points, source.town.relief.points)
 
 
@@ -111,7 +112,7 @@ def test_cars_alone_change_their_sizes(source: EmbeddedSource):
 
 def test_returns_of_a_resized_car_lie_in_its_box(source: EmbeddedSource):
     frame = next(source.frames(source.scenes()[0]))
-    boxes = frame.annotations.boxes.transform(np.linalg.inv(frame.world_from_sensor("velodyne")))
+    boxes = frame.annotations.boxes.transform(inverse(frame.world_from_sensor("velodyne")))
     near = frame.annotations.returns.argmax()
     points = frame.lidar["velodyne"][:, :3] - boxes.center[near]
     cos, sin = np.cos(boxes.yaw[near]), np.sin(boxes.yaw[near])
@@ -119,6 +120,12 @@ def test_returns_of_a_resized_car_lie_in_its_box(source: EmbeddedSource):
     inside = (np.abs(along) < boxes.size[near, 0] / 2 + 0.15) & (np.abs(aside) < boxes.size[near, 1] / 2 + 0.15)
     high = points[inside, 2] > 0.3 - boxes.size[near, 2] / 2  # above the ground, which is uneven
     assert abs(high.sum() / frame.annotations.returns[near] - 1) < 0.15
+
+
+def test_a_lidar_that_is_drawn_into_the_ground_is_refused():
+    rig = {"lidars": {"low": {"mount": {"z": 0.05}}}}
+    with pytest.raises(InputError, match="not above the ground"):
+        EmbeddedSource(Recipe.model_validate(FIELDS | {"randomise": "streets", "vehicle_rig": rig, "cavs": 9}))
 
 
 def test_without_the_field_nothing_is_drawn():

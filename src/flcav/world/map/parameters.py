@@ -8,6 +8,7 @@ from flcav.config import Config
 from flcav.world.shapes import SHAPES
 
 LARGEST_M = 1000.0
+MOST = 10_000  # vehicles, or pedestrians
 CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, height [m]
     "hedge": (5.0, 0.8, 1.2),
     "bins": (3.2, 0.9, 1.3),
@@ -30,7 +31,7 @@ KERBSIDE = ("bin", "bollard", "cabinet", "post")  # kinds that stand between ker
 Height = Annotated[float, Field(ge=0.1, le=100)]
 Spacing = Annotated[float, Field(ge=0.5, le=10_000)]
 NotNegative = Annotated[float, Field(ge=0, le=10_000)]
-Many = Annotated[int, Field(ge=0, le=10_000)]
+Many = Annotated[int, Field(ge=0, le=MOST)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
