@@ -13,7 +13,7 @@ from typing import Any
 from flcav.dataset.recording.jobs import Engine, Job, perform
 from flcav.processes import exit_with_parent
 from flcav.sources.source import Source
-from flcav.threads import VARIABLES
+from flcav.threads import threads_of_children
 
 POLL_S = 0.2
 
@@ -33,7 +33,7 @@ def start_processes(source: Source, work: Path, jobs: int, wrote: Callable[[int]
     context = multiprocessing.get_context("spawn")
     written = context.Value("q", 0)
     with (
-        _threads_per_process(max(1, (os.cpu_count() or 1) // jobs)),
+        threads_of_children(max(1, (os.cpu_count() or 1) // jobs)),
         ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(source, work, written)) as pool,
         _children_end_on_error(),
     ):
@@ -115,17 +115,3 @@ def _children_end_on_error() -> Iterator[None]:
         for child in set(multiprocessing.active_children()) - before:
             child.terminate()
         raise
-
-
-@contextlib.contextmanager
-def _threads_per_process(count: int) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in VARIABLES}
-    os.environ.update(dict.fromkeys(VARIABLES, str(count)))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
