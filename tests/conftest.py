@@ -1,4 +1,6 @@
+import gc
 import signal
+from collections.abc import Generator
 
 import pytest
 
@@ -11,6 +13,17 @@ def _children_can_be_interrupted():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Import the tests without the collector of cyclic garbage, and spare it all modules afterwards: they stay."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

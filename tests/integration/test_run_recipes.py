@@ -60,9 +60,10 @@ def shrunk(name: str) -> RunRecipe:
     for region in asked["regions"].values():
         region["vehicles"] = 1 if region["role"] == "federate" else None
     limits = {"samples": (20, None), "edge_rounds": (1, 1), "cloud_rounds": (1, 1)}
-    asked["placement"]["group_range_m"] = 400.0
-    asked["recording"]["warmup_s"] = 10.0  # few vehicles have set off
-    return RunRecipe.model_validate(asked | {"splits": TINY, "training": QUICK, "limits": limits})
+    placement = asked["placement"] | {"group_range_m": 400.0}
+    return RunRecipe.model_validate(
+        asked | {"splits": TINY, "training": QUICK, "limits": limits, "placement": placement}
+    )
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Execution engines: the protocol of an engine, and worker processes on this machine."""
 
 import contextlib
+import gc
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -90,6 +91,7 @@ def _start(queue: Any, variables: Mapping[str, str]) -> None:
     global _queue
     _queue = queue
     os.environ.update(variables)
+    gc.freeze()  # modules stay: the collector of cyclic garbage need not look at them again and again
     exit_with_parent()
     use_threads(1)
 
