@@ -6,7 +6,7 @@ export OMP_NUM_THREADS := 1
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: demo test test-peers lint docs check bench format clean
+.PHONY: demo test test-peers lint docs check bench bench-peers format clean
 demo: $(STAMP)
 	$(BIN)/flcav demo --out out/demo
 
@@ -34,6 +34,10 @@ check: lint docs
 
 bench: $(STAMP)
 	for b in benchmarks/bench_*.py; do $(BIN)/python $$b || exit 1; done
+
+# A federated round of pfl and of Flower's simulation beside ours, in an environment below out/peers.
+bench-peers: $(STAMP)
+	$(BIN)/python benchmarks/peers/compare.py
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

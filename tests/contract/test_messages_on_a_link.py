@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flwr.app import Message, RecordDict
+from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 from flwr.common.serde import recorddict_from_proto, recorddict_to_proto
 from flwr.proto.recorddict_pb2 import RecordDict as Serialised
 from flwr.serverapp import Grid
@@ -18,6 +18,7 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.federation import stages
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
@@ -144,3 +145,21 @@ def test_the_ledger_has_what_a_socket_carried_in_every_stage(wire: Wire, tmp_pat
     )
     kinds = {(entry.stage, entry.link, entry.direction) for entry in book.entries}
     assert len(kinds) == 2 + 3 + 4  # samples up; network, mistakes, views and rounds; edge and cloud rounds
+
+
+def test_sizes_are_those_of_flower_s_serialisation():
+    sizes = [0, 1, 100, *range(118, 130), *range(16370, 16386), 2_097_140, 2_097_152]  # lengths get a byte longer
+    arrays = {f"layer{size}.weight": Array("uint8", (size,), "numpy.ndarray", bytes(size)) for size in sizes}
+    records = {
+        **{name: ArrayRecord({name: array}) for name, array in arrays.items()},
+        "all": ArrayRecord(arrays),
+        "none": ArrayRecord({}),
+        "scalar": ArrayRecord({"": Array(np.array(3, np.int64)), "ä": Array(np.ones((2, 0, 300)))}),
+        "config": ConfigRecord({"round": 3, "secret": bytes(300), "names": ["a", "b"]}),
+        "metrics": MetricRecord({"loss": 0.5}),
+    }
+    for key, each in records.items():
+        for content in (RecordDict({key: each}), RecordDict({key: each, "again": each})):
+            assert wire_bytes(content) == len(recorddict_to_proto(content).SerializeToString()), key
+    assert wire_bytes(RecordDict(records)) == len(recorddict_to_proto(RecordDict(records)).SerializeToString())
+    assert wire_bytes(RecordDict({})) == 0
