@@ -28,6 +28,7 @@ class Target(StrEnum):
     """Targets other than the tasks' studies."""
 
     demo_arms = "demo-arms"
+    federation_faults = "federation-faults"
     fig1b = "fig1b"
     fig3a = "fig3a"
     fig3b = "fig3b"
@@ -39,6 +40,7 @@ class Target(StrEnum):
 
 
 RECORDED = (Target.fig3b, Target.fig4, Target.road_average, Target.road_detector)  # one recording, no training
+ATTACKS = (Target.federation_faults,)  # one recording, several seeds
 
 
 class Scale(StrEnum):
@@ -54,9 +56,10 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig1b: (),
     Target.fig3a: (),
     **dict.fromkeys(RECORDED, ()),
+    **dict.fromkeys(ATTACKS, ("seeds",)),
     Target.sim_to_real: (*RUN, "kitti", "weights"),
 }
-SEEDS: Mapping[str, int] = {Target.demo_arms: 5}
+SEEDS: Mapping[str, int] = {Target.demo_arms: 5, **dict.fromkeys(ATTACKS, 5)}
 
 
 class Reproducible(click.Choice):
@@ -76,7 +79,7 @@ def reproduce(
     ),
     out: Path = typer.Option(..., "--out", help="Folder of the runs; the same command goes on after a stop."),
     seeds: int | None = typer.Option(
-        None, "--seeds", min=1, help="Number of seeds, from 1: 5 of demo-arms, 3 of the others if not given."
+        None, "--seeds", min=1, help="Number of seeds, from 1: 5 of demo-arms and federation-*, 3 of the others if not given."
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
@@ -103,6 +106,9 @@ def reproduce(
         _sim_to_real(out, kitti, weights, jobs, engine, stale)
         return
     count = seeds or SEEDS.get(target, COMMON_SEEDS)
+    if target in ATTACKS:
+        _attack(Target(target), out, count)
+        return
     numbers = range(1, count + 1)
     quick = scale == Scale.quick
     if target.startswith(TASK) or ":" in target:
@@ -154,6 +160,19 @@ def _record_and_draw(target: Target, out: Path) -> None:
     write_json(out / "result.json", results.as_json())
     for name, picture in pictures.items():
         write_bytes(out / name, picture)
+    for sentence in results.sentences():
+        typer.echo(sentence)
+
+
+@when_interrupted()
+def _attack(target: Target, out: Path, seeds: int) -> None:
+    from flcav import progress
+    from flcav.experiments.attacks.faults import repeat_faults
+    from flcav.files import write_json
+
+    with progress.show_progress(target.value) as report:
+        results = repeat_faults(out, seeds, report)
+    write_json(out / "result.json", results.as_json())
     for sentence in results.sentences():
         typer.echo(sentence)
 

@@ -1,0 +1,191 @@
+"""Byzantine clients: three of ten vehicles lie about what they learned, under four strategies.
+
+Lies: the change of the weights with its sign turned and multiplied by 4 (Li et al., "RSA", AAAI 2019); the change
+multiplied by the number of clients, as in model replacement (Bagdasaryan et al., "How To Backdoor Federated Learning",
+AISTATS 2020); and a training on wrong labels, l for L - 1 - l of L classes (Fang et al., "Local Model Poisoning
+Attacks", USENIX Security 2020).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.experiments.attacks.drives import BATCH, CONFIG, LEARNING_RATE, Drives, find_right, pretrain, record_drives
+from flcav.federation.rounds import ClientFailed
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.stages import Schedule, federate
+from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.strategies.krum import Krum
+from flcav.federation.strategies.median import Median
+from flcav.federation.strategies.trimmed_mean import TrimmedMean
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights, learned_names
+from flcav.intervals import MeanOverSeeds, mean_over_seeds, share_scenes
+from flcav.network.ledger import Budget, Ledger
+from flcav.perception.client import TaskClient
+from flcav.perception.weather.task import WEATHER
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.progress import Report, ignore_progress
+from flcav.records import LEFT_OUT, Record
+from flcav.seeds import stream
+
+BYZANTINE, ROUNDS, STEPS = 3, 5, 4
+HONEST, SIGN, SCALED, LABELS = "none", "sign flip", "scaled", "label flip"
+LIES = (HONEST, SIGN, SCALED, LABELS)
+STRATEGIES: Mapping[str, Strategy] = {
+    "FedAvg": FEDAVG,
+    "median": Median(),
+    "trimmed mean": TrimmedMean(BYZANTINE / 10),
+    "Krum": Krum(byzantine=BYZANTINE),
+}
+
+
+@dataclass(frozen=True)
+class Liar:
+    """A client that sends its change of the weights multiplied by a factor."""
+
+    client: Trainable
+    factor: float
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        """Return start + factor (trained - start) of all that is learned."""
+        found = self.client.train(weights, steps=steps, learning_rate=learning_rate, seed=seed)
+        sent = dict(found.weights)
+        for name in learned_names(weights):
+            start = weights[name]
+            sent[name] = (start + self.factor * (found.weights[name] - start)).astype(start.dtype)
+        return LocalUpdate(sent, found.samples, found.loss)
+
+
+@dataclass(frozen=True)
+class FaultsSeed:
+    """Accuracy in one seed."""
+
+    seed: int
+    byzantine: tuple[str, ...]  # names of the vehicles that lie
+    pretrained: float
+    accuracy: Mapping[str, Mapping[str, float]]  # by lie and strategy
+
+
+@dataclass(frozen=True)
+class FaultsResult(Record):
+    """Accuracy on held-out drives after the federation, by lie and strategy: by seed, and means over seeds."""
+
+    pictures: int  # of the test
+    scenes: int
+    seeds: tuple[FaultsSeed, ...]
+    pretrained: MeanOverSeeds
+    accuracy: Mapping[str, Mapping[str, MeanOverSeeds]]  # by lie and strategy
+    gained: Mapping[str, Mapping[str, MeanOverSeeds]]  # over FedAvg, by lie and strategy
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+
+    def sentences(self) -> list[str]:
+        """Return the accuracies in words, a sentence per lie."""
+        return [
+            f"{lie}: " + ", ".join(f"{name} {mean.describe()}" for name, mean in row.items())
+            for lie, row in self.accuracy.items()
+        ]
+
+
+def repeat_faults(out: Path, seeds: int, progress: Report = ignore_progress) -> FaultsResult:
+    """Record the drives into `out`, and federate once for each seed, lie and strategy."""
+    drives = record_drives(out, progress)
+    right: dict[tuple[str, str], list[NDArray[np.bool_]]] = {}
+    started, liars = [], []
+    total = seeds * len(LIES) * len(STRATEGIES)
+    for seed in range(1, seeds + 1):
+        start = pretrain(drives, seed)
+        started.append(find_right(start, drives.test))
+        liars.append(choose_liars(drives, seed))
+        for lie in LIES:
+            for name, strategy in STRATEGIES.items():
+                weights = run_federation(drives, start, liars[-1], lie, strategy, seed)
+                right.setdefault((lie, name), []).append(find_right(weights, drives.test))
+                progress(sum(map(len, right.values())), total, f"seed {seed}, {lie}, {name}")
+    return summarise(drives, liars, started, right)
+
+
+def choose_liars(drives: Drives, seed: int) -> tuple[str, ...]:
+    """Return the names of the vehicles that lie, drawn anew for each seed."""
+    names = [*drives.vehicles]
+    return tuple(names[i] for i in sorted(stream(seed, "byzantine").permutation(len(names))[:BYZANTINE]))
+
+
+def make_clients(drives: Drives, liars: tuple[str, ...], lie: str) -> dict[str, Trainable]:
+    """Return the vehicles as clients, some of which lie."""
+    clients: dict[str, Trainable] = {}
+    for name, samples in drives.vehicles.items():
+        false = lie == LABELS and name in liars
+        labelled = [replace(each, label=len(CONFIG.classes) - 1 - each.label) for each in samples] if false else samples
+        clients[name] = TaskClient(WEATHER, CONFIG, labelled, batch=BATCH)
+    factor = {SIGN: -4.0, SCALED: float(len(clients))}.get(lie)
+    return clients if factor is None else {**clients, **{name: Liar(clients[name], factor) for name in liars}}
+
+
+def run_federation(
+    drives: Drives, start: Weights, liars: tuple[str, ...], lie: str, strategy: Strategy, seed: int
+) -> Weights:
+    """Return the weights after the federation; where they grew until nobody could train, those of the last round."""
+    account = Account(Ledger(Budget(1e6, 1e6)), "edge", WEATHER.name, "wireless")
+    reached: list[Weights] = [start]
+    try:
+        federate(
+            make_clients(drives, liars, lie),
+            start,
+            Schedule(ROUNDS, STEPS, LEARNING_RATE, LEARNING_RATE / 4, seed),
+            account,
+            strategy=strategy,
+            rules=Rules(least_clients=10 - BYZANTINE),
+            on_round=lambda round_, weights, loss: reached.append(weights),
+        )
+    except ClientFailed:
+        pass
+    return reached[-1]
+
+
+def summarise(
+    drives: Drives,
+    liars: list[tuple[str, ...]],
+    started: list[NDArray[np.bool_]],
+    right: Mapping[tuple[str, str], list[NDArray[np.bool_]]],
+) -> FaultsResult:
+    """Return the means over seeds, which share the test's scenes."""
+    scenes = [each.scene for each in drives.test]
+
+    def mean(values: list[NDArray[np.float64]], share: bool) -> MeanOverSeeds:
+        measures = [lambda times, each=each: times @ each / np.maximum(times.sum(axis=1), 1) for each in values]
+        shared = share_scenes(measures, [scenes] * len(values), rng=stream(0, "scenes")) if len(values) > 1 else None
+        means = [float(each.mean()) for each in values]
+        return mean_over_seeds(means, share=share, **({} if shared is None else {"shared": shared}))
+
+    floats = {key: [each.astype(float) for each in values] for key, values in right.items()}
+    rows = tuple(
+        FaultsSeed(
+            number + 1,
+            liars[number],
+            float(started[number].mean()),
+            {lie: {name: float(right[lie, name][number].mean()) for name in STRATEGIES} for lie in LIES},
+        )
+        for number in range(len(started))
+    )
+    robust = [name for name in STRATEGIES if name != "FedAvg"]
+    gained = {
+        lie: {
+            name: mean([one - other for one, other in zip(floats[lie, name], floats[lie, "FedAvg"])], share=False)
+            for name in robust
+        }
+        for lie in LIES
+    }
+    return FaultsResult(
+        pictures=len(scenes),
+        scenes=len(set(scenes)),
+        seeds=rows,
+        pretrained=mean([each.astype(float) for each in started], share=True),
+        accuracy={lie: {name: mean(floats[lie, name], share=True) for name in STRATEGIES} for lie in LIES},
+        gained=gained,
+        provenance=provenance(),
+    )
