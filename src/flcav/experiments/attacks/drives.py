@@ -1,4 +1,8 @@
-"""Drives of ten vehicles through all weathers: the pictures of each, held-out ones, and a pretrained network."""
+"""Drives of ten vehicles through all weathers, and the last two layers of LeNet as what they train and exchange.
+
+The convolutions are those of the package and stay as they are, so that a picture is the 120 numbers that they make of
+it (layer C5), and a local step is a few matrix products.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,26 +10,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.perception.client import camera_ahead
+from flcav.perception.networks import resolve_network
 from flcav.perception.task import build_network
-from flcav.perception.training import train
-from flcav.perception.weather.config import LeNetConfig
-from flcav.perception.weather.model import Classifier
-from flcav.perception.weather.predict import predict_probabilities
-from flcav.perception.weather.samples import Sample
+from flcav.perception.training import batches
+from flcav.perception.weather.model import Classifier, LeNet
+from flcav.perception.weather.predict import tensor_of
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import from_arrays, to_arrays
+from flcav.perception.weights import to_arrays
 from flcav.progress import Report, ignore_progress
+from flcav.seeds import derive_seed
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.world.weather import WEATHER_CLASSES
 
-CONFIG = LeNetConfig()
 RECIPE: Mapping[str, Any] = {
     "town": "ring",
     "seed": 9101,
@@ -39,63 +44,105 @@ RECIPE: Mapping[str, Any] = {
     "weather": {"classes": list(WEATHER_CLASSES), "turn_s": 4.0},
 }
 TEST: Mapping[str, Any] = {**RECIPE, "seed": 9102, "split": "test", "scenes": 10, "cavs": 4}
-PRETRAINING_SCENES = 3  # the first ones: their pictures are the cloud's, and no vehicle's
-PRETRAINING_STEPS, BATCH, LEARNING_RATE = 100, 16, 2e-3
+CLASSES, BATCH = len(WEATHER_CLASSES), 16
+HIDDEN, OUT = "layers.9", "layers.11"  # F6 and the output layer of `LeNet.layers`
+F6 = 9  # place of F6 in them
 
-Weights = Mapping[str, NDArray[np.number]]
+Vector = NDArray[np.float32]
+Labels = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Labelled pictures as the convolutions see them."""
+
+    features: Vector  # (N, 120)
+    labels: Labels  # (N,)
+    scenes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Drives:
-    """Labelled pictures of a federation."""
+    """Pictures of a federation."""
 
-    pretraining: Sequence[Sample]  # of the cloud
-    vehicles: Mapping[str, Sequence[Sample]]  # by name
-    test: Sequence[Sample]  # of other drives in the same town
+    vehicles: Mapping[str, Pictures]  # by name
+    test: Pictures  # of other drives in the same town
 
 
 def record_drives(out: Path, progress: Report = ignore_progress) -> Drives:
     """Record the drives into `out`, or go on with what is there; return their pictures."""
     for name, recipe in (("train", RECIPE), ("test", TEST)):
         record(EmbeddedSource(parse_config(Recipe, dict(recipe), name)), out / name, progress=progress)
-    return read_drives(Dataset.open(out / "train"), Dataset.open(out / "test"))
-
-
-def read_drives(data: Dataset, test: Dataset) -> Drives:
-    """Return the pictures of recorded drives: those of the first scenes are the cloud's."""
-    pretraining_scenes = sorted({key.scene for key in data.keys})[:PRETRAINING_SCENES]
+    data, network = Dataset.open(out / "train"), resolve_network(WEATHER, None)
     frames: dict[str, list[int]] = {}
     for number, key in enumerate(data.keys):
-        owner = "cloud" if key.scene in pretraining_scenes else key.agent
-        frames.setdefault(owner, []).append(number)
-    samples = {owner: WEATHER.samples(data, CONFIG, numbers) for owner, numbers in sorted(frames.items())}
-    return Drives(samples.pop("cloud"), samples, WEATHER.samples(test, CONFIG))
+        frames.setdefault(key.agent, []).append(number)
+    vehicles = {name: see_pictures(network, data, frames[name]) for name in sorted(frames)}
+    return Drives(vehicles, see_pictures(network, Dataset.open(out / "test"), None))
 
 
-def pretrain(drives: Drives, seed: int) -> Weights:
-    """Return the weights that the cloud hands to the vehicles: a short training on its own pictures."""
-    network = build_network(WEATHER, CONFIG, seed)
-    train(
-        WEATHER,
-        network,
-        drives.pretraining,
-        steps=PRETRAINING_STEPS,
-        batch=BATCH,
-        learning_rate=LEARNING_RATE,
-        seed=seed,
-    )
-    return to_arrays(network)
+def see_pictures(network: Classifier, data: Dataset, frames: Sequence[int] | None) -> Pictures:
+    """Return the features of the labelled pictures in frames of a dataset (None: all)."""
+    assert isinstance(network, LeNet)
+    samples = WEATHER.samples(data, network.config, frames)
+    with torch.inference_mode():
+        features = network.layers[:F6](tensor_of(network, [each.picture for each in samples])).numpy()
+    labels = np.array([each.label for each in samples])
+    return Pictures(features, labels, tuple(each.scene for each in samples))
 
 
-def load(weights: Weights) -> Classifier:
-    """Return a network with these weights."""
-    network = build_network(WEATHER, CONFIG, 0)
-    from_arrays(network, weights)
-    return network
+def draw_head(seed: int) -> Weights:
+    """Return first weights of the two layers, as those of a new LeNet (not of that whose convolutions these are)."""
+    arrays = to_arrays(build_network(WEATHER, WEATHER.configurations["tiny"], derive_seed(seed, "head")))
+    return {name: array for name, array in arrays.items() if name.startswith((f"{HIDDEN}.", f"{OUT}."))}
 
 
-def find_right(weights: Weights, samples: Sequence[Sample]) -> NDArray[np.bool_]:
-    """Return whether the network names the class of each picture (N,)."""
+def predict(weights: Weights, features: Vector) -> tuple[Vector, Vector]:
+    """Return activations of F6 (N, 84) and class probabilities (N, 8)."""
     with np.errstate(all="ignore"):  # of weights that an attack made useless
-        found = predict_probabilities(load(weights), [each.picture for each in samples]).argmax(1)
-    return found == np.array([each.label for each in samples])
+        hidden = np.maximum(features @ weights[f"{HIDDEN}.weight"].T + weights[f"{HIDDEN}.bias"], 0)
+        logits = hidden @ weights[f"{OUT}.weight"].T + weights[f"{OUT}.bias"]
+        powers = np.exp(logits - logits.max(axis=1, keepdims=True))
+        return hidden, powers / powers.sum(axis=1, keepdims=True)
+
+
+def find_right(weights: Weights, pictures: Pictures) -> NDArray[np.bool_]:
+    """Return whether the network names the class of each picture (N,)."""
+    return predict(weights, pictures.features)[1].argmax(axis=1) == pictures.labels
+
+
+def measure_losses(weights: Weights, pictures: Pictures) -> NDArray[np.float64]:
+    """Return the cross entropy of each picture (N,)."""
+    probabilities = predict(weights, pictures.features)[1]
+    return -np.log(np.maximum(probabilities[np.arange(len(pictures.labels)), pictures.labels], 1e-30))
+
+
+def differentiate(weights: Weights, features: Vector, labels: Labels) -> dict[str, Vector]:
+    """Return the gradient of the mean cross entropy of a batch, by name of array."""
+    hidden, probabilities = predict(weights, features)
+    at_output = (probabilities - np.eye(CLASSES, dtype=np.float32)[labels]) / len(labels)
+    at_hidden = (at_output @ weights[f"{OUT}.weight"]) * (hidden > 0)
+    return {
+        f"{HIDDEN}.weight": at_hidden.T @ features,
+        f"{HIDDEN}.bias": at_hidden.sum(axis=0),
+        f"{OUT}.weight": at_output.T @ hidden,
+        f"{OUT}.bias": at_output.sum(axis=0),
+    }
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A client that takes plain gradient steps on its pictures."""
+
+    pictures: Pictures
+    batch: int = BATCH
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        """Return the weights after `steps` steps of gradient descent."""
+        seen, reached, losses = self.pictures, dict(weights), []
+        for places in batches(len(seen.labels), self.batch, steps, seed):
+            features, labels = seen.features[places], seen.labels[places]
+            losses.append(float(measure_losses(reached, Pictures(features, labels, ())).mean()))
+            for name, slope in differentiate(reached, features, labels).items():
+                reached[name] = reached[name] - np.float32(learning_rate) * slope
+        return LocalUpdate(reached, len(seen.labels), float(np.mean(losses)))

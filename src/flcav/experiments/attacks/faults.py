@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.experiments.attacks.drives import BATCH, CONFIG, LEARNING_RATE, Drives, find_right, pretrain, record_drives
+from flcav.experiments.attacks.drives import CLASSES, Drives, Vehicle, draw_head, find_right, record_drives
 from flcav.federation.rounds import ClientFailed
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
@@ -26,14 +26,13 @@ from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights, learned_names
 from flcav.intervals import MeanOverSeeds, mean_over_seeds, share_scenes
 from flcav.network.ledger import Budget, Ledger
-from flcav.perception.client import TaskClient
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.progress import Report, ignore_progress
 from flcav.records import LEFT_OUT, Record
 from flcav.seeds import stream
 
-BYZANTINE, ROUNDS, STEPS = 3, 5, 4
+BYZANTINE, ROUNDS, STEPS, LEARNING_RATE = 3, 10, 5, 0.05
 HONEST, SIGN, SCALED, LABELS = "none", "sign flip", "scaled", "label flip"
 LIES = (HONEST, SIGN, SCALED, LABELS)
 STRATEGIES: Mapping[str, Strategy] = {
@@ -67,7 +66,6 @@ class FaultsSeed:
 
     seed: int
     byzantine: tuple[str, ...]  # names of the vehicles that lie
-    pretrained: float
     accuracy: Mapping[str, Mapping[str, float]]  # by lie and strategy
 
 
@@ -78,7 +76,6 @@ class FaultsResult(Record):
     pictures: int  # of the test
     scenes: int
     seeds: tuple[FaultsSeed, ...]
-    pretrained: MeanOverSeeds
     accuracy: Mapping[str, Mapping[str, MeanOverSeeds]]  # by lie and strategy
     gained: Mapping[str, Mapping[str, MeanOverSeeds]]  # over FedAvg, by lie and strategy
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
@@ -95,18 +92,17 @@ def repeat_faults(out: Path, seeds: int, progress: Report = ignore_progress) -> 
     """Record the drives into `out`, and federate once for each seed, lie and strategy."""
     drives = record_drives(out, progress)
     right: dict[tuple[str, str], list[NDArray[np.bool_]]] = {}
-    started, liars = [], []
+    liars = []
     total = seeds * len(LIES) * len(STRATEGIES)
     for seed in range(1, seeds + 1):
-        start = pretrain(drives, seed)
-        started.append(find_right(start, drives.test))
+        start = draw_head(seed)
         liars.append(choose_liars(drives, seed))
         for lie in LIES:
             for name, strategy in STRATEGIES.items():
                 weights = run_federation(drives, start, liars[-1], lie, strategy, seed)
                 right.setdefault((lie, name), []).append(find_right(weights, drives.test))
                 progress(sum(map(len, right.values())), total, f"seed {seed}, {lie}, {name}")
-    return summarise(drives, liars, started, right)
+    return summarise(drives, liars, right)
 
 
 def choose_liars(drives: Drives, seed: int) -> tuple[str, ...]:
@@ -118,10 +114,9 @@ def choose_liars(drives: Drives, seed: int) -> tuple[str, ...]:
 def make_clients(drives: Drives, liars: tuple[str, ...], lie: str) -> dict[str, Trainable]:
     """Return the vehicles as clients, some of which lie."""
     clients: dict[str, Trainable] = {}
-    for name, samples in drives.vehicles.items():
+    for name, pictures in drives.vehicles.items():
         false = lie == LABELS and name in liars
-        labelled = [replace(each, label=len(CONFIG.classes) - 1 - each.label) for each in samples] if false else samples
-        clients[name] = TaskClient(WEATHER, CONFIG, labelled, batch=BATCH)
+        clients[name] = Vehicle(replace(pictures, labels=CLASSES - 1 - pictures.labels) if false else pictures)
     factor = {SIGN: -4.0, SCALED: float(len(clients))}.get(lie)
     return clients if factor is None else {**clients, **{name: Liar(clients[name], factor) for name in liars}}
 
@@ -150,11 +145,10 @@ def run_federation(
 def summarise(
     drives: Drives,
     liars: list[tuple[str, ...]],
-    started: list[NDArray[np.bool_]],
     right: Mapping[tuple[str, str], list[NDArray[np.bool_]]],
 ) -> FaultsResult:
     """Return the means over seeds, which share the test's scenes."""
-    scenes = [each.scene for each in drives.test]
+    scenes = drives.test.scenes
 
     def mean(values: list[NDArray[np.float64]], share: bool) -> MeanOverSeeds:
         measures = [lambda times, each=each: times @ each / np.maximum(times.sum(axis=1), 1) for each in values]
@@ -167,10 +161,9 @@ def summarise(
         FaultsSeed(
             number + 1,
             liars[number],
-            float(started[number].mean()),
             {lie: {name: float(right[lie, name][number].mean()) for name in STRATEGIES} for lie in LIES},
         )
-        for number in range(len(started))
+        for number in range(len(liars))
     )
     robust = [name for name in STRATEGIES if name != "FedAvg"]
     gained = {
@@ -184,7 +177,6 @@ def summarise(
         pictures=len(scenes),
         scenes=len(set(scenes)),
         seeds=rows,
-        pretrained=mean([each.astype(float) for each in started], share=True),
         accuracy={lie: {name: mean(floats[lie, name], share=True) for name in STRATEGIES} for lie in LIES},
         gained=gained,
         provenance=provenance(),

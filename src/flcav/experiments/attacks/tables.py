@@ -8,7 +8,6 @@ from flcav.verdicts import Claim, format_p, judge
 def fault_tables(results: FaultsResult) -> dict[str, str]:
     """Return Markdown by name: accuracy, gained."""
     rows = [[lie, *(results.accuracy[lie][name].describe() for name in STRATEGIES)] for lie in LIES]
-    rows.append(["pretrained", *(results.pretrained.describe() for _ in STRATEGIES)])
     pairs = [(lie, name) for lie in LIES for name in STRATEGIES if name in results.gained[lie]]
     judged = judge([Claim(results.gained[lie][name]) for lie, name in pairs])
     gained = []
