@@ -29,6 +29,7 @@ class Target(StrEnum):
 
     demo_arms = "demo-arms"
     federation_faults = "federation-faults"
+    federation_leakage = "federation-leakage"
     fig1b = "fig1b"
     fig3a = "fig3a"
     fig3b = "fig3b"
@@ -40,7 +41,7 @@ class Target(StrEnum):
 
 
 RECORDED = (Target.fig3b, Target.fig4, Target.road_average, Target.road_detector)  # one recording, no training
-ATTACKS = (Target.federation_faults,)  # one recording, several seeds
+ATTACKS = (Target.federation_faults, Target.federation_leakage)  # one recording, several seeds
 
 
 class Scale(StrEnum):
@@ -167,12 +168,17 @@ def _record_and_draw(target: Target, out: Path) -> None:
 @when_interrupted()
 def _attack(target: Target, out: Path, seeds: int) -> None:
     from flcav import progress
-    from flcav.experiments.attacks.faults import repeat_faults
-    from flcav.files import write_json
+    from flcav.files import write_bytes, write_json
 
     with progress.show_progress(target.value) as report:
-        results = repeat_faults(out, seeds, report)
+        if target == Target.federation_faults:
+            from flcav.experiments.attacks.faults import repeat_faults as repeat
+        else:
+            from flcav.experiments.attacks.leakage import repeat_leakage as repeat
+        results, pictures = repeat(out, seeds, report)
     write_json(out / "result.json", results.as_json())
+    for name, picture in pictures.items():
+        write_bytes(out / name, picture)
     for sentence in results.sentences():
         typer.echo(sentence)
 

@@ -2,7 +2,7 @@
 
 Lies: the change of the weights with its sign turned and multiplied by 4 (Li et al., "RSA", AAAI 2019); the change
 multiplied by the number of clients, as in model replacement (Bagdasaryan et al., "How To Backdoor Federated Learning",
-AISTATS 2020); and a training on wrong labels, l for L - 1 - l of L classes (Fang et al., "Local Model Poisoning
+AISTATS 2020), or by more; and a training on wrong labels, l for L - 1 - l of L classes (Fang et al., "Local Model Poisoning
 Attacks", USENIX Security 2020).
 """
 
@@ -33,8 +33,9 @@ from flcav.records import LEFT_OUT, Record
 from flcav.seeds import stream
 
 BYZANTINE, ROUNDS, STEPS, LEARNING_RATE = 3, 10, 5, 0.05
-HONEST, SIGN, SCALED, LABELS = "none", "sign flip", "scaled", "label flip"
-LIES = (HONEST, SIGN, SCALED, LABELS)
+HONEST, LABELS = "none", "label flip"
+FACTORS = {"sign flip, -4": -4.0, "scaled, 10": 10.0, "scaled, 100": 100.0}  # of the change of the weights, by lie
+LIES = (HONEST, *FACTORS, LABELS)
 STRATEGIES: Mapping[str, Strategy] = {
     "FedAvg": FEDAVG,
     "median": Median(),
@@ -88,8 +89,10 @@ class FaultsResult(Record):
         ]
 
 
-def repeat_faults(out: Path, seeds: int, progress: Report = ignore_progress) -> FaultsResult:
-    """Record the drives into `out`, and federate once for each seed, lie and strategy."""
+def repeat_faults(
+    out: Path, seeds: int, progress: Report = ignore_progress
+) -> tuple[FaultsResult, dict[str, bytes]]:
+    """Record the drives into `out`, and federate once for each seed, lie and strategy; return numbers, no pictures."""
     drives = record_drives(out, progress)
     right: dict[tuple[str, str], list[NDArray[np.bool_]]] = {}
     liars = []
@@ -102,7 +105,7 @@ def repeat_faults(out: Path, seeds: int, progress: Report = ignore_progress) -> 
                 weights = run_federation(drives, start, liars[-1], lie, strategy, seed)
                 right.setdefault((lie, name), []).append(find_right(weights, drives.test))
                 progress(sum(map(len, right.values())), total, f"seed {seed}, {lie}, {name}")
-    return summarise(drives, liars, right)
+    return summarise(drives, liars, right), {}
 
 
 def choose_liars(drives: Drives, seed: int) -> tuple[str, ...]:
@@ -117,8 +120,7 @@ def make_clients(drives: Drives, liars: tuple[str, ...], lie: str) -> dict[str, 
     for name, pictures in drives.vehicles.items():
         false = lie == LABELS and name in liars
         clients[name] = Vehicle(replace(pictures, labels=CLASSES - 1 - pictures.labels) if false else pictures)
-    factor = {SIGN: -4.0, SCALED: float(len(clients))}.get(lie)
-    return clients if factor is None else {**clients, **{name: Liar(clients[name], factor) for name in liars}}
+    return clients | {name: Liar(clients[name], FACTORS[lie]) for name in liars if lie in FACTORS}
 
 
 def run_federation(

@@ -1,0 +1,178 @@
+"""Leakage against noise: accuracy of a federation, and what its server can tell about the vehicles' pictures.
+
+The server is curious and sees each update, so that noise is added by the vehicles themselves; or it sees masked updates
+and their sum alone.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.experiments.attacks.drives import (
+    Drives,
+    Pictures,
+    Vector,
+    Vehicle,
+    draw_head,
+    find_right,
+    measure_losses,
+    record_drives,
+)
+from flcav.experiments.attacks.inference import (
+    invert,
+    membership_advantage,
+    membership_auc,
+    name_nearest,
+    read_round,
+)
+from flcav.federation.privacy import Privacy, account_epsilon
+from flcav.federation.rules import Rules, SecureAggregation
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.selection import Selection
+from flcav.federation.stages import Schedule, federate
+from flcav.federation.trainable import Weights
+from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.network.ledger import Budget, Ledger
+from flcav.perception.weather.task import WEATHER
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.progress import Report, ignore_progress
+from flcav.records import LEFT_OUT, Record
+from flcav.report import style
+from flcav.report.charts.leakage import draw_leakage
+from flcav.seeds import stream
+
+NOISES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # standard deviation as a multiple of the clipping norm
+CLIP, DELTA = 1.0, 1e-5
+PICTURES, ROUNDS, STEPS, LEARNING_RATE = 16, 10, 20, 0.05  # pictures of each vehicle
+LONG_STEP = 1.0  # rate of the single step on one picture: longer than what clipping leaves of it
+
+
+@dataclass(frozen=True)
+class Leaked:
+    """What was reached and what leaked in one seed, or by name of one of these numbers its mean over seeds."""
+
+    accuracy: float  # on held-out drives
+    membership_auc: float  # 0.5: members cannot be told from others
+    membership_advantage: float
+    recognised_one: float  # share of vehicles whose picture the inversion of a step on one picture names
+    recognised_round: float  # share of vehicles of which the inversion of a whole update names a picture
+
+
+@dataclass(frozen=True)
+class Level:
+    """One amount of noise, or secure aggregation."""
+
+    name: str
+    epsilon: float | None  # of a vehicle's whole data after all rounds, at delta; None: unbounded
+    seeds: tuple[Leaked, ...]
+    mean: Mapping[str, MeanOverSeeds]  # by name of the numbers
+
+
+@dataclass(frozen=True)
+class LeakageResult(Record):
+    """Accuracy and leakage by amount of noise, and under secure aggregation."""
+
+    pictures: int  # that a picture is to be recognised among
+    clip: float
+    delta: float
+    rounds: int
+    levels: tuple[Level, ...]  # ascending noise
+    masked: Level  # a single masked update
+    summed: Level  # the sum of all updates, which secure aggregation shows
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+
+    def sentences(self) -> list[str]:
+        """Return a sentence per level."""
+        told = []
+        for level in (*self.levels, self.masked, self.summed):
+            epsilon = "" if level.epsilon is None else f" (epsilon {level.epsilon:.3g})"
+            numbers = ", ".join(f"{name} {mean.mean:.3f}" for name, mean in level.mean.items())
+            told.append(f"{level.name}{epsilon}: {numbers}")
+        return told
+
+
+def repeat_leakage(
+    out: Path, seeds: int, progress: Report = ignore_progress
+) -> tuple[LeakageResult, dict[str, bytes]]:
+    """Record the drives into `out`, federate and attack; return the numbers, and the figure as PNG by file name."""
+    drives = record_drives(out, progress)
+    known = np.concatenate([each.features for each in drives.vehicles.values()])
+    names, levels, done = [*drives.vehicles], [], 0
+    for noise in NOISES:
+        privacy = Privacy(where="local", clip=CLIP, noise=noise, delta=DELTA) if noise else None
+        found = []
+        for seed in range(1, seeds + 1):
+            found.append(attack(drives, known, Rules(privacy=privacy), seed)[0])
+            done += 1
+            progress(done, (len(NOISES) + 1) * seeds, f"noise {noise:g}, seed {seed}")
+        epsilon = None if privacy is None else account_epsilon(privacy, Selection(), names, ROUNDS)
+        levels.append(make_level(f"{noise:g}" if noise else "none", epsilon, found))
+    secure = Rules(secure=SecureAggregation())
+    by_update, by_sum = zip(*(attack(drives, known, secure, seed) for seed in range(1, seeds + 1)), strict=True)
+    masked, summed = make_level("masked update", None, by_update), make_level("sum of all", None, by_sum)
+    results = LeakageResult(len(known), CLIP, DELTA, ROUNDS, tuple(levels), masked, summed, provenance())
+    lines = {
+        "accuracy": [level.mean["accuracy"] for level in levels],
+        "membership, area under the curve": [level.mean["membership_auc"] for level in levels],
+        "picture recognised, of a step on one": [level.mean["recognised_one"] for level in levels],
+        "picture recognised, of an update": [level.mean["recognised_round"] for level in levels],
+    }
+    ticks = [f"{level.name}\n{'∞' if level.epsilon is None else f'{level.epsilon:.2g}'}" for level in levels]
+    return results, {"leakage.png": style.png(draw_leakage(ticks, lines))}
+
+
+def split_members(drives: Drives, seed: int) -> tuple[dict[str, Pictures], dict[str, Pictures]]:
+    """Return the pictures that each vehicle trains on, and as many others of the same drives that nobody sees."""
+    members, others = {}, {}
+    for name, seen in drives.vehicles.items():
+        order = stream(seed, "members", name).permutation(len(seen.labels))
+        members[name], others[name] = take(seen, order[:PICTURES]), take(seen, order[PICTURES : 2 * PICTURES])
+    return members, others
+
+
+def take(pictures: Pictures, places: Sequence[int] | NDArray[np.int64]) -> Pictures:
+    """Return the pictures at these places."""
+    scenes = tuple(pictures.scenes[place] for place in places)
+    return Pictures(pictures.features[places], pictures.labels[places], scenes)
+
+
+def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> tuple[Leaked, Leaked]:
+    """Return accuracy and leakage of a federation under these rules: by each vehicle's update, and by their mean.
+
+    known: (N, 120), the pictures that one is to be recognised among.
+    """
+    members, others = split_members(drives, seed)
+    first = {name: take(pictures, [0]) for name, pictures in members.items()}
+    start, account = draw_head(seed), Account(Ledger(Budget(1e6, 1e6)), "edge", WEATHER.name, "wireless")
+    schedule = Schedule(ROUNDS, STEPS, LEARNING_RATE, LEARNING_RATE / 4, seed)
+    vehicles = {name: Vehicle(pictures) for name, pictures in members.items()}
+    single = {name: Vehicle(pictures, 1) for name, pictures in first.items()}
+    final = federate(vehicles, start, schedule, account, rules=rules).weights
+    losses = [np.concatenate([measure_losses(final, each) for each in part.values()]) for part in (members, others)]
+    about = find_right(final, drives.test).mean(), membership_auc(*losses), membership_advantage(*losses)
+    seen_one, mean_one = read_round(single, start, Schedule(1, 1, LONG_STEP, LONG_STEP, seed), rules)
+    seen, mean = read_round(vehicles, start, schedule, rules)
+    by_update = share_recognised(start, seen_one, first, known), share_recognised(start, seen, members, known)
+    same_one, same = dict.fromkeys(members, mean_one), dict.fromkeys(members, mean)
+    by_mean = share_recognised(start, same_one, first, known), share_recognised(start, same, members, known)
+    return Leaked(*map(float, about), *by_update), Leaked(*map(float, about), *by_mean)
+
+
+def share_recognised(
+    start: Weights, sent: Mapping[str, Weights], own: Mapping[str, Pictures], known: Vector
+) -> float:
+    """Return the share of vehicles of which the inversion of what was sent names one of its own pictures."""
+    named = {name: known[name_nearest(invert(start, weights), known)] for name, weights in sent.items()}
+    return float(np.mean([(own[name].features == found).all(axis=1).any() for name, found in named.items()]))
+
+
+def make_level(name: str, epsilon: float | None, seeds: Sequence[Leaked]) -> Level:
+    """Return a level with the means over its seeds."""
+    numbers = {field.name: [getattr(each, field.name) for each in seeds] for field in fields(Leaked)}
+    shares = {key: key != "membership_advantage" for key in numbers}
+    means = {key: mean_over_seeds(values, share=shares[key]) for key, values in numbers.items()}
+    return Level(name, epsilon, tuple(seeds), means)
