@@ -17,6 +17,7 @@ from flcav.experiments.arms import tables as arms_tables
 from flcav.experiments.arms.run import ArmsResult
 from flcav.experiments.attacks import tables as attack_tables
 from flcav.experiments.attacks.faults import FaultsResult
+from flcav.experiments.attacks.leakage import LeakageResult
 from flcav.experiments.fig3a import tables as fig3a_tables
 from flcav.experiments.fig3a.run import Fig3a
 from flcav.experiments.fig3b import tables as fig3b_tables
@@ -61,6 +62,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "fig3b": _told(Fig3b, fig3b_tables.tables),
     "fig4": _told(Fig4, roadside_tables.fig4_tables),
     "fig6a-allocation": _told(AllocationResult, fig6a_tables.tables),
+    "leakage": _told(LeakageResult, attack_tables.leakage_tables),
     "road-average": _told(RoadAverageResult, roadside_tables.average_tables),
     "road-detector": _told(RoadDetectorResult, roadside_tables.detector_tables),
     "sim-to-real": _told(SimToReal, sim_to_real_tables.tables),

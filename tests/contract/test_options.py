@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.reproduce import RECORDED, TARGETS
+from flcav.cli.reproduce import ATTACKS, RECORDED, TARGETS
 from flcav.config import InputError
 from flcav.dataset.formats.export import FORMATS
 from flcav.dataset.formats.importing import READABLE
@@ -20,7 +20,8 @@ from flcav.perception.tasks import TASKS, task_named
 
 ALWAYS = "always"
 SCORED = tuple(name for name in TASKS if isinstance(task_named(name), Scores))
-STUDIES = tuple(target for target in TARGETS if target not in ("fig1b", "fig3a", "sim-to-real", *map(str, RECORDED)))
+SINGLE = ("fig1b", "fig3a", "sim-to-real", *map(str, (*RECORDED, *ATTACKS)))  # are no studies
+STUDIES = tuple(target for target in TARGETS if target not in SINGLE)
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
     "export": {name: f"{name} none --out out" for name in FORMATS},
@@ -120,7 +121,8 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         ALWAYS,
     ),
     "reproduce": {
-        **dict.fromkeys(("--seeds", "--scale"), STUDIES),
+        "--seeds": (*STUDIES, *map(str, ATTACKS)),
+        "--scale": STUDIES,
         "--jobs": (*STUDIES, "sim-to-real"),
         **dict.fromkeys(("--engine", "--stale"), (*STUDIES, "sim-to-real")),
         "--kitti": ("sim-to-real",),

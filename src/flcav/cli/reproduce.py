@@ -80,7 +80,10 @@ def reproduce(
     ),
     out: Path = typer.Option(..., "--out", help="Folder of the runs; the same command goes on after a stop."),
     seeds: int | None = typer.Option(
-        None, "--seeds", min=1, help="Number of seeds, from 1: 5 of demo-arms and federation-*, 3 of the others if not given."
+        None,
+        "--seeds",
+        min=1,
+        help="Number of seeds, from 1: 5 of demo-arms and federation-*, 3 of the others if not given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."

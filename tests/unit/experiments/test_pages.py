@@ -9,7 +9,8 @@ from flcav.markdown import format_table
 
 REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"
 RUNS = sorted((REPRODUCTIONS / "runs").glob("*"))
-PAGES = [*(folder for folder in REPRODUCTIONS.iterdir() if folder.name in TABLES), *RUNS]
+FEDERATIONS = sorted((REPRODUCTIONS / "federation").glob("*"))
+PAGES = [*(folder for folder in (*REPRODUCTIONS.iterdir(), *FEDERATIONS) if folder.name in TABLES), *RUNS]
 MADE = [*(folder for folder in PAGES if (folder / "result.json").exists()), *RUNS]
 
 

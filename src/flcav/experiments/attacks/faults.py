@@ -2,10 +2,11 @@
 
 Lies: the change of the weights with its sign turned and multiplied by 4 (Li et al., "RSA", AAAI 2019); the change
 multiplied by the number of clients, as in model replacement (Bagdasaryan et al., "How To Backdoor Federated Learning",
-AISTATS 2020), or by more; and a training on wrong labels, l for L - 1 - l of L classes (Fang et al., "Local Model Poisoning
-Attacks", USENIX Security 2020).
+AISTATS 2020), or by more; and a training on wrong labels, l for L - 1 - l of L classes (Fang et al., "Local Model
+Poisoning Attacks", USENIX Security 2020).
 """
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -89,9 +90,7 @@ class FaultsResult(Record):
         ]
 
 
-def repeat_faults(
-    out: Path, seeds: int, progress: Report = ignore_progress
-) -> tuple[FaultsResult, dict[str, bytes]]:
+def repeat_faults(out: Path, seeds: int, progress: Report = ignore_progress) -> tuple[FaultsResult, dict[str, bytes]]:
     """Record the drives into `out`, and federate once for each seed, lie and strategy; return numbers, no pictures."""
     drives = record_drives(out, progress)
     right: dict[tuple[str, str], list[NDArray[np.bool_]]] = {}
@@ -129,7 +128,7 @@ def run_federation(
     """Return the weights after the federation; where they grew until nobody could train, those of the last round."""
     account = Account(Ledger(Budget(1e6, 1e6)), "edge", WEATHER.name, "wireless")
     reached: list[Weights] = [start]
-    try:
+    with contextlib.suppress(ClientFailed):
         federate(
             make_clients(drives, liars, lie),
             start,
@@ -139,8 +138,6 @@ def run_federation(
             rules=Rules(least_clients=10 - BYZANTINE),
             on_round=lambda round_, weights, loss: reached.append(weights),
         )
-    except ClientFailed:
-        pass
     return reached[-1]
 
 

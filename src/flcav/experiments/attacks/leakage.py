@@ -95,9 +95,7 @@ class LeakageResult(Record):
         return told
 
 
-def repeat_leakage(
-    out: Path, seeds: int, progress: Report = ignore_progress
-) -> tuple[LeakageResult, dict[str, bytes]]:
+def repeat_leakage(out: Path, seeds: int, progress: Report = ignore_progress) -> tuple[LeakageResult, dict[str, bytes]]:
     """Record the drives into `out`, federate and attack; return the numbers, and the figure as PNG by file name."""
     drives = record_drives(out, progress)
     known = np.concatenate([each.features for each in drives.vehicles.values()])
@@ -162,9 +160,7 @@ def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> tuple[Leak
     return Leaked(*map(float, about), *by_update), Leaked(*map(float, about), *by_mean)
 
 
-def share_recognised(
-    start: Weights, sent: Mapping[str, Weights], own: Mapping[str, Pictures], known: Vector
-) -> float:
+def share_recognised(start: Weights, sent: Mapping[str, Weights], own: Mapping[str, Pictures], known: Vector) -> float:
     """Return the share of vehicles of which the inversion of what was sent names one of its own pictures."""
     named = {name: known[name_nearest(invert(start, weights), known)] for name, weights in sent.items()}
     return float(np.mean([(own[name].features == found).all(axis=1).any() for name, found in named.items()]))

@@ -1,6 +1,7 @@
 """Markdown tables of the attacks."""
 
 from flcav.experiments.attacks.faults import LIES, STRATEGIES, FaultsResult
+from flcav.experiments.attacks.leakage import LeakageResult, Level
 from flcav.markdown import format_table
 from flcav.verdicts import Claim, format_p, judge
 
@@ -18,4 +19,29 @@ def fault_tables(results: FaultsResult) -> dict[str, str]:
     return {
         "accuracy": format_table((f"lie of 3 of 10 vehicles, {len(results.seeds)} seeds", *STRATEGIES), rows),
         "gained": format_table(("lie", "strategy", "accuracy - FedAvg's", "p, corrected", claim), gained),
+    }
+
+
+def leakage_tables(results: LeakageResult) -> dict[str, str]:
+    """Return Markdown by name: levels, secure."""
+    names = {
+        "accuracy": "accuracy",
+        "membership_auc": "membership: area under the curve",
+        "membership_advantage": "advantage",
+        "recognised_one": "picture recognised, of a step on one",
+        "recognised_round": "of an update",
+    }
+
+    def row(level: Level) -> list[str]:
+        return [level.mean[name].describe() for name in names]
+
+    levels = [
+        [level.name, "∞" if level.epsilon is None else f"{level.epsilon:.3g}", *row(level)] for level in results.levels
+    ]
+    shown = {"every update": results.levels[0], "a masked update": results.masked, "the sum of all": results.summed}
+    return {
+        "levels": format_table(("noise", "ε", *names.values()), levels),
+        "secure": format_table(
+            ("what the server sees", *names.values()), [[name, *row(each)] for name, each in shown.items()]
+        ),
     }
