@@ -9,10 +9,11 @@ from torch.nn import functional
 from flcav.experiments.attacks import faults
 from flcav.experiments.attacks.drives import CLASSES, Drives, Pictures, Vehicle, differentiate, draw_head, find_right
 from flcav.experiments.attacks.faults import LIES, STRATEGIES, Liar, choose_liars, run_federation, summarise
-from flcav.experiments.attacks.inference import invert, membership_advantage, membership_auc, name_nearest, read_round
+from flcav.experiments.attacks.inference import invert, membership_advantage, membership_auc, name_nearest
 from flcav.experiments.attacks.leakage import attack, make_level, split_members
 from flcav.experiments.attacks.tables import fault_tables
 from flcav.federation.rules import Rules, SecureAggregation
+from flcav.federation.runtimes.reading import read_round
 from flcav.federation.stages import Schedule
 
 START = draw_head(1)
@@ -38,7 +39,7 @@ def test_gradient_is_that_of_autograd():
     logits = functional.linear(hidden.relu(), tensors["layers.11.weight"], tensors["layers.11.bias"])
     functional.cross_entropy(logits, torch.from_numpy(seen.labels)).backward()
     for name, slope in differentiate(START, seen.features, seen.labels).items():
-        np.testing.assert_allclose(slope, tensors[name].grad, rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(slope, np.asarray(tensors[name].grad), rtol=1e-3, atol=1e-5)
 
 
 def test_a_liar_sends_a_multiple_of_its_change():

@@ -122,12 +122,13 @@ def differentiate(weights: Weights, features: Vector, labels: Labels) -> dict[st
     hidden, probabilities = predict(weights, features)
     at_output = (probabilities - np.eye(CLASSES, dtype=np.float32)[labels]) / len(labels)
     at_hidden = (at_output @ weights[f"{OUT}.weight"]) * (hidden > 0)
-    return {
+    slopes = {
         f"{HIDDEN}.weight": at_hidden.T @ features,
         f"{HIDDEN}.bias": at_hidden.sum(axis=0),
         f"{OUT}.weight": at_output.T @ hidden,
         f"{OUT}.bias": at_output.sum(axis=0),
     }
+    return {name: np.asarray(slope, np.float32) for name, slope in slopes.items()}
 
 
 @dataclass(frozen=True)

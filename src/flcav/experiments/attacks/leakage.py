@@ -27,11 +27,11 @@ from flcav.experiments.attacks.inference import (
     membership_advantage,
     membership_auc,
     name_nearest,
-    read_round,
 )
 from flcav.federation.privacy import Privacy, account_epsilon
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.metered import Account
+from flcav.federation.runtimes.reading import read_round
 from flcav.federation.selection import Selection
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import Weights
@@ -151,13 +151,16 @@ def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> tuple[Leak
     single = {name: Vehicle(pictures, 1) for name, pictures in first.items()}
     final = federate(vehicles, start, schedule, account, rules=rules).weights
     losses = [np.concatenate([measure_losses(final, each) for each in part.values()]) for part in (members, others)]
-    about = find_right(final, drives.test).mean(), membership_auc(*losses), membership_advantage(*losses)
+    accuracy, auc = float(find_right(final, drives.test).mean()), membership_auc(*losses)
+    advantage = membership_advantage(*losses)
     seen_one, mean_one = read_round(single, start, Schedule(1, 1, LONG_STEP, LONG_STEP, seed), rules)
     seen, mean = read_round(vehicles, start, schedule, rules)
-    by_update = share_recognised(start, seen_one, first, known), share_recognised(start, seen, members, known)
-    same_one, same = dict.fromkeys(members, mean_one), dict.fromkeys(members, mean)
-    by_mean = share_recognised(start, same_one, first, known), share_recognised(start, same, members, known)
-    return Leaked(*map(float, about), *by_update), Leaked(*map(float, about), *by_mean)
+
+    def tell(sent_one: Mapping[str, Weights], sent: Mapping[str, Weights]) -> Leaked:
+        one, whole = share_recognised(start, sent_one, first, known), share_recognised(start, sent, members, known)
+        return Leaked(accuracy, auc, advantage, one, whole)
+
+    return tell(seen_one, seen), tell(dict.fromkeys(members, mean_one), dict.fromkeys(members, mean))
 
 
 def share_recognised(start: Weights, sent: Mapping[str, Weights], own: Mapping[str, Pictures], known: Vector) -> float:

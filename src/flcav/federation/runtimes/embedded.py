@@ -38,13 +38,14 @@ def wire_bytes(content: RecordDict) -> int:
     Arrays are counted by the rules of Protocol Buffers, since serialising a large network takes longer than a local
     step. A field is its tag, its length and its content; empty ones are left out, but for records.
     """
-    others = {key: record for key, record in content.items() if not isinstance(record, ArrayRecord)}
-    total = recorddict_to_proto(RecordDict(others)).ByteSize()
+    others, total = RecordDict(), 0
     for key, record in content.items():
-        if isinstance(record, ArrayRecord):
+        if not isinstance(record, ArrayRecord):
+            others[key] = record
+        else:
             arrays = sum(_nested(_text(name) + _nested(_array_bytes(array))) for name, array in record.items())
             total += _nested(_text(key) + _nested(arrays))
-    return total
+    return total + recorddict_to_proto(others).ByteSize()
 
 
 def _array_bytes(array: Array) -> int:

@@ -1,0 +1,64 @@
+"""A server that reads: the updates of a round as they arrive, for experiments on what they give away."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from flwr.app import Message
+from flwr.serverapp import Grid
+
+from flcav.federation.client import client_app
+from flcav.federation.encoding import decode, unflatten
+from flcav.federation.records import ARRAYS, VECTOR, to_arrays, to_update, to_weights
+from flcav.federation.rounds import Rounds
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.embedded import EmbeddedGrid
+from flcav.federation.runtimes.wrapped import WrappedGrid
+from flcav.federation.secure.masks import to_values
+from flcav.federation.stages import Schedule
+from flcav.federation.state import FederationState
+from flcav.federation.strategies import FEDAVG
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+
+
+class ReadGrid(WrappedGrid):
+    """A grid whose server keeps the last update of each client as it was sent."""
+
+    def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:
+        self._grid, self._names = grid, names
+        self.updates: dict[str, LocalUpdate] = {}
+
+    def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
+        """Pass messages on."""
+        return self._grid.push_messages(messages)
+
+    def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]:
+        """Pass replies on."""
+        return self._grid.pull_messages(message_ids)
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
+        """Yield the replies, and keep those that are updates."""
+        for reply in self._grid.send_and_receive(messages, timeout=timeout):
+            if reply.has_content() and ARRAYS in reply.content:
+                self.updates[self._names[reply.metadata.src_node_id]] = to_update(reply)
+            yield reply
+
+
+def read_round(
+    clients: Mapping[str, Trainable], start: Weights, schedule: Schedule, rules: Rules
+) -> tuple[dict[str, Weights], Weights]:
+    """Return what the server makes of each client's update in the first round, and the weights after it.
+
+    Of a masked update it takes the integers for a change of the weights.
+    """
+    with EmbeddedGrid(client_app(clients, FEDAVG, rules), [*clients]) as grid:
+        reading = ReadGrid(grid, grid.names)
+        app = Rounds(FEDAVG, rules, schedule.work, grid.names, FederationState(), 0, 0, lambda *_: None)
+        after = to_weights(app.start(reading, to_arrays(start), 1).arrays)
+    seen: dict[str, Weights] = {}
+    for name, update in reading.updates.items():
+        if rules.secure is None:
+            seen[name] = decode(update.weights, start, rules)
+        else:
+            vector = np.asarray(update.weights[VECTOR], np.uint32)
+            seen[name] = unflatten(to_values(vector, rules.secure.largest, len(clients)), start, rules)
+    return seen, after
