@@ -10,12 +10,13 @@ import numpy as np
 from flcav.config import InputError, read_json
 from flcav.files import write_json
 from flcav.intervals import Estimate, MeanOverSeeds, Spread
+from flcav.network.plan import Price
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
 from flcav.records import LEFT_OUT, Record
 from flcav.verdicts import Judged
 
-RESULT = "result.json"
+RESULT, PROBLEM = "result.json", "problem.json"  # the latter: the allocation problem of a plan
 WEIGHTS, LEDGER, ERRORS, OUTCOMES = "weights.safetensors", "ledger.parquet", "errors.parquet", "outcomes.npz"
 
 
@@ -72,6 +73,19 @@ class Plan(Saved):
     tasks: Mapping[str, TaskPlan]
     after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was made anew; None: before the run
     reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score then, by task, which it rests on
+
+
+@dataclass(frozen=True)
+class RoundPlan(Record):
+    """The plan of the rest of a stage of a task, made anew after one of the stage's rounds."""
+
+    round: int  # of the stage
+    reached: float | None  # score on validation frames then; None: another federation's plan is followed
+    planned_mb: (
+        Price  # list price of what was done until then: of stage II of the region's rounds, of III of all stages
+    )
+    sent_mb: Price  # what was sent upwards for it
+    plan: TaskPlan  # counts in total; of stage II what the region itself sends, and its vehicles alone
 
 
 @dataclass(frozen=True)
@@ -177,6 +191,7 @@ class StageResult(Saved):
     poles: tuple[int, ...]  # whose sensors contributed labels
     losses: tuple[float, ...] = ()  # mean training loss of each round
     records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
+    plans: Annotated[tuple[RoundPlan, ...] | None, LEFT_OUT] = None  # after each round; None: not made anew by rounds
 
 
 @dataclass(frozen=True)
@@ -195,8 +210,13 @@ def average_regions(watched: Sequence[Watched]) -> tuple[Round, ...]:
     frames = [each.frames for each in watched]
     return tuple(
         Round(at[0].round, float(np.average([each.score for each in at], weights=frames)))
-        for at in zip(*(each.rounds for each in watched), strict=True)
+        for at in zip(*(each.rounds for each in watched), strict=False)
     )
+
+
+def average_last(watched: Sequence[Watched]) -> float:
+    """Return the mean over regions of the score after each one's last round, weighted by frames."""
+    return float(np.average([each.rounds[-1].score for each in watched], weights=[each.frames for each in watched]))
 
 
 @dataclass(frozen=True)
