@@ -187,7 +187,17 @@ class Graph:
         recipe, names = self.recipe, self.names
         starts = recipe.with_role("pretrain")
         pools = {task: [names.recording(region, "pool", task) for region in starts] for task in recipe.tasks}
-        others = {"retrainings", "spread", "test_draw", "replan", "arms", "training", "recording", "placement"}
+        others = {
+            "retrainings",
+            "spread",
+            "test_draw",
+            "replan",
+            "uploads",
+            "arms",
+            "training",
+            "recording",
+            "placement",
+        }
         asked = recipe.model_dump(mode="json", exclude=others)
         asked["splits"] = recipe.sized_splits.model_dump(mode="json")
         asked["placement"] = {"tasks": []}  # not part of the plan; the default would depend on objects
@@ -195,6 +205,9 @@ class Graph:
         planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "histories": self._histories()}
         if (forms := update_forms(self.settings.values())) != [UpdateForm()]:
             planned["updates"] = [form.model_dump(mode="json") for form in forms]
+        if recipe.uploads == "planned":
+            network = recipe.model_dump(mode="json")["federation"]["network"]
+            planned["uploads"] = {"regions": starts, "network": network, "range_m": recipe.placement.range_m}
         if self.recorded:
             planned["recorded"] = self.recorded
         plan = names.plan(arm.name)

@@ -145,7 +145,7 @@ def remake_plan(
         past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)
         joins = continue_joins(before, new, before.edge_rounds) if stage == EDGE else new.joins
         predicted = {**new.predicted, **{each: before.predicted[each] for each in past}}
-        tasks[own.name] = replace(new, predicted=predicted, joins=joins)
+        tasks[own.name] = replace(new, predicted=predicted, joins=joins, uploads=before.uploads)
     return Plan(plan.rule, tasks, stage, dict(reached))
 
 

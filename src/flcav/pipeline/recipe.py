@@ -241,6 +241,9 @@ class RunRecipe(Config):
     replan: Replanning = (
         "stages"  # the plan is made anew, from what was reached and sent, after stages I and II; rounds: also in them
     )
+    uploads: Literal["drawn", "planned"] = (
+        "drawn"  # samples of stage I: drawn from all vehicles' frames; or the plan says how many each vehicle uploads
+    )
     headroom: float = Field(default=0.02, ge=0, lt=0.5)  # fraction left unspent: samples differ in size
     limits: Limits = Limits()  # bounds of the plan's quantities
     horizon_s: Positive | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]

@@ -59,6 +59,10 @@ class TaskPlan:
         None  # by vehicle the rounds it joins, of 1 … edge rounds + k · cloud rounds; None: every vehicle joins all
     )
 
+    uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
+        None  # samples that each vehicle of the pretraining regions uploads; None: drawn from the frames of all
+    )
+
     def joins_after(self, rounds: int) -> Mapping[str, tuple[int, ...]]:
         """Return the rounds that each vehicle joins, numbered from 1 after the first `rounds`; empty: all join all."""
         own = self.joins or {}
@@ -339,6 +343,11 @@ class ArmResult:
     def plans(self) -> tuple[Plan, ...]:
         """Return all plans in the order in which they were made."""
         return (*(self.earlier or ()), self.plan)
+
+    @property
+    def round_plans(self) -> list[tuple[StageResult, RoundPlan]]:
+        """Return the plans that were made after rounds, with the stage of each."""
+        return [(stage, made) for stage in self.stages for made in stage.plans or ()]
 
     def sent_mb(self, task: str, link: str) -> float:
         """Return the uplink traffic of a task on a link, over all stages [MB]."""

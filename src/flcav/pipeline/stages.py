@@ -87,6 +87,24 @@ def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) 
     return {region: tuple(frames) for region, frames in chosen.items()}
 
 
+def choose_planned_uploads(
+    pools: Mapping[str, Mapping[str, Sequence[int]]], uploads: Mapping[str, int], seed: int
+) -> dict[str, tuple[int, ...]]:
+    """Draw the frames that each vehicle uploads from its own, as many as `uploads` says; return them by region.
+
+    pools: by region the frames of each vehicle, "region/vehicle".
+    """
+    chosen: dict[str, tuple[int, ...]] = {}
+    for region, vehicles in pools.items():
+        drawn = [
+            frames[number]
+            for name, frames in vehicles.items()
+            for number in stream(seed, "upload", name).permutation(len(frames))[: uploads.get(name, 0)]
+        ]
+        chosen[region] = tuple(sorted(drawn))
+    return chosen
+
+
 def upload_samples(
     book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int]
 ) -> Sequence[Any]:

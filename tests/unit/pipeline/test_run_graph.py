@@ -128,6 +128,14 @@ def test_rounds_are_planned_anew_by_the_run_itself_and_followed_by_its_arms() ->
         before.add(step.name)
 
 
+def test_uploads_are_planned_where_the_recipe_asks_for_it_and_drawn_as_ever_otherwise() -> None:
+    drawn, planned = steps_of(recipe_of(uploads="drawn")), steps_of(recipe_of(uploads="planned"))
+    assert drawn == steps_of(recipe_of())
+    assert drawn["plan"] != planned["plan"]
+    (plan,) = (step for step in Graph(recipe_of(uploads="planned"), Path()).steps if step.name == "plan")
+    assert plan.arguments["uploads"] == {"regions": ("suburb",), "network": None, "range_m": 40.0}
+
+
 def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
     arms = {"densest": {"placement": {"rule": "densest"}, "stages": ["edge"]}}
     plain = Graph(recipe_of(arms=arms), Path())

@@ -156,7 +156,8 @@ class Planner:
         over = done if terms.stage == EDGE else before.edge_rounds + k * done
         past = (PRETRAIN,) if terms.stage == EDGE else (PRETRAIN, EDGE)
         predicted = {**(new.predicted or {}), **{each: (before.predicted or {})[each] for each in past}}
-        new = replace(new, predicted=predicted, joins=continue_joins(before, new, over))
+        joins = continue_joins(before, new, over)
+        new = replace(new, predicted=predicted, joins=joins, uploads=before.uploads)
         return terms.settle(new, done, sent_mb)
 
 

@@ -32,6 +32,7 @@ from flcav.pipeline.results import PROBLEM, Plan, StageResult, Watched, average_
 from flcav.pipeline.steps import Work
 from flcav.pipeline.work import Fields
 from flcav.pipeline.work.budgets import read_entries
+from flcav.pipeline.work.uploads import plan_uploads
 
 
 def plan_step(
@@ -42,11 +43,13 @@ def plan_step(
     histories: Mapping[str, str],
     updates: Sequence[Fields] = (),
     recorded: Mapping[str, Mapping[str, int]] | None = None,
+    uploads: Fields | None = None,
 ) -> None:
     """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables.
 
     `updates` are the forms of the arms' updates, of which the largest is planned with; default: whole updates.
-    `recorded`: of federating regions of recorded data, the vehicles with their numbers of training frames.
+    `recorded`: of federating regions of recorded data, the vehicles with their numbers of training frames. `uploads`:
+    how the vehicles' uploads are planned, see `plan_uploads`; None: they are drawn.
     """
     asked_for = RunRecipe.model_validate(recipe)
     asked, held = [], _held_frames(asked_for, recorded or {})
@@ -72,6 +75,8 @@ def plan_step(
     plan, problem = make_plan(tuple(asked), frame, rule)
     if problem is not None:
         write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
+    if uploads is not None:
+        plan = plan_uploads(work, plan, pools, uploads, asked_for.seed)
     plan.save(work.folder)
 
 

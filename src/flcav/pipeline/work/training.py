@@ -31,6 +31,7 @@ from flcav.pipeline.stages import (
     Learning,
     RegionStart,
     Strategies,
+    choose_planned_uploads,
     choose_uploads,
     federate_cloud,
     federate_edge,
@@ -44,6 +45,7 @@ from flcav.pipeline.steps import Work
 from flcav.pipeline.work import Fields
 from flcav.pipeline.work.budgets import open_region_book, read_entries, share_plan_budget
 from flcav.pipeline.work.replanning import count_further_rounds, open_cloud_course, open_edge_course
+from flcav.pipeline.work.uploads import list_frames
 
 
 def pretrain_step(
@@ -65,9 +67,13 @@ def pretrain_step(
     opened = {region: Frames.open(work.inputs[step]) for region, step in pools.items()}
     watched = [Frames.open(work.inputs[step]) for step in validation]
     config = learning.config
-    chosen = choose_uploads(
-        {region: split.vehicles for region, split in opened.items()}, own.tasks[task].samples, upload_seed
-    )
+    uploads = own.tasks[task].uploads
+    if uploads is None:
+        pools_of = {region: split.vehicles for region, split in opened.items()}
+        chosen = choose_uploads(pools_of, own.tasks[task].samples, upload_seed)
+    else:
+        held = {region: dict(list_frames(region, split)) for region, split in opened.items()}
+        chosen = choose_planned_uploads(held, uploads, upload_seed)
     book = Ledger(share_plan_budget(own, budget_mb, task))
     samples: list[Any] = []
     for region, frames in chosen.items():
