@@ -6,7 +6,7 @@ from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
 from flcav.pipeline.findings import name_stage
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results import Run
+from flcav.pipeline.results import RoundPlan, Run, StageResult
 
 
 def tables(run: Run) -> dict[str, str]:
@@ -69,8 +69,22 @@ def _plan(run: Run) -> str:
             sizes = (f"{mb:.3f}" for mb in (own.sample_mb, own.model_mb))
             megabytes = (f"{own.wireless_mb:.1f}", f"{own.wireline_mb:.1f}")
             rows.append([task, made[plan.after], reached, *counts, *sizes, *megabytes, source])
+        for stage, after in run.arms[MAIN].round_plans:
+            if stage.task == task:
+                rows.append(_round_plan(stage, after))
     header = ("samples", "edge rounds", "cloud rounds", "sample MB", "network MB", "wireless MB", "wireline MB")
     return format_table(("task", "made", "reached", *header, "predicted"), rows)
+
+
+def _round_plan(stage: StageResult, after: RoundPlan) -> list[str | float]:
+    """Return the row of a plan that was made after a round: of stage II with the megabytes of the region alone."""
+    own = after.plan
+    made = f"after round {after.round} of stage {f'II in {stage.region}' if stage.region else 'III'}"
+    reached = "" if after.reached is None else f"{after.reached:.3f}"
+    sizes = (f"{mb:.3f}" for mb in (own.sample_mb, own.model_mb))
+    megabytes = (f"{own.wireless_mb:.1f}", f"{own.wireline_mb:.1f}")
+    source = f"planned: {(own.predicted or {})['cloud']:.3f}"
+    return [stage.task, made, reached, own.samples, own.edge_rounds, own.cloud_rounds, *sizes, *megabytes, source]
 
 
 def _budgets(run: Run) -> str:

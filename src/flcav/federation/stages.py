@@ -48,10 +48,15 @@ class Schedule:
     learning_rate: float  # in the first round
     final_learning_rate: float  # in the last round, where there are several
     seed: int  # of the federation; each round derives its own
+    planned: tuple[int, ...] = ()  # before each round, the number of rounds by the plan of then; others: `rounds`
 
     def work(self, round_: int) -> LocalWork:
-        """Return the local work of round `round_`, counted from 1."""
-        progress = (round_ - 1) / max(self.rounds - 1, 1)
+        """Return the local work of round `round_`, counted from 1.
+
+        Its rate is that of its place among all rounds by the plan before it; the rate never rises.
+        """
+        whole = (*self.planned[:round_], *(self.rounds,) * (round_ - len(self.planned)))
+        progress = max((number - 1) / max(rounds - 1, 1) for number, rounds in enumerate(whole, start=1))
         rate = self.learning_rate * (self.final_learning_rate / self.learning_rate) ** progress
         return LocalWork(round_, self.steps, rate, derive_seed(self.seed, "round", round_))
 

@@ -51,6 +51,7 @@ class Setting:
     regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
     replanned: bool  # whether the plan is made anew after stages I and II, from what the run itself reached
+    by_round: bool  # whether it is also made anew after each round of stages II and III
 
     @property
     def pretraining(self) -> Mapping[str, Training]:
@@ -78,6 +79,7 @@ def name_repeat(arm: str, repeat: int) -> str:
 
 
 def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: int, arm: Arm) -> Setting:
+    learned = arm.plan == "joint" and any(task.history for task in recipe.tasks.values())
     return Setting(
         name,
         repeat,
@@ -92,7 +94,8 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         arm.central,
         arm.regions or recipe.with_role("federate"),
         (CENTRAL,) if arm.central else arm.stages,
-        recipe.replan and arm.plan == "joint" and any(task.history for task in recipe.tasks.values()),
+        learned and recipe.replan != "none",
+        learned and recipe.replan == "rounds",
     )
 
 

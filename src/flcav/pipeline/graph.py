@@ -187,7 +187,17 @@ class Graph:
         recipe, names = self.recipe, self.names
         starts = recipe.with_role("pretrain")
         pools = {task: [names.recording(region, "pool", task) for region in starts] for task in recipe.tasks}
-        others = {"retrainings", "spread", "test_draw", "replan", "arms", "training", "recording", "placement"}
+        others = {
+            "retrainings",
+            "spread",
+            "test_draw",
+            "replan",
+            "uploads",
+            "arms",
+            "training",
+            "recording",
+            "placement",
+        }
         asked = recipe.model_dump(mode="json", exclude=others)
         asked["splits"] = recipe.sized_splits.model_dump(mode="json")
         asked["placement"] = {"tasks": []}  # not part of the plan; the default would depend on objects
@@ -195,6 +205,9 @@ class Graph:
         planned = {"recipe": asked, "rule": arm.plan, "pools": pools, "histories": self._histories()}
         if (forms := update_forms(self.settings.values())) != [UpdateForm()]:
             planned["updates"] = [form.model_dump(mode="json") for form in forms]
+        if recipe.uploads == "planned":
+            network = recipe.model_dump(mode="json")["federation"]["network"]
+            planned["uploads"] = {"regions": starts, "network": network, "range_m": recipe.placement.range_m}
         if self.recorded:
             planned["recorded"] = self.recorded
         plan = names.plan(arm.name)
@@ -220,9 +233,27 @@ class Graph:
             for task, steps in books.items():
                 steps += [names.edge(MAIN, region, task) for region in main.regions]
         first, plan = names.plan(MAIN), names.plan(MAIN, stage)
-        arguments = {"first": first, "plan": plan, "stage": stage, "watched": watched, "books": books}
+        arguments: dict[str, Any] = {"first": first, "plan": plan, "stage": stage, "watched": watched, "books": books}
+        if stage == EDGE and main.by_round:
+            arguments["edges"] = {task: [names.edge(MAIN, region, task) for region in main.regions] for task in tasks}
         needs = [first, plan, *(step for each in (watched, books) for steps in each.values() for step in steps)]
         self._add(_step(names.plan(MAIN, CLOUD if stage == EDGE else EDGE), replan_step, arguments, needs))
+
+    def _replan(self, arm: Setting, task: str, stage: str, region: str | None, own: str) -> dict[str, Any]:
+        """Return how the step `own` plans its rest anew after each round; nothing where it does not.
+
+        The run itself plans, of stage II each region for itself; others keep to its rounds: further edge rounds to the
+        number of its stage III.
+        """
+        if not arm.by_round or self.recipe.tasks[task].history is None:
+            return {}
+        names = self.names
+        how: dict[str, Any] = {"vehicles": self._vehicles(), "headroom": self.recipe.headroom}
+        ours = names.edge(MAIN, region, task) if stage == EDGE and region else names.cloud(MAIN, task)
+        if own != ours:
+            return {"replan": how | {"follows": ours}}
+        watched = {name: names.recording(name, "validation", task) for name in ([region] if region else arm.regions)}
+        return {"replan": how | {"first": names.plan(MAIN), "frames": watched}}
 
     def _add_placement(self, arm: Setting, region: str) -> None:
         names, errors = self.names, {}
@@ -282,9 +313,10 @@ class Graph:
                     self._add(self._central(arm, region, task))
                     continue
                 steps = self._rests_on(arm, region, task, EDGE)
-                own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
                 name = self.names.edge(arm.name, region, task)
-                self._add(_step(name, edge_step, self._federation(arm, task) | own, _named_in(steps)))
+                own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
+                own |= self._replan(arm, task, EDGE, region, name)
+                self._add(_step(name, edge_step, self._federation(arm, task) | own, _named_in(steps, own)))
 
     def _add_further(self, arm: Setting) -> None:
         """Add what follows stage II: stage III or further edge rounds."""
@@ -300,11 +332,15 @@ class Graph:
             if last == CLOUD:
                 needs = [step for steps in edges.values() for step in _named_in(steps)]
                 arguments = self._federation(arm, task) | {"regions": edges}
+                arguments |= self._replan(arm, task, CLOUD, None, names.cloud(arm.name, task))
+                needs += _named_in({}, arguments)
                 self._add(_step(names.cloud(arm.name, task), cloud_step, arguments, needs))
                 continue
             for region, steps in edges.items():
+                name = names.more_edge(arm.name, region, task)
                 more = self._federation(arm, task) | {"region": region, "vehicles": self._vehicles(), "steps": steps}
-                self._add(_step(names.more_edge(arm.name, region, task), edge_step, more, _named_in(steps)))
+                more |= self._replan(arm, task, MORE_EDGE, region, name)
+                self._add(_step(name, edge_step, more, _named_in(steps, more)))
 
     def _central(self, arm: Setting, region: str, task: str) -> Step:
         steps = self._rests_on(arm, region, task, CENTRAL)
@@ -317,7 +353,10 @@ class Graph:
             "source": arm.central,
             "steps": steps | {"pools": pools},
         }
-        needs = [*_named_in(steps), *pools.values()]
+        replan = self._replan(arm, task, EDGE, region, arm.name).get("replan")
+        follows = {} if replan is None else {"follows": replan["follows"]}
+        arguments |= follows
+        needs = [*_named_in(steps), *pools.values(), *follows.values()]
         return _step(self.names.central(arm.name, region, task), central_step, arguments, needs)
 
     @property
@@ -355,7 +394,12 @@ def _step(name: str, function: Callable[..., None], arguments: Mapping[str, Any]
     return Step(name, function, dict(arguments), tuple(dict.fromkeys(needs)))
 
 
-def _named_in(steps: Mapping[str, Any]) -> list[str]:
-    """Return the names of the steps in what `Graph._rests_on` returned; for stage III also that of stage II."""
+def _named_in(steps: Mapping[str, Any], arguments: Mapping[str, Any] = {}) -> list[str]:
+    """Return the names of the steps in what `Graph._rests_on` returned; for stage III also that of stage II.
+
+    Of a step's arguments also those in `replan`.
+    """
     one = [steps[key] for key in ("plan", "pretrain", "errors", "frames", "place", "edge") if key in steps]
-    return [*one, *steps["sites"]]
+    replan: Mapping[str, Any] = arguments.get("replan", {})
+    replanned = [replan[key] for key in ("first", "follows") if key in replan]
+    return [*one, *steps.get("sites", ()), *replanned, *replan.get("frames", {}).values()]

@@ -33,7 +33,7 @@ from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule, Setting
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, Federation, FixedPlan, Limits
-from flcav.pipeline.results import Plan, TaskPlan
+from flcav.pipeline.results import Plan, StageResult, TaskPlan
 from flcav.pipeline.tables import read_table
 
 
@@ -101,24 +101,30 @@ def make_plan(tasks: tuple[PlanRequest, ...], frame: PlanSettings, rule: PlanRul
     learned = [task for task in tasks if task.history is not None]
     problem = _problem(learned, frame, left) if learned else None
     if problem is not None:
-        allotted, shares = (baseline(problem, rule).tasks, {}) if rule != "joint" else _allocate(problem)
+        allotted, shares = (baseline(problem, rule).tasks, {}) if rule != "joint" else allocate_tasks(problem)
         for task, own in zip(learned, allotted, strict=True):
-            plans[task.name] = _planned(task.sizes, own, problem, shares)
+            plans[task.name] = make_task_plan(task.sizes, own, problem, shares)
     return Plan(rule, {task.name: plans[task.name] for task in tasks}), problem
 
 
 def remake_plan(
-    plan: Plan, problem: Problem, stage: Literal["pretrain", "edge"], reached: Mapping[str, float], used_mb: Price
+    plan: Plan,
+    problem: Problem,
+    stage: Literal["pretrain", "edge"],
+    reached: Mapping[str, float],
+    used_mb: Price,
+    done: Mapping[str, TaskPlan] = {},
 ) -> Plan:
     """Return the plan of the rest of a run after `stage`, which `plan` was carried out in; fixed plans stay.
 
     `problem` is that of the first plan, `reached` the score of each of its tasks now, `used_mb` what they have sent.
     Counts are totals, including what is spent. Scores predicted of stages that are over are kept. Where what is left of
-    the budgets allows no other plan, the counts are those of `plan`.
+    the budgets allows no other plan, the counts are those of `plan`. `done` are the plans of tasks whose stage came out
+    otherwise than planned, with the rounds that were carried out.
     """
-    states = {}
+    states, tasks = {}, {**plan.tasks, **done}
     for task in problem.tasks:
-        own = plan.tasks[task.name]
+        own = tasks[task.name]
         counts = (own.samples, own.edge_rounds if stage == EDGE else 0, 0)
         predicted = float(task.curve.error(*counts, problem.edge_rounds_per_cloud_round))
         known = 0 < predicted < np.inf  # a curve without points before the first round has no error there
@@ -127,34 +133,50 @@ def remake_plan(
         )
     sent = Sent(wireless=used_mb.wireless_mb, wireline=used_mb.wireline_mb)
     rest = condition_problem(problem, PlanState(tasks=states, used_mb=sent))
-    tasks = dict(plan.tasks)
     try:
-        allotted, shares = _allocate(rest)
+        allotted, shares = allocate_tasks(rest)
     except Infeasible:
         allotted, shares = (), {}
     for own in allotted:
         before = tasks[own.name]
-        new = _planned(MessageSizes(before.sample_mb, before.model_mb), own, rest, shares)
+        new = make_task_plan(MessageSizes(before.sample_mb, before.model_mb), own, rest, shares)
         assert new.predicted is not None
         assert before.predicted is not None
         past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)
-        joins = _continue_joins(before, new) if stage == EDGE else new.joins
+        joins = continue_joins(before, new, before.edge_rounds) if stage == EDGE else new.joins
         predicted = {**new.predicted, **{each: before.predicted[each] for each in past}}
-        tasks[own.name] = replace(new, predicted=predicted, joins=joins)
+        tasks[own.name] = replace(new, predicted=predicted, joins=joins, uploads=before.uploads)
     return Plan(plan.rule, tasks, stage, dict(reached))
 
 
-def _allocate(problem: Problem) -> tuple[Sequence[Allotted], Shares]:
+def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult]) -> TaskPlan:
+    """Return the plan of a task with the edge rounds that its regions carried out, and who joined them.
+
+    `stages` are the results of stage II. Where regions ran different numbers of rounds, theirs is the mean by vehicles.
+    """
+    rounds = round(float(np.average([each.rounds for each in stages], weights=[each.clients for each in stages])))
+    joins = plan.joins
+    if joins is not None:
+        last = {
+            name: own
+            for each in stages
+            for made in (each.plans or ())[-1:]
+            for name, own in (made.plan.joins or {}).items()
+        }
+        joins = {name: last.get(name, own) for name, own in joins.items()}
+    return replace(plan, edge_rounds=rounds, joins=joins)
+
+
+def allocate_tasks(problem: Problem) -> tuple[Sequence[Allotted], Shares]:
     """Return the best plan and, of vehicles with names, each one's share of it."""
     plan, shares = allocate_fleet(problem)
     return plan.tasks, shares
 
 
-def _continue_joins(before: TaskPlan, new: TaskPlan) -> Mapping[str, tuple[int, ...]] | None:
-    """Return the edge rounds that vehicles joined by the plan `before`, and the later rounds by the `new` one."""
+def continue_joins(before: TaskPlan, new: TaskPlan, over: int) -> Mapping[str, tuple[int, ...]] | None:
+    """Return the first `over` rounds that vehicles joined by the plan `before`, and the later ones by the `new` one."""
     if before.joins is None or new.joins is None:
         return new.joins
-    over = before.edge_rounds
     return {
         name: tuple(each for each in before.joins[name] if each <= over) + tuple(each for each in joined if each > over)
         for name, joined in new.joins.items()
@@ -219,7 +241,8 @@ def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan
     return TaskPlan(*counts, cost.wireless_mb, cost.wireline_mb, task.sizes.sample_mb, task.sizes.model_mb, None)
 
 
-def _planned(sizes: MessageSizes, own: Allotted, problem: Problem, shares: Shares) -> TaskPlan:
+def make_task_plan(sizes: MessageSizes, own: Allotted, problem: Problem, shares: Shares) -> TaskPlan:
+    """Return the plan of a task by its allocation in `problem`: scores predicted after each stage, rounds to join."""
     curve = next(each.curve for each in problem.tasks if each.name == own.name)
     k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
     spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}

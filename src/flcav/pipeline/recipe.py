@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.rules import Rules
@@ -178,6 +178,13 @@ class Federation(Rules):
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
 
 
+def _name_replanning(value: Any) -> Any:
+    return ("stages" if value else "none") if isinstance(value, bool) else value
+
+
+Replanning = Annotated[Literal["none", "stages", "rounds"], BeforeValidator(_name_replanning)]
+
+
 class Arm(Config):
     """An arm of a comparison: how it differs from the run itself, and which stages it runs."""
 
@@ -231,7 +238,12 @@ class RunRecipe(Config):
     tasks: Annotated[Mapping[str, TaskRecipe], Field(min_length=1)]  # tasks by name
     regions: Annotated[Mapping[Name, Region], Field(min_length=1)]  # regions by name
     budgets_mb: Budgets  # uplink budgets
-    replan: bool = True  # whether the plan is made anew after stages I and II, from what they reached and spent
+    replan: Replanning = (
+        "stages"  # the plan is made anew, from what was reached and sent, after stages I and II; rounds: also in them
+    )
+    uploads: Literal["drawn", "planned"] = (
+        "drawn"  # samples of stage I: drawn from all vehicles' frames; or the plan says how many each vehicle uploads
+    )
     headroom: float = Field(default=0.02, ge=0, lt=0.5)  # fraction left unspent: samples differ in size
     limits: Limits = Limits()  # bounds of the plan's quantities
     horizon_s: Positive | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]

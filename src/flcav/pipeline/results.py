@@ -10,12 +10,13 @@ import numpy as np
 from flcav.config import InputError, read_json
 from flcav.files import write_json
 from flcav.intervals import Estimate, MeanOverSeeds, Spread
+from flcav.network.plan import Price
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
 from flcav.records import LEFT_OUT, Record
 from flcav.verdicts import Judged
 
-RESULT = "result.json"
+RESULT, PROBLEM = "result.json", "problem.json"  # the latter: the allocation problem of a plan
 WEIGHTS, LEDGER, ERRORS, OUTCOMES = "weights.safetensors", "ledger.parquet", "errors.parquet", "outcomes.npz"
 
 
@@ -58,6 +59,10 @@ class TaskPlan:
         None  # by vehicle the rounds it joins, of 1 … edge rounds + k · cloud rounds; None: every vehicle joins all
     )
 
+    uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
+        None  # samples that each vehicle of the pretraining regions uploads; None: drawn from the frames of all
+    )
+
     def joins_after(self, rounds: int) -> Mapping[str, tuple[int, ...]]:
         """Return the rounds that each vehicle joins, numbered from 1 after the first `rounds`; empty: all join all."""
         own = self.joins or {}
@@ -72,6 +77,19 @@ class Plan(Saved):
     tasks: Mapping[str, TaskPlan]
     after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was made anew; None: before the run
     reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score then, by task, which it rests on
+
+
+@dataclass(frozen=True)
+class RoundPlan(Record):
+    """The plan of the rest of a stage of a task, made anew after one of the stage's rounds."""
+
+    round: int  # of the stage
+    reached: float | None  # score on validation frames then; None: another federation's plan is followed
+    planned_mb: (
+        Price  # list price of what was done until then: of stage II of the region's rounds, of III of all stages
+    )
+    sent_mb: Price  # what was sent upwards for it
+    plan: TaskPlan  # counts in total; of stage II what the region itself sends, and its vehicles alone
 
 
 @dataclass(frozen=True)
@@ -177,6 +195,7 @@ class StageResult(Saved):
     poles: tuple[int, ...]  # whose sensors contributed labels
     losses: tuple[float, ...] = ()  # mean training loss of each round
     records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
+    plans: Annotated[tuple[RoundPlan, ...] | None, LEFT_OUT] = None  # after each round; None: not made anew by rounds
 
 
 @dataclass(frozen=True)
@@ -195,8 +214,13 @@ def average_regions(watched: Sequence[Watched]) -> tuple[Round, ...]:
     frames = [each.frames for each in watched]
     return tuple(
         Round(at[0].round, float(np.average([each.score for each in at], weights=frames)))
-        for at in zip(*(each.rounds for each in watched), strict=True)
+        for at in zip(*(each.rounds for each in watched), strict=False)
     )
+
+
+def average_last(watched: Sequence[Watched]) -> float:
+    """Return the mean over regions of the score after each one's last round, weighted by frames."""
+    return float(np.average([each.rounds[-1].score for each in watched], weights=[each.frames for each in watched]))
 
 
 @dataclass(frozen=True)
@@ -319,6 +343,11 @@ class ArmResult:
     def plans(self) -> tuple[Plan, ...]:
         """Return all plans in the order in which they were made."""
         return (*(self.earlier or ()), self.plan)
+
+    @property
+    def round_plans(self) -> list[tuple[StageResult, RoundPlan]]:
+        """Return the plans that were made after rounds, with the stage of each."""
+        return [(stage, made) for stage in self.stages for made in stage.plans or ()]
 
     def sent_mb(self, task: str, link: str) -> float:
         """Return the uplink traffic of a task on a link, over all stages [MB]."""

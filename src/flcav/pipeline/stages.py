@@ -7,12 +7,13 @@ vehicles federate with their edge server. Stage III: edge servers federate with 
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.choice import open_runtime
 from flcav.federation.runtimes.metered import Account, Outage
@@ -20,7 +21,7 @@ from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, f
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
-from flcav.federation.trainable import Trainable, Weights
+from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.messages import send
 from flcav.perception.client import TaskClient, as_shared
@@ -29,6 +30,7 @@ from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.training import Checkpointing, Validation, train, train_steps
 from flcav.perception.weights import from_arrays, load_network, save_network, to_arrays
 from flcav.pipeline.federations.checkpoint import LAST
+from flcav.pipeline.federations.replanning import Driven, Replanning
 from flcav.pipeline.federations.rounds import FederationCheckpoints, load_round_network
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, Training
@@ -83,6 +85,24 @@ def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) 
         region, frame = every[number]
         chosen[region].append(frame)
     return {region: tuple(frames) for region, frames in chosen.items()}
+
+
+def choose_planned_uploads(
+    pools: Mapping[str, Mapping[str, Sequence[int]]], uploads: Mapping[str, int], seed: int
+) -> dict[str, tuple[int, ...]]:
+    """Draw the frames that each vehicle uploads from its own, as many as `uploads` says; return them by region.
+
+    pools: by region the frames of each vehicle, "region/vehicle".
+    """
+    chosen: dict[str, tuple[int, ...]] = {}
+    for region, vehicles in pools.items():
+        drawn = [
+            frames[number]
+            for name, frames in vehicles.items()
+            for number in stream(seed, "upload", name).permutation(len(frames))[: uploads.get(name, 0)]
+        ]
+        chosen[region] = tuple(sorted(drawn))
+    return chosen
 
 
 def upload_samples(
@@ -209,13 +229,15 @@ def federate_edge(
     validation: Mapping[str, Frames] = {},
     processes: int = 1,
     runtime: str = "embedded",
+    replanning: Replanning | None = None,
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
 
     A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
     After each round the network that a federation of so many rounds ends with is scored on `validation`, frames by
     region. Vehicles train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights.
-    The vehicles that `outages` name by round are lost in it.
+    The vehicles that `outages` name by round are lost in it. Under `replanning` the number of rounds, who joins them
+    and who is lost are those of the plan before each.
     """
     state, task, averaged = FederationState(), learning.task, learning.training.average_rounds
     share = 0.0 if earlier else learning.training.start_share
@@ -229,10 +251,23 @@ def federate_edge(
     federating = FederationCheckpoints(task, folder, book, report, {EDGE: state}, identity, scored)
     start, done = federating.resume(to_arrays(network))
     account = Account(book, EDGE, task.name, "wireless", outages)
-    keep = federating.make_saver(schedule.rounds)
-    how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
+    how: Any = {"strategy": strategy, "state": state, "earlier": earlier}
     with open_runtime(runtime, clients, processes) as where:
-        federate(clients, start, schedule, account, **how, done=done, on_round=keep, runtime=where)
+        how["runtime"] = where
+        if replanning is None:
+            keep = federating.make_saver(schedule.rounds)
+            federate(clients, start, schedule, account, **how, rules=rules, done=done, on_round=keep)
+        else:
+            course = replanning.course
+
+            def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
+                own, lossy = course.schedule(schedule, number), replace(account, outages=driven.outages)
+                keep = federating.make_saver(course.rounds)
+                asked: Any = {**how, "rules": driven.rules, "done": number - 1, "on_round": keep}
+                found = federate(clients, weights, own, lossy, **asked)
+                return found if len(federating.losses) == number else None
+
+            replanning.run(start, done, federating.scores, run_round)
     federating.finish(network, len(federating.losses), averaged, share)
     return tuple(federating.losses)
 
@@ -249,25 +284,38 @@ def federate_cloud(
     folder: Path,
     report: Report,
     outages: Mapping[tuple[int, str], Outage] = {},
+    validation: Mapping[str, Frames] = {},
+    replanning: Replanning | None = None,
 ) -> tuple[float, ...]:
     """Run stage III from `network`; `regions`: where each edge server starts.
 
     An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers, and
     an edge round loses the vehicles that `outages` names. Writes weights and ledger, returns each round's loss. Where
     rules make arrays personal, the weights have the mean of the regions' own, and each region's model is beside them.
+    Validation and `replanning` are as in `federate_edge`.
     """
     state, own_states = FederationState(), {region: FederationState() for region in regions}
     states = {CLOUD: state, **{f"{EDGE}/{region}": own for region, own in own_states.items()}}
-    for own in regions.values() if rules.privacy is not None else ():
-        rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, edge_rounds, own.earlier))
-    federating = FederationCheckpoints(
-        learning.task, folder, book, report, states, describe_federation(strategies, rules)
-    )
+    averaged = learning.training.average_rounds
+
+    def afford(rounds: int) -> int:
+        for own in regions.values() if rules.privacy is not None else ():
+            rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, edge_rounds, own.earlier))
+        return rounds
+
+    def score(round_: int) -> Mapping[str, float]:
+        reached = load_round_network(learning.task, network, folder, round_, averaged)
+        return {name: score_network(learning.task, reached, own.data, own.vehicles) for name, own in validation.items()}
+
+    rounds = afford(rounds)
+    identity = describe_federation(strategies, rules)
+    scored = score if validation else None
+    federating = FederationCheckpoints(learning.task, folder, book, report, states, identity, scored)
     rules.check_personal(to_arrays(network))
     start, done = federating.resume(to_arrays(network))
     wireless = Account(book, CLOUD, learning.task.name, "wireless", outages)
     wireline = Account(book, CLOUD, learning.task.name, "wireline")
-    servers: dict[str, Trainable] = {
+    servers = {
         region: EdgeServer(
             own.clients,
             edge_rounds,
@@ -283,15 +331,32 @@ def federate_cloud(
     }
     earlier = max(own.earlier for own in regions.values())
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier)
-    keep = federating.make_saver(rounds)
 
-    def keep_whole(round_: int, weights: Weights, loss: float) -> None:
-        personal = [own.personal for own in own_states.values() if own.personal]
-        keep(round_, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
+    def make_saver(rounds: int) -> OnRound:
+        keep = federating.make_saver(rounds)
+
+        def keep_whole(round_: int, weights: Weights, loss: float) -> None:
+            personal = [own.personal for own in own_states.values() if own.personal]
+            keep(round_, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
+
+        return keep_whole
 
     how: Any = {"strategy": strategies.cloud, "rules": rules.of_servers(), "state": state}
-    federate(servers, start, schedule, wireline, **how, done=done, on_round=keep_whole)
-    federating.finish(network, rounds, learning.training.average_rounds)
+    if replanning is None:
+        federate(servers, start, schedule, wireline, **how, done=done, on_round=make_saver(rounds))
+    else:
+        course = replanning.course
+
+        def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
+            if afford(number) < number:
+                return None
+            for server in servers.values():
+                server.rules, server.account = driven.rules, replace(wireless, outages=driven.outages)
+            asked: Any = {**how, "done": number - 1, "on_round": make_saver(course.rounds)}
+            return federate(servers, weights, course.schedule(schedule, number), wireline, **asked)
+
+        replanning.run(start, done, federating.scores, run_round)
+    federating.finish(network, len(federating.losses), averaged)
     for region, own in own_states.items() if rules.personal else ():
         model = load_stage_network(learning.task, folder)
         from_arrays(model, {**to_arrays(model), **own.personal})

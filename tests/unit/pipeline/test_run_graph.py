@@ -97,6 +97,45 @@ def test_plans_are_made_anew_between_stages_from_what_the_run_itself_reached() -
         assert not [step.name for step in Graph(fixed, Path()).steps if step.name.startswith("plan-")]
 
 
+def test_rounds_are_planned_anew_by_the_run_itself_and_followed_by_its_arms() -> None:
+    arms = {
+        "densest": {"placement": {"rule": "densest"}},
+        "equal": {"plan": "equal-stages"},
+        "further": {"stages": ["edge", "more_edge"]},
+        "oracle": {"central": "federate"},
+    }
+    between, within = (recipe_of(arms=arms, replan=how) for how in ("stages", "rounds"))
+    assert [recipe_of(replan=old).replan for old in (True, False)] == ["stages", "none"]
+    assert recipe_of().replan == "stages"
+    plain, steps = ({step.name: step for step in Graph(each, Path()).steps} for each in (between, within))
+    assert list(plain) == list(steps)
+    changed = {name for name in steps if dict(plain[name].arguments) != dict(steps[name].arguments)}
+    grid, cloud, more = "grid-edge-fl-objects", "cloud-fl-objects", "grid-more-edge-fl-objects"
+    followed = {f"{grid}-densest": grid, f"{cloud}-densest": cloud, more: cloud}
+    assert changed == {grid, cloud, *followed, "grid-central-objects-oracle", "plan-after-edge"}
+    for name, own in ((grid, steps[grid]), (cloud, steps[cloud])):
+        assert own.arguments["replan"]["frames"] == {"grid": "grid-validation-objects"}, name
+        assert {"plan", "grid-validation-objects"} <= set(own.needs)
+    for name, other in followed.items():
+        assert steps[name].arguments["replan"]["follows"] == other
+        assert other in steps[name].needs
+    assert steps["grid-central-objects-oracle"].arguments["follows"] == grid
+    assert grid in steps["grid-central-objects-oracle"].needs
+    assert steps["plan-after-edge"].arguments["edges"] == {"objects": [grid]}
+    before: set[str] = set()
+    for step in steps.values():
+        assert set(step.needs) <= before, step.name
+        before.add(step.name)
+
+
+def test_uploads_are_planned_where_the_recipe_asks_for_it_and_drawn_as_ever_otherwise() -> None:
+    drawn, planned = steps_of(recipe_of(uploads="drawn")), steps_of(recipe_of(uploads="planned"))
+    assert drawn == steps_of(recipe_of())
+    assert drawn["plan"] != planned["plan"]
+    (plan,) = (step for step in Graph(recipe_of(uploads="planned"), Path()).steps if step.name == "plan")
+    assert plan.arguments["uploads"] == {"regions": ("suburb",), "network": None, "range_m": 40.0}
+
+
 def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
     arms = {"densest": {"placement": {"rule": "densest"}, "stages": ["edge"]}}
     plain = Graph(recipe_of(arms=arms), Path())

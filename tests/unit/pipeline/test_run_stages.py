@@ -33,6 +33,7 @@ from flcav.pipeline.recipe import Training
 from flcav.pipeline.results import WEIGHTS
 from flcav.pipeline.stages import (
     Learning,
+    choose_planned_uploads,
     choose_uploads,
     pretrain,
     region_budget,
@@ -316,3 +317,12 @@ def test_uploads_are_drawn_over_all_pools_and_by_the_seed() -> None:
     assert all(set(frames) <= set(pools[region]) for region, frames in chosen.items())
     assert chosen == choose_uploads(pools, 9, seed=1) != choose_uploads(pools, 9, seed=2)
     assert cast(Any, choose_uploads(pools, 15, seed=1)) == {"a": tuple(range(10, 20)), "b": tuple(range(5))}
+
+
+def test_planned_uploads_are_drawn_from_each_vehicle_s_own_frames() -> None:
+    pools = {"a": {"a/cav0": range(10, 20), "a/cav1": range(20, 24)}, "b": {"b/cav0": range(5)}}
+    uploads = {"a/cav0": 3, "a/cav1": 4, "b/cav0": 0}
+    chosen = choose_planned_uploads(pools, uploads, seed=1)
+    assert (len(chosen["a"]), chosen["a"][3:], chosen["b"]) == (7, (20, 21, 22, 23), ())
+    assert set(chosen["a"][:3]) <= set(range(10, 20))
+    assert chosen == choose_planned_uploads(pools, uploads, seed=1) != choose_planned_uploads(pools, uploads, seed=2)

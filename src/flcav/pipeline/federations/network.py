@@ -4,9 +4,11 @@ Round n of a region is driven in one of the scenes of its training data, in turn
 roadside units are on the poles of its sensors.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from flcav.config import InputError
 from flcav.federation.rules import Rules
@@ -21,10 +23,12 @@ from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.placing import find_sites, read_traces
 from flcav.pipeline.recipe import CLOUD, Federation
 from flcav.pipeline.results import Placed
 from flcav.pipeline.stages import Learning
 from flcav.pipeline.steps import Work
+from flcav.world.map.census import measure_traffic_density
 
 CLOCK = "clock"  # begins the names of the files of rounds on the network, by region
 AWAY, TOO_SLOW = "not in the town", "predicted past the deadline"
@@ -62,17 +66,40 @@ class Fleet:
         return ClientWork(vehicle, self.download_bytes, self.train_s / self.speeds.get(client, 1.0), self.upload_bytes)
 
 
-def link_scenes(split: Frames, placed: Placed, settings: NetworkSettings, most: int, seed: int) -> list[RadioLinks]:
+def link_scenes(
+    split: Frames, placed: Placed, settings: NetworkSettings, most: int, seed: int, known: Sequence[RadioLinks] = ()
+) -> list[RadioLinks]:
     """Return the links of the vehicles in the first `most` scenes of a split to the units on a region's chosen poles.
 
-    Without chosen poles, the unit is on the pole with most traffic. Raises `InputError` where there is no pole, and as
-    `link_scene`.
+    Without chosen poles, the unit is on the pole with most traffic. Those of the first scenes may be `known`. Raises
+    `InputError` where there is no pole, and as `link_scene`.
     """
     if not placed.poles:
         raise InputError(f"federation.network: '{placed.region}' has no poles for roadside units")
     scenes = list(dict.fromkeys(split.data.keys[i].scene for i in split.vehicles))[:most]
     poles = placed.chosen or (placed.densest,)
-    return [link_scene(split.data, settings.radio, poles, scene, seed).links for scene in scenes]
+    linked = (link_scene(split.data, settings.radio, poles, scene, seed).links for scene in scenes[len(known) :])
+    return [*known, *linked]
+
+
+def measure_uplinks(
+    region: str, split: Frames, settings: NetworkSettings, range_m: float, seed: int
+) -> dict[str, float]:
+    """Return the mean rate of the uplink [Mbit/s] of each vehicle of a split, "region/vehicle", over all its scenes.
+
+    The roadside unit is on the pole with most traffic within `range_m`, and each vehicle has its whole band; where it
+    is not in the town, its rate is 0. Raises `InputError` where there is no pole, and as `link_scene`.
+    """
+    sites = find_sites(split, split if split.data.town() is None else None)
+    if not len(sites.number):
+        raise InputError(f"federation.network: '{region}' has no poles for roadside units")
+    density = measure_traffic_density(sites.position, read_traces(split.data, split.vehicles), range_m)
+    pole, rates = int(sites.number[int(np.argmax(density))]), dict[str, list[float]]()
+    for scene in dict.fromkeys(split.data.keys[i].scene for i in split.vehicles):
+        links = link_scene(split.data, settings.radio, (pole,), scene, seed).links
+        for vehicle, mean in zip(links.vehicle, links.rate_bps[:, :, 0].mean(axis=0) / 1e6, strict=True):
+            rates.setdefault(f"{region}/{vehicle}", []).append(float(mean))
+    return {name: float(np.mean(each)) for name, each in rates.items()}
 
 
 def drive_rounds(
@@ -133,42 +160,58 @@ def _find_slow(fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: 
     return {name for name, t in timings.items() if t.dropped or t.end_s - t.start_s > deadline_s}
 
 
-def drive_region(
+def open_network(
     work: Work,
     learning: Learning,
     how: Federation,
-    rules: Rules,
     region: str,
     clients: Sequence[str],
     steps: Mapping[str, Any],
-    seeds: Sequence[int],
     earlier: int,
     train_s: float,
     speeds: Mapping[str, float],
-) -> DrivenRounds:
-    """Simulate a region's rounds over the radio network and write their clock; without a network no client is lost."""
-    if how.network is None:
-        return DrivenRounds(rules, {}, ())
+) -> Callable[[Rules, Sequence[int]], DrivenRounds]:
+    """Return what simulates a region's rounds over the radio network, by rules and by the seeds of the rounds.
+
+    It writes their clock. Without a network no client is lost.
+    """
+    settings = how.network
+    if settings is None:
+        return lambda rules, seeds: DrivenRounds(rules, {}, ())
     weights = to_arrays(learning.build_network())
-    sizes = update_bytes(weights), update_bytes(weights, rules.upload, exchanging=exchanges_more(how.strategy))
+    sizes = update_bytes(weights), update_bytes(weights, how.upload, exchanging=exchanges_more(how.strategy))
     fleet = Fleet(region, tuple(clients), *sizes, train_s, speeds)
     split, placed = Frames.open(work.inputs[steps["frames"]]), Placed.load(work.inputs[steps["place"]])
-    scenes = link_scenes(split, placed, how.network, earlier + len(seeds), learning.seed)
-    driven = drive_rounds(fleet, scenes, how.network, rules, seeds, earlier)
-    save_rounds(driven.records, work.folder / f"{CLOCK}-{region}.parquet")
-    return driven
+    scenes: list[RadioLinks] = []
+
+    def drive(rules: Rules, seeds: Sequence[int]) -> DrivenRounds:
+        scenes[:] = link_scenes(split, placed, settings, earlier + len(seeds), learning.seed, scenes)
+        driven = drive_rounds(fleet, scenes, settings, rules, seeds, earlier)
+        save_rounds(driven.records, work.folder / f"{CLOCK}-{region}.parquet")
+        return driven
+
+    return drive
+
+
+@dataclass(frozen=True)
+class DrivenCloud:
+    """The rounds of stage III on the network: rules of all regions, who is lost and why, and how long each takes."""
+
+    rules: Rules
+    outages: Mapping[tuple[int, str], Outage]  # by edge round, from 1, and client
+    seconds: Mapping[str, Sequence[float]]  # of each round, by server
 
 
 def join_regions(
     driven: Mapping[str, DrivenRounds], k: int, settings: NetworkSettings | None, model_bytes: int
-) -> tuple[Rules, dict[tuple[int, str], Outage], dict[str, list[float]]]:
-    """Return the rules of all regions in stage III, whom they lose, and the seconds of each round, by server.
+) -> DrivenCloud:
+    """Return the rounds of all regions in stage III together.
 
     A cloud round is `k` edge rounds of the slowest region, and a model of `model_bytes` down and up by wireline.
     """
     rules = next(iter(driven.values())).rules
     if settings is None:
-        return rules, {}, {}
+        return DrivenCloud(rules, {}, {})
     if all(each.rules.selection.rule == "planned" for each in driven.values()):
         joins = {name: rounds for each in driven.values() for name, rounds in each.rules.selection.joins.items()}
         rules = rules.model_copy(update={"selection": Selection(rule="planned", joins=joins)})
@@ -177,4 +220,4 @@ def join_regions(
     rounds = range(0, len(next(iter(seconds.values()))), k)
     cloud = [ways + max(sum(own[first : first + k]) for own in seconds.values()) for first in rounds]
     outages = {key: outage for each in driven.values() for key, outage in each.outages.items()}
-    return rules, outages, {**seconds, CLOUD: cloud}
+    return DrivenCloud(rules, outages, {**seconds, CLOUD: cloud})

@@ -1,6 +1,7 @@
 """Steps that plan a run, and plan the rest of it anew."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -14,23 +15,24 @@ from flcav.perception.client import as_shared
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import PlanRule
+from flcav.pipeline.federations.replanning import price_rounds, settle
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.planning import (
     PlanRequest,
     PlanSettings,
     UpdateForm,
+    count_carried_out,
     make_plan,
     model_mb,
     parse_history,
     remake_plan,
 )
 from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.results import Plan, Watched, average_regions
+from flcav.pipeline.results import PROBLEM, Plan, StageResult, Watched, average_last
 from flcav.pipeline.steps import Work
 from flcav.pipeline.work import Fields
 from flcav.pipeline.work.budgets import read_entries
-
-PROBLEM = "problem.json"
+from flcav.pipeline.work.uploads import plan_uploads
 
 
 def plan_step(
@@ -41,11 +43,13 @@ def plan_step(
     histories: Mapping[str, str],
     updates: Sequence[Fields] = (),
     recorded: Mapping[str, Mapping[str, int]] | None = None,
+    uploads: Fields | None = None,
 ) -> None:
     """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables.
 
     `updates` are the forms of the arms' updates, of which the largest is planned with; default: whole updates.
-    `recorded`: of federating regions of recorded data, the vehicles with their numbers of training frames.
+    `recorded`: of federating regions of recorded data, the vehicles with their numbers of training frames. `uploads`:
+    how the vehicles' uploads are planned, see `plan_uploads`; None: they are drawn.
     """
     asked_for = RunRecipe.model_validate(recipe)
     asked, held = [], _held_frames(asked_for, recorded or {})
@@ -71,6 +75,8 @@ def plan_step(
     plan, problem = make_plan(tuple(asked), frame, rule)
     if problem is not None:
         write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
+    if uploads is not None:
+        plan = plan_uploads(work, plan, pools, uploads, asked_for.seed)
     plan.save(work.folder)
 
 
@@ -81,22 +87,35 @@ def replan_step(
     stage: Literal["pretrain", "edge"],
     watched: Mapping[str, Sequence[str]],
     books: Mapping[str, Sequence[str]],
+    edges: Mapping[str, Sequence[str]] = {},
 ) -> None:
     """Plan the rest of the run anew after `stage`: by task, `watched` are its validations, `books` its ledgers.
 
-    `first` is the step of the first plan, `plan` that of the one carried out in `stage`.
+    `first` is the step of the first plan, `plan` that of the one carried out in `stage`. `edges` are the steps of stage
+    II whose numbers of rounds were planned anew after each round.
     """
     problem = read_config(Problem, work.inputs[first] / PROBLEM)
     done = Plan.load(work.inputs[plan])
     reached: dict[str, float] = {}
-    used: dict[Link, int] = dict.fromkeys(LINKS, 0)
+    used: dict[str, dict[Link, int]] = {task.name: dict.fromkeys(LINKS, 0) for task in problem.tasks}
     for task in problem.tasks:
-        last = average_regions([Watched.load(work.inputs[step]) for step in watched[task.name]])[-1]
-        reached[task.name] = last.score
+        reached[task.name] = average_last([Watched.load(work.inputs[step]) for step in watched[task.name]])
         for entry in read_entries(work, *books[task.name]):
-            used[entry.link] += entry.bytes * (entry.direction == "up")
-    used_mb = Price(used["wireless"] / BYTES_PER_MB, used["wireline"] / BYTES_PER_MB)
-    remake_plan(done, problem, stage, reached, used_mb).save(work.folder)
+            used[task.name][entry.link] += entry.bytes * (entry.direction == "up")
+    sent = {task: Price(own["wireless"] / BYTES_PER_MB, own["wireline"] / BYTES_PER_MB) for task, own in used.items()}
+    used_mb = Price(*(sum(own[link] for own in used.values()) / BYTES_PER_MB for link in LINKS))
+    ran = {
+        task: count_carried_out(done.tasks[task], [StageResult.load(work.inputs[step]) for step in steps])
+        for task, steps in edges.items()
+    }
+    made = remake_plan(done, problem, stage, reached, used_mb, ran)
+    k = problem.edge_rounds_per_cloud_round
+    groups = problem.tasks[0].edge_groups
+    booked = {}
+    for task in edges:
+        own = made.tasks[task]
+        booked[task] = settle(own, price_rounds(own, groups, k, 0, own.cloud_rounds), sent[task])
+    replace(made, tasks={**made.tasks, **booked}).save(work.folder)
 
 
 def _list_speeds(recipe: RunRecipe, held: Mapping[str, Mapping[str, int]]) -> dict[str, float]:

@@ -12,8 +12,9 @@ from flcav.network.ledger import Ledger
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import find_strategies
-from flcav.pipeline.federations.network import drive_region, join_regions
+from flcav.pipeline.federations.network import DrivenCloud, DrivenRounds, join_regions, open_network
 from flcav.pipeline.federations.records import read_rounds
+from flcav.pipeline.federations.replanning import Replanning, mean_by_frames
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import (
     LABEL_SOURCES,
@@ -25,11 +26,12 @@ from flcav.pipeline.labels import (
 from flcav.pipeline.placing import find_sites
 from flcav.pipeline.planning import follow_plan
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MORE_EDGE, Federation, Role, Training
-from flcav.pipeline.results import LEDGER, WEIGHTS, Placed, Plan, Pretrained, StageResult
+from flcav.pipeline.results import LEDGER, WEIGHTS, Placed, Plan, Pretrained, StageResult, TaskPlan
 from flcav.pipeline.stages import (
     Learning,
     RegionStart,
     Strategies,
+    choose_planned_uploads,
     choose_uploads,
     federate_cloud,
     federate_edge,
@@ -42,6 +44,8 @@ from flcav.pipeline.stages import (
 from flcav.pipeline.steps import Work
 from flcav.pipeline.work import Fields
 from flcav.pipeline.work.budgets import open_region_book, read_entries, share_plan_budget
+from flcav.pipeline.work.replanning import count_further_rounds, open_cloud_course, open_edge_course
+from flcav.pipeline.work.uploads import list_frames
 
 
 def pretrain_step(
@@ -63,9 +67,13 @@ def pretrain_step(
     opened = {region: Frames.open(work.inputs[step]) for region, step in pools.items()}
     watched = [Frames.open(work.inputs[step]) for step in validation]
     config = learning.config
-    chosen = choose_uploads(
-        {region: split.vehicles for region, split in opened.items()}, own.tasks[task].samples, upload_seed
-    )
+    uploads = own.tasks[task].uploads
+    if uploads is None:
+        pools_of = {region: split.vehicles for region, split in opened.items()}
+        chosen = choose_uploads(pools_of, own.tasks[task].samples, upload_seed)
+    else:
+        held = {region: dict(list_frames(region, split)) for region, split in opened.items()}
+        chosen = choose_planned_uploads(held, uploads, upload_seed)
     book = Ledger(share_plan_budget(own, budget_mb, task))
     samples: list[Any] = []
     for region, frames in chosen.items():
@@ -101,41 +109,60 @@ def edge_step(
     validation: Mapping[str, str] = {},
     processes: int = 1,
     runtime: str = "embedded",
+    replan: Mapping[str, Any] = {},
 ) -> None:
     """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`.
 
     With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III. On a network,
     a vehicle trains `train_s` / speed in a round [s]. Each round is scored on the frames of the steps `validation`, by
-    region. Vehicles train in so many `processes` of a `runtime`.
+    region. Vehicles train in so many `processes` of a `runtime`. `replan` is empty where the plan is not made anew
+    after each round; it has the `vehicles` of each region, the `headroom`, and the step that the rounds keep to
+    (`follows`) or those of the `first` plan and of the region's validation `frames`.
     """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
-    own = plan.tasks[task]
+    own, k = plan.tasks[task], how.edge_rounds_per_cloud_round
     book = open_region_book(work, task, region, steps["plan"], steps["pretrain"], vehicles, budget_mb)
     if "errors" in steps:
         book = Ledger(book.budget, read_entries(work, steps["errors"]))
     if "edge" in steps:
-        stage, rounds = MORE_EDGE, own.cloud_rounds * how.edge_rounds_per_cloud_round
+        stage, rounds = MORE_EDGE, own.cloud_rounds * k
         book = Ledger(book.budget, read_entries(work, steps["edge"]))
         samples, poles = _label_samples(work, learning, region, labels, steps)
     else:
         stage, rounds = EDGE, own.edge_rounds
         samples, poles = _label_samples(work, learning, region, labels, steps, book)
+    terms: Any = (work, plan, task, region, k, budget_mb, replan, book, steps["pretrain"])
+    course = open_edge_course(*terms) if replan and stage == EDGE else None
+    if replan and stage == MORE_EDGE:
+        rounds = count_further_rounds(*terms)
     start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
     clients = make_clients(learning, start.config, samples)
     earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region, earlier=earlier)
     strategy, _ = find_strategies(how)
-    rules = follow_plan(how, own, earlier)
+    simulate = open_network(work, learning, how, region, [*clients], steps, earlier, train_s, speeds)
+
+    def drive(by: TaskPlan, rounds: int) -> DrivenRounds:
+        seeds = [schedule.work(number).seed for number in range(1, rounds + 1)]
+        return simulate(follow_plan(how, by, earlier), seeds)
+
     before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
-    seeds = [schedule.work(number).seed for number in range(1, rounds + 1)]
-    driven = drive_region(work, learning, how, rules, region, [*clients], steps, seeds, earlier, train_s, speeds)
-    watched = {name: Frames.open(work.inputs[step]) for name, step in validation.items()}
-    where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
-    losses = federate_edge(*asked, driven.rules, earlier, *where)
+    frames = replan.get("frames", {}) | validation if course is not None else validation
+    watched = {name: Frames.open(work.inputs[step]) for name, step in frames.items()}
+    if course is None:
+        driven = drive(own, rounds)
+        where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
+        losses = federate_edge(*asked, driven.rules, earlier, *where)
+    else:
+        replanning = Replanning(course, drive, lambda scores: scores[region])
+        where = (book, work.folder, work.report, {}, watched, processes, runtime, replanning)
+        losses = federate_edge(*asked, how, earlier, *where)
+        driven = drive(course.plan, len(losses))
     held = sum(len(client.samples) for client in clients.values())
     records = read_rounds(work.folder, region, before, {region: driven.seconds})
-    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses, records).save(work.folder)
+    made = None if course is None else tuple(course.made)
+    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses, records, made).save(work.folder)
 
 
 def cloud_step(
@@ -150,8 +177,12 @@ def cloud_step(
     regions: Mapping[str, Mapping[str, Any]],
     train_s: float = 0.0,
     speeds: Mapping[str, float] = {},
+    replan: Mapping[str, Any] = {},
 ) -> None:
-    """Run stage III of a task: the edge servers of `regions` federate with the cloud, vehicles with edge servers."""
+    """Run stage III of a task: the edge servers of `regions` federate with the cloud, vehicles with edge servers.
+
+    `replan` is as in `edge_step`, with the validation `frames` of every region.
+    """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     first = next(iter(regions.values()))
     own, how = Plan.load(work.inputs[first["plan"]]), Federation.model_validate(federation)
@@ -170,22 +201,31 @@ def cloud_step(
         count, helped = count + len(clients), [*helped, *poles]
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
     federating = Strategies(*find_strategies(how))
-    rules = follow_plan(how, own.tasks[task], own.tasks[task].edge_rounds)
     before, schedule = len(book.entries), learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
-    seeds = {
-        name: [seed for n in range(1, rounds + 1) for seed in edge_seeds(schedule, n, name, k)] for name in servers
-    }
-    driven = {
-        name: drive_region(
-            work, learning, how, rules, name, [*at.clients], regions[name], seeds[name], at.earlier, train_s, speeds
-        )
+    networks = {
+        name: open_network(work, learning, how, name, [*at.clients], regions[name], at.earlier, train_s, speeds)
         for name, at in servers.items()
     }
-    rules, lost, seconds = join_regions(driven, k, how.network, update_bytes(to_arrays(start)))
-    asked = (learning, start, servers, rounds, k, federating, rules)
-    losses = federate_cloud(*asked, book, work.folder, work.report, lost)
-    records = read_rounds(work.folder, None, before, seconds)
-    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses, records).save(work.folder)
+
+    def drive(by: TaskPlan, rounds: int) -> DrivenCloud:
+        rules, numbers = follow_plan(how, by, by.edge_rounds), range(1, rounds + 1)
+        seeds = {name: [seed for n in numbers for seed in edge_seeds(schedule, n, name, k)] for name in servers}
+        driven = {name: network(rules, seeds[name]) for name, network in networks.items()}
+        return join_regions(driven, k, how.network, update_bytes(to_arrays(start)))
+
+    if replan:
+        course = open_cloud_course(work, own, task, regions, k, budget_mb, replan, book)
+        watched = {name: Frames.open(work.inputs[step]) for name, step in replan.get("frames", {}).items()}
+        replanning = Replanning(course, drive, lambda scores: mean_by_frames(scores, watched))
+        asked = (learning, start, servers, rounds, k, federating, how)
+        losses = federate_cloud(*asked, book, work.folder, work.report, {}, watched, replanning)
+        driven, made = drive(course.plan, len(losses)), tuple(course.made)
+    else:
+        driven, made = drive(own.tasks[task], rounds), None
+        asked = (learning, start, servers, rounds, k, federating, driven.rules)
+        losses = federate_cloud(*asked, book, work.folder, work.report, driven.outages)
+    records = read_rounds(work.folder, None, before, driven.seconds)
+    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses, records, made).save(work.folder)
 
 
 def central_step(
@@ -198,9 +238,11 @@ def central_step(
     vehicles: int,
     source: Role,
     steps: Mapping[str, Any],
+    follows: str | None = None,
 ) -> None:
     """Continue training centrally on ground truth, for as many optimiser steps as stage II takes in the region.
 
+    `follows` is the step of that stage II where its number of rounds was planned anew.
     `source` "pretrain": on the uploaded samples. "federate": on the training frames of the region's vehicles.
     """
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
@@ -214,7 +256,10 @@ def central_step(
     samples = [
         sample for split, frames in parts for sample in _each(learning.task.samples(split.data, trained.config, frames))
     ]
-    rounds = Plan.load(work.inputs[steps["plan"]]).tasks[task].edge_rounds
+    if follows is None:
+        rounds = Plan.load(work.inputs[steps["plan"]]).tasks[task].edge_rounds
+    else:
+        rounds = StageResult.load(work.inputs[follows]).rounds
     losses = train_centrally(learning, trained, samples, rounds, vehicles, source)
     save_network(learning.task, trained, work.folder / WEIGHTS)
     StageResult(CENTRAL, task, region, rounds, len(samples), 1, (), losses).save(work.folder)

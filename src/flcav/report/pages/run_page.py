@@ -84,6 +84,8 @@ def page(run: Run) -> dict[str, Any]:
         "findings": run.findings,
         "placed": main.placed,
         "plans": main.plans,
+        "round_plans": main.round_plans,
+        "uploads": {task: plan.uploads for task, plan in main.plan.tasks.items() if plan.uploads is not None},
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},
         "links": main.links,
         "sent": {link: [main.sent_mb(task, link) for task in recipe.tasks] for link in main.links},

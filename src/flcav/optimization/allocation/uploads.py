@@ -1,0 +1,60 @@
+"""Shares of the vehicles in the samples of stage I: by what they hold, or by what their uplinks carry."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from flcav.optimization.allocation.allocate import TaskPlan
+from flcav.optimization.allocation.vehicles import split_plan
+from flcav.optimization.curves.curves import Additive
+from flcav.optimization.problem import AllocationTask, Budgets, Limits, Problem, Uplink
+
+LEAST_MBPS = 1e-3  # rate of a vehicle that is never in coverage: it uploads last
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The samples of stage I of a task, and who holds how many."""
+
+    samples: int
+    sample_mb: float  # of one
+    held: Mapping[str, int]  # by vehicle
+
+
+def share_by_held(asked: Asked) -> dict[str, int]:
+    """Return each vehicle's number of samples, in proportion to what it holds, by the method of largest remainders.
+
+    Equal remainders go to the vehicle that is named first.
+    """
+    total = sum(asked.held.values())
+    shares = {name: asked.samples * count // total for name, count in asked.held.items()}
+    rest = sorted(shares, key=lambda name: -(asked.samples * asked.held[name] % total))
+    for name in rest[: asked.samples - sum(shares.values())]:
+        shares[name] += 1
+    return shares
+
+
+def share_by_links(tasks: Mapping[str, Asked], mbps: Mapping[str, float]) -> dict[str, dict[str, int]]:
+    """Return each vehicle's number of samples by task, by which the last sample arrives earliest: see `split_plan`.
+
+    mbps: rate of the wireless uplink of every vehicle [Mbit/s]. A vehicle sends the samples of all tasks one after
+    another.
+    """
+    units, plans = [], []
+    for name, asked in tasks.items():
+        links = {vehicle: Uplink(wireless=max(mbps[vehicle], LEAST_MBPS)) for vehicle in asked.held}
+        limits = Limits(samples=(asked.samples, asked.samples), edge_rounds=(0, 0), cloud_rounds=(0, 0))
+        units.append(
+            AllocationTask(
+                name=name,
+                sample_mb=asked.sample_mb,
+                model_mb=1.0,  # of no round
+                edge_groups=(len(asked.held),),
+                uplink_mbps=links,
+                samples_held=asked.held,
+                limits=limits,
+                curve=Additive(),
+            )
+        )
+        plans.append(TaskPlan(name, asked.samples, 0, 0, 0.0, 0.0, 0.0))
+    shares = split_plan(Problem(budgets_mb=Budgets(wireless=1.0, wireline=1.0), tasks=tuple(units)), plans)
+    return {name: {share.vehicle: share.samples for share in own} for name, own in shares.items()}
