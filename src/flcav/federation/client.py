@@ -13,6 +13,7 @@ from flcav.federation.privacy import change_norm
 from flcav.federation.records import (
     ARRAYS,
     ASK,
+    CENTRE,
     CONFIG,
     EXTRA,
     LOSS,
@@ -27,7 +28,7 @@ from flcav.federation.records import (
     reply_norm,
     to_arrays,
 )
-from flcav.federation.rules import Rules
+from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.secure.masks import to_integers
 from flcav.federation.secure.messages import KEYS, MASKED, NAMES, SHARES, UNMASK, answer_secretly, mask_update
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
@@ -89,6 +90,8 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
         """Return the result of local training, and a strategy's arrays beside it."""
         sent, own = _optional(message.content, EXTRA), _recorded(context, OWN)
         correction = strategy.correct(sent, own) if isinstance(strategy, Corrects) else Correction()
+        if isinstance(rules.personal, RegionalModels) and CENTRE in message.content:
+            correction = Correction(rules.personal.pull, centre=read_arrays(message.content, CENTRE))
         layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
         how = {**correction.arguments(), **layers}
         update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)

@@ -20,7 +20,7 @@ from flcav.federation.client import OWN, RESIDUAL, check_arguments, client_app
 from flcav.federation.privacy import affordable_rounds, expected_clients
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.rounds import OnRound, Rounds
-from flcav.federation.rules import Rules, SecureAggregation
+from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.runtimes.outages import LossyGrid
@@ -73,6 +73,7 @@ def federate(
     earlier: int = 0,
     on_round: OnRound = _ignore,
     runtime: "ClientProcesses | RaySimulation | None" = None,
+    centre: Weights | None = None,
 ) -> LocalUpdate:
     """Run rounds `done + 1 .. schedule.rounds` of a federation, starting from `weights`.
 
@@ -87,8 +88,8 @@ def federate(
     Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
     before this one, with the same clients and rules, which count against that budget. Clients train in this process, or
     several at a time in a `runtime`: `ClientProcesses` of the same clients, or Flower's simulation on Ray; the weights
-    are the same. `clients` is asked for a client when it is to train; of updates no more are in memory than the
-    strategy needs.
+    are the same. Clients are pulled to `centre`, where there is one, by the `personal` of the rules. `clients` is asked
+    for a client when it is to train; of updates no more are in memory than the strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
     no update, and fewer are left than `rules` ask for (by default all), `InputError` where there are no clients, or
@@ -126,7 +127,7 @@ def federate(
                 state.clients = read_states()
             on_round(round_, aggregated, loss)
 
-        app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep)
+        app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep, centre)
         lossy = LossyGrid(grid, account, nodes) if account.outages else grid
         results.append(app.start(MeteredGrid(lossy, account, nodes), to_arrays(weights), rounds - done))
 
@@ -152,6 +153,8 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
         check_arguments(clients, strategy.correct({}, {}).arguments(), type(strategy).__name__)
     if rules.upload.layers:
         check_arguments(clients, ["layers"], f"layers {', '.join(rules.upload.layers)}:")
+    if isinstance(rules.personal, RegionalModels):
+        check_arguments(clients, ["proximal", "centre"], "personal:")
 
 
 def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
@@ -167,6 +170,8 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
             raise InputError(f"{told} looks at each update, and importance selection gives each a weight of its own")
         if rules.privacy is not None:
             raise InputError("privacy: importance selection reads norms of the updates, which no noise covers")
+    if isinstance(rules.personal, RegionalModels) and isinstance(strategy, Corrects):
+        raise InputError(f"{told} corrects local steps, and so does the pull of regional models, 'personal'")
     if rules.privacy is not None and selection.rule == "planned":
         raise InputError("privacy: rounds of a plan have other numbers of clients, and noise is for one number")
     if isinstance(strategy, Robust):
@@ -239,11 +244,14 @@ class EdgeServer:
         """Return the update of the region after k edge rounds from the cloud's `weights`; raises as `federate` does.
 
         The first cloud round starts from the server's own stage II model instead: the cloud has not averaged yet, and
-        its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are.
+        its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are;
+        of regional models these are all, and vehicles are pulled to the cloud's from the second cloud round on.
         Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles
         keep to.
         """
         start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
+        regional = isinstance(self.rules.personal, RegionalModels)
+        centre = weights if regional and self.cloud_rounds_done else None
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
         self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
@@ -258,7 +266,8 @@ class EdgeServer:
             done=done,
             earlier=self.earlier,
             runtime=self.runtime,
+            centre=centre,
         )
-        names = name_like(found.weights, self.rules.personal)
+        names = [*found.weights] if regional else name_like(found.weights, self.rules.personal_arrays)
         self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
         return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody

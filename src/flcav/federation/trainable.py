@@ -55,18 +55,20 @@ class LocalUpdate:
 
 @dataclass(frozen=True)
 class Correction:
-    """A change of a client's gradients at every local step: g + proximal (w - start) + shift.
+    """A change of a client's gradients at every local step: g + proximal (w - centre) + shift.
 
     The mean of g over the steps is to be returned as the update's `gradient` where there is a `shift`.
     """
 
     proximal: float = 0.0  # mu
     shift: Weights | None = None  # by name of parameter; one that is not in it is not shifted
+    centre: Weights | None = None  # by name of parameter; None: the weights that the round began with
 
     def arguments(self) -> dict[str, Any]:
         """Return the further arguments of `Trainable.train`: none where nothing is corrected."""
         found: dict[str, Any] = {"proximal": self.proximal} if self.proximal else {}
-        return found if self.shift is None else found | {"shift": self.shift}
+        arrays = {"shift": self.shift, "centre": self.centre}
+        return found | {name: each for name, each in arrays.items() if each is not None}
 
 
 class Trainable(Protocol):

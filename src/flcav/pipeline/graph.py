@@ -264,9 +264,9 @@ class Graph:
             "recorded": self.recipe.regions[region].data is not None,
         }
 
-    def _federation(self, arm: Setting, task: str) -> dict[str, Any]:
-        """Return the settings that all federated stages of a task have in common."""
-        federation = arm.federation.model_dump(mode="json")
+    def _federation(self, arm: Setting, task: str, stage: str) -> dict[str, Any]:
+        """Return the settings that a federated stage of a task depends on."""
+        federation = (arm.federation if stage == CLOUD else arm.edge_federation).model_dump(mode="json")
         own = {"labels": arm.labels[task], "federation": federation, "budget_mb": self._budget_mb}
         if arm.federation.network is not None:
             given = {name: self.recipe.regions[name].speed for name in self.recipe.with_role("federate")}
@@ -284,7 +284,7 @@ class Graph:
                 steps = self._rests_on(arm, region, task, EDGE)
                 own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
                 name = self.names.edge(arm.name, region, task)
-                self._add(_step(name, edge_step, self._federation(arm, task) | own, _named_in(steps)))
+                self._add(_step(name, edge_step, self._federation(arm, task, EDGE) | own, _named_in(steps)))
 
     def _add_further(self, arm: Setting) -> None:
         """Add what follows stage II: stage III or further edge rounds."""
@@ -299,11 +299,12 @@ class Graph:
             }
             if last == CLOUD:
                 needs = [step for steps in edges.values() for step in _named_in(steps)]
-                arguments = self._federation(arm, task) | {"regions": edges}
+                arguments = self._federation(arm, task, last) | {"regions": edges}
                 self._add(_step(names.cloud(arm.name, task), cloud_step, arguments, needs))
                 continue
             for region, steps in edges.items():
-                more = self._federation(arm, task) | {"region": region, "vehicles": self._vehicles(), "steps": steps}
+                own = self._federation(arm, task, last)
+                more = own | {"region": region, "vehicles": self._vehicles(), "steps": steps}
                 self._add(_step(names.more_edge(arm.name, region, task), edge_step, more, _named_in(steps)))
 
     def _central(self, arm: Setting, region: str, task: str) -> Step:

@@ -254,7 +254,8 @@ def federate_cloud(
 
     An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers, and
     an edge round loses the vehicles that `outages` names. Writes weights and ledger, returns each round's loss. Where
-    rules make arrays personal, the weights have the mean of the regions' own, and each region's model is beside them.
+    rules make arrays personal, the weights have the mean of the regions' own, and each region's model is beside them,
+    as are regional models.
     """
     state, own_states = FederationState(), {region: FederationState() for region in regions}
     states = {CLOUD: state, **{f"{EDGE}/{region}": own for region, own in own_states.items()}}
@@ -286,7 +287,7 @@ def federate_cloud(
     keep = federating.make_saver(rounds)
 
     def keep_whole(round_: int, weights: Weights, loss: float) -> None:
-        personal = [own.personal for own in own_states.values() if own.personal]
+        personal = [own.personal for own in own_states.values() if own.personal and rules.personal_arrays]
         keep(round_, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
 
     how: Any = {"strategy": strategies.cloud, "rules": rules.of_servers(), "state": state}
