@@ -31,6 +31,7 @@ from flcav.federation.records import (
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.secure.masks import to_integers
 from flcav.federation.secure.messages import KEYS, MASKED, NAMES, SHARES, UNMASK, answer_secretly, mask_update
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Update, Weights, learned_names
 from flcav.federation.upload import Arrays, subtract
@@ -94,7 +95,11 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
             correction = Correction(rules.personal.pull, centre=read_arrays(message.content, CENTRE))
         layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
         how = {**correction.arguments(), **layers}
+        if isinstance(strategy, FedMD):
+            how |= {"own": own, "imitation_steps": strategy.steps}
         update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
+        if isinstance(strategy, FedMD):
+            _record(context, OWN, getattr(update, "own", {}))
         if not isinstance(strategy, Exchanges):
             return update, {}
         gradient = getattr(update, "gradient", {})  # asked for by the correction

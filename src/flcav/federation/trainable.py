@@ -51,6 +51,7 @@ class LocalUpdate:
     loss: float  # mean over the local steps
     gradient: Weights = field(default_factory=dict)  # mean over the local steps, uncorrected; where `shift` was given
     extra: Weights = field(default_factory=dict)  # what else a strategy's clients send: see `Exchanges`
+    own: Weights = field(default_factory=dict)  # what a client keeps for the next round, where `own` was given
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ class Trainable(Protocol):
 
     Strategies that correct the clients' gradients need a `train` that takes the arguments of `Correction`, too, and
     federations that exchange named layers alone need one that takes `layers`, patterns of the parameters to train.
+    Clients of FedMD get their mean outputs for weights, `own`, what they kept, and `imitation_steps`.
     """
 
     def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> Update:
@@ -83,4 +85,16 @@ class Trainable(Protocol):
 
         `seed` determines the batches and the augmentation: the same arguments give the same update.
         """
+        ...
+
+
+class Distiller(Protocol):
+    """What a server needs where clients send outputs on shared samples: its own, and a network that learns them."""
+
+    def outputs(self, weights: Weights) -> Weights:
+        """Return the outputs of a network with these weights."""
+        ...
+
+    def imitate(self, weights: Weights, outputs: Weights, *, steps: int, learning_rate: float, seed: int) -> Weights:
+        """Return the weights after local steps towards `outputs`."""
         ...

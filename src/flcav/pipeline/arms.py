@@ -7,9 +7,11 @@ from typing import Literal
 from flcav.config import InputError
 from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects
+from flcav.perception.distillation import Imitates
 from flcav.perception.task import build_network, find_configuration
-from flcav.perception.tasks import task_named
+from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.recipe import (
     CENTRAL,
@@ -111,6 +113,10 @@ def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
     cloud = of_servers(edge) if how.cloud_strategy is None else strategy_named(how.cloud_strategy)
     if isinstance(cloud, Corrects):
         raise InputError(f"cloud_strategy: {type(cloud).__name__} corrects local steps, and edge servers take none")
+    if isinstance(cloud, FedMD):
+        raise InputError(
+            "cloud_strategy: FedMD shares frames among vehicles, and edge servers have no networks of their own"
+        )
     return edge, cloud
 
 
@@ -128,6 +134,8 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
             raise InputError(
                 "federation.network: a deadline leaves other numbers of clients, and noise is for one number"
             )
+        if isinstance(edge, FedMD) and setting.central is None:
+            _check_outputs(recipe, setting)
         for region in setting.regions:
             if recipe.regions[region].data is None:
                 check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])
@@ -135,6 +143,16 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
             check_rules(cloud, setting.federation.of_servers(), setting.regions)
         for task in recipe.tasks if setting.federation.personal or setting.federation.upload.layers else ():
             _check_arrays(task, recipe.tasks[task].network, setting)
+
+
+def _check_outputs(recipe: RunRecipe, setting: Setting) -> None:
+    """Raise `InputError` where vehicles cannot send class probabilities: for such a task, or on a network."""
+    for name in recipe.tasks:
+        if not isinstance(task_named(name), Imitates):
+            fit = " and ".join(each for each in TASKS if isinstance(task_named(each), Imitates))
+            raise InputError(f"strategy fedmd: '{name}' has no class probabilities of shared frames; {fit} have")
+    if setting.federation.network is not None:
+        raise InputError("federation.network: its clock knows updates of weights alone, and fedmd sends probabilities")
 
 
 def _check_arrays(task: str, network: str | None, setting: Setting) -> None:

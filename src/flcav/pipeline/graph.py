@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError, shorten
+from flcav.federation.strategies import sends_outputs
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import count_training_frames, hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
@@ -254,6 +255,8 @@ class Graph:
         names = self.names
         helped = any(LABEL_SOURCES[each.labels[task]].from_poles for each in self.settings.values())
         reported = {"errors": names.errors(arm.name, region, task)} if task in arm.placement.tasks else {}
+        if sends_outputs(arm.federation.strategy):
+            reported |= {"pools": self._pools(task)}  # shared frames are drawn from them
         return reported | {
             "plan": names.plan(arm.name, stage),
             "pretrain": names.pretrain(arm.name, task),
@@ -309,8 +312,7 @@ class Graph:
 
     def _central(self, arm: Setting, region: str, task: str) -> Step:
         steps = self._rests_on(arm, region, task, CENTRAL)
-        starts = self.recipe.with_role("pretrain")
-        pools = {name: self.names.recording(name, "pool", task) for name in starts}
+        pools = self._pools(task)
         arguments = {
             **self._learning(arm, task),
             "region": region,
@@ -320,6 +322,10 @@ class Graph:
         }
         needs = [*_named_in(steps), *pools.values()]
         return _step(self.names.central(arm.name, region, task), central_step, arguments, needs)
+
+    def _pools(self, task: str) -> dict[str, str]:
+        """Return the steps that record a task's candidates for upload, by region."""
+        return {region: self.names.recording(region, "pool", task) for region in self.recipe.with_role("pretrain")}
 
     @property
     def shown(self) -> tuple[str, str] | None:
@@ -359,4 +365,4 @@ def _step(name: str, function: Callable[..., None], arguments: Mapping[str, Any]
 def _named_in(steps: Mapping[str, Any]) -> list[str]:
     """Return the names of the steps in what `Graph._rests_on` returned; for stage III also that of stage II."""
     one = [steps[key] for key in ("plan", "pretrain", "errors", "frames", "place", "edge") if key in steps]
-    return [*one, *steps["sites"]]
+    return [*one, *steps["sites"], *steps.get("pools", {}).values()]

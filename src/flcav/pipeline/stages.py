@@ -8,6 +8,7 @@ vehicles federate with their edge server. Stage III: edge servers federate with 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.choice import open_runtime
 from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
+from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate, federate_outputs
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
@@ -24,6 +25,7 @@ from flcav.federation.trainable import Trainable, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.messages import send
 from flcav.perception.client import TaskClient, as_shared
+from flcav.perception.distillation import OutputClient, SharedSamples
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.training import Checkpointing, Validation, train, train_steps
@@ -171,6 +173,11 @@ def make_clients(learning: Learning, config: Any, samples: Mapping[str, Sequence
     }
 
 
+def give_outputs(clients: Mapping[str, TaskClient], shared: SharedSamples, start: Weights) -> dict[str, OutputClient]:
+    """Return clients that send outputs on `shared` samples, and begin with a network of the weights `start`."""
+    return {name: OutputClient(client, shared, start) for name, client in clients.items()}
+
+
 @dataclass(frozen=True)
 class RegionStart:
     """Where a region's edge server starts in stage III."""
@@ -209,13 +216,14 @@ def federate_edge(
     validation: Mapping[str, Frames] = {},
     processes: int = 1,
     runtime: str = "embedded",
+    shared: SharedSamples | None = None,
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
 
     A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
     After each round the network that a federation of so many rounds ends with is scored on `validation`, frames by
     region. Vehicles train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights.
-    The vehicles that `outages` name by round are lost in it.
+    The vehicles that `outages` name by round are lost in it. With `shared` samples they send outputs on these.
     """
     state, task, averaged = FederationState(), learning.task, learning.training.average_rounds
     share = 0.0 if earlier else learning.training.start_share
@@ -231,8 +239,13 @@ def federate_edge(
     account = Account(book, EDGE, task.name, "wireless", outages)
     keep = federating.make_saver(schedule.rounds)
     how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
-    with open_runtime(runtime, clients, processes) as where:
-        federate(clients, start, schedule, account, **how, done=done, on_round=keep, runtime=where)
+    run, asked = (
+        (federate, clients)
+        if shared is None
+        else (partial(federate_outputs, shared), give_outputs(clients, shared, to_arrays(network)))
+    )
+    with open_runtime(runtime, asked, processes) as where:
+        run(asked, start, schedule, account, **how, done=done, on_round=keep, runtime=where)
     federating.finish(network, len(federating.losses), averaged, share)
     return tuple(federating.losses)
 
@@ -249,13 +262,14 @@ def federate_cloud(
     folder: Path,
     report: Report,
     outages: Mapping[tuple[int, str], Outage] = {},
+    shared: SharedSamples | None = None,
 ) -> tuple[float, ...]:
     """Run stage III from `network`; `regions`: where each edge server starts.
 
     An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers, and
     an edge round loses the vehicles that `outages` names. Writes weights and ledger, returns each round's loss. Where
     rules make arrays personal, the weights have the mean of the regions' own, and each region's model is beside them,
-    as are regional models.
+    as are regional models. With `shared` samples vehicles, which begin with their region's weights, send outputs.
     """
     state, own_states = FederationState(), {region: FederationState() for region in regions}
     states = {CLOUD: state, **{f"{EDGE}/{region}": own for region, own in own_states.items()}}
@@ -270,7 +284,7 @@ def federate_cloud(
     wireline = Account(book, CLOUD, learning.task.name, "wireline")
     servers: dict[str, Trainable] = {
         region: EdgeServer(
-            own.clients,
+            own.clients if shared is None else give_outputs(own.clients, shared, own.weights),
             edge_rounds,
             wireless,
             own.weights,
@@ -279,6 +293,7 @@ def federate_cloud(
             rules=rules,
             state=own_states[region],
             earlier=own.earlier,
+            distiller=shared,
         )
         for region, own in regions.items()
     }

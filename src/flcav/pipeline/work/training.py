@@ -8,11 +8,13 @@ import numpy as np
 from flcav.config import InputError
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.stages import edge_seeds
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.network.ledger import Ledger
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import find_strategies
 from flcav.pipeline.federations.network import drive_region, join_regions
+from flcav.pipeline.federations.outputs import send_region_network, share_frames
 from flcav.pipeline.federations.records import read_rounds
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import (
@@ -126,12 +128,17 @@ def edge_step(
     earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region, earlier=earlier)
     strategy, _ = find_strategies(how)
-    rules = follow_plan(how, own, earlier)
+    rules, shared = follow_plan(how, own, earlier), None
+    if isinstance(strategy, FedMD):
+        shown = share_frames(work, learning, start.config, strategy, steps["pools"], steps["pretrain"])
+        if "edge" not in steps:  # where the vehicles have them
+            shown.send(book, start, region, [*clients], released="errors" in steps)
+        shared = shown.samples
     before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
     seeds = [schedule.work(number).seed for number in range(1, rounds + 1)]
     driven = drive_region(work, learning, how, rules, region, [*clients], steps, seeds, earlier, train_s, speeds)
     watched = {name: Frames.open(work.inputs[step]) for name, step in validation.items()}
-    where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
+    where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime, shared)
     losses = federate_edge(*asked, driven.rules, earlier, *where)
     held = sum(len(client.samples) for client in clients.values())
     records = read_rounds(work.folder, region, before, {region: driven.seconds})
@@ -170,7 +177,12 @@ def cloud_step(
         count, helped = count + len(clients), [*helped, *poles]
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
     federating = Strategies(*find_strategies(how))
-    rules = follow_plan(how, own.tasks[task], own.tasks[task].edge_rounds)
+    rules, shared = follow_plan(how, own.tasks[task], own.tasks[task].edge_rounds), None
+    if isinstance(federating.edge, FedMD):
+        shown = share_frames(work, learning, start.config, federating.edge, first["pools"], first["pretrain"])
+        shared = shown.samples
+        for at in servers.values():
+            send_region_network(book, learning.task, at.weights, at.clients)
     before, schedule = len(book.entries), learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
     seeds = {
         name: [seed for n in range(1, rounds + 1) for seed in edge_seeds(schedule, n, name, k)] for name in servers
@@ -183,7 +195,7 @@ def cloud_step(
     }
     rules, lost, seconds = join_regions(driven, k, how.network, update_bytes(to_arrays(start)))
     asked = (learning, start, servers, rounds, k, federating, rules)
-    losses = federate_cloud(*asked, book, work.folder, work.report, lost)
+    losses = federate_cloud(*asked, book, work.folder, work.report, lost, shared)
     records = read_rounds(work.folder, None, before, seconds)
     StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses, records).save(work.folder)
 
