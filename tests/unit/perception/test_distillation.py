@@ -92,7 +92,7 @@ def test_rounds_are_what_a_loop_by_hand_gives_and_no_weights_are_sent():
             update = vehicle.train(mean, **how, own=own[name], imitation_steps=3)
             own[name] = update.own
             sent.append(update.weights[PROBABILITIES])
-        mean = {PROBABILITIES: np.mean(sent, axis=0, dtype=np.float64).astype(np.float32)}
+        mean = {PROBABILITIES: np.asarray(np.mean(sent, axis=0, dtype=np.float64), np.float32)}
         rate, seed = work.learning_rate, derive_seed(work.seed, "server")
         server = SHARED.imitate(server, mean, steps=3, learning_rate=rate, seed=seed)
     for name, array in server.items():
