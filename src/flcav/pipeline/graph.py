@@ -164,6 +164,16 @@ class Graph:
             raise InputError(f"regions: there is no dataset folder {shorten(named)} in {self.beside}")
         return found.absolute()
 
+    def _air(self) -> dict[str, Any]:
+        """Return what a plan within a horizon predicts times on the network from; nothing without a network."""
+        network = self.recipe.federation.network
+        if network is None or self.recipe.horizon_s is None:
+            return {}
+        first = next(task for task in self.recipe.tasks if self._first(task))
+        drives = {region: self.names.recording(region, "registry", first) for region in self.federating}
+        how = {"network": network.model_dump(mode="json"), "range_m": self.recipe.placement.range_m}
+        return {"air": how | {"drives": drives}}
+
     def _histories(self) -> dict[str, str]:
         """Return the learning history (CSV) of each task that has one, as text: another text, another plan."""
         own = {name: task.history for name, task in self.recipe.tasks.items()}
@@ -198,8 +208,11 @@ class Graph:
             planned["updates"] = [form.model_dump(mode="json") for form in forms]
         if self.recorded:
             planned["recorded"] = self.recorded
+        planned |= self._air()
         plan = names.plan(arm.name)
-        self._add(_step(plan, plan_step, planned, [step for steps in pools.values() for step in steps]))
+        needs = [step for steps in pools.values() for step in steps]
+        needs += planned["air"]["drives"].values() if "air" in planned else ()
+        self._add(_step(plan, plan_step, planned, needs))
         for task in recipe.tasks:
             own = {region: names.recording(region, "pool", task) for region in starts}
             validation = [names.recording(region, "validation", task) for region in starts]
