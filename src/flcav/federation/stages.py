@@ -154,8 +154,11 @@ def federate_outputs(
     *,
     strategy: FedMD,
     state: FederationState,
+    rules: Rules = EVERYBODY,
+    done: int = 0,
+    earlier: int = 0,
     on_round: OnRound = _ignore,
-    **how: Any,
+    runtime: "ClientProcesses | RaySimulation | None" = None,
 ) -> LocalUpdate:
     """Run rounds of a federation whose clients send outputs: as `federate`, with the server's network for the weights.
 
@@ -173,7 +176,9 @@ def federate_outputs(
         on_round(round_, network, loss)
 
     begin = state.server or distiller.outputs(weights)
-    found = federate(clients, begin, schedule, account, strategy=strategy, state=state, on_round=keep, **how)
+    asked = (clients, begin, schedule, account)
+    how: Any = {"strategy": strategy, "state": state, "rules": rules, "done": done, "earlier": earlier}
+    found = federate(*asked, **how, on_round=keep, runtime=runtime)
     return replace(found, weights=network)
 
 
@@ -304,9 +309,9 @@ class EdgeServer:
         self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
         asked = (self.vehicles, start, schedule, self.account)
         how: Any = {"strategy": self.strategy, "rules": self.rules, "state": self.state, "done": done}
-        how |= {"earlier": self.earlier, "runtime": self.runtime, "centre": centre}
+        how |= {"earlier": self.earlier, "runtime": self.runtime}
         if self.distiller is None:
-            found = federate(*asked, **how)
+            found = federate(*asked, **how, centre=centre)
         else:
             self.state.server = {}  # begins with the outputs of the cloud's network
             found = federate_outputs(self.distiller, *asked, **how)

@@ -6,14 +6,15 @@ at temperature 1).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Generic, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from typing_extensions import TypeVar
 
 from flcav.perception.client import TaskClient
-from flcav.perception.task import Practice, Task
+from flcav.perception.task import ConfigT, NetworkT, Practice, SampleT, Task
 from flcav.perception.training import train_steps
 from flcav.perception.weights import from_arrays, to_arrays
 from flcav.seeds import derive_seed
@@ -22,18 +23,24 @@ PROBABILITIES = "probabilities"  # name of the one array that is sent
 SAME = 1e-6  # difference up to which probabilities teach nothing
 Arrays = Mapping[str, NDArray[np.number]]
 NOTHING: Arrays = {}
+NetworkT_contra = TypeVar("NetworkT_contra", contravariant=True, default=Any)  # a network
+SampleT_contra = TypeVar("SampleT_contra", contravariant=True, default=Any)  # a sample
 Part = tuple[Any, NDArray[np.float32]]  # a sample, and the class probabilities (rows, classes) of what it shows
 
 
 @runtime_checkable
-class Imitates(Protocol):
+class Imitates(Protocol[NetworkT_contra, SampleT_contra]):
     """A task whose networks can learn from class probabilities of samples: of pictures, or of what is seen in them."""
 
-    def class_probabilities(self, network: Any, samples: Sequence[Any]) -> list[NDArray[np.float32]]:
+    def class_probabilities(
+        self, network: NetworkT_contra, samples: Sequence[SampleT_contra]
+    ) -> list[NDArray[np.float32]]:
         """Return the class probabilities (rows, classes) of each sample; the number of rows is the sample's alone."""
         ...
 
-    def imitation_loss(self, network: Any, samples: Sequence[Any], targets: Sequence[NDArray[np.float32]]) -> Tensor:
+    def imitation_loss(
+        self, network: NetworkT_contra, samples: Sequence[SampleT_contra], targets: Sequence[NDArray[np.float32]]
+    ) -> Tensor:
         """Return the loss of a batch with class probabilities for labels, as `class_probabilities` returns them."""
         ...
 
@@ -70,15 +77,15 @@ class SentOutputs:
 
 
 @dataclass(frozen=True)
-class SharedSamples:
+class SharedSamples(Generic[ConfigT, NetworkT, SampleT]):
     """Samples that clients and server share, to say what their networks see in them and to learn from the mean."""
 
-    task: Task  # which `Imitates`
-    config: Any  # of all networks
-    samples: Sequence[Any]
+    task: Task[ConfigT, NetworkT, SampleT]  # which `Imitates`
+    config: ConfigT  # of all networks
+    samples: Sequence[SampleT]
     batch: int
 
-    def build(self, weights: Arrays) -> Any:
+    def _build(self, weights: Arrays) -> NetworkT:
         """Return a network with these weights."""
         network = self.task.build(self.config)
         from_arrays(network, weights)
@@ -86,12 +93,12 @@ class SharedSamples:
 
     def outputs(self, weights: Arrays) -> dict[str, NDArray[np.number]]:
         """Return the class probabilities (rows, classes), as `PROBABILITIES`, by a network with these weights."""
-        rows = cast(Imitates, self.task).class_probabilities(self.build(weights), self.samples)
+        rows = cast(Imitates, self.task).class_probabilities(self._build(weights), self.samples)
         return {PROBABILITIES: np.concatenate(rows).astype(np.float32)}
 
     def imitate(self, weights: Arrays, outputs: Arrays, *, steps: int, learning_rate: float, seed: int) -> Arrays:
         """Return the weights after local steps towards `outputs`; those given where they say the same already."""
-        now = cast(Imitates, self.task).class_probabilities(network := self.build(weights), self.samples)
+        now = cast(Imitates, self.task).class_probabilities(network := self._build(weights), self.samples)
         wanted = np.asarray(outputs[PROBABILITIES], np.float32)
         if np.allclose(np.concatenate(now), wanted, rtol=0.0, atol=SAME):
             return weights
