@@ -1,6 +1,6 @@
 """Shared samples of federated distillation: frames that were uploaded in stage I, sent to a region's vehicles."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.messages import send_to_vehicles
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import CLOUD
+from flcav.pipeline.recipe import CLOUD, EDGE
 from flcav.pipeline.results import Pretrained
 from flcav.pipeline.stages import Learning
 from flcav.pipeline.steps import Work
@@ -29,10 +29,12 @@ class SharedFrames:
     messages: tuple[bytes, ...]
     samples: SharedSamples
 
-    def send(self, book: Ledger, network: Any, region: str, clients: Iterable[str], *, released: bool) -> None:
-        """Send the frames to a region's vehicles, and the network that they begin with unless it is `released`."""
-        first = () if released else (pack(to_arrays(network)),)
-        for message in (*first, *self.messages):
+    def send(self, book: Ledger, network: Any, region: str, clients: Sequence[str]) -> None:
+        """Send the frames to a region's vehicles, and the network that they begin with to those who lack it."""
+        have = {entry.client for entry in book.entries if (entry.stage, entry.direction) == (EDGE, "down")}
+        if lacking := [client for client in clients if client not in have]:
+            send_to_vehicles(book, pack(to_arrays(network)), self.samples.task, region, lacking)
+        for message in self.messages:
             send_to_vehicles(book, message, self.samples.task, region, clients)
 
 

@@ -132,7 +132,7 @@ def edge_step(
     if isinstance(strategy, FedMD):
         shown = share_frames(work, learning, start.config, strategy, steps["pools"], steps["pretrain"])
         if "edge" not in steps:  # where the vehicles have them
-            shown.send(book, start, region, [*clients], released="errors" in steps)
+            shown.send(book, start, region, [*clients])
         shared = shown.samples
     before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
     seeds = [schedule.work(number).seed for number in range(1, rounds + 1)]
