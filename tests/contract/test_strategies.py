@@ -20,6 +20,7 @@ from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Stateful
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
@@ -48,6 +49,8 @@ class Client:
         seed: int,
         proximal: float = 0.0,
         shift: Weights | None = None,
+        own: Weights | None = None,
+        imitation_steps: int = 0,
     ) -> LocalUpdate:
         rng = np.random.default_rng(seed)
         gradient = (self.samples * rng.normal(size=(5, 3))).astype(np.float32)
@@ -56,7 +59,11 @@ class Client:
             "layer.weight": (weights["layer.weight"] + learning_rate * corrected).astype(np.float32),
             "norm.count": weights["norm.count"] + self.samples,
         }
-        return LocalUpdate(moved, self.samples, float(rng.uniform(0.1, 2.0)), {"layer.weight": gradient})
+        loss, kept = float(rng.uniform(0.1, 2.0)), {}
+        if own is not None:  # what it keeps changes what it sends
+            kept = {"drift": own.get("drift", np.zeros((5, 3), np.float32)) + np.float32(imitation_steps) * gradient}
+            moved["layer.weight"] = moved["layer.weight"] + np.float32(learning_rate) * kept["drift"]
+        return LocalUpdate(moved, self.samples, loss, {"layer.weight": gradient}, own=kept)
 
 
 def of_the_example() -> type[Strategy]:
@@ -136,8 +143,8 @@ def test_no_client_is_special(strategy):
 
 
 def test_without_state_it_keeps_nothing_between_rounds(strategy):
-    if isinstance(strategy, Stateful):
-        pytest.skip("has a state, which is checkpointed")
+    if isinstance(strategy, Stateful | FedMD):
+        pytest.skip("has a state, on the server or on clients, which is checkpointed")
     kept: list[Weights] = []
     whole = federated(strategy, on_round=lambda number, weights, loss: kept.append(weights))
     for done in (1, 2):

@@ -121,9 +121,14 @@ def test_vehicles_join_the_rounds_that_they_have_time_for(tmp_path: Path) -> Non
             "horizon_s": 4.0,
             "placement": {"rule": "none"},
             "recording": {"warmup_s": 5.0, "weather": "clear"},
+            "arms": {
+                "outputs": {"federation": {"strategy": {"fedmd": {"frames": 2, "steps": 1}}}},
+                "regional": {"federation": {"personal": {"pull": 0.1}}},
+            },
         }
     )
-    main = run(recipe, tmp_path / "out", beside=tmp_path).arms[MAIN]
+    result = run(recipe, tmp_path / "out", beside=tmp_path)
+    main = result.arms[MAIN]
     plan = main.plan.tasks["weather"]
     assert plan.joins is not None
     rounds = plan.edge_rounds + plan.cloud_rounds
@@ -138,6 +143,16 @@ def test_vehicles_join_the_rounds_that_they_have_time_for(tmp_path: Path) -> Non
         for name, joined in plan.joins.items()
         for number in joined
     )
+    for own, other in zip(result.arms["outputs"].stages, main.stages, strict=True):  # of probabilities, and weights
+        for few, many in zip(own.records or (), other.records or (), strict=True):
+            assert few.clients == many.clients
+            if few.server != CLOUD and few.clients:
+                assert 0 < few.up_bytes < many.up_bytes / 100
+    sent = {(e.link, e.client) for e in Ledger.load(tmp_path / "out/ledgers/outputs.parquet").entries if not e.round}
+    assert {("wireline", "ring"), *(("wireless", f"ring/cav{number}") for number in range(2))} <= sent
+    tested = result.arms["regional"].regional
+    assert {(test.model, test.region) for test in tested or ()} == {("ring", "suburb"), ("ring", "ring")}
+    assert not (tmp_path / "out/work/ring-edge-fl-weather-regional").exists()
 
 
 def test_signs_are_federated_and_their_errors_place_the_sensor(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from flcav.federation.privacy import change_norm
 from flcav.federation.records import (
     ARRAYS,
     ASK,
+    CENTRE,
     CONFIG,
     EXTRA,
     LOSS,
@@ -27,9 +28,10 @@ from flcav.federation.records import (
     reply_norm,
     to_arrays,
 )
-from flcav.federation.rules import Rules
+from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.secure.masks import to_integers
 from flcav.federation.secure.messages import KEYS, MASKED, NAMES, SHARES, UNMASK, answer_secretly, mask_update
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Update, Weights, learned_names
 from flcav.federation.upload import Arrays, subtract
@@ -89,9 +91,15 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
         """Return the result of local training, and a strategy's arrays beside it."""
         sent, own = _optional(message.content, EXTRA), _recorded(context, OWN)
         correction = strategy.correct(sent, own) if isinstance(strategy, Corrects) else Correction()
+        if isinstance(rules.personal, RegionalModels) and CENTRE in message.content:
+            correction = Correction(rules.personal.pull, centre=read_arrays(message.content, CENTRE))
         layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
         how = {**correction.arguments(), **layers}
+        if isinstance(strategy, FedMD):
+            how |= {"own": own, "imitation_steps": strategy.steps}
         update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
+        if isinstance(strategy, FedMD):
+            _record(context, OWN, getattr(update, "own", {}))
         if not isinstance(strategy, Exchanges):
             return update, {}
         gradient = getattr(update, "gradient", {})  # asked for by the correction

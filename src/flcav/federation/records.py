@@ -10,6 +10,7 @@ from flcav.federation.trainable import LocalUpdate, Update, Weights
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"  # records of a message, by key
 EXTRA = "extra"  # a strategy's arrays beside the weights, where it has any
+CENTRE = "centre"  # the model that clients are pulled to, where it is not the round's
 ASK = "ask"  # record and its entry: what is to be sent, where it is not the update after training
 VECTOR = "#masked"  # the one array of an update under secure aggregation
 NORM, SEND = "norm", "send"  # ask for the norm of the update after training; for the update whose norm was sent

@@ -21,6 +21,7 @@ from flcav.federation.privacy import account_epsilon, average_privately, expecte
 from flcav.federation.records import (
     ARRAYS,
     ASK,
+    CENTRE,
     CONFIG,
     EXTRA,
     LOSS,
@@ -91,7 +92,7 @@ class Rounds(FlowerStrategy):
     `rules` say who takes part, what is sent and what is kept private; `work` gives the local training of a round by its
     number; numbers continue after the `done` rounds. `names` are the clients' names by node. `earlier` is the number of
     rounds of earlier federations with the same clients, which privacy is accounted with. `state` is changed in place;
-    `on_round` is called after each aggregation.
+    `on_round` is called after each aggregation. `centre` is the model that clients are pulled to, if any.
     """
 
     def __init__(
@@ -104,9 +105,11 @@ class Rounds(FlowerStrategy):
         done: int,
         earlier: int,
         on_round: OnRound,
+        centre: Weights | None = None,
     ) -> None:
         self._strategy, self._rules, self._work, self._names = strategy, rules, work, names
         self._state, self._done, self._earlier, self._on_round = state, done, earlier, on_round
+        self._centre = centre
         self._nodes = {name: node for node, name in names.items()}
         self._start: Weights = {}
         self._chosen: list[str] = []  # who is to send an update in this round
@@ -130,6 +133,8 @@ class Rounds(FlowerStrategy):
         work, records = self._work(self._done + server_round), {ARRAYS: arrays}
         if isinstance(self._strategy, Exchanges) and (sent := self._strategy.send(self._state.server)):
             records[EXTRA] = to_arrays(sent)
+        if self._centre is not None:
+            records[CENTRE] = to_arrays({name: self._centre[name] for name in learned_names(self._centre)})
         selection, local = self._rules.selection, work.record()
         self._chosen = selection.choose([*self._names.values()], work.round, work.seed)
         self._failed = {}

@@ -20,6 +20,12 @@ class SecureAggregation(Config):
         return max(clients // 2 + 1, 2) if self.threshold is None else self.threshold
 
 
+class RegionalModels(Config):
+    """Regional models as in Ditto (Li et al., ICML 2021): each is pulled to the cloud's, but never replaced by it."""
+
+    pull: float = Field(ge=0, le=1e6)  # lambda of the gradients g + lambda (v - w); 0: regions learn by themselves
+
+
 class Rules(Config):
     """Rules of the rounds of a federation; by default every client sends its whole update in every round."""
 
@@ -27,7 +33,7 @@ class Rules(Config):
     upload: Upload = Upload()  # form of the updates
     privacy: Privacy | None = None  # clipping and noise; default: none
     secure: SecureAggregation | None = None  # default: the server sees every update
-    personal: Patterns = ()  # arrays that every edge server keeps for its region, as in `head.*`
+    personal: Patterns | RegionalModels = ()  # what edge servers keep for their regions: arrays, as in `head.*`, or all
     least_clients: int | None = Field(default=None, ge=1, le=10**6)  # whose updates a round needs; default: all chosen
 
     def of_servers(self) -> "Rules":
@@ -35,14 +41,19 @@ class Rules(Config):
 
         All take part, and send in the same form; noise is the vehicles', and all that comes after it is as private.
         """
-        return Rules(upload=self.upload.model_copy(update={"kept": self.personal}))
+        return Rules(upload=self.upload.model_copy(update={"kept": self.personal_arrays}))
+
+    @property
+    def personal_arrays(self) -> Patterns:
+        """Return the patterns of the arrays that are not averaged between regions."""
+        return () if isinstance(self.personal, RegionalModels) else self.personal
 
     def check_personal(self, weights: Weights) -> None:
         """Raise `InputError` where a pattern of `personal` matches no array, or nothing that is learned is left."""
-        for pattern in self.personal:
+        for pattern in self.personal_arrays:
             if not name_like(weights, (pattern,)):
                 raise InputError(
                     f"personal: '{pattern}' matches none of {len(weights)} arrays, such as '{next(iter(weights))}'"
                 )
         if not {*learned_names(weights)} & {*self.of_servers().upload.exchanged(weights)}:
-            raise InputError(f"personal: {', '.join(self.personal)} leave nothing for the regions to average")
+            raise InputError(f"personal: {', '.join(self.personal_arrays)} leave nothing for the regions to average")

@@ -8,7 +8,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from flwr.app import ArrayRecord
@@ -20,15 +20,16 @@ from flcav.federation.client import OWN, RESIDUAL, check_arguments, client_app
 from flcav.federation.privacy import affordable_rounds, expected_clients
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.rounds import OnRound, Rounds
-from flcav.federation.rules import Rules, SecureAggregation
+from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
 from flcav.federation.state import ClientStates, FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust
-from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights
 from flcav.federation.upload import name_like
 from flcav.seeds import derive_seed
 
@@ -78,6 +79,7 @@ def federate(
     earlier: int = 0,
     on_round: OnRound = _ignore,
     runtime: "ClientProcesses | RaySimulation | None" = None,
+    centre: Weights | None = None,
 ) -> LocalUpdate:
     """Run rounds `done + 1 .. schedule.rounds` of a federation, starting from `weights`.
 
@@ -92,8 +94,8 @@ def federate(
     Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
     before this one, with the same clients and rules, which count against that budget. Clients train in this process, or
     several at a time in a `runtime`: `ClientProcesses` of the same clients, or Flower's simulation on Ray; the weights
-    are the same. `clients` is asked for a client when it is to train; of updates no more are in memory than the
-    strategy needs.
+    are the same. Clients are pulled to `centre`, where there is one, by the `personal` of the rules. `clients` is asked
+    for a client when it is to train; of updates no more are in memory than the strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
     no update, and fewer are left than `rules` ask for (by default all), `InputError` where there are no clients, or
@@ -131,11 +133,11 @@ def federate(
                 state.clients = read_states()
             on_round(round_, aggregated, loss)
 
-        app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep)
+        app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep, centre)
         lossy = LossyGrid(grid, account, nodes) if account.outages else grid
         results.append(app.start(MeteredGrid(lossy, account, nodes), to_arrays(weights), rounds - done))
 
-    keeps = isinstance(strategy, Exchanges) or rules.upload.compression == "top-k"  # something on the clients
+    keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"  # something on the clients
     make_app = partial(client_app, strategy=strategy, rules=rules)
     if runtime is None or isinstance(runtime, ClientProcesses):
         trained, at_once = (clients, 1) if runtime is None else (RemoteClients(clients, runtime), runtime.count)
@@ -148,6 +150,43 @@ def federate(
     return LocalUpdate(to_weights(arrays), int(metrics[SAMPLES]), float(metrics[LOSS]))  # type: ignore[arg-type]
 
 
+def federate_outputs(
+    distiller: Distiller,
+    clients: Mapping[str, Trainable],
+    weights: Weights,
+    schedule: Schedule,
+    account: Account,
+    *,
+    strategy: FedMD,
+    state: FederationState,
+    rules: Rules = EVERYBODY,
+    done: int = 0,
+    earlier: int = 0,
+    on_round: OnRound = _ignore,
+    runtime: "ClientProcesses | RaySimulation | None" = None,
+) -> LocalUpdate:
+    """Run rounds of a federation whose clients send outputs: as `federate`, with the server's network for the weights.
+
+    After a round the server's network learns from the mean of the clients' outputs, which are sent down in the next
+    one; in the first it sends its own. They are kept in `state`.
+    """
+    network = weights
+
+    def keep(round_: int, outputs: Weights, loss: float) -> None:
+        nonlocal network
+        state.server = {name: np.asarray(array) for name, array in outputs.items()}
+        work = schedule.work(round_)
+        rate, seed = work.learning_rate, derive_seed(work.seed, "server")
+        network = distiller.imitate(network, outputs, steps=strategy.steps, learning_rate=rate, seed=seed)
+        on_round(round_, network, loss)
+
+    begin = state.server or distiller.outputs(weights)
+    asked = (clients, begin, schedule, account)
+    how: Any = {"strategy": strategy, "state": state, "rules": rules, "done": done, "earlier": earlier}
+    found = federate(*asked, **how, on_round=keep, runtime=runtime)
+    return replace(found, weights=network)
+
+
 def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> None:
     """Raise `InputError` where these clients cannot federate by this strategy and these rules."""
     if not clients:
@@ -155,8 +194,12 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
     check_rules(strategy, rules, [*clients])
     if isinstance(strategy, Corrects):
         check_arguments(clients, strategy.correct({}, {}).arguments(), type(strategy).__name__)
+    if isinstance(strategy, FedMD):
+        check_arguments(clients, ["own", "imitation_steps"], "FedMD")
     if rules.upload.layers:
         check_arguments(clients, ["layers"], f"layers {', '.join(rules.upload.layers)}:")
+    if isinstance(rules.personal, RegionalModels):
+        check_arguments(clients, ["proximal", "centre"], "personal:")
 
 
 def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
@@ -172,6 +215,10 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
             raise InputError(f"{told} looks at each update, and importance selection gives each a weight of its own")
         if rules.privacy is not None:
             raise InputError("privacy: importance selection reads norms of the updates, which no noise covers")
+    if isinstance(strategy, FedMD):
+        _check_outputs(rules)
+    if isinstance(rules.personal, RegionalModels) and isinstance(strategy, Corrects):
+        raise InputError(f"{told} corrects local steps, and so does the pull of regional models, 'personal'")
     if rules.privacy is not None and selection.rule == "planned":
         raise InputError("privacy: rounds of a plan have other numbers of clients, and noise is for one number")
     if isinstance(strategy, Robust):
@@ -185,6 +232,15 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
             raise InputError(f"{told} sends further arrays beside the weights, which the noise does not cover")
         if rules.privacy.where == "central" and single:
             raise InputError(f"{told} looks at each update, and central noise covers their sum alone")
+
+
+def _check_outputs(rules: Rules) -> None:
+    if rules.upload.layers:
+        raise InputError("FedMD sends class probabilities, and 'upload.layers' names arrays of weights")
+    if isinstance(rules.personal, RegionalModels):
+        raise InputError("FedMD's vehicles have networks of their own, which regional models, 'personal', cannot pull")
+    if rules.privacy is not None:
+        raise InputError("FedMD sends class probabilities, and noise is for changes of weights")
 
 
 def _check_secure(told: str, rules: Rules, secure: SecureAggregation, chosen: int, single: bool) -> None:
@@ -237,6 +293,7 @@ class EdgeServer:
     state: FederationState = field(default_factory=FederationState)  # of the region's rounds
     earlier: int = 0  # rounds of stage II, which a privacy budget counts
     runtime: ClientProcesses | None = None  # where the vehicles train; None: in this process
+    distiller: Distiller | None = None  # where vehicles send outputs
 
     def train(
         self, weights: Weights, *, steps: int, learning_rate: float, seed: int, layers: Sequence[str] = ()
@@ -244,26 +301,25 @@ class EdgeServer:
         """Return the update of the region after k edge rounds from the cloud's `weights`; raises as `federate` does.
 
         The first cloud round starts from the server's own stage II model instead: the cloud has not averaged yet, and
-        its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are.
+        its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are;
+        of regional models these are all, and vehicles are pulled to the cloud's from the second cloud round on.
         Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles
         keep to.
         """
         start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
+        regional = isinstance(self.rules.personal, RegionalModels)
+        centre = weights if regional and self.cloud_rounds_done else None
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
         self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
-        found = federate(
-            self.vehicles,
-            start,
-            schedule,
-            self.account,
-            strategy=self.strategy,
-            rules=self.rules,
-            state=self.state,
-            done=done,
-            earlier=self.earlier,
-            runtime=self.runtime,
-        )
-        names = name_like(found.weights, self.rules.personal)
+        asked = (self.vehicles, start, schedule, self.account)
+        how: Any = {"strategy": self.strategy, "rules": self.rules, "state": self.state, "done": done}
+        how |= {"earlier": self.earlier, "runtime": self.runtime}
+        if self.distiller is None:
+            found = federate(*asked, **how, centre=centre)
+        else:
+            self.state.server = {}  # begins with the outputs of the cloud's network
+            found = federate_outputs(self.distiller, *asked, **how)
+        names = [*found.weights] if regional else name_like(found.weights, self.rules.personal_arrays)
         self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
         return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody

@@ -51,22 +51,25 @@ class LocalUpdate:
     loss: float  # mean over the local steps
     gradient: Weights = field(default_factory=dict)  # mean over the local steps, uncorrected; where `shift` was given
     extra: Weights = field(default_factory=dict)  # what else a strategy's clients send: see `Exchanges`
+    own: Weights = field(default_factory=dict)  # what a client keeps for the next round, where `own` was given
 
 
 @dataclass(frozen=True)
 class Correction:
-    """A change of a client's gradients at every local step: g + proximal (w - start) + shift.
+    """A change of a client's gradients at every local step: g + proximal (w - centre) + shift.
 
     The mean of g over the steps is to be returned as the update's `gradient` where there is a `shift`.
     """
 
     proximal: float = 0.0  # mu
     shift: Weights | None = None  # by name of parameter; one that is not in it is not shifted
+    centre: Weights | None = None  # by name of parameter; None: the weights that the round began with
 
     def arguments(self) -> dict[str, Any]:
         """Return the further arguments of `Trainable.train`: none where nothing is corrected."""
         found: dict[str, Any] = {"proximal": self.proximal} if self.proximal else {}
-        return found if self.shift is None else found | {"shift": self.shift}
+        arrays = {"shift": self.shift, "centre": self.centre}
+        return found | {name: each for name, each in arrays.items() if each is not None}
 
 
 class Trainable(Protocol):
@@ -74,6 +77,7 @@ class Trainable(Protocol):
 
     Strategies that correct the clients' gradients need a `train` that takes the arguments of `Correction`, too, and
     federations that exchange named layers alone need one that takes `layers`, patterns of the parameters to train.
+    Clients of FedMD get their mean outputs for weights, `own`, what they kept, and `imitation_steps`.
     """
 
     def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> Update:
@@ -81,4 +85,16 @@ class Trainable(Protocol):
 
         `seed` determines the batches and the augmentation: the same arguments give the same update.
         """
+        ...
+
+
+class Distiller(Protocol):
+    """What a server needs where clients send outputs on shared samples: its own, and a network that learns them."""
+
+    def outputs(self, weights: Weights) -> Weights:
+        """Return the outputs of a network with these weights."""
+        ...
+
+    def imitate(self, weights: Weights, outputs: Weights, *, steps: int, learning_rate: float, seed: int) -> Weights:
+        """Return the weights after local steps towards `outputs`."""
         ...

@@ -127,17 +127,20 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         proximal: float = 0.0,
         shift: Mapping[str, NDArray[np.number]] | None = None,
         layers: Sequence[str] = (),
+        centre: Mapping[str, NDArray[np.number]] | None = None,
     ) -> TrainedWeights:
         """Train for `steps` steps from `weights` at a constant learning rate; deterministic in its arguments.
 
-        The gradient of each step is g + proximal (w - weights) + shift, by name of parameter; with a `shift` the result
-        has the mean of g. With `layers`, patterns of names, all other parameters stay as they are. Raises `InputError`
-        if `weights` do not fit the network, or no parameter is named by `layers`.
+        The gradient of each step is g + proximal (w - centre) + shift, by name of parameter; `centre` is by default
+        `weights`. With a `shift` the result has the mean of g. With `layers`, patterns of names, all other parameters
+        stay as they are. Raises `InputError` if `weights` do not fit the network, or no parameter is named by `layers`.
         """
         network = self.task.build(self.config)
         from_arrays(network, weights)
         freeze_others(network, layers)
-        correction = GradientCorrection(weights, proximal, shift) if proximal or shift is not None else None
+        correction = None
+        if proximal or shift is not None:
+            correction = GradientCorrection(weights if centre is None else centre, proximal, shift)
         loss = train_steps(
             self.task,
             network,
@@ -165,15 +168,15 @@ def freeze_others(network: nn.Module, layers: Sequence[str]) -> None:
 
 
 class GradientCorrection:
-    """Correction of gradients in local training, g + proximal (w - start) + shift, which sums up the g that it sees."""
+    """Correction of gradients in local training, g + proximal (w - centre) + shift, which sums up the g it sees."""
 
     def __init__(
         self,
-        start: Mapping[str, NDArray[np.number]],
+        centre: Mapping[str, NDArray[np.number]],
         proximal: float,
         shift: Mapping[str, NDArray[np.number]] | None,
     ) -> None:
-        self._start = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in start.items()}
+        self._centre = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in centre.items()}
         self._shift = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in (shift or {}).items()}
         self._proximal, self._sum, self._steps = proximal, {}, 0
 
@@ -186,7 +189,7 @@ class GradientCorrection:
                 continue
             self._sum[name] = self._sum.get(name, 0) + parameter.grad
             if self._proximal:
-                parameter.grad += self._proximal * (parameter - self._start[name])
+                parameter.grad += self._proximal * (parameter - self._centre[name])
             if name in self._shift:
                 parameter.grad += self._shift[name]
 

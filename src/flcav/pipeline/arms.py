@@ -7,7 +7,12 @@ from typing import Literal
 from flcav.config import InputError
 from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects
+from flcav.perception.distillation import Imitates
+from flcav.perception.task import build_network, find_configuration
+from flcav.perception.tasks import TASKS, task_named
+from flcav.perception.weights import to_arrays
 from flcav.pipeline.recipe import (
     CENTRAL,
     CLOUD,
@@ -34,6 +39,7 @@ OF_ROUNDS = (  # fields of `Training` of federations alone
     "start_share",
 )
 LEARNED = ("plan", "training", "repeat", "placement", "labels", "federation")  # those that decide a federation
+OF_EDGE = (*LEARNED[:-1], "edge_federation")  # those that decide a federation without the cloud
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,11 @@ class Setting:
         """Return the training by task without what decides federations alone."""
         of_rounds = {name: field.default for name, field in Training.model_fields.items() if name in OF_ROUNDS}
         return {task: training.model_copy(update=of_rounds) for task, training in self.training.items()}
+
+    @property
+    def edge_federation(self) -> Federation:
+        """Return the federation without what decides stage III alone."""
+        return self.federation.model_copy(update={"personal": (), "cloud_strategy": None})
 
 
 def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:
@@ -105,6 +116,10 @@ def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
     cloud = of_servers(edge) if how.cloud_strategy is None else strategy_named(how.cloud_strategy)
     if isinstance(cloud, Corrects):
         raise InputError(f"cloud_strategy: {type(cloud).__name__} corrects local steps, and edge servers take none")
+    if isinstance(cloud, FedMD):
+        raise InputError(
+            "cloud_strategy: FedMD shares frames among vehicles, and edge servers have no networks of their own"
+        )
     return edge, cloud
 
 
@@ -122,11 +137,35 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
             raise InputError(
                 "federation.network: a deadline leaves other numbers of clients, and noise is for one number"
             )
+        if isinstance(edge, FedMD) and setting.central is None:
+            _check_outputs(recipe, setting)
         for region in setting.regions:
             if recipe.regions[region].data is None:
                 check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])
         if CLOUD in setting.stages:
             check_rules(cloud, setting.federation.of_servers(), setting.regions)
+        for task in recipe.tasks if setting.federation.personal or setting.federation.upload.layers else ():
+            _check_arrays(task, recipe.tasks[task].network, setting)
+
+
+def _check_outputs(recipe: RunRecipe, setting: Setting) -> None:
+    """Raise `InputError` where vehicles cannot send class probabilities: for such a task, or on a network."""
+    for name in recipe.tasks:
+        if not isinstance(task_named(name), Imitates):
+            fit = " and ".join(each for each in TASKS if isinstance(task_named(each), Imitates))
+            raise InputError(f"strategy fedmd: '{name}' has no class probabilities of shared frames; {fit} have")
+    if setting.federation.network is not None:
+        raise InputError("federation.network: its clock knows updates of weights alone, and fedmd sends probabilities")
+
+
+def _check_arrays(task: str, network: str | None, setting: Setting) -> None:
+    """Raise `InputError` where patterns of names do not fit the arrays of a task's network."""
+    learned = task_named(task)
+    weights = to_arrays(build_network(learned, find_configuration(learned, network), 0))
+    if setting.federation.upload.layers:
+        setting.federation.upload.check_layers(weights)
+    if CLOUD in setting.stages:
+        setting.federation.check_personal(weights)
 
 
 class Names:
@@ -162,11 +201,11 @@ class Names:
 
     def edge(self, arm: str, region: str, task: str) -> str:
         """Return stage II of a task in a region."""
-        return f"{region}-{EDGE}-fl-{task}" + self._suffix(arm, LEARNED, task)
+        return f"{region}-{EDGE}-fl-{task}" + self._suffix(arm, OF_EDGE, task)
 
     def more_edge(self, arm: str, region: str, task: str) -> str:
         """Return the further edge rounds of a task in a region."""
-        return f"{region}-more-{EDGE}-fl-{task}" + self._suffix(arm, LEARNED, task)
+        return f"{region}-more-{EDGE}-fl-{task}" + self._suffix(arm, OF_EDGE, task)
 
     def cloud(self, arm: str, task: str) -> str:
         """Return stage III of a task."""

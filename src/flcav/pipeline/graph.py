@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError, shorten
+from flcav.federation.strategies import sends_outputs
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import count_training_frames, hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
@@ -163,6 +164,16 @@ class Graph:
             raise InputError(f"regions: there is no dataset folder {shorten(named)} in {self.beside}")
         return found.absolute()
 
+    def _air(self) -> dict[str, Any]:
+        """Return what a plan within a horizon predicts times on the network from; nothing without a network."""
+        network = self.recipe.federation.network
+        if network is None or self.recipe.horizon_s is None:
+            return {}
+        first = next(task for task in self.recipe.tasks if self._first(task))
+        drives = {region: self.names.recording(region, "registry", first) for region in self.federating}
+        how = {"network": network.model_dump(mode="json"), "range_m": self.recipe.placement.range_m}
+        return {"air": how | {"drives": drives}}
+
     def _histories(self) -> dict[str, str]:
         """Return the learning history (CSV) of each task that has one, as text: another text, another plan."""
         own = {name: task.history for name, task in self.recipe.tasks.items()}
@@ -210,8 +221,11 @@ class Graph:
             planned["uploads"] = {"regions": starts, "network": network, "range_m": recipe.placement.range_m}
         if self.recorded:
             planned["recorded"] = self.recorded
+        planned |= self._air()
         plan = names.plan(arm.name)
-        self._add(_step(plan, plan_step, planned, [step for steps in pools.values() for step in steps]))
+        needs = [step for steps in pools.values() for step in steps]
+        needs += planned["air"]["drives"].values() if "air" in planned else ()
+        self._add(_step(plan, plan_step, planned, needs))
         for task in recipe.tasks:
             own = {region: names.recording(region, "pool", task) for region in starts}
             validation = [names.recording(region, "validation", task) for region in starts]
@@ -285,6 +299,8 @@ class Graph:
         names = self.names
         helped = any(LABEL_SOURCES[each.labels[task]].from_poles for each in self.settings.values())
         reported = {"errors": names.errors(arm.name, region, task)} if task in arm.placement.tasks else {}
+        if sends_outputs(arm.federation.strategy):
+            reported |= {"pools": self._pools(task)}  # shared frames are drawn from them
         return reported | {
             "plan": names.plan(arm.name, stage),
             "pretrain": names.pretrain(arm.name, task),
@@ -295,9 +311,9 @@ class Graph:
             "recorded": self.recipe.regions[region].data is not None,
         }
 
-    def _federation(self, arm: Setting, task: str) -> dict[str, Any]:
-        """Return the settings that all federated stages of a task have in common."""
-        federation = arm.federation.model_dump(mode="json")
+    def _federation(self, arm: Setting, task: str, stage: str) -> dict[str, Any]:
+        """Return the settings that a federated stage of a task depends on."""
+        federation = (arm.federation if stage == CLOUD else arm.edge_federation).model_dump(mode="json")
         own = {"labels": arm.labels[task], "federation": federation, "budget_mb": self._budget_mb}
         if arm.federation.network is not None:
             given = {name: self.recipe.regions[name].speed for name in self.recipe.with_role("federate")}
@@ -316,7 +332,7 @@ class Graph:
                 name = self.names.edge(arm.name, region, task)
                 own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
                 own |= self._replan(arm, task, EDGE, region, name)
-                self._add(_step(name, edge_step, self._federation(arm, task) | own, _named_in(steps, own)))
+                self._add(_step(name, edge_step, self._federation(arm, task, EDGE) | own, _named_in(steps, own)))
 
     def _add_further(self, arm: Setting) -> None:
         """Add what follows stage II: stage III or further edge rounds."""
@@ -331,21 +347,20 @@ class Graph:
             }
             if last == CLOUD:
                 needs = [step for steps in edges.values() for step in _named_in(steps)]
-                arguments = self._federation(arm, task) | {"regions": edges}
+                arguments = self._federation(arm, task, last) | {"regions": edges}
                 arguments |= self._replan(arm, task, CLOUD, None, names.cloud(arm.name, task))
                 needs += _named_in({}, arguments)
                 self._add(_step(names.cloud(arm.name, task), cloud_step, arguments, needs))
                 continue
             for region, steps in edges.items():
-                name = names.more_edge(arm.name, region, task)
-                more = self._federation(arm, task) | {"region": region, "vehicles": self._vehicles(), "steps": steps}
+                name, own = names.more_edge(arm.name, region, task), self._federation(arm, task, last)
+                more = own | {"region": region, "vehicles": self._vehicles(), "steps": steps}
                 more |= self._replan(arm, task, MORE_EDGE, region, name)
                 self._add(_step(name, edge_step, more, _named_in(steps, more)))
 
     def _central(self, arm: Setting, region: str, task: str) -> Step:
         steps = self._rests_on(arm, region, task, CENTRAL)
-        starts = self.recipe.with_role("pretrain")
-        pools = {name: self.names.recording(name, "pool", task) for name in starts}
+        pools = self._pools(task)
         arguments = {
             **self._learning(arm, task),
             "region": region,
@@ -358,6 +373,10 @@ class Graph:
         arguments |= follows
         needs = [*_named_in(steps), *pools.values(), *follows.values()]
         return _step(self.names.central(arm.name, region, task), central_step, arguments, needs)
+
+    def _pools(self, task: str) -> dict[str, str]:
+        """Return the steps that record a task's candidates for upload, by region."""
+        return {region: self.names.recording(region, "pool", task) for region in self.recipe.with_role("pretrain")}
 
     @property
     def shown(self) -> tuple[str, str] | None:
@@ -402,4 +421,5 @@ def _named_in(steps: Mapping[str, Any], arguments: Mapping[str, Any] = {}) -> li
     one = [steps[key] for key in ("plan", "pretrain", "errors", "frames", "place", "edge") if key in steps]
     replan: Mapping[str, Any] = arguments.get("replan", {})
     replanned = [replan[key] for key in ("first", "follows") if key in replan]
-    return [*one, *steps.get("sites", ()), *replanned, *replan.get("frames", {}).values()]
+    given = (*steps.get("sites", ()), *steps.get("pools", {}).values())
+    return [*one, *given, *replanned, *replan.get("frames", {}).values()]

@@ -61,6 +61,7 @@ class PlanRequest:
     history: History | None  # None: the plan is fixed
     fixed: FixedPlan | None
     train_s: float = 0.0  # time that a vehicle trains in one round [s]
+    air_s: Mapping[str, float] = field(default_factory=dict)  # time of a round's messages on the air [s], by region
 
 
 @dataclass(frozen=True)
@@ -228,7 +229,10 @@ def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
             "cloud_rounds": cloud,
         },
         "train_s": task.train_s,
-        "vehicle_train_s": {name: task.train_s / speed for name, speed in frame.speeds.items()},
+        "vehicle_train_s": {
+            name: task.train_s / speed + task.air_s.get(name.rpartition("/")[0], 0.0)
+            for name, speed in frame.speeds.items()
+        },
         "curve": found.curve.model_dump(),
     }
 

@@ -8,6 +8,7 @@ vehicles federate with their edge server. Stage III: edge servers federate with 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.choice import open_runtime
 from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate
+from flcav.federation.stages import EdgeServer, Schedule, afford_cloud_rounds, federate, federate_outputs
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
@@ -25,6 +26,7 @@ from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.messages import send
 from flcav.perception.client import TaskClient, as_shared
+from flcav.perception.distillation import OutputClient, SharedSamples
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.training import Checkpointing, Validation, train, train_steps
@@ -191,6 +193,11 @@ def make_clients(learning: Learning, config: Any, samples: Mapping[str, Sequence
     }
 
 
+def give_outputs(clients: Mapping[str, TaskClient], shared: SharedSamples, start: Weights) -> dict[str, OutputClient]:
+    """Return clients that send outputs on `shared` samples, and begin with a network of the weights `start`."""
+    return {name: OutputClient(client, shared, start) for name, client in clients.items()}
+
+
 @dataclass(frozen=True)
 class RegionStart:
     """Where a region's edge server starts in stage III."""
@@ -230,6 +237,7 @@ def federate_edge(
     processes: int = 1,
     runtime: str = "embedded",
     replanning: Replanning | None = None,
+    shared: SharedSamples | None = None,
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
 
@@ -237,7 +245,7 @@ def federate_edge(
     After each round the network that a federation of so many rounds ends with is scored on `validation`, frames by
     region. Vehicles train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights.
     The vehicles that `outages` name by round are lost in it. Under `replanning` the number of rounds, who joins them
-    and who is lost are those of the plan before each.
+    and who is lost are those of the plan before each. With `shared` samples vehicles send outputs on these.
     """
     state, task, averaged = FederationState(), learning.task, learning.training.average_rounds
     share = 0.0 if earlier else learning.training.start_share
@@ -252,19 +260,24 @@ def federate_edge(
     start, done = federating.resume(to_arrays(network))
     account = Account(book, EDGE, task.name, "wireless", outages)
     how: Any = {"strategy": strategy, "state": state, "earlier": earlier}
-    with open_runtime(runtime, clients, processes) as where:
+    run, asked = (
+        (federate, clients)
+        if shared is None
+        else (partial(federate_outputs, shared), give_outputs(clients, shared, to_arrays(network)))
+    )
+    with open_runtime(runtime, asked, processes) as where:
         how["runtime"] = where
         if replanning is None:
             keep = federating.make_saver(schedule.rounds)
-            federate(clients, start, schedule, account, **how, rules=rules, done=done, on_round=keep)
+            run(asked, start, schedule, account, **how, rules=rules, done=done, on_round=keep)
         else:
             course = replanning.course
 
             def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
                 own, lossy = course.schedule(schedule, number), replace(account, outages=driven.outages)
                 keep = federating.make_saver(course.rounds)
-                asked: Any = {**how, "rules": driven.rules, "done": number - 1, "on_round": keep}
-                found = federate(clients, weights, own, lossy, **asked)
+                given: Any = {**how, "rules": driven.rules, "done": number - 1, "on_round": keep}
+                found = run(asked, weights, own, lossy, **given)
                 return found if len(federating.losses) == number else None
 
             replanning.run(start, done, federating.scores, run_round)
@@ -286,13 +299,15 @@ def federate_cloud(
     outages: Mapping[tuple[int, str], Outage] = {},
     validation: Mapping[str, Frames] = {},
     replanning: Replanning | None = None,
+    shared: SharedSamples | None = None,
 ) -> tuple[float, ...]:
     """Run stage III from `network`; `regions`: where each edge server starts.
 
     An edge server runs `edge_rounds` rounds in a cloud round, by `rules`; the cloud's rounds need all edge servers, and
     an edge round loses the vehicles that `outages` names. Writes weights and ledger, returns each round's loss. Where
-    rules make arrays personal, the weights have the mean of the regions' own, and each region's model is beside them.
-    Validation and `replanning` are as in `federate_edge`.
+    rules make arrays personal, the weights have the mean of the regions' own, and each region's model is beside them,
+    as are regional models. Validation and `replanning` are as in `federate_edge`. With `shared` samples vehicles, which
+    begin with their region's weights, send outputs.
     """
     state, own_states = FederationState(), {region: FederationState() for region in regions}
     states = {CLOUD: state, **{f"{EDGE}/{region}": own for region, own in own_states.items()}}
@@ -317,7 +332,7 @@ def federate_cloud(
     wireline = Account(book, CLOUD, learning.task.name, "wireline")
     servers = {
         region: EdgeServer(
-            own.clients,
+            own.clients if shared is None else give_outputs(own.clients, shared, own.weights),
             edge_rounds,
             wireless,
             own.weights,
@@ -326,6 +341,7 @@ def federate_cloud(
             rules=rules,
             state=own_states[region],
             earlier=own.earlier,
+            distiller=shared,
         )
         for region, own in regions.items()
     }
@@ -336,7 +352,7 @@ def federate_cloud(
         keep = federating.make_saver(rounds)
 
         def keep_whole(round_: int, weights: Weights, loss: float) -> None:
-            personal = [own.personal for own in own_states.values() if own.personal]
+            personal = [own.personal for own in own_states.values() if own.personal and rules.personal_arrays]
             keep(round_, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
 
         return keep_whole

@@ -11,13 +11,15 @@ from regression import START, TRUTH, Regression, ledger, vehicles
 from scipy.stats import trim_mean
 
 from flcav.config import InputError
-from flcav.federation.rules import Rules
+from flcav.federation.privacy import Privacy
+from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, check_federation, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, STRATEGIES, of_servers, strategy_named
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.fedprox import FedProx
 from flcav.federation.strategies.fedyogi import FedYogi
 from flcav.federation.strategies.krum import Krum
@@ -25,6 +27,7 @@ from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.federation.trainable import LocalUpdate
+from flcav.federation.upload import Upload
 from flcav.seeds import derive_seed
 
 RATE, STEPS = 0.02, 5
@@ -224,6 +227,10 @@ def test_what_makes_no_sense_is_one_sentence():
         (Scaffold(), Rules(), r"Scaffold needs clients whose training takes 'shift'"),
         (Krum(byzantine=1), Rules(), r"krum: 5 clients or more are wanted for byzantine = 1 and kept = 1, .* are 3"),
         (TrimmedMean(0.2), Rules(), r"trimmed-mean: a fraction of 0\.2 of 3 clients leaves nobody out"),
+        (FedMD(), Rules(), r"FedMD needs clients whose training takes 'own'"),
+        (FedMD(), Rules(upload=Upload(layers=("w",))), r"FedMD sends class probabilities, and 'upload.layers' names"),
+        (FedMD(), Rules(privacy=Privacy(clip=1.0, noise=1.0)), r"FedMD sends class probabilities, and noise is for"),
+        (FedMD(), Rules(personal=RegionalModels(pull=1.0)), r"FedMD's vehicles have networks of their own, which regi"),
         (FEDAVG, Rules(least_clients=4), r"least_clients: 4 are wanted in a round, and 3 take part"),
     ):
         with pytest.raises(InputError, match=said):

@@ -2,7 +2,8 @@
 
 import os
 import signal
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.state import FederationState
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import LocalUpdate, Weights
 
 SCHEDULE = Schedule(rounds=1, steps=5, learning_rate=0.05, final_learning_rate=0.01, seed=3)
@@ -25,10 +27,20 @@ class Mortal(Regression):
 
     killed: bool = False
 
-    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+    def train(
+        self,
+        weights: Weights,
+        *,
+        steps: int,
+        learning_rate: float,
+        seed: int,
+        own: Weights | None = None,
+        imitation_steps: int = 0,
+    ) -> LocalUpdate:
         if self.killed:
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().train(weights, steps=steps, learning_rate=learning_rate, seed=seed)
+        found = super().train({**weights, **(own or {})}, steps=steps, learning_rate=learning_rate, seed=seed)
+        return found if own is None else replace(found, own=found.weights)
 
 
 def test_clients_in_two_processes_federate_to_the_same_bits_and_one_killed_is_named():
@@ -41,10 +53,16 @@ def test_clients_in_two_processes_federate_to_the_same_bits_and_one_killed_is_na
     )
     with ClientProcesses(clients, 2) as processes:
         found = federate(clients, START, SCHEDULE, account, rules=rules, state=state, runtime=processes)
+        own = FederationState()  # of clients that keep networks between rounds
+        where = Account(ledger(), "edge", "regression", "wireless")
+        asked: Any = (START, replace(SCHEDULE, rounds=3), where)
+        keeping = federate(clients, *asked, strategy=FedMD(), rules=rules, state=own, runtime=processes)
     left = {name: client for name, client in clients.items() if name != "grid/cav1"}
     alone = Account(ledger(), "edge", "regression", "wireless")
     want = federate(left, START, SCHEDULE, alone)
     np.testing.assert_array_equal(found.weights["w"], want.weights["w"])
+    np.testing.assert_array_equal(keeping.weights["w"], federate(left, *asked, strategy=FedMD()).weights["w"])
+    assert set(own.clients) == set(left)
     assert [record.clients for record in state.records] == [tuple(left)]
     assert state.records[0].failed == {"grid/cav1": "ClientKilled('its process was killed while it trained')"}
     assert [each for each in account.ledger.entries if each.client != "grid/cav1"] == [*alone.ledger.entries]

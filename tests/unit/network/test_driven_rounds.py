@@ -17,6 +17,7 @@ from flcav.network.ledger import Budget, Ledger
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.wireline import Wireline
 from flcav.pipeline.federations.network import DrivenRounds, Fleet, drive_rounds, join_regions
+from flcav.pipeline.federations.prediction import predict_air_s
 from flcav.pipeline.recipe import CLOUD
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
@@ -175,3 +176,13 @@ def test_importance_cannot_be_driven() -> None:
         )
         with pytest.raises(InputError, match=f"federation.network: .*{said}"):
             check_federations(recipe, resolve_settings(recipe, {"objects": "ideal-road"}).values())
+
+
+def test_a_plan_s_time_on_the_air_is_the_mean_of_those_that_share_the_band():
+    """5 MB down and 10 MB up at 20 Mbit/s: 6 s alone, 12 s for each of two; a third has no rate, a fourth is away."""
+    alone = made_links(np.arange(0.0, 40.0), {"cav0": 30.0})
+    pair = made_links(np.arange(0.0, 40.0), {"cav0": 30.0, "cav1": 30.0, "cav3": np.nan})
+    deaf = made_links(np.arange(0.0, 40.0), {"cav2": -60.0})
+    assert predict_air_s([alone], 5_000_000, 10_000_000) == pytest.approx(6.0)
+    assert predict_air_s([alone, pair, deaf], 5_000_000, 10_000_000) == pytest.approx((6.0 + 12.0 + 12.0) / 3)
+    assert predict_air_s([deaf, made_links([0.0], {"cav0": 30.0})], 5_000_000, 10_000_000) is None

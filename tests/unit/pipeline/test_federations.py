@@ -65,6 +65,13 @@ def settings(arms: dict[str, Any], **federation: Any) -> tuple[RunRecipe, Any]:
             "selection: 5 clients are wanted in a round, and there are 4",
         ),
         ({"least_clients": 5}, "least_clients: 5 are wanted in a round, and 4 take part"),
+        ({"cloud_strategy": "fedmd"}, "cloud_strategy: FedMD shares frames among vehicles, and edge servers have no"),
+        ({"strategy": "fedmd"}, "strategy fedmd: 'objects' has no class probabilities .*; weather and signs have"),
+        ({"strategy": {"fedmd": {"frames": 0}}}, "strategy 'fedmd': frames = 0: "),
+        ({"personal": ["tail.*"]}, "personal: 'tail.\\*' matches none of [0-9]+ arrays, such as '"),
+        ({"personal": ["*"]}, "personal: \\* leave nothing for the regions to average"),
+        ({"personal": {"pull": 1}, "strategy": "fedprox"}, "FedProx corrects local steps, and so does the pull"),
+        ({"upload": {"layers": ["tail.*"]}}, "layers: 'tail.\\*' matches none of [0-9]+ arrays, such as '"),
     ],
 )
 def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any, said: str) -> None:
@@ -147,6 +154,22 @@ def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
     assert found[None]["bias"] == pytest.approx((found["a"]["bias"] + found["b"]["bias"]) / 2)
     with pytest.raises(InputError, match="personal: 'head' matches none of 2 arrays"):
         federate_cloud(learning, network, starts, 2, 1, strategies, Rules(personal=("head",)), *where)
+
+
+def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2, average_rounds=1), 3)
+    network = learning.build_network()
+    starts = {}
+    for region, x in (("a", 1.0), ("b", 4.0)):
+        clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
+        starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
+    strategies, where = Strategies(FEDAVG, FEDAVG), (Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    rules = Rules.model_validate({"personal": {"pull": 0.5}})
+    federate_cloud(learning, network, starts, 2, 1, strategies, rules, *where)
+    found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
+    for name in ("weight", "bias"):
+        assert found["a"][name] != found["b"][name]
+        assert found[None][name] == pytest.approx((found["a"][name] + found["b"][name]) / 2)
 
 
 def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:

@@ -200,6 +200,13 @@ def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> 
         assert {each for name in names for each in own.joins[name]} == set(
             range(1, 1 + own.edge_rounds + own.cloud_rounds)
         )
+    on_air, slower = make_plan((replace(asked(), train_s=2.0, air_s={"b": 1.0}),), settings, "joint")
+    assert slower is not None
+    for name, speed in speeds.items():
+        assert slower.tasks[0].vehicle_train_s[name] == 2.0 / speed + (1.0 if name.startswith("b/") else 0.0)
+    air_joins = on_air.tasks["objects"].joins
+    assert air_joins is not None
+    assert all(len(air_joins[name]) * slower.tasks[0].vehicle_train_s[name] <= 12.0 for name in speeds)
     later = remake_plan(first, problem, "edge", {"objects": 0.4}, Price(own.wireless_mb / 2, own.wireline_mb / 2))
     joins = later.tasks["objects"].joins
     assert joins is not None

@@ -58,6 +58,29 @@ def test_an_arm_adds_what_it_does_differently_and_no_more() -> None:
     assert {name for name in plain if plain[name] == armed[name]} >= {"plan", "pretrain-objects", "grid-place"}
 
 
+def test_arms_of_which_only_stage_three_differs_share_stage_two() -> None:
+    plain = steps_of(recipe_of())
+    for own in ({"personal": ["head.*"]}, {"personal": {"pull": 0.1}}, {"cloud_strategy": "fedadam"}):
+        armed = steps_of(recipe_of(arms={"own": {"federation": own}}))
+        models = ("", "of-grid-") if "personal" in own else ("",)
+        tests = {f"test-cloud-fl-objects-own-{m}{where}" for m in models for where in ("suburb", "grid", "arterial")}
+        assert set(armed) - set(plain) == {"cloud-fl-objects-own", *tests}
+        assert {name: armed[name] for name in plain} == plain
+
+
+def test_a_plan_within_a_horizon_reckons_with_the_network() -> None:
+    def plan(**changes: Any) -> Any:
+        return next(step for step in Graph(recipe_of(**changes), Path()).steps if step.name == "plan")
+
+    on_air = plan(horizon_s=60.0, federation={"network": {"radio": {"bandwidth_mhz": 20}}})
+    assert on_air.arguments["air"]["drives"] == {"grid": "grid-registry-objects"}
+    assert on_air.arguments["air"]["network"]["radio"]["bandwidth_mhz"] == 20
+    assert "grid-registry-objects" in on_air.needs
+    for without in (plan(), plan(horizon_s=60.0), plan(federation={"network": {}})):
+        assert "air" not in without.arguments
+        assert "grid-registry-objects" not in without.needs
+
+
 def test_further_edge_rounds_go_on_from_the_runs_own_edge_rounds() -> None:
     armed = Graph(recipe_of(arms={"further": {"stages": ["edge", "more_edge"]}}), Path())
     plain = {step.name for step in Graph(recipe_of(), Path()).steps}

@@ -9,6 +9,7 @@ from flcav.config import InputError, shorten
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavg import FedAvg
 from flcav.federation.strategies.fedavgm import FedAvgM
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.fedprox import FedProx
 from flcav.federation.strategies.fedyogi import FedYogi
 from flcav.federation.strategies.krum import Krum
@@ -26,6 +27,7 @@ STRATEGIES: dict[str, type[Strategy]] = {
     "fedadam": FedAdam,
     "fedyogi": FedYogi,
     "scaffold": Scaffold,
+    "fedmd": FedMD,
     "median": Median,
     "trimmed-mean": TrimmedMean,
     "krum": Krum,
@@ -74,9 +76,16 @@ def exchanges_more(spec: Spec) -> bool:
     return name in STRATEGIES and issubclass(STRATEGIES[name], Exchanges)
 
 
+def sends_outputs(spec: Spec) -> bool:
+    """Return whether clients of one of `STRATEGIES` send probabilities instead of weights; see `exchanges_more`."""
+    name = spec if isinstance(spec, str) else next(iter(spec), "")
+    return name in STRATEGIES and issubclass(STRATEGIES[name], FedMD)
+
+
 def of_servers(strategy: Strategy) -> Strategy:
     """Return the strategy among edge servers, which federate with the cloud, where vehicles have `strategy`.
 
-    It is the same one, unless it corrects the gradients of local steps: edge servers take none, and FedAvg is used.
+    It is the same one, unless it is about vehicles alone: edge servers take no local steps whose gradients could be
+    corrected, and share no samples. Then it is FedAvg.
     """
-    return FEDAVG if isinstance(strategy, Corrects) else strategy
+    return FEDAVG if isinstance(strategy, Corrects | FedMD) else strategy

@@ -1,7 +1,7 @@
 """Inference of the sign detector: decoding, score threshold and class-agnostic non-maximum suppression."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from flcav.perception.ops.rectangles import nms
 from flcav.perception.signs.augment import GREY
 from flcav.perception.signs.config import STRIDES
 from flcav.perception.signs.model import SignDetector, decode
+from flcav.perception.signs.samples import Sample
+from flcav.perception.signs.targets import assign_anchors
 from flcav.perception.task import Result
 from flcav.records import Class
 
@@ -80,6 +82,32 @@ def detect(network: SignDetector, picture: Picture, *, threshold: float) -> Dete
             for level, maps in enumerate(raw)
         ]
         found = _chosen(torch.cat(cells), threshold, picture)
+    network.train(training)
+    return found
+
+
+def class_probabilities(network: SignDetector, samples: Sequence[Sample]) -> list[NDArray[np.float32]]:
+    """Return the class probabilities (boxes, classes) of the boxes of each sample; sides are multiples of 32.
+
+    A box has the mean of the anchors that it is assigned to in training, and zeros where there are none. The network's
+    training mode is left as it was.
+    """
+    training, found = network.training, []
+    network.eval()
+    with torch.inference_mode():
+        for sample in samples:
+            total, count = (
+                torch.zeros(len(sample.boxes), len(network.config.classes)),
+                torch.zeros(len(sample.boxes), 1),
+            )
+            numbered = replace(sample, label=np.arange(len(sample.boxes)))
+            for maps, at in zip(
+                predict(network, [sample.picture]), assign_anchors([numbered], network.config), strict=True
+            ):
+                shares = maps[at.image, at.anchor, at.row, at.column, 5:].sigmoid().cpu()
+                total.index_add_(0, at.label, shares)
+                count.index_add_(0, at.label, torch.ones(len(at.label), 1))
+            found.append((total / count.clamp(min=1)).numpy())
     network.train(training)
     return found
 

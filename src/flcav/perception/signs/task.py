@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
@@ -16,10 +17,11 @@ from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
 from flcav.perception.signs.errors import register_errors
 from flcav.perception.signs.evaluate import SignsEvaluation, mean_average_precision
 from flcav.perception.signs.infer import detect_signs
-from flcav.perception.signs.loss import batch_loss
+from flcav.perception.signs.loss import batch_loss, imitation_loss
 from flcav.perception.signs.messages import pack_frame, unpack_frame
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.outcomes import SignsOutcomes, by_picture
+from flcav.perception.signs.predict import class_probabilities
 from flcav.perception.signs.samples import RecordedPictures, Sample
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
@@ -61,6 +63,16 @@ class SignsTask(SignsOutcomes):
     def loss(self, network: SignDetector, samples: Sequence[Sample]) -> Tensor:
         """Return the loss of a batch of images of one size, whose sides are multiples of 32."""
         return batch_loss(network, samples)
+
+    def class_probabilities(self, network: SignDetector, samples: Sequence[Sample]) -> list[NDArray[np.float32]]:
+        """Return the class probabilities (boxes, classes) of the boxes of each image."""
+        return class_probabilities(network, samples)
+
+    def imitation_loss(
+        self, network: SignDetector, samples: Sequence[Sample], targets: Sequence[NDArray[np.float32]]
+    ) -> Tensor:
+        """Return the loss of a batch whose boxes have class probabilities instead of labels."""
+        return imitation_loss(network, samples, targets)
 
     def evaluate(
         self,

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.dataset.store import Dataset
@@ -15,10 +16,11 @@ from flcav.perception.weather.augment import augment
 from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
 from flcav.perception.weather.evaluate import Classification, evaluate_samples
 from flcav.perception.weather.infer import classify_pictures
-from flcav.perception.weather.loss import batch_loss
+from flcav.perception.weather.loss import batch_loss, imitation_loss
 from flcav.perception.weather.messages import pack_frame, unpack_frame
 from flcav.perception.weather.model import Classifier, LeNet
 from flcav.perception.weather.outcomes import WeatherOutcomes
+from flcav.perception.weather.predict import predict_probabilities
 from flcav.perception.weather.samples import Sample, label_pictures
 from flcav.progress import Report, ignore_progress
 from flcav.world.weather import WEATHER_CLASSES
@@ -58,6 +60,16 @@ class WeatherTask(WeatherOutcomes):
     def loss(self, network: Classifier, samples: Sequence[Sample]) -> Tensor:
         """Return the mean cross entropy of a batch."""
         return batch_loss(network, samples)
+
+    def class_probabilities(self, network: Classifier, samples: Sequence[Sample]) -> list[NDArray[np.float32]]:
+        """Return the class probabilities (1, classes) of each image."""
+        return [*predict_probabilities(network, [sample.picture for sample in samples])[:, None]]
+
+    def imitation_loss(
+        self, network: Classifier, samples: Sequence[Sample], targets: Sequence[NDArray[np.float32]]
+    ) -> Tensor:
+        """Return the mean cross entropy of a batch with class probabilities for targets."""
+        return imitation_loss(network, samples, targets)
 
     def evaluate(
         self,

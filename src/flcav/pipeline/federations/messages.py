@@ -1,5 +1,6 @@
 """Messages before the rounds of a region: the pretrained network to its vehicles, and the mistakes that they report."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from flcav.network.ledger import Ledger
@@ -13,12 +14,19 @@ from flcav.pipeline.recipe import EDGE
 
 def release_network(book: Ledger, task: Task, network: Any, region: str, drive: Frames) -> Any:
     """Return a network as the vehicles receive it: from the cloud to the edge server by wireline, then by wireless."""
-    about: Any = {"stage": EDGE, "task": task.name, "direction": "down"}
-    received = at_edge = send(book, pack(to_arrays(network)), **about, link="wireline", client=region)
-    for vehicle in sorted({drive.data.keys[i].agent for i in drive.vehicles}):
-        received = send(book, at_edge, **about, link="wireless", client=f"{region}/{vehicle}")
-    from_arrays(network, unpack(received))
+    vehicles = sorted({drive.data.keys[i].agent for i in drive.vehicles})
+    clients = [f"{region}/{vehicle}" for vehicle in vehicles]
+    from_arrays(network, unpack(send_to_vehicles(book, pack(to_arrays(network)), task, region, clients)))
     return network
+
+
+def send_to_vehicles(book: Ledger, message: bytes, task: Task, region: str, clients: Iterable[str]) -> bytes:
+    """Return a message as a region's vehicles receive it: from the cloud by wireline, then to each by wireless."""
+    about: Any = {"stage": EDGE, "task": task.name, "direction": "down"}
+    received = at_edge = send(book, message, **about, link="wireline", client=region)
+    for client in clients:
+        received = send(book, at_edge, **about, link="wireless", client=client)
+    return received
 
 
 def report_errors(book: Ledger, task: Task, found: Registry, region: str, drive: Frames) -> Registry:

@@ -6,15 +6,18 @@ from typing import Literal
 
 import numpy as np
 
-from flcav.config import read_config
+from flcav.config import InputError, read_config
 from flcav.files import write_json
+from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Link
 from flcav.network.plan import MessageSizes, Price
+from flcav.network.radio.links import RadioLinks
 from flcav.optimization.problem import Problem
 from flcav.perception.client import as_shared
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import PlanRule
+from flcav.pipeline.federations.prediction import link_drive, predict_air_s
 from flcav.pipeline.federations.replanning import price_rounds, settle
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.planning import (
@@ -44,16 +47,20 @@ def plan_step(
     updates: Sequence[Fields] = (),
     recorded: Mapping[str, Mapping[str, int]] | None = None,
     uploads: Fields | None = None,
+    air: Fields | None = None,
 ) -> None:
     """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables.
 
     `updates` are the forms of the arms' updates, of which the largest is planned with; default: whole updates.
     `recorded`: of federating regions of recorded data, the vehicles with their numbers of training frames. `uploads`:
-    how the vehicles' uploads are planned, see `plan_uploads`; None: they are drawn.
+    how the vehicles' uploads are planned, see `plan_uploads`; None: they are drawn. `air`: the network that counts in
+    the time of a round, its "range_m" of traffic, and by region the "drives" that it is predicted from; None: vehicles
+    train alone.
     """
     asked_for = RunRecipe.model_validate(recipe)
     asked, held = [], _held_frames(asked_for, recorded or {})
     forms = tuple(UpdateForm.model_validate(update) for update in updates) or (UpdateForm(),)
+    linked = {} if air is None else _link_drives(work, asked_for, recorded or {}, air)
     for name in asked_for.tasks:
         task, network = task_named(name), asked_for.tasks[name].network
         config = find_configuration(task, network)
@@ -66,10 +73,12 @@ def plan_step(
         messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network, forms))
         own = asked_for.tasks[name]
         history = parse_history(name, histories[name], name) if name in histories else None
-        asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan, own.train_s))
+        whole_mb = model_mb(task, network) if linked else 0.0
+        air_s = {region: _predict(region, name, scenes, whole_mb, messages) for region, scenes in linked.items()}
+        asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan, own.train_s, air_s))
     budgets = Price(asked_for.budgets_mb.wireless, asked_for.budgets_mb.wireline)
     k = asked_for.federation.edge_rounds_per_cloud_round
-    speeds = _list_speeds(asked_for, held)
+    speeds = _list_speeds(asked_for, held, linked)
     groups, samples = tuple(map(len, held.values())), tuple(sum(own.values()) for own in held.values())
     frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k, samples, asked_for.horizon_s, speeds)
     plan, problem = make_plan(tuple(asked), frame, rule)
@@ -118,12 +127,37 @@ def replan_step(
     replace(made, tasks={**made.tasks, **booked}).save(work.folder)
 
 
-def _list_speeds(recipe: RunRecipe, held: Mapping[str, Mapping[str, int]]) -> dict[str, float]:
-    """Return the speed of every vehicle by its name in a federation; empty where no region gives any.
+def _link_drives(
+    work: Work, recipe: RunRecipe, recorded: Mapping[str, Mapping[str, int]], air: Fields
+) -> dict[str, list[RadioLinks]]:
+    """Return the links of each region's drives, see `plan_step`."""
+    settings = NetworkSettings.model_validate(air["network"])
+    return {
+        region: link_drive(
+            region, Frames.open(work.inputs[step]), settings, air["range_m"], recipe.seed, region in recorded
+        )
+        for region, step in air["drives"].items()
+    }
+
+
+def _predict(region: str, task: str, scenes: Sequence[RadioLinks], whole_mb: float, sizes: MessageSizes) -> float:
+    found = predict_air_s(scenes, round(whole_mb * BYTES_PER_MB), round(sizes.model_mb * BYTES_PER_MB))
+    if found is None:
+        raise InputError(
+            f"federation.network: no vehicle of '{region}' ends the messages of a round of '{task}' in its registry "
+            "drives, so that a plan within horizon_s cannot reckon with them"
+        )
+    return found
+
+
+def _list_speeds(
+    recipe: RunRecipe, held: Mapping[str, Mapping[str, int]], linked: Mapping[str, Sequence[RadioLinks]]
+) -> dict[str, float]:
+    """Return the speed of every vehicle by its name in a federation; empty where no region gives any, nor links.
 
     held: the vehicles of each federating region with their numbers of training frames.
     """
-    if not any(recipe.regions[region].speed for region in held):
+    if not linked and not any(recipe.regions[region].speed for region in held):
         return {}
     names = [(region, vehicle) for region, vehicles in held.items() for vehicle in vehicles]
     return {f"{region}/{vehicle}": recipe.regions[region].speed.get(vehicle, 1.0) for region, vehicle in names}

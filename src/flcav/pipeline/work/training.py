@@ -8,11 +8,13 @@ import numpy as np
 from flcav.config import InputError
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.stages import edge_seeds
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.network.ledger import Ledger
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import find_strategies
 from flcav.pipeline.federations.network import DrivenCloud, DrivenRounds, join_regions, open_network
+from flcav.pipeline.federations.outputs import send_region_network, share_frames
 from flcav.pipeline.federations.records import read_rounds
 from flcav.pipeline.federations.replanning import Replanning, mean_by_frames
 from flcav.pipeline.frames import Frames
@@ -141,6 +143,12 @@ def edge_step(
     earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region, earlier=earlier)
     strategy, _ = find_strategies(how)
+    shared = None
+    if isinstance(strategy, FedMD):
+        shown = share_frames(work, learning, start.config, strategy, steps["pools"], steps["pretrain"])
+        if "edge" not in steps:  # where the vehicles have them
+            shown.send(book, start, region, [*clients])
+        shared = shown.samples
     simulate = open_network(work, learning, how, region, [*clients], steps, earlier, train_s, speeds)
 
     def drive(by: TaskPlan, rounds: int) -> DrivenRounds:
@@ -152,11 +160,11 @@ def edge_step(
     watched = {name: Frames.open(work.inputs[step]) for name, step in frames.items()}
     if course is None:
         driven = drive(own, rounds)
-        where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
+        where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime, None, shared)
         losses = federate_edge(*asked, driven.rules, earlier, *where)
     else:
         replanning = Replanning(course, drive, lambda scores: scores[region])
-        where = (book, work.folder, work.report, {}, watched, processes, runtime, replanning)
+        where = (book, work.folder, work.report, {}, watched, processes, runtime, replanning, shared)
         losses = federate_edge(*asked, how, earlier, *where)
         driven = drive(course.plan, len(losses))
     held = sum(len(client.samples) for client in clients.values())
@@ -201,6 +209,12 @@ def cloud_step(
         count, helped = count + len(clients), [*helped, *poles]
     rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
     federating = Strategies(*find_strategies(how))
+    shared = None
+    if isinstance(federating.edge, FedMD):
+        shown = share_frames(work, learning, start.config, federating.edge, first["pools"], first["pretrain"])
+        shared = shown.samples
+        for at in servers.values():
+            send_region_network(book, learning.task, at.weights, at.clients)
     before, schedule = len(book.entries), learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
     networks = {
         name: open_network(work, learning, how, name, [*at.clients], regions[name], at.earlier, train_s, speeds)
@@ -218,12 +232,12 @@ def cloud_step(
         watched = {name: Frames.open(work.inputs[step]) for name, step in replan.get("frames", {}).items()}
         replanning = Replanning(course, drive, lambda scores: mean_by_frames(scores, watched))
         asked = (learning, start, servers, rounds, k, federating, how)
-        losses = federate_cloud(*asked, book, work.folder, work.report, {}, watched, replanning)
+        losses = federate_cloud(*asked, book, work.folder, work.report, {}, watched, replanning, shared)
         driven, made = drive(course.plan, len(losses)), tuple(course.made)
     else:
         driven, made = drive(own.tasks[task], rounds), None
         asked = (learning, start, servers, rounds, k, federating, driven.rules)
-        losses = federate_cloud(*asked, book, work.folder, work.report, driven.outages)
+        losses = federate_cloud(*asked, book, work.folder, work.report, driven.outages, shared=shared)
     records = read_rounds(work.folder, None, before, driven.seconds)
     StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses, records, made).save(work.folder)
 
