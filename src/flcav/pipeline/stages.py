@@ -6,7 +6,7 @@ vehicles federate with their edge server. Stage III: edge servers federate with 
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from flcav.pipeline.results import WEIGHTS, Validated
 from flcav.progress import Report
 from flcav.seeds import derive_seed, stream
 
+OnStart = Callable[[int, Weights], None]  # called before a round with its number and weights
 CHECKPOINT, ROUND = "checkpoint.pt", LAST
 VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart
 
@@ -209,13 +210,15 @@ def federate_edge(
     validation: Mapping[str, Frames] = {},
     processes: int = 1,
     runtime: str = "embedded",
+    before_round: OnStart | None = None,
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
 
     A privacy budget, which `earlier` rounds with the same vehicles count against, may end it before the schedule's end.
     After each round the network that a federation of so many rounds ends with is scored on `validation`, frames by
     region. Vehicles train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights.
-    The vehicles that `outages` name by round are lost in it.
+    The vehicles that `outages` name by round are lost in it. `before_round` is called before each round with its number
+    and the weights that it begins with.
     """
     state, task, averaged = FederationState(), learning.task, learning.training.average_rounds
     share = 0.0 if earlier else learning.training.start_share
@@ -229,7 +232,17 @@ def federate_edge(
     federating = FederationCheckpoints(task, folder, book, report, {EDGE: state}, identity, scored)
     start, done = federating.resume(to_arrays(network))
     account = Account(book, EDGE, task.name, "wireless", outages)
-    keep = federating.make_saver(schedule.rounds)
+    save = federating.make_saver(schedule.rounds)
+
+    def prepare(round_: int, weights: Weights) -> None:
+        if before_round is not None and round_ <= schedule.rounds:
+            before_round(round_, weights)
+
+    def keep(round_: int, weights: Weights, loss: float) -> None:
+        save(round_, weights, loss)
+        prepare(round_ + 1, weights)
+
+    prepare(done + 1, start)
     how: Any = {"strategy": strategy, "rules": rules, "state": state, "earlier": earlier}
     with open_runtime(runtime, clients, processes) as where:
         federate(clients, start, schedule, account, **how, done=done, on_round=keep, runtime=where)

@@ -1,6 +1,7 @@
 """Steps of the three stages of training, and of centralised training in place of stage II."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from flcav.network.ledger import Ledger
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import find_strategies
+from flcav.pipeline.federations.distillation import RoadAverageLabels
 from flcav.pipeline.federations.network import drive_region, join_regions
 from flcav.pipeline.federations.records import read_rounds
 from flcav.pipeline.frames import Frames
@@ -42,6 +44,7 @@ from flcav.pipeline.stages import (
 from flcav.pipeline.steps import Work
 from flcav.pipeline.work import Fields
 from flcav.pipeline.work.budgets import open_region_book, read_entries, share_plan_budget
+from flcav.pipeline.work.distilling import label_by_average, learn_by_distillation, score_labels
 
 
 def pretrain_step(
@@ -101,13 +104,18 @@ def edge_step(
     validation: Mapping[str, str] = {},
     processes: int = 1,
     runtime: str = "embedded",
+    distillation: Fields | None = None,
+    scored: bool = False,
 ) -> None:
     """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`.
 
     With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III. On a network,
     a vehicle trains `train_s` / speed in a round [s]. Each round is scored on the frames of the steps `validation`, by
-    region. Vehicles train in so many `processes` of a `runtime`.
+    region. Vehicles train in so many `processes` of a `runtime`. `distillation`: settings of the labels "road-average".
+    `scored`: the labels are compared with ground truth.
     """
+    if distillation is not None and (processes > 1 or runtime != "embedded"):
+        raise InputError("labels 'road-average' are renewed between rounds: vehicles train in one process, --jobs 1")
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
     own = plan.tasks[task]
@@ -117,10 +125,12 @@ def edge_step(
     if "edge" in steps:
         stage, rounds = MORE_EDGE, own.cloud_rounds * how.edge_rounds_per_cloud_round
         book = Ledger(book.budget, read_entries(work, steps["edge"]))
-        samples, poles = _label_samples(work, learning, region, labels, steps)
+        samples, poles = _label_samples(work, learning, region, labels, steps, None, distillation)
     else:
         stage, rounds = EDGE, own.edge_rounds
-        samples, poles = _label_samples(work, learning, region, labels, steps, book)
+        samples, poles = _label_samples(work, learning, region, labels, steps, book, distillation)
+    if distillation is not None:
+        learning = learn_by_distillation(learning, distillation)
     start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
     clients = make_clients(learning, start.config, samples)
     earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
@@ -132,10 +142,17 @@ def edge_step(
     driven = drive_region(work, learning, how, rules, region, [*clients], steps, seeds, earlier, train_s, speeds)
     watched = {name: Frames.open(work.inputs[step]) for name, step in validation.items()}
     where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
-    losses = federate_edge(*asked, driven.rules, earlier, *where)
+    renewed = samples if isinstance(samples, RoadAverageLabels) and stage == EDGE else None
+    before_round = None if renewed is None else partial(renewed.renew, book=book)
+    losses = federate_edge(*asked, driven.rules, earlier, *where, before_round=before_round)
     held = sum(len(client.samples) for client in clients.values())
     records = read_rounds(work.folder, region, before, {region: driven.seconds})
-    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses, records).save(work.folder)
+    quality = None
+    if scored and stage == EDGE:
+        frames = _select_group(work, Frames.open(work.inputs[steps["frames"]]), steps)
+        quality = score_labels(work, region, steps, frames, start.config, samples)
+    about = (stage, task, region, len(losses), held, len(clients), poles, losses, records)
+    StageResult(*about, quality).save(work.folder)
 
 
 def cloud_step(
@@ -150,6 +167,7 @@ def cloud_step(
     regions: Mapping[str, Mapping[str, Any]],
     train_s: float = 0.0,
     speeds: Mapping[str, float] = {},
+    distillation: Fields | None = None,
 ) -> None:
     """Run stage III of a task: the edge servers of `regions` federate with the cloud, vehicles with edge servers."""
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
@@ -160,9 +178,11 @@ def cloud_step(
         share_plan_budget(own, budget_mb, task),
         read_entries(work, first["pretrain"], *(s["edge"] for s in regions.values())),
     )
+    if distillation is not None:
+        learning = learn_by_distillation(learning, distillation)
     servers, held, count, helped = {}, 0, 0, []
     for region, steps in regions.items():
-        samples, poles = _label_samples(work, learning, region, labels, steps)
+        samples, poles = _label_samples(work, learning, region, labels, steps, None, distillation)
         clients = make_clients(learning, start.config, samples)
         weights = to_arrays(load_stage_network(learning.task, work.inputs[steps["edge"]]))
         servers[region] = RegionStart(clients, weights, StageResult.load(work.inputs[steps["edge"]]).rounds)
@@ -221,11 +241,18 @@ def central_step(
 
 
 def _label_samples(
-    work: Work, learning: Learning, region: str, labels: str, steps: Mapping[str, Any], book: Ledger | None = None
+    work: Work,
+    learning: Learning,
+    region: str,
+    labels: str,
+    steps: Mapping[str, Any],
+    book: Ledger | None = None,
+    distillation: Fields | None = None,
 ) -> tuple[Mapping[str, Sequence[Any]], tuple[int, ...]]:
     """Return each vehicle's labelled samples, and the poles that contributed labels.
 
     `steps`: "pretrain", the recorded "frames", the arm's "place", and "sites", the placements of all arms.
+    `distillation`: settings of the labels "road-average", which are made before each round.
     """
     split, kind = Frames.open(work.inputs[steps["frames"]]), LABEL_SOURCES[labels]
     frames = _select_group(work, split, steps)
@@ -233,6 +260,8 @@ def _label_samples(
         config = load_stage_network(learning.task, work.inputs[steps["pretrain"]]).config
         return annotated_samples(learning.task, config, split, frames, region), ()
     poles = Placed.load(work.inputs[steps["place"]]).chosen if kind.from_poles else ()
+    if distillation is not None:
+        return label_by_average(work, learning, region, steps, frames, poles, distillation, book), poles
     frozen = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
     threshold = Pretrained.load(work.inputs[steps["pretrain"]]).threshold
     assert threshold is not None  # fixed wherever labels come from detections
