@@ -32,7 +32,7 @@ from flcav.sensors.frame import Frame
 
 Array = NDArray[np.float64]
 
-TOLD = 0.2  # lowest score of a detection that a vehicle tells of
+TOLD = 0.1  # lowest score of a detection that a vehicle tells of
 FREE = 0.5  # what vehicles alone tell of is dropped where road sensors saw more than this share of its footprint free
 PARTS = (8, 4)  # of a footprint, along and across, by which that share is measured
 RETURNS_M = 0.3  # margin around a box within which a vehicle's returns are the object's: poses are off

@@ -119,7 +119,7 @@ def pseudo_label_samples(
 
 
 def road_views(split: Frames, poles: Sequence[int], trained: bool) -> dict[tuple[str, int], list[RoadView]]:
-    """Return what the sensors on `poles` see in each spin, by scene and number of the spin; see `pseudo_label_samples`."""
+    """Return what sensors on `poles` see in each spin, by scene and number of the spin: see `pseudo_label_samples`."""
     views: dict[tuple[str, int], list[RoadView]] = {}
     find = road_detector(split.data) if trained and poles else None
     for pole in poles:
