@@ -82,6 +82,26 @@ def test_two_vehicles_that_agree_are_surer_than_each() -> None:
     assert [len(each.boxes) for each in average_spin([one, other], [], CONFIG, 0.7)] == [1, 1]  # 1 - .5 * .5
 
 
+def test_nobody_tells_of_anything_and_that_is_an_average_too() -> None:
+    nothing = Sighting("cav0", 1.0, np.eye(4), Boxes.empty(), navigation=ACCURATE)
+    pole = Sighting("pole 0", 1.0, np.eye(4), Boxes.empty())
+    (guidance,) = average_spin([nothing, pole], [view(Boxes.empty())], CONFIG, 0.5)
+    assert not len(Guidance.from_message(guidance.message()).boxes)
+
+
+def test_a_pose_graph_places_a_vehicle_by_what_it_and_the_road_see() -> None:
+    pytest.importorskip("gtsam")
+    both = boxes((12.0, 3.0), (20.0, -6.0), (30.0, 9.0), sd=0.05)
+    off = pose(0.6, -0.5)  # by its navigation; it is at the origin
+    seen = Sighting("cav0", 1.0, off, both, navigation=Navigation(0.6, 0.01))
+    sightings = [seen, Sighting("pole 0", 1.0, np.eye(4), replace(both, label=np.full(3, "car")))]
+    (guidance,) = average_spin(sightings, [], CONFIG, 0.5, posts=np.zeros((0, 2)))
+    assert np.hypot(*guidance.world_from_agent[:2, 3]) < 0.2
+    (told,) = average_spin(sightings, [], CONFIG, 0.5)
+    error = [np.linalg.norm(g.boxes.center[:, :2] - both.center[:, :2], axis=1).max() for g in (guidance, told)]
+    assert error[0] < 0.3 < error[1]
+
+
 def test_a_pose_adds_its_uncertainty_across_the_line_of_sight() -> None:
     seen = Sighting("cav0", 0.0, pose(10, 0), Boxes.empty(), navigation=Navigation(0.3, 0.02))
     placed = place_in(boxes((50.0, 0.0), sd=0.1), seen).boxes

@@ -1,5 +1,7 @@
 """The loss of federated distillation against independent sums, and where it has no gradient."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -16,12 +18,21 @@ from flcav.perception.objects.distillation import (
     regression_loss,
 )
 from flcav.perception.objects.loss import SMOOTH_L1_BETA
-from flcav.perception.objects.model import HeadOutput, head_shape, second_tiny
+from flcav.perception.objects.model import HeadOutput, head_shape, second, tiny_config
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.targets import Targets, assign_anchors, cell_size, decode_variance, encode_variance
 
-CONFIG: SecondConfig = second_tiny().config
+CONFIG: SecondConfig = tiny_config()
+NARROW = replace(  # quick to train
+    CONFIG,
+    range_m=(0, -16, -3, 40, 16, 1),
+    sparse_channels=(4, 4, 4, 4),
+    sparse_out=4,
+    bev_layers=(0, 0),
+    bev_channels=(4, 4),
+    bev_up_channels=(4, 4),
+)
 
 
 def cars(*places: tuple[float, float], sd: float | None = None, yaw: float = 0.0) -> Boxes:
@@ -51,10 +62,10 @@ def test_pooling_takes_the_mean_inside_a_turned_box() -> None:
     plane = np.stack(np.broadcast_arrays(x[None], y[:, None]))  # features: x and y of the cell
     pooled = pool_boxes(torch.from_numpy(plane), cars((20.3, -7.1), (31.0, 5.5), yaw=0.7), CONFIG)
     np.testing.assert_allclose(pooled.numpy(), [[20.3, -7.1], [31.0, 5.5]], atol=1e-6)  # linear: those of the centre
-    strip = torch.from_numpy((np.abs(y[:, None] - 5.5) < 1.2) * np.ones(columns))[None]
+    strip = torch.from_numpy((np.abs(y[:, None] - 5.5) < 2) * np.ones(columns))[None]
     along, across = cars((20.0, 5.5)), cars((20.0, 5.5), yaw=np.pi / 2)
     assert float(pool_boxes(strip, along, CONFIG)) == pytest.approx(1.0)
-    assert float(pool_boxes(strip, across, CONFIG)) < 0.8  # its ends stick out
+    assert float(pool_boxes(strip, across, CONFIG)) < 0.95  # an end sticks out
 
 
 def test_own_boxes_match_the_nearest_of_their_class_once() -> None:
@@ -120,7 +131,7 @@ def test_variances_of_boxes_and_residuals_are_each_others_inverse() -> None:
 @pytest.mark.parametrize("terms", [DistillationTerms(), DistillationTerms(regression=False)])
 def test_confidence_falls_only_where_the_road_saw_free_ground(terms: DistillationTerms) -> None:
     torch.manual_seed(0)
-    network = second_tiny()
+    network = second(NARROW)
     rng = np.random.default_rng(5)
     points = np.column_stack((rng.uniform(1, 47, 300), rng.uniform(-20, 20, 300), np.full(300, -1.8), np.zeros(300)))
     free = np.stack(np.meshgrid(np.arange(30.2, 36, 0.4), np.arange(-15.8, -10, 0.4)), -1).reshape(-1, 2)
@@ -144,12 +155,12 @@ def test_confidence_falls_only_where_the_road_saw_free_ground(terms: Distillatio
     place = np.arange(len(moved)) // 2
     x = network.config.range_m[0] + (place % columns + 0.5) * cell_size(network.config)[0]
     y = network.config.range_m[1] + (place // columns + 0.5) * cell_size(network.config)[1]
-    seen = (x > 30) & (x < 36) & (y > -16) & (y < -10)
+    inside, outside = (np.maximum(np.abs(x - 33), np.abs(y + 13)) < reach_m for reach_m in (2.5, 3.5))
     positive = np.zeros(len(moved), dtype=bool)
     positive[targets.positive.numpy()] = True
-    assert (moved[seen] > 0).all()  # a step against the gradient lowers these scores
+    assert (moved[inside] > 0).all()  # a step against the gradient lowers these scores
     assert (moved[positive] < 0).all()
-    assert (moved[~seen & ~positive] == 0).all()
+    assert (moved[~outside & ~positive] == 0).all()
     blind = Sample(sample.points, Boxes.empty(), free=sample.free[:0] if sample.free is not None else None)
     network.zero_grad()
     distillation_loss(network, [blind], terms).backward()
@@ -158,7 +169,7 @@ def test_confidence_falls_only_where_the_road_saw_free_ground(terms: Distillatio
 
 def test_a_network_answers_the_same_from_its_feature_map() -> None:
     torch.manual_seed(0)
-    network = second_tiny().eval()
+    network = second(NARROW).eval()
     points = np.random.default_rng(6).uniform((0, -20, -2, 0), (45, 20, 0, 1), size=(200, 4)).astype(np.float32)
     with torch.inference_mode():
         voxels = network.voxels(torch.from_numpy(points), torch.zeros(200, dtype=torch.int64), 1)
