@@ -1,6 +1,7 @@
 """Labels by the road average on made-up scenes: what is kept, what is dropped, and where ground is known to be free."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -21,12 +22,15 @@ from flcav.fusion.distillation import (
 from flcav.fusion.pose_graph import Navigation, Sighting
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes, concatenate, pose
+from flcav.network.ledger import Budget, BudgetExceeded, Ledger
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import FrameTruth
+from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations import distillation as rounds
-from flcav.pipeline.federations.distillation import measure_labels
+from flcav.pipeline.federations.distillation import RoadAverageLabels, measure_labels, read_history
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.work.training import edge_step
 from flcav.sensors.frame import Annotations, Calibration, Frame
 
 CONFIG = second_tiny().config
@@ -223,3 +227,52 @@ def test_navigation_is_off_by_what_it_states() -> None:
 def test_settings_that_mean_nothing_are_refused(fields: dict[str, Any], told: str) -> None:
     with pytest.raises(InputError, match=told):
         parse_config(Distillation, fields, "distillation")
+
+
+def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen = view(boxes(BOTH, ROAD_ALONE, label="car", sd=0.1))
+    keys = [SimpleNamespace(scene="s", index=0, agent=f"cav{n}", time_s=0.0) for n in (1, 0)]
+    spins = [frame([BOTH]), frame([BOTH, OUT_OF_SIGHT])]
+    manifest = SimpleNamespace(recipe={"seed": 1})
+    data = SimpleNamespace(keys=keys, frame=lambda i: spins[i], manifest=manifest)
+    found = [boxes(BOTH, z=-1.0), boxes(BOTH, OUT_OF_SIGHT, z=-1.0)]
+    monkeypatch.setattr(rounds, "road_views", lambda *about, trained: {("s", 0): [seen]})
+    seen_cars = {len(each.lidar["lidar"]): told for each, told in zip(spins, found, strict=True)}
+    monkeypatch.setattr(rounds, "detect_in", lambda network, frames, **how: [seen_cars[len(frames[0].lidar["lidar"])]])
+    truth = FrameTruth("s", boxes(BOTH, z=-1.0), Boxes.empty(), Boxes.empty())
+    monkeypatch.setattr(rounds, "asked_of", lambda frame, config: truth)
+    how = Distillation(position_m=0.05, heading_deg=0.1)
+    split = Frames(cast(Any, data), (0, 1), {})
+    labels = RoadAverageLabels(how, CONFIG, 0.6, split, (0, 1), (3,), "grid", tmp_path)
+    book, weights = Ledger(Budget(1.0, 0.0)), to_arrays(second_tiny())
+    labels.send_views(book)
+    assert {entry.bytes for entry in book.entries} == {len(seen.message())}
+    assert [(entry.direction, entry.round) for entry in book.entries] == [("down", 0)] * 2
+    own = labels["grid/cav0"]
+    labels.renew(1, weights, book)
+    assert sorted(labels) == ["grid/cav0", "grid/cav1"]
+    assert labels["grid/cav0"] is own  # a client holds it
+    assert near(own[0].boxes, OUT_OF_SIGHT)
+    sent = book.entries[2:]
+    assert [(e.direction, e.client) for e in sent] == [(d, f"grid/cav{n}") for d in ("up", "down") for n in (1, 0)]
+    assert {(e.stage, e.task, e.link, e.round) for e in sent} == {("edge", "objects", "wireless", 1)}
+    assert abs(sent[1].bytes - sent[0].bytes - 15 * 4 - len("Car\n")) <= 8  # one box more, and padding of the header
+    labels.renew(2, weights, book)
+    labels.renew(2, weights, book)  # as after a stop
+    history = read_history(tmp_path).rounds
+    assert [(each.round, each.precision, each.recall) for each in history] == [(1, 2 / 3, 1.0), (2, 2 / 3, 1.0)]
+    before = len(book.entries)
+    labels.renew(1, weights)
+    assert (len(book.entries), read_history(tmp_path).rounds) == (before, history)
+    with pytest.raises(BudgetExceeded, match="wireless uplink budget exceeded: grid/cav1"):
+        labels.renew(3, weights, Ledger(Budget(1e-4, 0.0)))
+
+
+def test_labels_that_are_renewed_need_one_process() -> None:
+    nothing: Any = None
+    about = (nothing, "objects", None, {}, 1, (1.0, 1.0), "grid", {}, "road-average", {}, {})
+    for where in ({"processes": 2}, {"runtime": "ray"}):
+        with pytest.raises(InputError, match="renewed between rounds"):
+            edge_step(*about, distillation={}, **where)  # pyright: ignore[reportArgumentType]
