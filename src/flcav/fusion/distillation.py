@@ -4,8 +4,10 @@ Wang et al. (IEEE Network 37(3), 2023): road sensors and vehicles send boxes wit
 server, which averages them (`flcav.fusion.average`); each vehicle learns from the average of the spin of its own frame.
 Nobody knows ground truth, and vehicles know their poses by their own navigation alone.
 
-- A box of the average is a label where a road sensor has it, or its score reaches the threshold of pseudo-labels: so
-  what a vehicle sees confidently and the road cannot stays a label.
+- A box of the average is a label where a road sensor has it, or where several vehicles do and its score reaches the
+  threshold of pseudo-labels.
+- What one vehicle alone is sure of is ignored in the loss: it is not unlearned, nor does a network confirm itself. With
+  such boxes as labels the precision of the labels fell from .71 to .47 in three rounds (demo, seed 101).
 - What vehicles alone tell of is dropped where road sensors saw free ground, or have a box of their own.
 - An anchor is a negative only where a road sensor saw free ground.
 """
@@ -67,18 +69,19 @@ class Distillation(Config):
 class Guidance:
     """What the edge server tells a vehicle of one of its frames: the road average, in the vehicle's frame."""
 
-    boxes: Boxes  # label = detection class, or the actor category of a lookalike; with scores and variances
+    boxes: Boxes  # (K,) label = detection class, or the actor category of a lookalike; with scores and variances
+    confirmed: NDArray[np.bool_]  # (K,) whether a road sensor or several vehicles tell of the box; others are ignored
     world_from_agent: Array  # (4, 4) the vehicle's pose as the edge server has it
 
     def message(self) -> bytes:
         """Return it as the message to the vehicle."""
-        return pack({"pose": self.world_from_agent, **_pack_boxes(self.boxes)})
+        return pack({"pose": self.world_from_agent, "confirmed": self.confirmed, **_pack_boxes(self.boxes)})
 
     @classmethod
     def from_message(cls, message: bytes) -> "Guidance":
         """Return what is in a message: the inverse of `message` up to single precision."""
         arrays = unpack(message)
-        return cls(_unpack_boxes(arrays), arrays["pose"])
+        return cls(_unpack_boxes(arrays), arrays["confirmed"], arrays["pose"])
 
 
 def pack_sighting(seen: Sighting) -> bytes:
@@ -128,8 +131,9 @@ def average_spin(
     road = np.zeros(len(average.boxes), dtype=bool)
     for each, member in zip(told, average.member, strict=True):
         road[member] |= each.navigation is None
-    kept = average.boxes[_select_labels(average.boxes, road, views, threshold)]
-    return [place_in(kept, each) for each in told if each.navigation is not None]
+    kept = select_labels(average.boxes, road, views, threshold)
+    confirmed = road[kept] | (average.agents[kept] > 1)
+    return [place_in(average.boxes[kept], confirmed, each) for each in told if each.navigation is not None]
 
 
 def _classify(seen: Sighting, config: SecondConfig) -> Sighting:
@@ -140,10 +144,10 @@ def _classify(seen: Sighting, config: SecondConfig) -> Sighting:
     return replace(seen, boxes=replace(seen.boxes, label=label)[label != ""])
 
 
-def _select_labels(
+def select_labels(
     boxes: Boxes, road: NDArray[np.bool_], views: Sequence[RoadView], threshold: float
 ) -> NDArray[np.bool_]:
-    """Return (N,) which boxes of an average are labels; `road` (N,): whether a road sensor told of the box."""
+    """Return (N,) which boxes of an average are told to vehicles; `road` (N,): whether a road sensor has the box."""
     assert boxes.score is not None
     seen = boxes[road]
     near = np.linalg.norm(boxes.center[:, None, :2] - seen.center[None, :, :2], axis=2) < seen.size[None, :, 0] / 2
@@ -160,10 +164,10 @@ def share_of_free_ground(boxes: Boxes, views: Sequence[RoadView]) -> Array:
     return free.mean(axis=1)
 
 
-def place_in(boxes: Boxes, seen: Sighting) -> Guidance:
+def place_in(boxes: Boxes, confirmed: NDArray[np.bool_], seen: Sighting) -> Guidance:
     """Return the boxes, world frame, as guidance of a vehicle: in its frame, with the variance of its pose added."""
     placed = add_pose_variance(boxes, seen).transform(inverse(seen.world_from_agent))
-    return Guidance(placed, seen.world_from_agent)
+    return Guidance(placed, confirmed, seen.world_from_agent)
 
 
 def distil_sample(
@@ -171,15 +175,15 @@ def distil_sample(
 ) -> Sample:
     """Return a vehicle's frame with the labels of federated distillation; network's frame.
 
-    own: the vehicle's detections, LiDAR frame; views: of the road sensors at the spin. Boxes to find are those told of
-    with returns of the vehicle; others, and lookalikes, are ignored in the loss. `free` holds the cell centres that a
-    road sensor saw as free ground, by the pose and mount that the vehicle knows.
+    own: the vehicle's detections, LiDAR frame; views: of the road sensors at the spin. Boxes to find are the confirmed
+    ones with returns of the vehicle; others, and lookalikes, are ignored in the loss. `free` holds the cell centres
+    that a road sensor saw as free ground, by the pose and mount that the vehicle knows.
     """
     mount = frame.assumed.agent_from_sensor[lidar]
     points = crop_to_range(frame.lidar[lidar], config)
     boxes = told.boxes.transform(inverse(mount))
     asked = np.isin(boxes.label, config.classes)
-    targets = asked & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)
+    targets = asked & told.confirmed & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)
     cells = cell_centers(config)
     below = np.column_stack((cells, np.full(len(cells), -mount[2, 3])))
     world = transform_points(told.world_from_agent @ mount, below)[:, :2]

@@ -72,6 +72,10 @@ def test_the_average_has_what_the_road_sees_and_what_it_cannot_see_but_a_vehicle
     cars = guidance.boxes[guidance.boxes.label == "Car"]
     assert len(cars) == 3
     assert all(near(cars, place) for place in (BOTH, ROAD_ALONE, OUT_OF_SIGHT))  # not GHOST: free; not UNSURE
+    sure = guidance.boxes[guidance.confirmed]
+    assert near(sure, BOTH)
+    assert near(sure, ROAD_ALONE)
+    assert not near(sure, OUT_OF_SIGHT)
     assert guidance.boxes.label[guidance.boxes.label != "Car"].tolist() == ["bus"]
     (lower,) = average_spin(sightings, [seen], CONFIG, threshold=0.25)
     assert near(lower.boxes, UNSURE)
@@ -83,7 +87,8 @@ def test_the_average_has_what_the_road_sees_and_what_it_cannot_see_but_a_vehicle
 def test_two_vehicles_that_agree_are_surer_than_each() -> None:
     one, other = (Sighting(f"cav{n}", 1.0, np.eye(4), boxes(UNSURE, score=0.5), navigation=ACCURATE) for n in (0, 1))
     assert not len(average_spin([one], [], CONFIG, 0.7)[0].boxes)
-    assert [len(each.boxes) for each in average_spin([one, other], [], CONFIG, 0.7)] == [1, 1]  # 1 - .5 * .5
+    both = average_spin([one, other], [], CONFIG, 0.7)
+    assert [each.confirmed.tolist() for each in both] == [[True], [True]]  # 1 - .5 * .5 is above the threshold
 
 
 def test_nobody_tells_of_anything_and_that_is_an_average_too() -> None:
@@ -108,7 +113,7 @@ def test_a_pose_graph_places_a_vehicle_by_what_it_and_the_road_see() -> None:
 
 def test_a_pose_adds_its_uncertainty_across_the_line_of_sight() -> None:
     seen = Sighting("cav0", 0.0, pose(10, 0), Boxes.empty(), navigation=Navigation(0.3, 0.02))
-    placed = place_in(boxes((50.0, 0.0), sd=0.1), seen).boxes
+    placed = place_in(boxes((50.0, 0.0), sd=0.1), np.ones(1, dtype=bool), seen).boxes
     np.testing.assert_allclose(placed.center[0, :2], (40.0, 0.0))
     assert placed.variance is not None
     wanted = [0.01 + 0.09, 0.01 + 0.09 + (40 * 0.02) ** 2, 0.01, 0.01, 0.01, 0.01, 0.01 + 0.02**2]
@@ -136,6 +141,7 @@ def test_messages_keep_boxes_in_single_precision_and_weigh_little() -> None:
     again = Guidance.from_message(told)
     np.testing.assert_allclose(again.boxes.array(), guidance.boxes.array(), rtol=1e-6, atol=1e-6)
     assert again.boxes.label.tolist() == guidance.boxes.label.tolist()
+    assert again.confirmed.tolist() == guidance.confirmed.tolist()
     rows = 15 * 4  # bytes of a box: seven numbers, a score, seven variances
     for sent in (message, told):  # both have four boxes; the rest are a pose and names
         assert 4 * rows < len(sent) < 4 * rows + 700
@@ -156,9 +162,9 @@ def test_a_vehicle_learns_boxes_it_has_returns_from_and_negatives_from_the_road_
     (guidance,) = average_spin(sightings, [seen], CONFIG, 0.6)
     own = boxes(BOTH, GHOST, z=-1.0)
     sample = distil_sample(frame([BOTH, OUT_OF_SIGHT, GHOST]), own, guidance, [seen], CONFIG, "lidar")
-    assert len(sample.boxes) == 2
+    assert len(sample.boxes) == 1
     assert near(sample.boxes, BOTH)
-    assert near(sample.boxes, OUT_OF_SIGHT)  # it is not unlearned: the road could not see it
+    assert near(sample.ignore, OUT_OF_SIGHT)  # not unlearned, since the road could not see it, nor confirmed by itself
     np.testing.assert_allclose(sample.boxes.center[:, 2], -1.0, atol=1e-6)
     assert near(sample.ignore, ROAD_ALONE)  # without a return of the vehicle
     assert near(sample.ignore, (8.0, -12.0))  # a bus
@@ -254,7 +260,8 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     labels.renew(1, weights, book)
     assert sorted(labels) == ["grid/cav0", "grid/cav1"]
     assert labels["grid/cav0"] is own  # a client holds it
-    assert near(own[0].boxes, OUT_OF_SIGHT)
+    assert near(own[0].boxes, BOTH)
+    assert near(own[0].ignore, OUT_OF_SIGHT)
     sent = book.entries[2:]
     assert [(e.direction, e.client) for e in sent] == [(d, f"grid/cav{n}") for d in ("up", "down") for n in (1, 0)]
     assert {(e.stage, e.task, e.link, e.round) for e in sent} == {("edge", "objects", "wireless", 1)}
@@ -262,7 +269,7 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     labels.renew(2, weights, book)
     labels.renew(2, weights, book)  # as after a stop
     history = read_history(tmp_path).rounds
-    assert [(each.round, each.precision, each.recall) for each in history] == [(1, 2 / 3, 1.0), (2, 2 / 3, 1.0)]
+    assert [(each.round, each.precision, each.recall) for each in history] == [(1, 1.0, 1.0), (2, 1.0, 1.0)]
     before = len(book.entries)
     labels.renew(1, weights)
     assert (len(book.entries), read_history(tmp_path).rounds) == (before, history)
