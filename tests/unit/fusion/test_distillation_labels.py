@@ -21,7 +21,7 @@ from flcav.fusion.distillation import (
 )
 from flcav.fusion.pose_graph import Navigation, Sighting
 from flcav.fusion.road import RoadView
-from flcav.geometry import Boxes, concatenate, pose
+from flcav.geometry import Boxes, concatenate, inverse, pose
 from flcav.network.ledger import Budget, BudgetExceeded, Ledger
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import Sample
@@ -56,7 +56,7 @@ def view(found: Boxes) -> RoadView:
 def spin(world_from_vehicle: np.ndarray | None = None) -> tuple[list[Sighting], RoadView]:
     at = np.eye(4) if world_from_vehicle is None else world_from_vehicle
     sure, unsure = boxes(BOTH, OUT_OF_SIGHT, GHOST), boxes(UNSURE, score=0.3)
-    told = concatenate([sure, unsure]).transform(np.linalg.inv(at))
+    told = concatenate([sure, unsure]).transform(inverse(at))
     vehicle = Sighting("cav0", 1.0, at, told, navigation=ACCURATE)
     seen = concatenate([boxes(BOTH, ROAD_ALONE, label="van", sd=0.1), boxes((8.0, -12.0), label="bus")])
     return [vehicle, Sighting("pole 0", 1.0, np.eye(4), seen)], view(seen)
@@ -135,7 +135,7 @@ def test_messages_keep_boxes_in_single_precision_and_weigh_little() -> None:
     np.testing.assert_allclose(back.boxes.array(), sightings[0].boxes.array(), rtol=1e-6)
     assert (back.time_s, back.navigation, back.agent) == (1.0, ACCURATE, "cav0")
     assert back.boxes.variance is not None
-    np.testing.assert_allclose(back.boxes.variance, sightings[0].boxes.variance, rtol=1e-6)
+    np.testing.assert_allclose(back.boxes.variance, np.full((4, 7), 0.2**2), rtol=1e-6)
     (guidance,) = average_spin(sightings, [seen], CONFIG, 0.6)
     told = guidance.message()
     again = Guidance.from_message(told)
@@ -152,7 +152,8 @@ def frame(places: list[tuple[float, float]]) -> Frame:
     rng = np.random.default_rng(0)
     hits = [np.c_[rng.uniform(-0.8, 0.8, (30, 2)) + place, rng.uniform(-1.4, -0.4, 30)] for place in places]
     sweep = np.c_[np.concatenate(hits), np.full(30 * len(places), 0.3)].astype(np.float32)
-    nothing = Annotations(np.array([]), Boxes.empty(), *(np.zeros((0, 3)),) * 2, np.zeros(0, int), np.zeros(0))
+    still, none = np.zeros((0, 3)), np.zeros(0)
+    nothing = Annotations(np.zeros(0, np.str_), Boxes.empty(), still, still, np.zeros(0, np.int64), none)
     mounts = Calibration({"lidar": pose(0, 0, 1.8)})
     return Frame("s", 0, 0.0, "cav0", np.eye(4), mounts, mounts, {"lidar": sweep}, nothing)
 

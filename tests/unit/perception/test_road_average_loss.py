@@ -50,8 +50,8 @@ def test_info_nce_is_the_negative_logarithm_of_a_softmax_over_cosines() -> None:
         cosine = [float(query @ key / np.linalg.norm(query) / np.linalg.norm(key)) for key in keys]
         power = np.exp(np.array(cosine) / temperature)
         wanted.append(-np.log(power[own] / power.sum()))
-    tensors = [torch.from_numpy(each) for each in (queries, keys, positive)]
-    np.testing.assert_allclose(info_nce(*tensors, temperature).numpy(), wanted, rtol=1e-9)
+    found = info_nce(torch.from_numpy(queries), torch.from_numpy(keys), torch.from_numpy(positive), temperature)
+    np.testing.assert_allclose(found.numpy(), wanted, rtol=1e-9)
 
 
 def test_pooling_takes_the_mean_inside_a_turned_box() -> None:
