@@ -8,7 +8,7 @@ import torch
 
 from flcav.geometry import Boxes
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.distillation import (
+from flcav.perception.objects.distillation.loss import (
     DistillationTerms,
     contrastive_loss,
     distillation_loss,

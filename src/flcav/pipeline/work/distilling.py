@@ -6,7 +6,7 @@ from typing import Any
 
 from flcav.fusion.distillation import Distillation
 from flcav.network.ledger import Ledger
-from flcav.perception.objects.distillation import DistillationTerms, DistilledObjects
+from flcav.perception.objects.distillation.loss import DistillationTerms, DistilledObjects
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.distillation import RoadAverageLabels, measure_labels, read_history
 from flcav.pipeline.frames import Frames
