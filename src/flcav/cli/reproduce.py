@@ -28,6 +28,7 @@ class Target(StrEnum):
     """Targets other than the tasks' studies."""
 
     demo_arms = "demo-arms"
+    distillation = "distillation"
     federation_faults = "federation-faults"
     federation_leakage = "federation-leakage"
     fig1b = "fig1b"
@@ -118,7 +119,8 @@ def reproduce(
     if target.startswith(TASK) or ":" in target:
         _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
-        run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
+        compared = {Target.fig6a_allocation: _fig6a_allocation, Target.distillation: _distillation}
+        run = compared.get(Target(target), _demo_arms)
         run(out, count, "quick" if quick else "paper", jobs, engine, stale)
     typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
 
@@ -210,6 +212,17 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
     write_bytes(out / "plans.png", draw_allocation(results))
     for finding in results.findings:
         typer.echo(f"{finding.question} {finding.verdict}. {finding.sentence}")
+
+
+def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+    from flcav.experiments.distillation.run import compare_labels, draw_labels
+    from flcav.files import write_bytes, write_json
+
+    results = compare_labels(*_run_seeds(Target.distillation, "distillation", out, seeds, scale, jobs, engine, stale))
+    write_json(out / "result.json", results.as_json())
+    write_bytes(out / "arms.png", draw_labels(results))
+    for sentence in results.sentences():
+        typer.echo(sentence)
 
 
 @when_interrupted()

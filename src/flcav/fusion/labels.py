@@ -45,7 +45,7 @@ def label_sample(
     targets = (label != "") & (points_in_boxes(points, told, margin_m=0.1).sum(axis=1) > 0)
     ignored = ((label != "") & ~targets) | is_lookalike(told.label, config.classes)
 
-    cells = _cell_centers(config)
+    cells = cell_centers(config)
     height = float(frame.agent_from_sensor[lidar][2, 3])
     cells_world = transform_points(world_from_lidar, np.c_[cells, np.full(len(cells), -height)])[:, :2]
     looked = np.zeros(len(cells), dtype=bool)
@@ -68,7 +68,7 @@ def _distinct(boxes: Boxes) -> NDArray[np.int64]:
     return np.array(kept, dtype=np.int64)
 
 
-def _cell_centers(config: SecondConfig) -> NDArray[np.float64]:
+def cell_centers(config: SecondConfig) -> NDArray[np.float64]:
     """Return the centres (K, 2) of the cells of `CELL_M` over the detector's range, x first, LiDAR frame [m]."""
     x0, y0, _, x1, y1, _ = config.range_m
     x, y = np.arange(x0 + CELL_M / 2, x1, CELL_M), np.arange(y0 + CELL_M / 2, y1, CELL_M)

@@ -57,13 +57,18 @@ def tell(sighting: Sighting) -> Told:
     A heading error moves a box at distance r by r times the error, across the line of sight.
     """
     boxes = sighting.boxes.transform(sighting.world_from_agent)
+    return Told(sighting.agent, sighting.time_s, add_pose_variance(boxes, sighting))
+
+
+def add_pose_variance(boxes: Boxes, sighting: Sighting) -> Boxes:
+    """Return boxes, world frame, with the variance of an agent's pose added to theirs; of road sensors as they are."""
     if sighting.navigation is None:
-        return Told(sighting.agent, sighting.time_s, boxes)
+        return boxes
     known, variance = sighting.navigation, variance_of(boxes)
     arm = boxes.center[:, :2] - sighting.world_from_agent[:2, 3]
     variance[:, :2] += known.position_m**2 + (arm[:, ::-1] * known.heading_rad) ** 2
     variance[:, YAW] += known.heading_rad**2
-    return Told(sighting.agent, sighting.time_s, replace(boxes, variance=variance))
+    return replace(boxes, variance=variance)
 
 
 def correct_poses(sightings: Sequence[Sighting], posts: Array, at_s: float) -> list[Sighting]:

@@ -1,6 +1,13 @@
 """Rigid transforms and oriented 3D boxes."""
 
-from flcav.geometry.boxes import Boxes, concatenate, count_points_in_boxes, points_in_boxes, segments_meet_boxes
+from flcav.geometry.boxes import (
+    Boxes,
+    concatenate,
+    count_points_in_boxes,
+    points_in_boxes,
+    segments_meet_boxes,
+    spread_over_footprints,
+)
 from flcav.geometry.poses import (
     angles_of,
     heading_vectors,
@@ -32,6 +39,7 @@ __all__ = [
     "rotations",
     "rotations_about_z",
     "segments_meet_boxes",
+    "spread_over_footprints",
     "transform_points",
     "unit_vectors",
     "wrap_angle",

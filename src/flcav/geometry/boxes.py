@@ -9,7 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from flcav.geometry.poses import (
     Array,
     angles_of,
+    heading_vectors,
     inverse,
+    left_vectors,
     pose,
     rotations,
     rotations_about_z,
@@ -129,6 +131,15 @@ class Boxes:
         x = local[..., 0] * cos - local[..., 1] * sin
         y = local[..., 0] * sin + local[..., 1] * cos
         return np.stack((x, y, local[..., 2]), axis=-1) + self.center[:, None]
+
+
+def spread_over_footprints(boxes: Boxes, along: int, across: int) -> Array:
+    """Return (N, along * across, 2) x, y [m] of the centres of so many equal parts of the footprint of each box."""
+    parts = (np.arange(along) + 0.5) / along - 0.5, (np.arange(across) + 0.5) / across - 0.5
+    part = np.stack(np.meshgrid(*parts, indexing="ij"), axis=-1).reshape(-1, 2)
+    reach = part[None] * boxes.size[:, None, :2]
+    forward, left = heading_vectors(boxes.yaw)[:, None], left_vectors(boxes.yaw)[:, None]
+    return boxes.center[:, None, :2] + reach[..., :1] * forward + reach[..., 1:] * left
 
 
 def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects
+from flcav.fusion.distillation import Distillation
 from flcav.perception.distillation import Imitates
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
@@ -38,7 +39,15 @@ OF_ROUNDS = (  # fields of `Training` of federations alone
     "average_rounds",
     "start_share",
 )
-LEARNED = ("plan", "training", "repeat", "placement", "labels", "federation")  # those that decide a federation
+LEARNED = (  # those that decide a federation
+    "plan",
+    "training",
+    "repeat",
+    "placement",
+    "labels",
+    "distillation",
+    "federation",
+)
 OF_EDGE = (*LEARNED[:-1], "edge_federation")  # those that decide a federation without the cloud
 
 
@@ -51,6 +60,7 @@ class Setting:
     plan: PlanRule
     placement: Placement
     labels: Mapping[str, str]  # kind of labels, by task
+    distillation: Distillation  # where the labels are the road average
     federation: Federation
     training: Mapping[str, Training]  # by task
     central: Literal["pretrain", "federate"] | None
@@ -97,6 +107,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         arm.plan,
         Placement.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
         dict(labels) | dict(arm.labels),
+        Distillation.model_validate((recipe.distillation or Distillation()).model_dump() | dict(arm.distillation)),
         Federation.model_validate(recipe.federation.model_dump() | dict(arm.federation)),
         {
             task: Training.model_validate(recipe.training_of(task).model_dump() | dict(arm.training))

@@ -208,6 +208,7 @@ class Graph:
             "training",
             "recording",
             "placement",
+            "distillation",
         }
         asked = recipe.model_dump(mode="json", exclude=others)
         asked["splits"] = recipe.sized_splits.model_dump(mode="json")
@@ -315,6 +316,8 @@ class Graph:
         """Return the settings that a federated stage of a task depends on."""
         federation = (arm.federation if stage == CLOUD else arm.edge_federation).model_dump(mode="json")
         own = {"labels": arm.labels[task], "federation": federation, "budget_mb": self._budget_mb}
+        if LABEL_SOURCES[arm.labels[task]].averaged:
+            own["distillation"] = arm.distillation.model_dump(mode="json")
         if arm.federation.network is not None:
             given = {name: self.recipe.regions[name].speed for name in self.recipe.with_role("federate")}
             speeds = {f"{region}/{vehicle}": speed for region in given for vehicle, speed in given[region].items()}
@@ -329,10 +332,17 @@ class Graph:
                     self._add(self._central(arm, region, task))
                     continue
                 steps = self._rests_on(arm, region, task, EDGE)
+                own: dict[str, Any] = {"region": region, "vehicles": self._vehicles(), "steps": steps}
+                if self._scored(task):
+                    own["scored"] = True
                 name = self.names.edge(arm.name, region, task)
                 own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
                 own |= self._replan(arm, task, EDGE, region, name)
                 self._add(_step(name, edge_step, self._federation(arm, task, EDGE) | own, _named_in(steps, own)))
+
+    def _scored(self, task: str) -> bool:
+        """Return whether labels are compared with ground truth: in runs with an arm of federated distillation."""
+        return any(LABEL_SOURCES[arm.labels[task]].averaged for arm in self.settings.values())
 
     def _add_further(self, arm: Setting) -> None:
         """Add what follows stage II: stage III or further edge rounds."""

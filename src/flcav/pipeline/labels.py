@@ -35,12 +35,16 @@ class LabelSource:
     from_detections: bool = False  # pseudo-labels of the frozen stage I network
     from_poles: bool = False  # boxes of roadside sensors
     trained: bool = False  # these boxes are a trained detector's, not an ideal one's
+    averaged: bool = False  # the road average of a spin's poles and vehicles, renewed before each round of stage II
     caveat: str = ""  # stated with every result that depends on them
 
 
 LABEL_SOURCES: Mapping[str, LabelSource] = {
     "own-detections": LabelSource(from_detections=True),
     "road": LabelSource(from_detections=True, from_poles=True, trained=True, caveat="trained road detector"),
+    "road-average": LabelSource(
+        from_detections=True, from_poles=True, trained=True, averaged=True, caveat="trained road detector"
+    ),
     "ideal-road": LabelSource(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
     "annotated": LabelSource(caveat="ground truth as labels, upper bound"),
     "future": LabelSource(
@@ -99,7 +103,7 @@ def pseudo_label_samples(
     downlinks; stage III passes none, since its labels are those of stage II.
     """
     data = split.data
-    views = _views(split, poles, trained)
+    views = road_views(split, poles, trained)
     samples: dict[str, list[Sample]] = {}
     for done, i in enumerate(frames):
         key, frame = data.keys[i], data.frame(i)
@@ -114,7 +118,8 @@ def pseudo_label_samples(
     return samples
 
 
-def _views(split: Frames, poles: Sequence[int], trained: bool) -> dict[tuple[str, int], list[RoadView]]:
+def road_views(split: Frames, poles: Sequence[int], trained: bool) -> dict[tuple[str, int], list[RoadView]]:
+    """Return what sensors on `poles` see in each spin, by scene and number of the spin: see `pseudo_label_samples`."""
     views: dict[tuple[str, int], list[RoadView]] = {}
     find = road_detector(split.data) if trained and poles else None
     for pole in poles:

@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.rules import Rules
+from flcav.fusion.distillation import Distillation
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
@@ -194,6 +195,7 @@ class Arm(Config):
     placement: Mapping[str, Any] = {}  # fields of `Placement` that differ from the run
     federation: Mapping[str, Any] = {}  # fields of `Federation` that differ from the run
     labels: Mapping[str, str] = {}  # kinds of labels that differ from the run, by task
+    distillation: Mapping[str, Any] = {}  # fields of `Distillation` that differ from the run
     training: Mapping[str, Any] = {}  # fields of `Training` that differ from the run, for every task
     central: Literal["pretrain", "federate"] | None = (
         None  # train centrally on the ground truth of the regions of this role
@@ -249,6 +251,7 @@ class RunRecipe(Config):
     horizon_s: Positive | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]
     placement: Placement = Placement()  # placement of roadside sensors
     federation: Federation = Federation()  # settings of aggregation
+    distillation: Distillation | None = None  # of labels "road-average"; None: the defaults
     recording: Recording = Recording()  # changes to how all regions are recorded
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
 
@@ -298,6 +301,7 @@ class RunRecipe(Config):
         parts: list[tuple[type[Config], Config, str]] = [
             (Placement, self.placement, "placement"),
             (Federation, self.federation, "federation"),
+            (Distillation, self.distillation or Distillation(), "distillation"),
             *((Training, self.training_of(task), "training") for task in self.tasks),
         ]
         for model, own, part in parts:

@@ -183,6 +183,27 @@ class FederatedRound(Record):
 
 
 @dataclass(frozen=True)
+class LabelQuality(Record):
+    """Precision and recall of the labels that vehicles train on, against ground truth that they do not know.
+
+    A label is right that matches a target at IoU 0.5 in 3D; labels on neutral objects do not count.
+    """
+
+    round: int  # of stage II that they are made before, from 1
+    labels: int
+    targets: int
+    precision: float | None  # None: no labels
+    recall: float | None  # None: no targets
+
+
+@dataclass(frozen=True)
+class LabelHistory(Saved):
+    """Quality of the labels before each round of a stage."""
+
+    rounds: tuple[LabelQuality, ...] = ()
+
+
+@dataclass(frozen=True)
 class StageResult(Saved):
     """Result of a federated stage of a task, or of centralised training; the weights are in the same folder."""
 
@@ -196,6 +217,7 @@ class StageResult(Saved):
     losses: tuple[float, ...] = ()  # mean training loss of each round
     records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
     plans: Annotated[tuple[RoundPlan, ...] | None, LEFT_OUT] = None  # after each round; None: not made anew by rounds
+    labels: Annotated[tuple[LabelQuality, ...] | None, LEFT_OUT] = None  # before each round; None: not measured
 
 
 @dataclass(frozen=True)

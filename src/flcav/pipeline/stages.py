@@ -6,7 +6,7 @@ vehicles federate with their edge server. Stage III: edge servers federate with 
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -40,8 +40,13 @@ from flcav.pipeline.results import WEIGHTS, Validated
 from flcav.progress import Report
 from flcav.seeds import derive_seed, stream
 
+OnStart = Callable[[int, Weights], None]  # called before a round with its number and weights
 CHECKPOINT, ROUND = "checkpoint.pt", LAST
 VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart
+
+
+def _begin(round_: int, weights: Weights) -> None:
+    pass
 
 
 @dataclass(frozen=True)
@@ -238,6 +243,7 @@ def federate_edge(
     runtime: str = "embedded",
     replanning: Replanning | None = None,
     shared: SharedSamples | None = None,
+    before_round: OnStart = _begin,
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region from `network`; write weights and ledger, return each round's loss.
 
@@ -246,6 +252,7 @@ def federate_edge(
     region. Vehicles train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights.
     The vehicles that `outages` name by round are lost in it. Under `replanning` the number of rounds, who joins them
     and who is lost are those of the plan before each. With `shared` samples vehicles send outputs on these.
+    `before_round` is called before each round with its number and the weights that it begins with.
     """
     state, task, averaged = FederationState(), learning.task, learning.training.average_rounds
     share = 0.0 if earlier else learning.training.start_share
@@ -268,12 +275,21 @@ def federate_edge(
     with open_runtime(runtime, asked, processes) as where:
         how["runtime"] = where
         if replanning is None:
-            keep = federating.make_saver(schedule.rounds)
+            save = federating.make_saver(schedule.rounds)
+
+            def keep(round_: int, weights: Weights, loss: float) -> None:
+                save(round_, weights, loss)
+                if round_ < schedule.rounds:
+                    before_round(round_ + 1, weights)
+
+            if done < schedule.rounds:
+                before_round(done + 1, start)
             run(asked, start, schedule, account, **how, rules=rules, done=done, on_round=keep)
         else:
             course = replanning.course
 
             def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
+                before_round(number, weights)
                 own, lossy = course.schedule(schedule, number), replace(account, outages=driven.outages)
                 keep = federating.make_saver(course.rounds)
                 given: Any = {**how, "rules": driven.rules, "done": number - 1, "on_round": keep}

@@ -37,7 +37,7 @@ def steps_of(recipe: RunRecipe, beside: Path = Path()) -> dict[str, str]:
     return found
 
 
-@pytest.mark.parametrize("name", ["demo", "arms", "allocation"])
+@pytest.mark.parametrize("name", ["demo", "arms", "allocation", "distillation"])
 def test_every_step_comes_after_what_it_needs(name: str) -> None:
     before: set[str] = set()
     for step in Graph(load_run_recipe(recipe_path(f"runs/{name}")), Path()).steps:
@@ -276,3 +276,28 @@ def test_recordings_of_an_own_town_name_its_files(tmp_path: Path) -> None:
 def test_what_cannot_be_found_is_said_before_anything_runs(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
         Graph(recipe_of(**changes), Path())
+
+
+def test_arms_of_distillation_share_all_but_stage_two_and_have_their_labels_measured() -> None:
+    arms = {
+        "contrastive": {"labels": {"objects": "road-average"}, "distillation": {"terms": ["contrastive"]}},
+        "average": {"labels": {"objects": "road-average"}, "stages": ["edge"]},
+    }
+    plain, armed = steps_of(recipe_of()), Graph(recipe_of(arms=arms), Path()).steps
+    added = {step.name: step.arguments for step in armed if step.name not in plain}
+    edges = {name: added[name] for name in added if name.startswith("grid-edge-fl")}
+    assert list(edges) == ["grid-edge-fl-objects-contrastive", "grid-edge-fl-objects-average"]
+    terms = [each["distillation"]["terms"] for each in edges.values()]
+    assert terms == [["contrastive"], ["regression", "contrastive"]]
+    assert added["cloud-fl-objects-contrastive"]["distillation"]["terms"] == ["contrastive"]
+    assert {name.split("-")[0] for name in added} <= {"grid", "cloud", "test"}
+    arguments = {step.name: step.arguments for step in armed}
+    scored = [name for name, own in arguments.items() if own.get("scored")]
+    assert scored == ["grid-edge-fl-objects", *edges]
+    assert "distillation" not in arguments["grid-edge-fl-objects"]
+    before = {step.name: step.arguments for step in Graph(recipe_of(), Path()).steps}
+    assert all("scored" not in own and "distillation" not in own for own in before.values())
+    same = {"grid-edge-fl-objects"}  # whose labels are measured now
+    assert all(arguments[name] == own for name, own in before.items() if name not in same)
+    with pytest.raises(ValueError, match=r"arms\.odd\.distillation: .*terms"):
+        recipe_of(arms={"odd": {"distillation": {"terms": ["outputs"]}}})

@@ -13,7 +13,7 @@ from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
 from flcav.pipeline.federations.checkpoint import Checkpoint
 from flcav.pipeline.federations.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
-from flcav.pipeline.results import LEDGER, FederatedRound, Run, StageResult
+from flcav.pipeline.results import LEDGER, FederatedRound, LabelQuality, Run, StageResult
 from flcav.report.pages import html
 from flcav.report.pages.run_page import page
 
@@ -85,3 +85,14 @@ def test_rounds_are_a_table_curves_and_rows_of_the_page(tmp_path: Path) -> None:
     assert "<td>grid/cav1: no power</td>" in plain
     assert "<th>ε so far</th>" not in plain
     assert "Rounds of federated learning" not in html.render(page(made_up_run()), {})
+
+
+def test_the_page_has_precision_and_recall_of_labels_where_they_were_measured() -> None:
+    run = made_up_run()
+    labels = (LabelQuality(1, 8, 10, 0.75, 0.6), LabelQuality(2, 0, 10, None, 0.0))
+    stage = StageResult(EDGE, "objects", "grid", 2, 9, 2, (), (0.5, 0.25), None, labels)
+    measured = replace(run, arms={MAIN: replace(run.arms[MAIN], stages=(stage,))})
+    text = html.render(page(measured), {})
+    assert "<td>grid</td><td>1</td><td>8</td><td>10</td><td>0.750</td><td>0.600</td>" in text
+    assert Run.from_json(measured.as_json(), "run").arms[MAIN].stages == (stage,)
+    assert "Labels that vehicles learn from" not in html.render(page(run), {})

@@ -63,10 +63,16 @@ def transform_sample(sample: Sample, mirror: float, turn_rad: float, scale: floa
 
     def moved(boxes: Boxes) -> Boxes:
         center = np.concatenate((boxes.center[:, :2] @ plane, boxes.center[:, 2:] * scale), 1)
-        return replace(boxes, center=center, size=boxes.size * scale, yaw=boxes.yaw * mirror + turn_rad)
+        variance = boxes.variance
+        if variance is not None:
+            parts = variance[:, :2] @ np.square(plane), variance[:, 2:6] * scale**2, variance[:, 6:]
+            variance = np.concatenate(parts, axis=1)
+        yaw = boxes.yaw * mirror + turn_rad
+        return replace(boxes, center=center, size=boxes.size * scale, yaw=yaw, variance=variance)
 
     free = None if sample.free is None else (sample.free @ plane).astype(np.float32)
-    return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact)
+    own = None if sample.own is None else moved(sample.own)
+    return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact, own)
 
 
 def resize_objects(sample: Sample, factor: NDArray[np.float64]) -> Sample:
@@ -96,7 +102,8 @@ def shift_sample(sample: Sample, by_m: NDArray[np.float64]) -> Sample:
         return replace(boxes, center=boxes.center + step)
 
     free = None if sample.free is None else sample.free + by_m.astype(np.float32)
-    return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact)
+    own = None if sample.own is None else moved(sample.own)
+    return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact, own)
 
 
 def tilt_sample(sample: Sample, slope: NDArray[np.float64], lift_m: float) -> Sample:
@@ -108,7 +115,8 @@ def tilt_sample(sample: Sample, slope: NDArray[np.float64], lift_m: float) -> Sa
         rise = boxes.center[:, :2] @ slope + lift_m
         return replace(boxes, center=boxes.center + rise[:, None] * (0, 0, 1))
 
-    return replace(sample, points=points, boxes=moved(sample.boxes), ignore=moved(sample.ignore))
+    own = None if sample.own is None else moved(sample.own)
+    return replace(sample, points=points, boxes=moved(sample.boxes), ignore=moved(sample.ignore), own=own)
 
 
 def in_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:

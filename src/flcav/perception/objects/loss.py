@@ -32,32 +32,54 @@ def second_loss(output: HeadOutput, targets: Sequence[Targets], config: SecondCo
     The classification term of a sample is divided by its number of positive anchors; the box, direction and variance
     terms by its number of positive anchors with an exact box, the only ones that enter them.
     """
+    share = torch.cat([target.exact / target.exact.sum().clamp(min=1) for target in targets]).to(output.score.device)
+    box, direction, nll = box_losses(output, targets)
+    total = BOX_WEIGHT * box.sum(1) + DIRECTION_WEIGHT * direction
+    if nll is not None:
+        total = total + VARIANCE_WEIGHT * nll.sum(1)
+    return (classification_loss(output, targets, config) + (total * share).sum()) / len(targets)
+
+
+def classification_loss(output: HeadOutput, targets: Sequence[Targets], config: SecondConfig) -> Tensor:
+    """Return the sum over the samples of a batch of the focal loss of each, divided by its number of positive anchors.
+
+    Ignored anchors do not enter it.
+    """
     device = output.score.device
     samples, anchors, classes = output.score.shape
     count = torch.tensor([max(len(target.positive), 1) for target in targets], device=device)
-    positive = torch.cat([target.positive + i * anchors for i, target in enumerate(targets)]).to(device)
-    share = torch.cat([target.exact / target.exact.sum().clamp(min=1) for target in targets]).to(device)
+    positive = _positive(output, targets)
     weight = torch.stack([target.weight for target in targets]).to(device) / count[:, None]
     kind = torch.tensor(anchor_classes(config), device=device)[positive % anchors]
-
     logits = output.score.flatten()
     wanted = torch.zeros_like(logits)
     wanted[positive * classes + kind] = 1
     scores = focal_loss(logits, wanted).view(samples, anchors, classes).sum(2)
-    classification = (scores * weight).sum()
+    return (scores * weight).sum()
 
+
+def box_losses(output: HeadOutput, targets: Sequence[Targets]) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return the losses of a batch's P positive anchors: of residuals (P, 7), directions (P,) and variances (P, 7).
+
+    They are smooth L1, cross-entropy and Gaussian negative log-likelihood; the last is None where none are predicted.
+    """
+    device, positive = output.score.device, _positive(output, targets)
     residual = torch.cat([target.residual for target in targets]).to(device)
     error = output.box.flatten(0, 1)[positive] - residual
     error = torch.cat((error[:, :6], torch.sin(error[:, 6:])), 1)
-    box = F.smooth_l1_loss(error, torch.zeros_like(error), beta=SMOOTH_L1_BETA, reduction="none").sum(1)
-
+    box = F.smooth_l1_loss(error, torch.zeros_like(error), beta=SMOOTH_L1_BETA, reduction="none")
     half_turn = torch.cat([target.direction for target in targets]).to(device)
     direction = F.cross_entropy(output.direction.flatten(0, 1)[positive], half_turn, reduction="none")
-    total = BOX_WEIGHT * box + DIRECTION_WEIGHT * direction
-    if output.log_variance is not None:
-        log_variance = output.log_variance.flatten(0, 1)[positive].clamp(*LOG_VARIANCES)
-        total = total + VARIANCE_WEIGHT * gaussian_nll(error.detach(), log_variance).sum(1)
-    return (classification + (total * share).sum()) / samples
+    if output.log_variance is None:
+        return box, direction, None
+    log_variance = output.log_variance.flatten(0, 1)[positive].clamp(*LOG_VARIANCES)
+    return box, direction, gaussian_nll(error.detach(), log_variance)
+
+
+def _positive(output: HeadOutput, targets: Sequence[Targets]) -> Tensor:
+    """Return (P,) the indices of the positive anchors of a batch among the anchors of all samples."""
+    anchors = output.score.shape[1]
+    return torch.cat([target.positive + i * anchors for i, target in enumerate(targets)]).to(output.score.device)
 
 
 def gaussian_nll(error: Tensor, log_variance: Tensor) -> Tensor:

@@ -139,10 +139,18 @@ class Second(nn.Module):
 
     def forward(self, voxels: SparseTensor) -> HeadOutput:
         """Return the raw predictions for every anchor of each sample."""
-        features = voxels.features
+        return self.answer(self.map_features(voxels))
+
+    def map_features(self, voxels: SparseTensor) -> Tensor:
+        """Return the bird's-eye feature map (B, C, H, W) that the head reads, rows along y, columns along x."""
+        with autocast_bfloat16(voxels.features.device, self.training and self.config.bfloat16):
+            return self.birds_eye(self.backbone(voxels).birds_eye())
+
+    def answer(self, features: Tensor) -> HeadOutput:
+        """Return the raw predictions of the head from bird's-eye feature maps (B, C, H, W)."""
         with autocast_bfloat16(features.device, self.training and self.config.bfloat16):
-            maps = self.head(self.birds_eye(self.backbone(voxels).birds_eye()))
-        cells = maps.to(features.dtype).permute(0, 2, 3, 1).flatten(1, 2)  # (B, H W, channels)
+            maps = self.head(features)
+        cells = maps.to(self.head.weight.dtype).permute(0, 2, 3, 1).flatten(1, 2)  # (B, H W, channels)
         parts = cells.split([self.anchors_per_cell * width for width in self.per_anchor], 2)
         return HeadOutput(*(part.reshape(len(cells), -1, n) for part, n in zip(parts, self.per_anchor, strict=True)))
 

@@ -17,6 +17,7 @@ from flcav.perception.objects.samples import move_points
 from flcav.perception.objects.targets import anchor_boxes, anchor_classes, decode, decode_variance
 from flcav.perception.objects.truth import QUARTERS, FrameTruth, asked_of, choose_lidar, in_range, network_from_lidar
 from flcav.perception.ops.rotated import nms
+from flcav.perception.ops.sparse import SparseTensor
 from flcav.perception.task import Result
 from flcav.progress import Report, ignore_progress
 from flcav.records import Class
@@ -183,11 +184,16 @@ def detect_frames(
 
 def predict(network: Second, clouds: Sequence[NDArray[np.float32]]) -> HeadOutput:
     """Return the raw predictions of `network` for a batch of point clouds (N_i, 4), LiDAR frame, on its device."""
+    return network(voxels_of(network, clouds))
+
+
+def voxels_of(network: Second, clouds: Sequence[NDArray[np.float32]]) -> SparseTensor:
+    """Return the input voxels of `network` for a batch of point clouds (N_i, 4), LiDAR frame, on its device."""
     device = network.head.weight.device
     points = torch.from_numpy(np.concatenate(clouds)).to(device)
     sizes = torch.tensor([len(cloud) for cloud in clouds], device=device)
     sample = torch.repeat_interleave(torch.arange(len(clouds), device=device), sizes)
-    return network(network.voxels(points, sample, len(clouds)))
+    return network.voxels(points, sample, len(clouds))
 
 
 def calibrate_logits(logits: Tensor, config: SecondConfig) -> Tensor:

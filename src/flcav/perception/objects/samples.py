@@ -39,6 +39,7 @@ class Sample:
     ignore: Boxes = field(default_factory=Boxes.empty)  # objects left out of the loss, neither positive nor negative
     free: NDArray[np.float32] | None = None  # (K, 2) positions x, y [m] without objects; None: wherever no box is
     exact: NDArray[np.bool_] | None = None  # (B,) whether size and pose of the box are learned too; None: all
+    own: Boxes | None = None  # the vehicle's own detections, for a contrastive loss; None: there is none
 
 
 def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Sample:
@@ -77,6 +78,7 @@ def move_sample(sample: Sample, move: NDArray[np.float64] | None) -> Sample:
         boxes=sample.boxes.transform(move),
         ignore=sample.ignore.transform(move),
         free=free,
+        own=None if sample.own is None else sample.own.transform(move),
     )
 
 

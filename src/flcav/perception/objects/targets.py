@@ -71,6 +71,7 @@ class Targets:
     residual: Tensor  # (P, 7) float32, see `encode`
     exact: Tensor  # (P,) float32: 1 where residual and direction are learned, else 0
     direction: Tensor  # (P,) int64 direction class: 1 where the yaw is in [-3/4 pi, pi/4), else 0
+    variance: Tensor | None = None  # (P, 7) float32 of the residuals, where boxes have one
 
 
 def encode(boxes: Array, anchors: Array) -> Array:
@@ -106,9 +107,18 @@ def decode_variance(variance: Array, boxes: Array, anchors: Array) -> Array:
 
     First-order error propagation: a size is the exponential of its residual, the others are linear in theirs.
     """
+    return variance * _slopes(boxes, anchors) ** 2
+
+
+def encode_variance(variance: Array, boxes: Array, anchors: Array) -> Array:
+    """Return the variances (P, 7) of residuals from those of boxes [m^2, rad^2]: the inverse of `decode_variance`."""
+    return variance / _slopes(boxes, anchors) ** 2
+
+
+def _slopes(boxes: Array, anchors: Array) -> Array:
+    """Return the derivatives (P, 7) of decoded boxes by their residuals."""
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
-    slope = np.column_stack((diagonal, diagonal, anchors[:, 5], boxes[:, 3:6], np.ones(len(boxes))))
-    return variance * slope**2
+    return np.column_stack((diagonal, diagonal, anchors[:, 5], boxes[:, 3:6], np.ones(len(boxes))))
 
 
 def direction_of(yaw: Array) -> NDArray[np.int64]:
@@ -166,12 +176,17 @@ def assign_anchors(sample: Sample, config: SecondConfig) -> Targets:
     positive = np.flatnonzero(owner >= 0)
     counts[positive] = True
     targets = boxes[owner[positive]]
+    variance = None
+    if sample.boxes.variance is not None:
+        own = sample.boxes.variance[inside][owner[positive]]
+        variance = torch.from_numpy(encode_variance(own, targets, anchors[positive]).astype(np.float32))
     return Targets(
         positive=torch.from_numpy(positive),
         weight=torch.from_numpy(counts.astype(np.float32)),
         exact=torch.from_numpy(exact[owner[positive]].astype(np.float32)),
         residual=torch.from_numpy(encode(targets, anchors[positive]).astype(np.float32)),
         direction=torch.from_numpy(direction_of(targets[:, 6])),
+        variance=variance,
     )
 
 

@@ -1,6 +1,7 @@
 """Steps of the three stages of training, and of centralised training in place of stage II."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from flcav.network.ledger import Ledger
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import find_strategies
+from flcav.pipeline.federations.distillation import RoadAverageLabels
 from flcav.pipeline.federations.network import DrivenCloud, DrivenRounds, join_regions, open_network
 from flcav.pipeline.federations.outputs import send_region_network, share_frames
 from flcav.pipeline.federations.records import read_rounds
@@ -46,6 +48,7 @@ from flcav.pipeline.stages import (
 from flcav.pipeline.steps import Work
 from flcav.pipeline.work import Fields
 from flcav.pipeline.work.budgets import open_region_book, read_entries, share_plan_budget
+from flcav.pipeline.work.distilling import label_by_average, learn_by_distillation, score_labels
 from flcav.pipeline.work.replanning import count_further_rounds, open_cloud_course, open_edge_course
 from flcav.pipeline.work.uploads import list_frames
 
@@ -112,6 +115,8 @@ def edge_step(
     processes: int = 1,
     runtime: str = "embedded",
     replan: Mapping[str, Any] = {},
+    distillation: Fields | None = None,
+    scored: bool = False,
 ) -> None:
     """Run stage II of a task in a region; `steps`: what its samples depend on, see `_label_samples`.
 
@@ -119,8 +124,11 @@ def edge_step(
     a vehicle trains `train_s` / speed in a round [s]. Each round is scored on the frames of the steps `validation`, by
     region. Vehicles train in so many `processes` of a `runtime`. `replan` is empty where the plan is not made anew
     after each round; it has the `vehicles` of each region, the `headroom`, and the step that the rounds keep to
-    (`follows`) or those of the `first` plan and of the region's validation `frames`.
+    (`follows`) or those of the `first` plan and of the region's validation `frames`. `distillation`: settings of the
+    labels "road-average". `scored`: the labels are compared with ground truth.
     """
+    if distillation is not None and (processes > 1 or runtime != "embedded"):
+        raise InputError("labels 'road-average' are renewed between rounds: vehicles train in one process, --jobs 1")
     learning = Learning(task_named(task), network, Training.model_validate(training), seed)
     plan, how = Plan.load(work.inputs[steps["plan"]]), Federation.model_validate(federation)
     own, k = plan.tasks[task], how.edge_rounds_per_cloud_round
@@ -130,10 +138,12 @@ def edge_step(
     if "edge" in steps:
         stage, rounds = MORE_EDGE, own.cloud_rounds * k
         book = Ledger(book.budget, read_entries(work, steps["edge"]))
-        samples, poles = _label_samples(work, learning, region, labels, steps)
+        samples, poles = _label_samples(work, learning, region, labels, steps, None, distillation)
     else:
         stage, rounds = EDGE, own.edge_rounds
-        samples, poles = _label_samples(work, learning, region, labels, steps, book)
+        samples, poles = _label_samples(work, learning, region, labels, steps, book, distillation)
+    if distillation is not None:
+        learning = learn_by_distillation(learning, distillation)
     terms: Any = (work, plan, task, region, k, budget_mb, replan, book, steps["pretrain"])
     course = open_edge_course(*terms) if replan and stage == EDGE else None
     if replan and stage == MORE_EDGE:
@@ -158,19 +168,26 @@ def edge_step(
     before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
     frames = replan.get("frames", {}) | validation if course is not None else validation
     watched = {name: Frames.open(work.inputs[step]) for name, step in frames.items()}
+    about: Any = {"shared": shared}
+    if isinstance(samples, RoadAverageLabels) and stage == EDGE:
+        about["before_round"] = partial(samples.renew, book=book)
     if course is None:
         driven = drive(own, rounds)
-        where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime, None, shared)
-        losses = federate_edge(*asked, driven.rules, earlier, *where)
+        where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
+        losses = federate_edge(*asked, driven.rules, earlier, *where, **about)
     else:
         replanning = Replanning(course, drive, lambda scores: scores[region])
-        where = (book, work.folder, work.report, {}, watched, processes, runtime, replanning, shared)
-        losses = federate_edge(*asked, how, earlier, *where)
+        where = (book, work.folder, work.report, {}, watched, processes, runtime, replanning)
+        losses = federate_edge(*asked, how, earlier, *where, **about)
         driven = drive(course.plan, len(losses))
     held = sum(len(client.samples) for client in clients.values())
     records = read_rounds(work.folder, region, before, {region: driven.seconds})
-    made = None if course is None else tuple(course.made)
-    StageResult(stage, task, region, len(losses), held, len(clients), poles, losses, records, made).save(work.folder)
+    made, quality = None if course is None else tuple(course.made), None
+    if scored and stage == EDGE:
+        group = _select_group(work, Frames.open(work.inputs[steps["frames"]]), steps)
+        quality = score_labels(work, region, steps, group, start.config, samples)
+    found: Any = (stage, task, region, len(losses), held, len(clients), poles, losses, records, made, quality)
+    StageResult(*found).save(work.folder)
 
 
 def cloud_step(
@@ -186,6 +203,7 @@ def cloud_step(
     train_s: float = 0.0,
     speeds: Mapping[str, float] = {},
     replan: Mapping[str, Any] = {},
+    distillation: Fields | None = None,
 ) -> None:
     """Run stage III of a task: the edge servers of `regions` federate with the cloud, vehicles with edge servers.
 
@@ -199,9 +217,11 @@ def cloud_step(
         share_plan_budget(own, budget_mb, task),
         read_entries(work, first["pretrain"], *(s["edge"] for s in regions.values())),
     )
+    if distillation is not None:
+        learning = learn_by_distillation(learning, distillation)
     servers, held, count, helped = {}, 0, 0, []
     for region, steps in regions.items():
-        samples, poles = _label_samples(work, learning, region, labels, steps)
+        samples, poles = _label_samples(work, learning, region, labels, steps, None, distillation)
         clients = make_clients(learning, start.config, samples)
         weights = to_arrays(load_stage_network(learning.task, work.inputs[steps["edge"]]))
         servers[region] = RegionStart(clients, weights, StageResult.load(work.inputs[steps["edge"]]).rounds)
@@ -280,11 +300,18 @@ def central_step(
 
 
 def _label_samples(
-    work: Work, learning: Learning, region: str, labels: str, steps: Mapping[str, Any], book: Ledger | None = None
+    work: Work,
+    learning: Learning,
+    region: str,
+    labels: str,
+    steps: Mapping[str, Any],
+    book: Ledger | None = None,
+    distillation: Fields | None = None,
 ) -> tuple[Mapping[str, Sequence[Any]], tuple[int, ...]]:
     """Return each vehicle's labelled samples, and the poles that contributed labels.
 
     `steps`: "pretrain", the recorded "frames", the arm's "place", and "sites", the placements of all arms.
+    `distillation`: settings of the labels "road-average", which are made before each round.
     """
     split, kind = Frames.open(work.inputs[steps["frames"]]), LABEL_SOURCES[labels]
     frames = _select_group(work, split, steps)
@@ -292,6 +319,8 @@ def _label_samples(
         config = load_stage_network(learning.task, work.inputs[steps["pretrain"]]).config
         return annotated_samples(learning.task, config, split, frames, region), ()
     poles = Placed.load(work.inputs[steps["place"]]).chosen if kind.from_poles else ()
+    if distillation is not None:
+        return label_by_average(work, learning, region, steps, frames, poles, distillation, book), poles
     frozen = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
     threshold = Pretrained.load(work.inputs[steps["pretrain"]]).threshold
     assert threshold is not None  # fixed wherever labels come from detections

@@ -92,6 +92,12 @@ def page(run: Run) -> dict[str, Any]:
         "regional": [(arm, test) for arm, result in run.arms.items() for test in result.regional or ()],
         "gap_closed": run.gap_closed,
         "rounds": rounds,
+        "labels": [
+            (arm, stage.region, labels)
+            for arm, result in run.arms.items()
+            for stage in result.stages
+            for labels in stage.labels or ()
+        ],
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,

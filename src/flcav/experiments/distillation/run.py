@@ -1,0 +1,125 @@
+"""What vehicles learn from in stage II, as the arms of recipes/runs/distillation.yaml: same frames, steps and budget.
+
+Arms differ in their labels and in the terms of the loss alone. Every arm has a ledger of its own with the boxes that
+its vehicles send. Over seeds, which have recordings of their own, intervals cover training and traffic. The verdicts on
+all differences are corrected together.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+from flcav.files import Json
+from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results import LabelQuality, Run
+from flcav.pipeline.running import gap_closed
+from flcav.records import LEFT_OUT, Record
+from flcav.report import style
+from flcav.report.charts import figures
+from flcav.verdicts import Claim, Judged, judge
+
+TASK, TOWN = "objects", "grid"
+PRETRAINED, NO_ROAD, PLAIN, IDEAL, BOTH = (
+    "pretrained",
+    "no road sensor",
+    "plain pseudo-labels",
+    "ideal labels",
+    "regression and contrast",
+)
+ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
+    PRETRAINED: (MAIN, PRETRAIN),
+    NO_ROAD: ("no_road", EDGE),
+    PLAIN: ("plain", EDGE),
+    "regression": ("regression", EDGE),
+    "contrast": ("contrastive", EDGE),
+    BOTH: (MAIN, EDGE),
+    IDEAL: ("ideal", EDGE),
+}
+COMPARED = (  # (after, before): claims that the difference is positive
+    (BOTH, PRETRAINED),
+    (BOTH, NO_ROAD),
+    (BOTH, PLAIN),
+    (BOTH, "regression"),
+    (BOTH, "contrast"),
+    (PLAIN, PRETRAINED),
+    (IDEAL, PLAIN),
+)
+
+
+@dataclass(frozen=True)
+class DistillationArm:
+    """What one arm reached in one seed."""
+
+    ap50: float
+    ap70: float
+    up_mb: float  # by wireless in stage II, weights and boxes
+    labels: tuple[LabelQuality, ...]  # before each round; labels that stay: once; of the pretrained network: none
+
+
+@dataclass(frozen=True)
+class DistillationResult(Record):
+    """Results of the comparison: numbers by seed and arm, and means over seeds."""
+
+    seeds: Mapping[str, Mapping[str, DistillationArm]]  # by seed and arm
+    ap50: Mapping[str, MeanOverSeeds]  # by arm
+    differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
+    closed: MeanOverSeeds  # share of the gain with ideal labels that the trained road detector's bring
+    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+
+    def sentences(self) -> list[str]:
+        """Return AP50 by arm, the verdicts on differences, and what the trained road detector costs, in words."""
+        reached = [f"{arm}: AP50 {mean.describe()}" for arm, mean in self.ap50.items()]
+        judged = judge_differences(self)
+        told = [
+            f"{name}: {mean.describe(sign=True)}, {judged[name].verdict}: {judged[name].describe()}"
+            for name, mean in self.differences.items()
+        ]
+        share = f"share of the gain with an ideal road detector that the trained one brings: {self.closed.describe()}"
+        return [*reached, *told, share]
+
+
+def compare_labels(recipe: RunRecipe, runs: Sequence[Run]) -> DistillationResult:
+    """Return the results of the arms of `recipe`, from a run of each seed."""
+    seeds = {str(run.recipe.seed): {name: _reached(run, *arm) for name, arm in ARMS.items()} for run in runs}
+    each = [*seeds.values()]
+
+    def gain(seed: Mapping[str, DistillationArm], after: str, before: str) -> float:
+        return seed[after].ap50 - seed[before].ap50
+
+    shares = [gap_closed(*(seed[name].ap50 for name in (PRETRAINED, PLAIN, IDEAL))) for seed in each]
+    return DistillationResult(
+        seeds=seeds,
+        ap50={name: mean_over_seeds([seed[name].ap50 for seed in each], share=True) for name in ARMS},
+        differences={
+            f"{after} - {before}": mean_over_seeds([gain(seed, after, before) for seed in each])
+            for after, before in COMPARED
+        },
+        closed=mean_over_seeds(shares),
+        recipe=recipe.model_dump(mode="json", exclude={"seed"}),
+        provenance=provenance(),
+    )
+
+
+def _reached(run: Run, arm: str, stage: str) -> DistillationArm:
+    test = run.test(arm=arm, stage=stage, region=TOWN, task=TASK)
+    ap70 = test.numbers["AP70"]
+    assert ap70 is not None  # the town has targets
+    if stage == PRETRAIN:
+        return DistillationArm(test.estimate.mean, ap70, 0.0, ())
+    labels = next(each.labels for each in run.arms[arm].stages if each.stage == stage and each.region == TOWN)
+    sent = sum(each.mb for each in run.arms[arm].spent if (each.stage, each.link) == (stage, "wireless"))
+    return DistillationArm(test.estimate.mean, ap70, sent, labels or ())
+
+
+def judge_differences(results: DistillationResult) -> dict[str, Judged]:
+    """Return the verdicts on the claims that the differences are positive, corrected together."""
+    judged = judge([Claim(mean) for mean in results.differences.values()])
+    return dict(zip(results.differences, judged, strict=True))
+
+
+def draw_labels(results: DistillationResult) -> bytes:
+    """Return the forest plot of the AP50 of all arms as a PNG."""
+    return style.png(figures.arms({TOWN: {name: results.ap50[name] for name in ARMS}}))

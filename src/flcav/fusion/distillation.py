@@ -1,0 +1,195 @@
+"""Labels by federated distillation: what vehicles tell the edge server, and what they learn from the road average.
+
+Wang et al. (IEEE Network 37(3), 2023): road sensors and vehicles send boxes with their uncertainties to the edge
+server, which averages them (`flcav.fusion.average`); each vehicle learns from the average of the spin of its own frame.
+Nobody knows ground truth, and vehicles know their poses by their own navigation alone.
+
+- A box of the average is a label where a road sensor has it, or where several vehicles do and its score reaches the
+  threshold of pseudo-labels.
+- What one vehicle alone is sure of is ignored in the loss: it is not unlearned, nor does a network confirm itself. With
+  such boxes as labels the precision of the labels fell from .71 to .47 in three rounds, without from .80 to .72.
+- What vehicles alone tell of is dropped where road sensors saw free ground, or have a box of their own.
+- An anchor is a negative only where a road sensor saw free ground.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.config import Config
+from flcav.fusion.average import average_boxes, variance_of
+from flcav.fusion.labels import cell_centers
+from flcav.fusion.pose_graph import Navigation, Sighting, add_pose_variance, correct_poses, tell
+from flcav.fusion.road import RoadView
+from flcav.geometry import Boxes, inverse, points_in_boxes, pose, spread_over_footprints, transform_points
+from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
+from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
+from flcav.sensors.frame import Frame
+
+Array = NDArray[np.float64]
+
+TOLD = 0.1  # lowest score of a detection that a vehicle tells of
+FREE = 0.5  # what vehicles alone tell of is dropped where road sensors saw more than this share of its footprint free
+PARTS = (8, 4)  # of a footprint, along and across, by which that share is measured
+RETURNS_M = 0.3  # margin around a box within which a vehicle's returns are the object's: poses are off
+
+
+class Distillation(Config):
+    """Settings of federated distillation: terms of the loss, and navigation of the vehicles."""
+
+    terms: tuple[Literal["regression", "contrastive"], ...] = Field(
+        default=("regression", "contrastive"), min_length=1
+    )  # of the loss, beside classification
+    contrastive_weight: float = Field(default=0.1, gt=0, le=100)  # of the contrastive term
+    temperature: float = Field(default=0.1, ge=0.01, le=10)  # of the contrastive term
+    position_m: float = Field(default=0.2, ge=0, le=10)  # standard deviation of a vehicle's position, along x and y
+    heading_deg: float = Field(default=0.3, ge=0, le=45)  # standard deviation of its heading
+    pose_graph: bool = False  # whether a pose graph corrects vehicles' poses: needs the extra `fusion`
+
+    @property
+    def navigation(self) -> Navigation:
+        """Return what the navigation of a vehicle states of its accuracy: at least a centimetre and .05 degrees."""
+        return Navigation(max(self.position_m, 0.01), max(float(np.radians(self.heading_deg)), 0.001))
+
+    def navigate(self, world_from_agent: Array, rng: np.random.Generator) -> Array:
+        """Return a vehicle's pose (4, 4) as its navigation has it, with errors drawn from `rng`."""
+        off_m, turned = self.position_m * rng.standard_normal(2), np.radians(self.heading_deg) * rng.standard_normal()
+        known = world_from_agent @ pose(0, 0, 0, float(turned))
+        known[:2, 3] = world_from_agent[:2, 3] + off_m
+        return known
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """What the edge server tells a vehicle of one of its frames: the road average, in the vehicle's frame."""
+
+    boxes: Boxes  # (K,) label = detection class, or the actor category of a lookalike; with scores and variances
+    confirmed: NDArray[np.bool_]  # (K,) whether a road sensor or several vehicles tell of the box; others are ignored
+    world_from_agent: Array  # (4, 4) the vehicle's pose as the edge server has it
+
+    def message(self) -> bytes:
+        """Return it as the message to the vehicle."""
+        return pack({"pose": self.world_from_agent, "confirmed": self.confirmed, **_pack_boxes(self.boxes)})
+
+    @classmethod
+    def from_message(cls, message: bytes) -> "Guidance":
+        """Return what is in a message: the inverse of `message` up to single precision."""
+        arrays = unpack(message)
+        return cls(_unpack_boxes(arrays), arrays["confirmed"], arrays["pose"])
+
+
+def pack_sighting(seen: Sighting) -> bytes:
+    """Return a vehicle's sighting as its message to the edge server: pose and its accuracy, boxes, posts."""
+    known = seen.navigation
+    assert known is not None  # vehicles alone send messages: road sensors are wired
+    about = {"time_s": np.array(seen.time_s), "accuracy": np.array((known.position_m, known.heading_rad))}
+    posts = seen.posts.astype(np.float32)
+    return pack({**about, "pose": seen.world_from_agent, "posts": posts, **_pack_boxes(seen.boxes)})
+
+
+def unpack_sighting(agent: str, message: bytes) -> Sighting:
+    """Return the sighting in a message of `agent`: the inverse of `pack_sighting` up to single precision."""
+    arrays = unpack(message)
+    posts, known = arrays["posts"].astype(np.float64), Navigation(*arrays["accuracy"].tolist())
+    return Sighting(agent, float(arrays["time_s"]), arrays["pose"], _unpack_boxes(arrays), posts, known)
+
+
+def _pack_boxes(boxes: Boxes) -> dict[str, NDArray]:
+    score = np.ones(len(boxes)) if boxes.score is None else boxes.score
+    rows = np.column_stack((boxes.array(), score, variance_of(boxes))).astype(np.float32)
+    return {"boxes": rows, "label": from_names(boxes.label.tolist())}
+
+
+def _unpack_boxes(arrays: Mapping[str, NDArray]) -> Boxes:
+    rows = arrays["boxes"].astype(np.float64)
+    return replace(Boxes.from_array(rows[:, :7], to_names(arrays["label"]), rows[:, 7]), variance=rows[:, 8:])
+
+
+def average_spin(
+    sightings: Sequence[Sighting],
+    views: Sequence[RoadView],
+    config: SecondConfig,
+    threshold: float,
+    posts: Array | None = None,
+) -> list[Guidance]:
+    """Return what the edge server tells each vehicle of a spin, in the order of the vehicles among the sightings.
+
+    sightings: of vehicles, and of road sensors with actor categories as labels; views: of the road sensors. posts:
+    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses; None: poses are as told.
+    """
+    told = [_classify(each, config) if each.navigation is None else each for each in sightings]
+    at_s = max((each.time_s for each in told), default=0.0)
+    if posts is not None:
+        told = correct_poses(told, posts, at_s)
+    average = average_boxes([tell(each) for each in told], at_s)
+    road = np.zeros(len(average.boxes), dtype=bool)
+    for each, member in zip(told, average.member, strict=True):
+        road[member] |= each.navigation is None
+    kept = select_labels(average.boxes, road, views, threshold)
+    confirmed = road[kept] | (average.agents[kept] > 1)
+    return [place_in(average.boxes[kept], confirmed, each) for each in told if each.navigation is not None]
+
+
+def _classify(seen: Sighting, config: SecondConfig) -> Sighting:
+    """Return a road sensor's sighting with detection classes for actor categories; lookalikes keep theirs."""
+    category = seen.boxes.label
+    named, lookalike = detection_labels(category, config.classes), is_lookalike(category, config.classes)
+    label = np.where(lookalike, category, named)
+    return replace(seen, boxes=replace(seen.boxes, label=label)[label != ""])
+
+
+def select_labels(
+    boxes: Boxes, road: NDArray[np.bool_], views: Sequence[RoadView], threshold: float
+) -> NDArray[np.bool_]:
+    """Return (N,) which boxes of an average are told to vehicles; `road` (N,): whether a road sensor has the box."""
+    assert boxes.score is not None
+    seen = boxes[road]
+    near = np.linalg.norm(boxes.center[:, None, :2] - seen.center[None, :, :2], axis=2) < seen.size[None, :, 0] / 2
+    contradicted = near.any(axis=1) | (share_of_free_ground(boxes, views) > FREE)
+    return road | ((boxes.score >= threshold) & ~contradicted)
+
+
+def share_of_free_ground(boxes: Boxes, views: Sequence[RoadView]) -> Array:
+    """Return (N,) the share of the footprint of each box, world frame, that road sensors saw as free ground."""
+    xy = spread_over_footprints(boxes, *PARTS)
+    free = np.zeros(xy.shape[:2], dtype=bool)
+    for view in views:
+        free |= view.at(view.ground, xy.reshape(-1, 2)).reshape(free.shape)
+    return free.mean(axis=1)
+
+
+def place_in(boxes: Boxes, confirmed: NDArray[np.bool_], seen: Sighting) -> Guidance:
+    """Return the boxes, world frame, as guidance of a vehicle: in its frame, with the variance of its pose added."""
+    placed = add_pose_variance(boxes, seen).transform(inverse(seen.world_from_agent))
+    return Guidance(placed, confirmed, seen.world_from_agent)
+
+
+def distil_sample(
+    frame: Frame, own: Boxes, told: Guidance, views: Sequence[RoadView], config: SecondConfig, lidar: str
+) -> Sample:
+    """Return a vehicle's frame with the labels of federated distillation; network's frame.
+
+    own: the vehicle's detections, LiDAR frame; views: of the road sensors at the spin. Boxes to find are the confirmed
+    ones with returns of the vehicle; others, and lookalikes, are ignored in the loss. `free` holds the cell centres
+    that a road sensor saw as free ground, by the pose and mount that the vehicle knows.
+    """
+    mount = frame.assumed.agent_from_sensor[lidar]
+    points = crop_to_range(frame.lidar[lidar], config)
+    boxes = told.boxes.transform(inverse(mount))
+    asked = np.isin(boxes.label, config.classes)
+    targets = asked & told.confirmed & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)
+    cells = cell_centers(config)
+    below = np.column_stack((cells, np.full(len(cells), -mount[2, 3])))
+    world = transform_points(told.world_from_agent @ mount, below)[:, :2]
+    free = np.zeros(len(cells), dtype=bool)
+    for view in views:
+        free |= view.at(view.ground, world)
+    ignored = replace(boxes[~targets], score=None, variance=None)
+    sample = Sample(points, boxes[targets], ignored, cells[free].astype(np.float32), own=own)
+    return move_sample(sample, network_from_lidar(frame, config, lidar))

@@ -1,0 +1,1 @@
+"""Federated distillation: vehicles learn from the road average of boxes."""

@@ -1,0 +1,143 @@
+"""Federated distillation: the loss of a vehicle that learns from the road average of boxes.
+
+Wang et al. (IEEE Network 37(3), 2023), "federated distillation": each vehicle updates itself by a contrastive loss
+between its boxes and those of the road average. The loss of a batch is the sum of
+
+- classification: the focal loss of SECOND, in which anchors count as negatives only in the sample's `free` cells;
+- regression: smooth L1 of the residuals and cross-entropy of directions, weighted over the batch by the inverse
+  variance of the labels, component by component;
+- InfoNCE (van den Oord et al., "Representation Learning with Contrastive Predictive Coding", 2018, eq. 4) of
+  bird's-eye features pooled in boxes: the query is one of the vehicle's own boxes, its positive the box of the road
+  average that it is matched with, its negatives are the other boxes of the sweep, of the road average or its own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from flcav.geometry import Boxes, concatenate, spread_over_footprints
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.loss import (
+    BOX_WEIGHT,
+    DIRECTION_WEIGHT,
+    VARIANCE_WEIGHT,
+    box_losses,
+    classification_loss,
+)
+from flcav.perception.objects.model import HeadOutput, Second
+from flcav.perception.objects.predict import voxels_of
+from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.targets import Targets, assign_anchors
+from flcav.perception.objects.task import ObjectsTask
+
+MATCH_M = 2.0  # largest distance in bird's-eye view of a vehicle's box from the box of the road average
+POOL = (5, 3)  # points along and across a box at which features are sampled
+YAW = 6  # column of a residual
+
+
+@dataclass(frozen=True)
+class DistillationTerms:
+    """Terms of the loss beside classification."""
+
+    regression: bool = True
+    contrastive: bool = True
+    contrastive_weight: float = 0.1
+    temperature: float = 0.1  # of InfoNCE
+
+
+class DistilledObjects(ObjectsTask):
+    """3D object detection that learns by federated distillation."""
+
+    def __init__(self, terms: DistillationTerms) -> None:
+        super().__init__()
+        self.terms = terms
+
+    def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
+        """Return the distillation loss of a batch, differentiable in the network's parameters."""
+        return distillation_loss(network, samples, self.terms)
+
+
+def distillation_loss(network: Second, samples: Sequence[Sample], terms: DistillationTerms) -> Tensor:
+    """Return the scalar distillation loss of a batch, see the module."""
+    targets = [assign_anchors(sample, network.config) for sample in samples]
+    features = network.map_features(voxels_of(network, [sample.points for sample in samples]))
+    output = network.answer(features)
+    total = classification_loss(output, targets, network.config) / len(samples)
+    if terms.regression:
+        total = total + regression_loss(output, targets)
+    if terms.contrastive:
+        total = total + terms.contrastive_weight * contrastive_loss(
+            features.to(output.score.dtype), samples, network.config, terms.temperature
+        )
+    return total
+
+
+def regression_loss(output: HeadOutput, targets: Sequence[Targets]) -> Tensor:
+    """Return the scalar loss of box residuals, directions and variances of a batch, weighted by inverse variance.
+
+    For each component it is the mean over the positive anchors with the weights 1 / variance; a direction has that of
+    its yaw. Without a positive anchor it is 0. Without variances all anchors weigh the same.
+    """
+    box, direction, nll = box_losses(output, targets)
+    known = [torch.ones_like(each.residual) if each.variance is None else each.variance for each in targets]
+    weight = 1 / torch.cat(known).to(box.device)
+    weight = weight / weight.sum(0).clamp(min=torch.finfo(weight.dtype).tiny)
+    total = BOX_WEIGHT * (box * weight).sum() + DIRECTION_WEIGHT * (direction * weight[:, YAW]).sum()
+    return total if nll is None else total + VARIANCE_WEIGHT * (nll * weight).sum()
+
+
+def contrastive_loss(features: Tensor, samples: Sequence[Sample], config: SecondConfig, temperature: float) -> Tensor:
+    """Return the mean InfoNCE over the matched boxes of the vehicles' own in a batch; 0 without any.
+
+    features: (B, C, H, W) of the head's grid.
+    """
+    losses = []
+    for own_features, sample in zip(features, samples, strict=True):
+        own = Boxes.empty() if sample.own is None else sample.own
+        mine, road = match_boxes(own, sample.boxes)
+        if not len(mine):
+            continue
+        others = own[np.setdiff1d(np.arange(len(own)), mine)]
+        queries = pool_boxes(own_features, own[mine], config)
+        keys = pool_boxes(own_features, concatenate([sample.boxes, others]), config)
+        losses.append(info_nce(queries, keys, torch.from_numpy(road).to(keys.device), temperature))
+    return torch.cat(losses).mean() if losses else features.sum() * 0
+
+
+def info_nce(queries: Tensor, keys: Tensor, positive: Tensor, temperature: float) -> Tensor:
+    """Return InfoNCE (Q,) of queries (Q, C) against keys (K, C), of which `positive` (Q,) is each query's own.
+
+    - log( exp(s_p / t) / sum_k exp(s_k / t) ), with s the cosine of two features and t the temperature.
+    """
+    cosine = F.normalize(queries, dim=1) @ F.normalize(keys, dim=1).T
+    return F.cross_entropy(cosine / temperature, positive, reduction="none")
+
+
+def pool_boxes(features: Tensor, boxes: Boxes, config: SecondConfig) -> Tensor:
+    """Return the features (N, C) of N boxes, LiDAR frame: means of a map (C, H, W) over a grid in each footprint.
+
+    The map is that of the head's grid, rows along y, columns along x. It is interpolated bilinearly at the centres of
+    `POOL` parts of the box along and across; it is 0 outside the range.
+    """
+    low, high = np.array(config.range_m[:2]), np.array(config.range_m[3:5])
+    place = torch.from_numpy(2 * (spread_over_footprints(boxes, *POOL) - low) / (high - low) - 1).to(features)
+    sampled = F.grid_sample(features[None], place[None], align_corners=False)  # (1, C, N, points)
+    return sampled[0].mean(2).T
+
+
+def match_boxes(own: Boxes, road: Boxes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows of `own` and of `road` that are of one object: one to one, nearest in bird's-eye view together.
+
+    They are of one class and at most `MATCH_M` apart.
+    """
+    apart = np.linalg.norm(own.center[:, None, :2] - road.center[None, :, :2], axis=2)
+    fits = (apart <= MATCH_M) & (own.label[:, None] == road.label[None])
+    mine, theirs = linear_sum_assignment(np.where(fits, apart, 1e6))
+    paired = fits[mine, theirs]
+    return mine[paired], theirs[paired]

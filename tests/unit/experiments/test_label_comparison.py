@@ -1,0 +1,50 @@
+"""The comparison of what vehicles learn from: numbers of runs, means, shares and tables."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from flcav.experiments.distillation.run import ARMS, BOTH, IDEAL, NO_ROAD, PLAIN, PRETRAINED, compare_labels
+from flcav.experiments.distillation.tables import tables
+from flcav.pipeline.recipe import EDGE, MAIN, load_run_recipe
+from flcav.pipeline.results import LabelQuality, Spent
+from flcav.sources.recipe import recipe_path
+
+RECIPE = load_run_recipe(recipe_path("runs/distillation"))
+AP50 = {PRETRAINED: 0.5, NO_ROAD: 0.52, PLAIN: 0.58, "regression": 0.59, "contrast": 0.55, BOTH: 0.6, IDEAL: 0.6}
+
+
+def run_of(seed: int, more: float) -> Any:
+    """Return what is asked of a run: `AP50` and `more`, labels before two rounds of the run itself."""
+
+    def reached(arm: str, stage: str, **about: str) -> Any:
+        name = next(name for name, each in ARMS.items() if each == (arm, stage))
+        return SimpleNamespace(estimate=SimpleNamespace(mean=AP50[name] + more), numbers={"AP70": 0.2})
+
+    def stages(arm: str) -> list[Any]:
+        labels = (LabelQuality(1, 10, 20, 0.8, 0.4), LabelQuality(2, 12, 20, 0.75, 0.45))
+        return [SimpleNamespace(stage=EDGE, region="grid", labels=labels if arm == MAIN else labels[:1])]
+
+    spent = [Spent(EDGE, "objects", "wireless", 32.5), Spent("pretrain", "objects", "wireless", 20.0)]
+    arms = {arm: SimpleNamespace(stages=stages(arm), spent=spent) for arm in (MAIN, *RECIPE.arms)}
+    return SimpleNamespace(recipe=SimpleNamespace(seed=seed), test=reached, arms=arms)
+
+
+def test_every_arm_of_the_recipe_is_compared_in_stage_two() -> None:
+    assert {arm for arm, _ in ARMS.values()} == {MAIN, *RECIPE.arms}
+    assert all(arm.stages == (EDGE,) for arm in RECIPE.arms.values())
+
+
+def test_means_differences_and_the_share_that_the_trained_detector_brings() -> None:
+    found = compare_labels(RECIPE, cast(Any, [run_of(1, 0.0), run_of(2, 0.02)]))
+    assert found.ap50[BOTH].mean == pytest.approx(0.61)
+    assert found.differences[f"{BOTH} - {PLAIN}"].mean == pytest.approx(0.02)
+    assert found.closed.mean == pytest.approx(0.8)  # (.58 - .5) / (.6 - .5)
+    assert found.seeds["1"][BOTH].up_mb == 32.5
+    assert found.seeds["1"][PRETRAINED].labels == ()
+    shown = tables(found)
+    assert "| regression and contrast | 0.800 | 0.400 | 0.750 | 0.450 |" in shown["labels"]
+    assert "| plain pseudo-labels | 0.800 | 0.400 | 0.800 | 0.400 |" in shown["labels"]
+    assert "32.50 MB" in shown["arms"]
+    assert any("that the trained one brings: 0.800" in sentence for sentence in found.sentences())
