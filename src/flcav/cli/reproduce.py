@@ -1,6 +1,6 @@
 """`flcav reproduce`: the figures and comparisons of the article, and the tasks' studies."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +22,8 @@ STUDY = ("seeds", "scale", *RUN)  # options of targets that run over seeds
 TASK = "task-"  # before the name of a task's study
 OWN = "a task of your own that says how it is studied, as module:NAME"
 COMMON_SEEDS = 3
+DEMO_SIZE: Mapping[str, str | None] = {"size": "demo"}  # fields of a run recipe at the scale `quick`
+TOY_SIZE: Mapping[str, str | None] = {"size": "toy", "splits": None, "training": None}  # shows that it runs
 
 
 class Target(StrEnum):
@@ -33,6 +35,7 @@ class Target(StrEnum):
     fig3b = "fig3b"
     fig4 = "fig4"
     fig6a_allocation = "fig6a-allocation"
+    placement = "placement"
     road_average = "road-average"
     road_detector = "road-detector"
     sim_to_real = "sim-to-real"
@@ -108,7 +111,7 @@ def reproduce(
     if target.startswith(TASK) or ":" in target:
         _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
-        run = _fig6a_allocation if target == Target.fig6a_allocation else _demo_arms
+        run = COMPARISONS.get(target, _demo_arms)
         run(out, count, "quick" if quick else "paper", jobs, engine, stale)
     typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
 
@@ -184,11 +187,42 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
         typer.echo(f"{finding.question} {finding.verdict}. {finding.sentence}")
 
 
+def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+    from flcav.experiments.placement.run import describe_overlaps, draw_proof, list_overlaps, prove_placement
+    from flcav.files import write_bytes, write_json
+    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.pipeline.running import WORK
+    from flcav.sources.recipe import recipe_path
+
+    asked = load_run_recipe(recipe_path("runs/placement"))
+    typer.echo(describe_overlaps(list_overlaps(asked), asked.placement.range_m))
+    recipe, runs = _run_seeds(Target.placement, "placement", out, seeds, scale, jobs, engine, stale, TOY_SIZE)
+    results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs])
+    write_json(out / "result.json", results.as_json())
+    write_bytes(out / "placement.png", draw_proof(results))
+    for sentence in results.sentences():
+        typer.echo(sentence)
+
+
+COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] = {
+    Target.fig6a_allocation: _fig6a_allocation,
+    Target.placement: _placement,
+}
+
+
 @when_interrupted()
 def _run_seeds(
-    target: Target, name: str, out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale
+    target: Target,
+    name: str,
+    out: Path,
+    seeds: int,
+    scale: str,
+    jobs: int,
+    engine: Engine,
+    stale: Stale,
+    quick: Mapping[str, str | None] = DEMO_SIZE,
 ) -> "tuple[RunRecipe, tuple[Run, ...]]":
-    """Run or finish the package's recipe `runs/<name>` with several seeds; of the demo's size unless scale is paper."""
+    """Run or finish the package's recipe `runs/<name>` with several seeds, with the fields `quick` if scale is that."""
     from flcav.cli.steps import live_steps
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import run_seeds
@@ -196,7 +230,7 @@ def _run_seeds(
 
     recipe = load_run_recipe(recipe_path(f"runs/{name}"))
     if scale != "paper":
-        recipe = recipe.model_copy(update={"size": "demo"})
+        recipe = recipe.model_copy(update=dict(quick))
     with live_steps(target.value) as notify:
         runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     return recipe, runs
