@@ -21,6 +21,8 @@ from flcav.experiments.fig3b import tables as fig3b_tables
 from flcav.experiments.fig3b.run import Fig3b
 from flcav.experiments.fig6a import tables as fig6a_tables
 from flcav.experiments.fig6a.results import AllocationResult
+from flcav.experiments.placement import tables as placement_tables
+from flcav.experiments.placement.run import PlacementProof
 from flcav.experiments.roadside import tables as roadside_tables
 from flcav.experiments.roadside.average import RoadAverageResult
 from flcav.experiments.roadside.detector import RoadDetectorResult
@@ -58,6 +60,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "fig3b": _told(Fig3b, fig3b_tables.tables),
     "fig4": _told(Fig4, roadside_tables.fig4_tables),
     "fig6a-allocation": _told(AllocationResult, fig6a_tables.tables),
+    "placement": _told(PlacementProof, placement_tables.tables),
     "road-average": _told(RoadAverageResult, roadside_tables.average_tables),
     "road-detector": _told(RoadDetectorResult, roadside_tables.detector_tables),
     "sim-to-real": _told(SimToReal, sim_to_real_tables.tables),
