@@ -38,10 +38,17 @@ class Target(StrEnum):
     placement = "placement"
     road_average = "road-average"
     road_detector = "road-detector"
+    sensor_ranges = "sensor-ranges"
     sim_to_real = "sim-to-real"
 
 
-RECORDED = (Target.fig3b, Target.fig4, Target.road_average, Target.road_detector)  # one recording, no training
+RECORDED = (  # recordings, no training
+    Target.fig3b,
+    Target.fig4,
+    Target.road_average,
+    Target.road_detector,
+    Target.sensor_ranges,
+)
 
 
 class Scale(StrEnum):
@@ -149,6 +156,8 @@ def _record_and_draw(target: Target, out: Path) -> None:
             from flcav.experiments.fig3b.run import fig3b as repeat
         elif target == Target.fig4:
             from flcav.experiments.roadside.fig4 import fig4 as repeat
+        elif target == Target.sensor_ranges:
+            from flcav.experiments.roadside.ranges import measure_ranges as repeat
         elif target == Target.road_average:
             from flcav.experiments.roadside.average import evaluate_road_average as repeat
         else:

@@ -43,7 +43,7 @@ def test_rank_correlation_is_spearmans_and_nothing_where_nothing_is_ordered() ->
     rng = np.random.default_rng(1)
     for _ in range(5):
         one, other = rng.integers(0, 5, 9), rng.normal(size=9)
-        assert rank_correlation(one, other) == pytest.approx(spearmanr(one, other).statistic)
+        assert rank_correlation(one, other) == pytest.approx(spearmanr(one, other)[0])
     assert rank_correlation([1, 2, 3], [5, 5, 5]) == 0.0
 
 

@@ -64,7 +64,7 @@ def draw_suites(
         ylim=(0, 1.02), xlim=(0, edges_m[-1]), xlabel="distance from the first suite [m]", title="share of cars found"
     )
     axes.grid(axis="y")
-    axes.legend(loc="upper right", frameon=False)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), frameon=False)  # below: curves fill the axes
     handles = [
         axes.plot([], [], "o", color=colour, label=f"{number}: {name}")[0]
         for number, (name, colour) in enumerate(zip(names, SUITE_COLOURS, strict=True), start=1)
