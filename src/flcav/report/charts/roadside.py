@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from flcav.report import style
 
 ARM_COLOURS = (style.MUTED, style.SKY, style.BLUE)  # of the arms of a comparison, in their order
-WIDTHS = (6.0, 3.5, 1.5)  # of their lines: where they lie on each other, all are seen
+WIDTHS = (5.0, 3.0, 1.3)  # of their lines: where they lie on each other, all are seen
 
 
 @style.styled
