@@ -6,6 +6,7 @@ import pytest
 
 from flcav.cli.planning.place_inputs import read_given
 from flcav.config import parse_config
+from flcav.experiments.fig3b.cover import TownCover, cover_town, list_kinds
 from flcav.experiments.fig3b.run import ZONE_M, _count_zones
 from flcav.experiments.roadside.detector import _Frames, fit_threshold, score_town
 from flcav.experiments.roadside.errors import Errors, apply_errors
@@ -130,3 +131,18 @@ def test_sensor_models_are_those_of_a_rig() -> None:
     channels = {name: each.settings.channels for name, each in recipe.pole_rig.lidars.items()}
     assert channels == {"pole_16": 16, "pole_32": 32, "pole_64": 64, "pole_128": 128, "hdl32e": 32, "os1_128": 128}
     assert recipe.pole_rig.lidars["pole_64"] == RIGS["lidar_pole"].lidars["lidar"]
+
+
+def test_a_town_takes_as_many_sensors_as_its_errors_are_spread() -> None:
+    town = load_town("grid")
+    near = dict(zip(town.poles.id.tolist(), town.poles.position, strict=True))
+    errors = np.array([near[2], near[2], near[3], near[9], [900.0, 900.0, 0.0]])  # the last out of reach
+    found = cover_town(town, errors, 30.0)
+    assert (found.errors, found.poles) == (5, 9)
+    assert found.shares[:4] == (0.4, pytest.approx(0.6), 0.8, 0.8)
+    assert found.wanted == (1, 2, 3)
+    straight = [number for number, kind in zip(town.poles.id.tolist(), town.poles.kind) if kind == "straight"]
+    assert found.kinds["straight"] == pytest.approx(3 / len(straight))
+    assert cover_town(town, errors[[0, 4]], 30.0).wanted == (1, 1, None)
+    other = TownCover("ring", 4, 2, (0.5, 1.0), (1, 1, 2), {"tee": 0.1, "straight": 9.0})
+    assert list_kinds([found, other]) == ["tee", "cross", "straight"]

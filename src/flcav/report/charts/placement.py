@@ -1,4 +1,4 @@
-"""Chart of the proof of placement: what vehicles learn from each pole against what predicts it."""
+"""Charts of placement: what sensors cover, and what vehicles learn from each pole against what predicts it."""
 
 from collections.abc import Mapping, Sequence
 
@@ -32,4 +32,32 @@ def draw_gains(panels: Mapping[tuple[str, str], Mapping[int, Sequence[tuple[floa
         if predictor == columns[0]:
             axes.set_ylabel(f"gain in AP50\n{frames}")
     style.key(figure, [line for line in drawn[0, 0].get_lines() if not line.get_label().startswith("_")])
+    return figure
+
+
+@style.styled
+def draw_cover(
+    shares: Mapping[str, Sequence[float]], kinds: Sequence[str], around: Mapping[str, Sequence[float | None]]
+) -> Figure:
+    """Return the share of errors covered against the number of sensors, and errors around a pole by kind of scenario.
+
+    shares: by town, of 1, 2, ... sensors. around: by town, mean number of errors in reach of a pole of each of `kinds`;
+    None where the town has no such pole.
+    """
+    figure = style.canvas(8.4, 3.4)
+    left, right = figure.subplots(1, 2)
+    others = iter(style.OTHER_COLOURS)
+    colours = {town: style.TOWN_COLOURS.get(town) or next(others) for town in shares}
+    for town, own in shares.items():
+        left.plot(range(len(own) + 1), [0.0, *own], "o-", color=colours[town], markersize=4, label=town)
+    for row, (town, means) in enumerate(around.items()):
+        known = [(place, mean) for place, mean in enumerate(means) if mean is not None]
+        places = [place + (row - (len(around) - 1) / 2) * 0.16 for place, _ in known]
+        right.bar(places, [mean for _, mean in known], width=0.14, color=colours[town])
+    left.set(xlim=(0, None), ylim=(0, 1.02), xlabel="sensors, placed best", ylabel="share of errors covered")
+    right.set_xticks(range(len(kinds)), kinds)
+    right.set_ylabel("errors in reach of a pole, mean")
+    for axes in (left, right):
+        axes.grid(axis="y")
+    style.key(figure, left.get_lines())
     return figure
