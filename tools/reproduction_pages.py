@@ -67,6 +67,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "sensor-ranges": _told(SensorRanges, roadside_tables.range_tables),
     "sim-to-real": _told(SimToReal, sim_to_real_tables.tables),
     "task-objects": _of_study(objects.STUDY, objects_tables.tables),
+    "task-objects-streets": _of_study(objects.STREETS, objects_tables.tables),
     "task-signs": _of_study(signs.STUDY, signs_tables.tables),
     "task-trajectory": _of_study(trajectory.STUDY, trajectory_tables.tables),
     "task-trajectory-cameras": _of_study(trajectory.CAMERAS, trajectory_tables.tables),

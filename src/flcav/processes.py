@@ -8,14 +8,32 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from multiprocessing import forkserver
+from multiprocessing.context import BaseContext
 from types import ModuleType
 from typing import Any
 
 from flcav.config import InputError
 from flcav.extras import format_install_command
-from flcav.threads import VARIABLES
+from flcav.threads import VARIABLES, threads_of_children
 
 STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
+
+
+def start_server() -> BaseContext:
+    """Start the fork server of this process, if there is none, and return the context that makes workers of it.
+
+    The server is a process of one thread that imports the modules of flcav that this process has now; a worker is a
+    fork of it, so that many workers import them once. Where it cannot start, each worker is a process that imports
+    them itself (spawn).
+    """
+    multiprocessing.set_forkserver_preload([name for name in sys.modules if name.partition(".")[0] == "flcav"])
+    try:
+        with threads_of_children(1):
+            forkserver.ensure_running()
+    except OSError:  # its socket is in the folder of temporary files, whose path may be too long for one
+        return multiprocessing.get_context("spawn")
+    return multiprocessing.get_context("forkserver")
 
 
 def exit_with_parent() -> None:

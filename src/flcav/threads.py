@@ -1,7 +1,9 @@
 """Thread count of the numerical libraries. It decides the order of sums, and so the last bits of results."""
 
+import contextlib
 import os
 import sys
+from collections.abc import Iterator
 
 VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -15,3 +17,18 @@ def use_threads(count: int) -> None:
     os.environ.update(dict.fromkeys(VARIABLES, str(count)))
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(count)
+
+
+@contextlib.contextmanager
+def threads_of_children(count: int) -> Iterator[None]:
+    """Set the environment variables in VARIABLES to `count` within the context: processes started there inherit it."""
+    before = {name: os.environ.get(name) for name in VARIABLES}
+    os.environ.update(dict.fromkeys(VARIABLES, str(count)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,5 +1,7 @@
 """The `flcav` command. Exit codes: 0 done; 2 bad input, one sentence on stderr; 130 interrupted; 1 anything else."""
 
+import atexit
+import gc
 import sys
 
 import click
@@ -20,6 +22,8 @@ from flcav.config import InputError
 
 INTERRUPTED = 130
 LONGEST = 1000  # characters of a message
+
+atexit.register(gc.freeze)  # searching all modules for garbage would take a second before the process ends
 
 app = typer.Typer(
     name="flcav",

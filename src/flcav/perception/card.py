@@ -28,6 +28,7 @@ RECIPE_FIELDS = (
     "cavs",
     "poles",
     "weather",
+    "randomise",
     "beams",
 )
 FACTS = ("parameters", "seed", "samples", "licence", "flcav", "torch", "threads", "processor")
@@ -118,8 +119,11 @@ def write_card(card: Card, path: Path) -> None:
 def count_beams(recipe: Mapping[str, Json]) -> int | None:
     """Return the beams of the vehicles' first LiDAR by the recipe of a recording, or as an import counted them.
 
-    recipe: of a manifest, or of a card's entry, which names the rig. None where it does not say.
+    recipe: of a manifest, or of a card's entry, which names the rig. None where it does not say, and where the beams
+    are drawn.
     """
+    if recipe.get("randomise") is not None:
+        return None
     rig: Any = recipe.get("vehicle_rig")
     known: Any = RIGS[rig].model_dump(mode="json") if isinstance(rig, str) and rig in RIGS else rig
     try:

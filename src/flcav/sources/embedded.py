@@ -1,16 +1,18 @@
 """The built-in simulator as a source: SUMO traffic in a town, observed by simulated sensors."""
 
+import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError, shorten
-from flcav.files import Json, sha256
+from flcav.files import Json
 from flcav.seeds import derive_seed, stream
 from flcav.sensors.frame import LONGEST_NAME, Frame, format_key
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
+from flcav.sources.randomisation import randomise_rig, randomise_sizes, randomise_town, town_files
 from flcav.sources.recipe import Recipe
 from flcav.world.map.town import HEIGHTS, TOWNS, load_town
 from flcav.world.scene import Scene
@@ -35,6 +37,8 @@ class EmbeddedSource:
         """
         self.recipe = recipe
         self.town = load_town(recipe.town, beside)
+        if recipe.randomise is not None:
+            self.town = randomise_town(self.town, stream(recipe.seed, "streets", self.town.name))
         if not _SAFE_NAME.fullmatch(self.town.name):
             raise InputError(f"field 'town' = {recipe.town!r}: the folder's name must be letters, digits, - and _")
         known = self.town.poles.id.tolist()
@@ -44,7 +48,9 @@ class EmbeddedSource:
         self.agents = [f"cav{i}" for i in range(recipe.cavs)] + [f"pole{pole}" for pole in self.poles]
         if not self.agents:
             raise InputError("fields 'cavs' = 0 and 'poles' = []: nobody observes; give at least one of them")
-        _check_mounts("vehicle_rig", recipe.vehicle_rig, "a vehicle", 0.0)
+        self.vehicle_rigs = [self._vehicle_rig(i) for i in range(recipe.cavs)]
+        for rig in self.vehicle_rigs or [recipe.vehicle_rig]:
+            _check_mounts("vehicle_rig", rig, "a vehicle", 0.0)
         for pole in self.poles:
             x, y, z = self.town.poles.position[known.index(pole)].tolist()
             mount_m = z - self.town.ground(x, y)
@@ -62,10 +68,12 @@ class EmbeddedSource:
 
     def describe(self) -> Mapping[str, Json]:
         """Return the recipe as JSON values, with names resolved: numbers of poles, rigs, hashes of the town's files."""
+        drawn = {} if self.recipe.randomise is None else {"randomise": self.recipe.randomise}
         return {
-            **self.recipe.model_dump(mode="json"),
+            **self.recipe.model_dump(mode="json", exclude={"randomise"}),
+            **drawn,
             "town": self.town.name,
-            "town_files": {path.name: sha256(path) for path in self._town_paths()},
+            "town_files": {name: hashlib.sha256(data).hexdigest() for name, data in self._files().items()},
             "scenes": len(self.scenes()),
             "frames": self._frames,
             "poles": self.poles,
@@ -73,7 +81,8 @@ class EmbeddedSource:
 
     def town_files(self) -> Mapping[str, bytes]:
         """Return the contents of the town's files by name; empty for a town that comes with flcav."""
-        return {} if self.recipe.town in TOWNS else {path.name: path.read_bytes() for path in self._town_paths()}
+        kept = self.recipe.town not in TOWNS or self.recipe.randomise is not None
+        return self._files() if kept else {}
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, `<town>-<seed>-<number>`."""
@@ -98,7 +107,7 @@ class EmbeddedSource:
             index, agent = divmod(number, len(self.agents))
             yield observe(
                 world,
-                recipe.vehicle_rig if agent < recipe.cavs else recipe.pole_rig,
+                self.vehicle_rigs[agent] if agent < recipe.cavs else recipe.pole_rig,
                 self.agents[agent],
                 index,
                 scene_name=scene,
@@ -114,12 +123,25 @@ class EmbeddedSource:
             warmup = stream(self.recipe.seed, scene, "warmup").integers(*self.recipe.warmup_steps, endpoint=True)
             times_s, scenarios = self.recipe.times_s(int(warmup)), self.recipe.scenarios
             trace = simulate(self.town, seed=seed, cavs=self.recipe.cavs, times_s=times_s, scenarios=scenarios)
+            if self.recipe.randomise is not None:
+                trace = randomise_sizes(trace, stream(self.recipe.seed, scene, "sizes"))
             self._last_trace = scene, trace
         return self._last_trace[1]
 
-    def _town_paths(self) -> list[Path]:
+    def _vehicle_rig(self, number: int) -> Rig:
+        """Return the rig of the vehicle "cav<number>"."""
+        rig = self.recipe.vehicle_rig
+        if self.recipe.randomise is None:
+            return rig
+        return randomise_rig(rig, stream(self.recipe.seed, "rig", f"cav{number}"))
+
+    def _files(self) -> Mapping[str, bytes]:
+        """Return the contents of the files of the town, as drawn, by name."""
+        if self.recipe.randomise is not None:
+            return town_files(self.town)
         names = ("town.yaml", *([] if self.town.relief is None else [HEIGHTS]))
-        return [self.town.net, *(self.town.net.parent / name for name in names)]
+        paths = [self.town.net, *(self.town.net.parent / name for name in names)]
+        return {path.name: path.read_bytes() for path in paths}
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_last_trace": None, "_last_scene": None}

@@ -84,6 +84,7 @@ class Recipe(Config):
     weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])  # preset, values, keyframes, classes
     calibration_error: CalibrationError = CalibrationError()  # errors of the calibration that agents assume
     scenarios: tuple[Scenario, ...] = ()  # corner cases, in every scene
+    randomise: Literal["streets"] | None = None  # streets, sizes of cars and vehicles' LiDARs drawn by `seed`
 
     @model_validator(mode="after")
     def _ends(self) -> "Recipe":

@@ -47,8 +47,7 @@ class Scene:
         self.trace = trace
         self.index = 0
         self.offset_s = 0.0
-        shapes = [(str(category), int(shape)) for category, shape in zip(trace.category, trace.shape)]
-        models = [_town_model(town), *(_actor_model(*shape) for shape in shapes)]
+        models = [_town_model(town), *(_actor_model(*trace.model(actor)) for actor in range(len(trace.actor)))]
         self.surfaces = _surfaces(models, [str(name) for name in trace.actor])
         self._solids = [model.solid for model in models]
         self._engine = Embree()
@@ -200,9 +199,9 @@ def _surfaces(models: list[_Model], names: list[str]) -> Surfaces:
     )
 
 
-@lru_cache(maxsize=64)
-def _actor_model(category: str, shape: int) -> _Model:
-    return _model(actor_mesh(category, shape))
+@lru_cache(maxsize=256)
+def _actor_model(category: str, shape: int, size: tuple[float, ...]) -> _Model:
+    return _model(actor_mesh(category, shape, size))
 
 
 _TOWNS: dict[str, _Model] = {}  # by hash of the town: the last TOWNS_KEPT

@@ -68,6 +68,10 @@ class Trace:
         None  # (T, A, 2) pitch and roll [rad], as in `geometry.pose`; NaN where absent; None: all level
     )
 
+    def model(self, actor: int) -> tuple[str, int, tuple[float, ...]]:
+        """Return category, shape and size [m] of an actor, by which its mesh is known."""
+        return str(self.category[actor]), int(self.shape[actor]), tuple(self.size[actor].tolist())
+
     def tilts(self, index: int) -> Array:
         """Return pitch and roll (A, 2) [rad] at an instant."""
         return np.zeros((len(self.actor), 2)) if self.tilt is None else self.tilt[index]

@@ -2,7 +2,6 @@
 
 import contextlib
 import multiprocessing
-import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -11,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from flcav.dataset.recording.jobs import Engine, Job, perform
-from flcav.processes import exit_with_parent
+from flcav.processes import exit_with_parent, start_server
 from flcav.sources.source import Source
-from flcav.threads import VARIABLES
 
 POLL_S = 0.2
 
@@ -25,15 +23,14 @@ def start_processes(source: Source, work: Path, jobs: int, wrote: Callable[[int]
     """Yield an engine of `jobs` processes that perform jobs of `source` below the folder `work`.
 
     It calls `wrote` with the number of frames written so far. A single one is this process; more are child
-    processes, which end with this one, even if it is killed.
+    processes of one thread each, which end with this one, even if it is killed.
     """
     if jobs == 1:
         yield _InProcessEngine(source, work, wrote)
         return
-    context = multiprocessing.get_context("spawn")
+    context = start_server()
     written = context.Value("q", 0)
     with (
-        _threads_per_process(max(1, (os.cpu_count() or 1) // jobs)),
         ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(source, work, written)) as pool,
         _children_end_on_error(),
     ):
@@ -115,17 +112,3 @@ def _children_end_on_error() -> Iterator[None]:
         for child in set(multiprocessing.active_children()) - before:
             child.terminate()
         raise
-
-
-@contextlib.contextmanager
-def _threads_per_process(count: int) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in VARIABLES}
-    os.environ.update(dict.fromkeys(VARIABLES, str(count)))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

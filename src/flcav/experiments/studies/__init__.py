@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 STUDIES: Mapping[str, str] = {  # name -> module:NAME, so that listing them loads none
     "objects": "flcav.experiments.studies.objects:STUDY",
+    "objects-streets": "flcav.experiments.studies.objects:STREETS",
     "signs": "flcav.experiments.studies.signs:STUDY",
     "trajectory": "flcav.experiments.studies.trajectory:STUDY",
     "trajectory-cameras": "flcav.experiments.studies.trajectory:CAMERAS",

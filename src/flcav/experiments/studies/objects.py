@@ -10,7 +10,7 @@ from flcav.experiments.studies.run import Study, StudyResult, describe_limits, l
 from flcav.markdown import format_bullets, format_table
 from flcav.perception.objects.evaluate import BreakdownRow, ObjectsEvaluation, Score
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.study import TRACKS
+from flcav.perception.objects.study import STREETS_STUDY, TRACKS
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.tracking import evaluate_tracks
 from flcav.report import style
@@ -27,8 +27,9 @@ MEASURES = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
 
 
 def tables(results: StudyResult[ObjectsEvaluation]) -> dict[str, str]:
-    """Return Markdown by name: findings (a list), classes, slices, training, tracks."""
+    """Return Markdown by name: findings (a list), classes, slices, training, and tracks where these were tested."""
     heads = [f"{kind} at {overlap}" for kind, overlap in MEASURES]
+    tracked = format_table(("class", "MOTA", "AMOTA", "id switches", "velocity error [m/s]"), _tracks(results))
     return {
         "findings": format_bullets(_findings(results)),
         "classes": format_table(
@@ -39,7 +40,7 @@ def tables(results: StudyResult[ObjectsEvaluation]) -> dict[str, str]:
             ("seed", "sweeps", "steps", "validation, mean AP3D@0.5 of the classes, after each epoch; the best is kept"),
             training_rows(results),
         ),
-        "tracks": format_table(("class", "MOTA", "AMOTA", "id switches", "velocity error [m/s]"), _tracks(results)),
+        **({"tracks": tracked} if TRACKS in results.summary else {}),
     }
 
 
@@ -80,7 +81,8 @@ def _slices(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
 
 def _tracks(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
     rows = []
-    for seeds in zip(*(found.tracks.scores for found in results.tested("tracks") if found.tracks)):
+    tested = results.tested(TRACKS) if TRACKS in results.summary else []
+    for seeds in zip(*(found.tracks.scores for found in tested if found.tracks)):
         numbers = zip(*((row.mota, row.amota, row.id_switches, row.velocity_error_mps) for row in seeds))
         rows.append([seeds[0].label, *map(_mean, numbers)])
     return rows
@@ -127,3 +129,4 @@ def _bar(name: str, rows: Sequence[Score | BreakdownRow]) -> Bar:
 
 
 STUDY = Study(OBJECTS, OBJECTS.study(), draw=_draw, extra={TRACKS: add_tracks}, is_share=_is_share)
+STREETS = Study(OBJECTS, STREETS_STUDY, draw=_draw, is_share=_is_share)

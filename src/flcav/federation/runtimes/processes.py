@@ -8,13 +8,12 @@ import pickle
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
 from queue import SimpleQueue
 from typing import Any
 
 from flcav.config import InputError
 from flcav.federation.trainable import Trainable, Update, Weights
-from flcav.processes import exit_with_parent
+from flcav.processes import exit_with_parent, start_server
 from flcav.threads import use_threads
 
 _clients: Mapping[str, Trainable] = {}  # in a client process
@@ -54,7 +53,7 @@ class ClientProcesses:
 
     def _make(self) -> ProcessPoolExecutor:
         """Return a pool of one process: where it breaks, it is known whose training broke it."""
-        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_start, initargs=(self._pickled,))
+        return ProcessPoolExecutor(1, mp_context=start_server(), initializer=_start, initargs=(self._pickled,))
 
     def _train(self, name: str, weights: Weights, how: Mapping[str, Any]) -> Update:
         """Return what the client's `train` does in the first free process; raises what it raises.

@@ -1,7 +1,9 @@
 """Execution engines: the protocol of an engine, and worker processes on this machine."""
 
 import contextlib
+import gc
 import multiprocessing
+import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -11,7 +13,7 @@ from typing import Any, Protocol
 
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps.step import Record, Step, Work, read_value, write_done, write_started
-from flcav.processes import exit_with_parent
+from flcav.processes import exit_with_parent, start_server
 from flcav.progress import Report
 from flcav.threads import use_threads
 
@@ -45,10 +47,10 @@ class Processes:
     @contextlib.contextmanager
     def hands(self, folder: Path, jobs: int) -> Iterator[Workers]:
         """Yield `jobs` processes; raises `OSError` where one was killed."""
-        context = multiprocessing.get_context("spawn")
+        context = start_server()
         queue = context.Queue()
-        made_by = replace(provenance(), threads=1)
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start, initargs=(queue,)) as pool:
+        made_by, started = replace(provenance(), threads=1), (queue, {**os.environ})
+        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start, initargs=started) as pool:
             try:
                 yield Workers(lambda step, record: pool.submit(_perform, step, folder, record, made_by), queue)
             except BrokenProcessPool:
@@ -84,9 +86,12 @@ def find_seed(arguments: Mapping[str, Any]) -> int | None:
     return None
 
 
-def _start(queue: Any) -> None:
+def _start(queue: Any, variables: Mapping[str, str]) -> None:
+    """Begin a worker; `variables`: the environment of the process that asks, which may differ from the server's."""
     global _queue
     _queue = queue
+    os.environ.update(variables)
+    gc.freeze()  # modules stay: the collector of cyclic garbage need not look at them again and again
     exit_with_parent()
     use_threads(1)
 

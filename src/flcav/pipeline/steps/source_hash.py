@@ -11,7 +11,9 @@ A string `module:NAME` counts as a mention of that name, and so do the re-export
 """
 
 import ast
+import contextlib
 import functools
+import gc
 import hashlib
 import importlib.util
 import re
@@ -43,9 +45,11 @@ class Sources:
         """Return, by module, a hash of the definitions in it that are reachable from `starts`."""
         key = frozenset(starts)
         if key not in self._hashes:
+            with _without_collector():
+                reached = self._reached(key)
             self._hashes[key] = {
                 name: hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
-                for name, texts in sorted(self._reached(key).items())
+                for name, texts in sorted(reached.items())
                 if texts
             }
         return self._hashes[key]
@@ -114,6 +118,18 @@ class Sources:
             loaded = spec.origin or ""
         foreign = top in sys.stdlib_module_names - {"__main__"} or "site-packages" in loaded
         return None if foreign or not loaded.endswith(".py") else Path(loaded)
+
+
+@contextlib.contextmanager
+def _without_collector() -> Iterator[None]:
+    """Pause the collector of cyclic garbage: syntax trees are all kept, and it takes as long as reading them."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def find_definitions(value: Any) -> Iterator[Place]:
@@ -247,7 +263,8 @@ class _Names(ast.NodeVisitor):
 
 @functools.lru_cache(maxsize=2048)
 def _read(name: str, package: bool, text: str) -> _Module:
-    tree = _Undocumented().visit(ast.parse(text))
+    tree = ast.parse(text)
+    _undocument(tree)
     module = _Module(name, package)
     for node in tree.body:
         if isinstance(node, ast.If) and _left_out(node.test) and not node.orelse:
@@ -274,17 +291,20 @@ def _read(name: str, package: bool, text: str) -> _Module:
     return module
 
 
-class _Undocumented(ast.NodeTransformer):
-    """Transformer that removes docstrings: strings that are statements."""
+def _undocument(node: ast.AST) -> None:
+    """Remove the docstrings within a statement: strings that are statements, wherever those stand."""
+    for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+        inner = getattr(node, field, None)
+        if isinstance(inner, list):  # those of an expression are none
+            inner[:] = [each for each in inner if not _is_docstring(each)]
+            for each in inner:
+                _undocument(each)
+    if isinstance(node, ast.stmt) and getattr(node, "body", None) == []:
+        node.body = [ast.Pass()]  # pyright: ignore[reportAttributeAccessIssue]
 
-    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
-        return None if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str) else node
 
-    def generic_visit(self, node: ast.AST) -> ast.AST:
-        super().generic_visit(node)
-        if isinstance(node, ast.stmt) and getattr(node, "body", None) == []:
-            node.body = [ast.Pass()]  # pyright: ignore[reportAttributeAccessIssue]
-        return node
+def _is_docstring(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
 def _bound(node: ast.AST) -> Iterator[str]:

@@ -25,10 +25,10 @@ class Hull(NamedTuple):
     edges: NDArray[np.int64]  # (E, 2) indices of vertices
 
 
-@lru_cache(maxsize=64)
-def hull(category: str, shape: int) -> Hull:
-    """Return the convex hull of the mesh of an actor's `category` and `shape`, body frame."""
-    vertices = actor_mesh(category, shape).vertices.astype(np.float64)
+@lru_cache(maxsize=256)
+def hull(category: str, shape: int, size: tuple[float, ...] | None = None) -> Hull:
+    """Return the convex hull of an actor's mesh, body frame: see `actor_mesh`."""
+    vertices = actor_mesh(category, shape, size).vertices.astype(np.float64)
     found = ConvexHull(vertices)
     rows = np.searchsorted(found.vertices, found.simplices, sorter=(order := np.argsort(found.vertices)))
     faces = order[rows]
@@ -48,7 +48,7 @@ def compute_amodal_boxes(
     outlines: dict[int, Array] = {}
     for row in np.flatnonzero(_may_show(scene, camera_from_world, lens, actors)).tolist():
         actor = actors[row]
-        model = hull(str(scene.trace.category[actor]), int(scene.trace.shape[actor]))
+        model = hull(*scene.trace.model(int(actor)))
         points = transform_points(camera_from_world @ scene.world_from_actor(int(actor)), model.vertices)
         points = points if points[:, 2].min() >= near_m else clip_in_front(points, model.edges, near_m)
         if len(points):

@@ -1,8 +1,8 @@
 """Beam patterns of LiDAR models, from their makers' data sheets, and the LiDAR returns of CARLA.
 
-Patterns are for `beams: <name>` in a rig: Velodyne VLP-16 (63-9229), HDL-32E (97-0038), HDL-64E (63-HDL64E), VLS-128
-"Alpha Prime" (63-9679) at 10 spins a second, and Ouster OS1-128 in its mode 1024x10. Elevations are nominal: those of
-a unit differ by some hundredths of a degree.
+Patterns are for `beams: <name>` in a rig: Velodyne VLP-16 (63-9229), HDL-32E (97-0038), VLP-32C (63-9378),
+HDL-64E (63-HDL64E), VLS-128 "Alpha Prime" (63-9679) at 10 spins a second, and Ouster OS1-128 in its mode 1024x10.
+Elevations are nominal: those of a unit differ by some hundredths of a degree.
 
 CARLA's `sensor.lidar.ray_cast` (its documentation, core sensors, "Lidar sensor") gives a return at range d the
 intensity exp(-a d), whatever the surface. A share of all rays is lost; of the rest, returns with an intensity below a
@@ -32,6 +32,11 @@ def _even(high: float, low: float, count: int) -> tuple[float, ...]:
 
 
 _HDL64E = (*_even(2.0, 2.0 - 31 / 3, 32), *_even(-8.83, -24.33, 32))  # an upper and a lower block of lasers
+_VLP32C = (
+    *(15.0, 10.333, 7.0, 4.667, 3.333, 2.333),
+    *(1.667, 1.333, 1.0, 0.667, 0.333, 0.0, -0.333, -0.667, -1.0, -1.333, -1.667, -2.0, -2.333, -2.667, -3.0, -3.333),
+    *(-3.667, -4.0, -4.667, -5.333, -6.148, -7.254, -8.843, -11.31, -15.639, -25.0),
+)
 _VLS128 = (
     *(15.0, 11.75, 9.7, 8.43, 7.58, 6.98, 6.48, 6.08, 5.73, 5.43, 5.18, 4.98),
     *_even(4.83, -6.5, 104),
@@ -41,6 +46,7 @@ _VLS128 = (
 BEAMS: dict[str, Beams] = {
     "vlp16": Beams(_even(15.0, -15.0, 16), 1800, 100.0),
     "hdl32e": Beams(_even(10.67, -30.67, 32), 2170, 100.0),
+    "vlp32c": Beams(_VLP32C, 1800, 200.0),
     "hdl64e": Beams(_HDL64E, 2083, 120.0),  # as on KITTI's car
     "os1_128": Beams(_even(22.5, -22.5, 128), 1024, 120.0),
     "vls128": Beams(_VLS128, 1800, 245.0),

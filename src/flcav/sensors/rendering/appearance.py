@@ -100,8 +100,8 @@ def _appearance(scene: Scene) -> Appearance:
     thing[:actors] = -(scene.things.face + 1)
     corner = np.zeros((rows - actors, 3, 3), np.float32)
     corner_normal = np.zeros((rows - actors, 3, 3), np.float32)
-    for instance, (category, shape) in enumerate(zip(trace.category, trace.shape), start=1):
-        corners, normals = _corners(str(category), int(shape))
+    for instance, category in enumerate(trace.category, start=1):
+        corners, normals = _corners(*trace.model(instance - 1))
         first = int(surfaces.first[instance])
         faces = slice(first, first + len(corners))
         corner[first - actors : first - actors + len(corners)] = corners
@@ -139,9 +139,9 @@ def _markings(town: Town) -> Markings:
     return build_markings(map_layers(town))
 
 
-@lru_cache(maxsize=64)
-def _corners(category: str, shape: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    mesh = actor_mesh(category, shape)
+@lru_cache(maxsize=256)
+def _corners(category: str, shape: int, size: tuple[float, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    mesh = actor_mesh(category, shape, size)
     return mesh.vertices[mesh.faces], mesh.corner_normals()
 
 

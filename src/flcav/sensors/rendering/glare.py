@@ -99,7 +99,7 @@ def _glowing(
         if actor == hidden or not trace.present[scene.index, actor]:
             continue
         body = scene.world_from_actor(int(actor))
-        heads, tails = lamp_places(str(trace.category[actor]), int(trace.shape[actor]))
+        heads, tails = lamp_places(*trace.model(int(actor)))
         towards = (eye - body[:3, 3]) / (np.linalg.norm(eye - body[:3, 3]) + 1e-6)
         ahead = float(towards @ body[:3, 0])
         for place in transform_points(body, heads):

@@ -67,7 +67,7 @@ def collect_lamps(scene: Scene, state: LampState) -> Lamps:
     places, beams = [street], [np.zeros_like(street)]
     for actor in np.flatnonzero(state.head[1:] > 0.5):
         body = scene.world_from_actor(int(actor))
-        heads, _ = lamp_places(str(scene.trace.category[actor]), int(scene.trace.shape[actor]))
+        heads, _ = lamp_places(*scene.trace.model(int(actor)))
         if len(heads):
             places.append(transform_points(body, heads))
             beams.append(np.tile(body[:3, 0] - (0, 0, 0.012), (len(heads), 1)))
@@ -85,10 +85,12 @@ def no_lamps() -> Lamps:
     return Lamps(position, ahead, colour, *_grid(none, none, np.zeros(0)))
 
 
-@lru_cache(maxsize=64)
-def lamp_places(category: str, shape: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+@lru_cache(maxsize=256)
+def lamp_places(
+    category: str, shape: int, size: tuple[float, ...] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the centres (K, 3) of an actor's head lamps and those (L, 3) of its tail lamps, body frame [m]."""
-    mesh = actor_mesh(category, shape)
+    mesh = actor_mesh(category, shape, size)
     centres = mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64)
 
     def centre(material: Material) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from flcav.config import Config
 from flcav.world.shapes import SHAPES
 
 LARGEST_M = 1000.0
+MOST = 10_000  # vehicles, or pedestrians
 CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, height [m]
     "hedge": (5.0, 0.8, 1.2),
     "bins": (3.2, 0.9, 1.3),
@@ -16,11 +17,21 @@ CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, hei
     "shelter": (4.0, 1.5, 2.3),
     "container": (4.2, 1.8, 1.6),
     "cabinet": (1.4, 0.6, 1.3),
+    "hedgerow": (4.0, 0.9, 1.5),
+    "shrub": (1.6, 1.4, 1.2),
+    "wall": (4.0, 0.25, 1.2),
+    "fence": (4.0, 0.1, 1.3),
+    "railing": (4.0, 0.06, 1.1),
+    "bin": (0.6, 0.7, 1.1),
+    "bollard": (0.15, 0.15, 0.95),
+    "post": (0.09, 0.09, 2.6),
 }
+BOUNDARIES = ("hedge", "hedgerow", "wall", "fence", "railing")  # kinds of `CLUTTER` that enclose plots
+KERBSIDE = ("bin", "bollard", "cabinet", "post")  # kinds that stand between kerb and walkers
 Height = Annotated[float, Field(ge=0.1, le=100)]
 Spacing = Annotated[float, Field(ge=0.5, le=10_000)]
 NotNegative = Annotated[float, Field(ge=0, le=10_000)]
-Many = Annotated[int, Field(ge=0, le=10_000)]
+Many = Annotated[int, Field(ge=0, le=MOST)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -53,10 +64,20 @@ def _clutter_mix(value: dict[str, float]) -> dict[str, float]:
     return _mix(value, list(CLUTTER))
 
 
+def _boundary_mix(value: dict[str, float]) -> dict[str, float]:
+    return _mix(value, list(BOUNDARIES)) if value else value
+
+
+def _kerbside_mix(value: dict[str, float]) -> dict[str, float]:
+    return _mix(value, list(KERBSIDE)) if value else value
+
+
 Interval = Annotated[tuple[float, float], AfterValidator(_interval)]
 Extent = Annotated[tuple[float, float], AfterValidator(_extent)]
 VehicleMix = Annotated[dict[str, float], AfterValidator(_vehicle_mix)]
 ClutterMix = Annotated[dict[str, float], AfterValidator(_clutter_mix)]
+BoundaryMix = Annotated[dict[str, float], AfterValidator(_boundary_mix)]
+KerbsideMix = Annotated[dict[str, float], AfterValidator(_kerbside_mix)]
 
 
 class StreetParameters(Config):
@@ -72,6 +93,14 @@ class StreetParameters(Config):
     lamp_spacing_m: Spacing = 32.0  # distance between street lamps
     clutter_spacing_m: Spacing = 25.0  # distance between pieces of street furniture
     clutter: ClutterMix = Field(default={"hedge": 1.0})  # kinds of street furniture with their weights
+    clutter_size: Interval = (0.85, 1.15)  # factors of the usual length, width and height of a piece
+    boundary: BoundaryMix = Field(default={})  # kinds of hedges, walls and fences along the street; none if empty
+    boundary_length_m: Extent = (5.0, 20.0)  # length of a stretch of one kind
+    boundary_gap_m: Interval = (1.0, 5.0)  # gap between two stretches, for drives
+    boundary_setback_m: Interval = (0.1, 1.0)  # distance from the sidewalk
+    kerbside: KerbsideMix = Field(default={})  # kinds of small objects at the kerb with their weights; none if empty
+    kerbside_spacing_m: Spacing = 20.0  # distance between two of them
+    trees_at_kerb: Share = 0.0  # fraction of the street trees that stand at the kerb, not behind the sidewalk
     parked: Share = 0.0  # fraction of the parking lane's places that are taken
     parked_mix: VehicleMix = Field(default={"car": 1.0})  # categories of parked vehicles with their weights
     traffic: NotNegative = 1.0  # weight of its edges as destinations of vehicles

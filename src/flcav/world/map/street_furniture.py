@@ -31,6 +31,7 @@ CORNER_M = 9.0  # a row of buildings may begin and end this far beyond its edge'
 STEP_M = 1.0  # shift along the street to the next try where something did not fit
 CLEARANCE_M = 0.25  # least distance between solid objects
 SENSOR_CLEAR_M = 2.5  # no street lamp is nearer to a roadside sensor, since it would block the view
+KERBSIDE_M = 0.4  # from the kerb to the middle of what stands at it
 SIGN_HEIGHT_M = 2.2  # of the plate's centre
 SPEED_SIGNS: dict[int, Literal["speed_30", "speed_60", "speed_90"]] = {  # limit [km/h] -> kind of sign
     30: "speed_30",
@@ -48,14 +49,14 @@ class Plot:
         shapely.prepare(self._closed)
         self._taken: list[Polygon] = []
 
-    def build(self, shape: Polygon) -> bool:
+    def build(self, shape: Polygon, apart_m: float = CLEARANCE_M) -> bool:
         """Reserve the footprint `shape` and return True; return False where it is not free.
 
-        It is free where it does not touch the closed area and is `CLEARANCE_M` from all that was built before.
+        It is free where it does not touch the closed area and is farther than `apart_m` from all that was built before.
         """
         if self._closed.intersects(shape):
             return False
-        if self._taken and shapely.dwithin(np.array(self._taken), shape, CLEARANCE_M).any():
+        if self._taken and shapely.dwithin(np.array(self._taken), shape, apart_m).any():
             return False
         self._taken.append(shape)
         return True
@@ -104,14 +105,14 @@ def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) 
         street = verge.street
         along = -CORNER_M
         while along < verge.line.length + CORNER_M:
-            length, width = _draw(random, street.building_length_m), _draw(random, street.building_depth_m)
-            height = _draw(random, street.building_height_m)
-            right = verge.half_width + street.frontage_m + _draw(random, street.setback_m) + width / 2
+            length, width = draw(random, street.building_length_m), draw(random, street.building_depth_m)
+            height = draw(random, street.building_height_m)
+            right = verge.half_width + street.frontage_m + draw(random, street.setback_m) + width / 2
             for candidate in (length, street.building_length_m[0]):
                 x, y, yaw = verge.at(along + candidate / 2, right)
                 if plot.build(make_footprint(x, y, yaw, candidate, width)):
                     out.append((x, y, yaw, candidate, width, height))
-                    along += candidate + max(CLEARANCE_M, _draw(random, street.building_gap_m))
+                    along += candidate + max(CLEARANCE_M, draw(random, street.building_gap_m))
                     break
             else:
                 along += STEP_M
@@ -123,9 +124,9 @@ def place_clutter(rows: list[Verge], plot: Plot, random: np.random.Generator) ->
     out: dict[str, list[tuple[float, ...]]] = {}
     for verge in rows:
         kinds, weights = list(verge.street.clutter), np.array(list(verge.street.clutter.values()))
-        for along in _stations(verge, verge.street.clutter_spacing_m, random):
+        for along in list_stations(verge, verge.street.clutter_spacing_m, random):
             kind = kinds[int(random.choice(len(kinds), p=weights / weights.sum()))]
-            length, width, height = np.array(CLUTTER[kind]) * random.uniform(0.85, 1.15, size=3)
+            length, width, height = np.array(CLUTTER[kind]) * random.uniform(*verge.street.clutter_size, size=3)
             x, y, yaw = verge.at(along, verge.half_width + 0.15 + width / 2)
             if plot.build(make_footprint(x, y, yaw, length, width)):
                 out.setdefault(kind, []).append((x, y, yaw, float(length), float(width), float(height)))
@@ -142,8 +143,12 @@ def place_trees(rows: list[Verge], ground: GroundSurfaces, plot: Plot, random: n
             out.append((x, y, height, float(height * random.uniform(0.22, 0.32))))
 
     for verge in rows:
-        for along in _stations(verge, verge.street.tree_spacing_m, random):
+        for along in list_stations(verge, verge.street.tree_spacing_m, random):
             x, y, _ = verge.at(along, verge.half_width + random.uniform(0.6, 2.4))
+            if verge.street.trees_at_kerb and random.random() < verge.street.trees_at_kerb:
+                x, y, _ = verge.at(along, KERBSIDE_M - verge.half_width)
+                plant(x, y, lambda _: True)
+                continue
             plant(x, y, plot.build)
     for island in ground.islands.geoms:
         inner = island.buffer(-1.5)
@@ -161,7 +166,7 @@ def place_lamps(rows: list[Verge], sensors: Array, random: np.random.Generator) 
     """
     out = []
     for verge in rows:
-        for along in _stations(verge, verge.street.lamp_spacing_m, random):
+        for along in list_stations(verge, verge.street.lamp_spacing_m, random):
             x, y, _ = verge.at(along, 0.3 - verge.half_width)
             while len(sensors) and np.hypot(*(sensors[:, :2] - (x, y)).T).min() < SENSOR_CLEAR_M:
                 along += STEP_M
@@ -225,7 +230,7 @@ def _kerb_side(edge: Edge, before_end_m: float, side: int) -> tuple[float, float
     return verge.at(verge.line.length - before_end_m, 0.35 - verge.half_width)
 
 
-def _stations(verge: Verge, spacing_m: float, random: np.random.Generator) -> Iterator[float]:
+def list_stations(verge: Verge, spacing_m: float, random: np.random.Generator) -> Iterator[float]:
     """Yield places along a verge [m], jittered by up to 30 % about `spacing_m`."""
     along = spacing_m * random.uniform(0.2, 0.8)
     while along < verge.line.length - 2.0:
@@ -233,7 +238,8 @@ def _stations(verge: Verge, spacing_m: float, random: np.random.Generator) -> It
         along += spacing_m * random.uniform(0.7, 1.3)
 
 
-def _draw(random: np.random.Generator, interval: Interval) -> float:
+def draw(random: np.random.Generator, interval: Interval) -> float:
+    """Return a number drawn uniformly from an interval."""
     return float(random.uniform(*interval))
 
 

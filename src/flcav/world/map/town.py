@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, read_config, shorten
 from flcav.seeds import stream
-from flcav.world.map import street_furniture
+from flcav.world.map import boundaries, street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import RoadNet, read_net
@@ -117,8 +117,8 @@ def _build_town(folder: Path, files: str) -> Town:
     _check(net, parameters, folder / "town.yaml")
     heights = folder / HEIGHTS
     relief = Relief.load(heights) if heights.exists() else None
-    town = _furnish(folder.name, folder / "town.net.xml", net, parameters)
-    return town if relief is None else _lift(town, relief)
+    town = furnish_town(folder.name, folder / "town.net.xml", net, parameters)
+    return town if relief is None else lift_town(town, relief)
 
 
 def _folder(name: str, beside: Path | None) -> Path:
@@ -144,7 +144,7 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
             raise InputError(f"{origin}: pole {pole.id} stands on '{pole.edge}', which is no edge with a sidewalk")
 
 
-def _lift(town: Town, relief: Relief) -> Town:
+def lift_town(town: Town, relief: Relief) -> Town:
     """Return a level town lifted onto a relief: poles, signs and signals by the ground at their feet."""
 
     def raise_by(position: Array, foot: Array) -> Array:
@@ -161,8 +161,11 @@ def _lift(town: Town, relief: Relief) -> Town:
     )
 
 
-def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:
-    """Return the town of a net: ground first, then buildings, clutter, trees, poles, signs, lamps and signals."""
+def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:
+    """Return the level town of the net in the file `path`.
+
+    Ground first, then buildings, clutter, hedges and fences, trees, poles, signs, lamps and signals.
+    """
     ground = build_ground_surfaces(net, {kind: street.frontage_m for kind, street in parameters.streets.items()})
     rows = list(street_furniture.list_verges(net, parameters))
     paved = add(ground.roads, ground.sidewalks)
@@ -175,6 +178,8 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
     ]
     open_land = street_furniture.Plot(unite([ground.roads, walked, *facades]))
     clutter = street_furniture.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
+    enclosing = boundaries.place_boundaries(rows, open_land, stream(parameters.seed, "boundaries"))
+    kerbside = boundaries.place_kerbside(rows, stream(parameters.seed, "kerbside"))
     trees = street_furniture.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
     poles = street_furniture.place_poles(net, parameters.poles)
     mounts = np.array([row[1] for row in poles], dtype=np.float64).reshape(-1, 3)
@@ -192,7 +197,7 @@ def _furnish(name: str, path: Path, net: RoadNet, parameters: TownParameters) ->
         kerbs=find_kerbs(ground),
         buildings=buildings,
         trees=trees,
-        clutter=clutter,
+        clutter=boundaries.join_clutter(clutter, enclosing, kerbside),
         poles=Poles(
             id=np.array([row[0] for row in poles], dtype=np.int64),
             position=mounts,

@@ -21,11 +21,12 @@ MAKERS: dict[str, Callable[[Shape], Mesh]] = {
 }
 
 
-@lru_cache(maxsize=64)
-def actor_mesh(category: str, shape: int) -> Mesh:
+@lru_cache(maxsize=256)
+def actor_mesh(category: str, shape: int, size: tuple[float, ...] | None = None) -> Mesh:
     """Return the mesh of `SHAPES[category][shape]` in its body frame: ground centre at the origin, x forward.
 
-    It has exactly the outer dimensions of the shape. Raises `KeyError` and `IndexError` for an unknown shape.
+    It has exactly the outer dimensions `size` (3,) [m], None: those of the shape. Raises `KeyError` and `IndexError`
+    for an unknown shape.
     """
     wanted = SHAPES[category][shape]
-    return fit_to_size(MAKERS[category](wanted), wanted.length, wanted.width, wanted.height)
+    return fit_to_size(MAKERS[category](wanted), *(size or wanted[1:]))

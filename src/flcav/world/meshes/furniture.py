@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flcav.world.materials import Material
+from flcav.world.meshes import barriers
 from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join_meshes, sheet, tube
 
 LEAVES = 360  # triangles of a crown; each stands for a cluster of leaves
@@ -191,4 +192,5 @@ CLUTTER: dict[str, Callable[[float, float, float], Mesh]] = {
     "shelter": _shelter,
     "container": _container,
     "cabinet": _box,
+    **barriers.MAKERS,
 }

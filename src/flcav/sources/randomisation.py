@@ -1,0 +1,187 @@
+"""Domain randomisation of recordings: streets, terrain, sizes of cars and LiDARs drawn widely around those of a recipe.
+
+A detector that meets every kind of street in training takes a real one for another of them (Tobin et al., "Domain
+randomization for transferring deep neural networks from simulation to the real world", IROS 2017).
+"""
+
+import io
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import shapely
+import yaml
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from flcav.sensors.lidar.beams import BEAMS
+from flcav.sensors.lidar.lidar import Lidar
+from flcav.sensors.rig import MountedLidar, Rig
+from flcav.world.map.parameters import BOUNDARIES, CLUTTER, KERBSIDE, MOST, StreetParameters, TownParameters
+from flcav.world.map.relief import Relief
+from flcav.world.map.roads import read_net
+from flcav.world.map.town import HEIGHTS, Town, furnish_town, lift_town
+from flcav.world.shapes import SHAPES
+from flcav.world.static import LAND_M
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+Draw = np.random.Generator
+
+CELL_M, FAR_CELL_M = 5.0, 50.0  # of the terrain within the town's bounds, and beyond them
+STEEPEST = 0.035  # slope of one of three long waves of the terrain
+LARGEST = 1.06  # factor of a car's length: parked cars keep apart
+PATTERNS = ("hdl64e", "vlp32c twice", "vls128", "os1_128", "even")  # of beams; "twice": two LiDARs, one on the other
+DROPPING = 0.4  # fraction of the LiDARs that lose many returns
+
+
+def randomise_town(town: Town, draw: Draw) -> Town:
+    """Return a town on the same net with streets, traffic and, unless it has heights, terrain drawn by `draw`."""
+    parameters = _draw_parameters(town.parameters, draw)
+    drawn = furnish_town(town.name, town.net, read_net(town.net), parameters)
+    return lift_town(drawn, town.relief or draw_terrain(drawn, draw))
+
+
+def town_files(town: Town) -> Mapping[str, bytes]:
+    """Return the files of a town's folder by name: net, parameters and heights, from which `load_town` makes it."""
+    values = town.parameters.model_dump(mode="json", exclude_defaults=True)
+    files = {"town.net.xml": town.net.read_bytes(), "town.yaml": yaml.safe_dump(values, sort_keys=False).encode()}
+    if town.relief is not None:
+        heights = io.BytesIO()
+        pq.write_table(pa.table(dict(zip("xyz", town.relief.points.T))), heights, compression="zstd")
+        files[HEIGHTS] = heights.getvalue()
+    return files
+
+
+def _draw_parameters(town: TownParameters, draw: Draw) -> TownParameters:
+    """Return parameters of the same net: other streets, other traffic."""
+    shapes = {kind: _mix([shape.name for shape in SHAPES[kind]], draw) for kind in ("car", "van")}
+    mix = _mix(["van", "truck", "bus", "motorcycle", "bicycle"], draw)
+    others = draw.uniform(0.15, 0.5)
+    values = town.model_dump() | {
+        "seed": int(draw.integers(2**31)),
+        "vehicles": min(round(town.vehicles * draw.uniform(0.7, 1.4)), MOST),
+        "pedestrians": min(round(town.pedestrians * draw.uniform(0.7, 1.6)), MOST),
+        "mix": {"car": 1 - others} | {kind: others * share for kind, share in mix.items()},
+        "shapes": shapes,
+        "streets": {kind: _draw_street(street, draw).model_dump() for kind, street in town.streets.items()},
+    }
+    return TownParameters.model_validate(values)
+
+
+def _draw_street(street: StreetParameters, draw: Draw) -> StreetParameters:
+    """Return the parameters of a street: its plots, what encloses them, what stands about, parked vehicles."""
+
+    def span(low: tuple[float, float], more: tuple[float, float]) -> tuple[float, float]:
+        start = draw.uniform(*low)
+        return start, start + draw.uniform(*more)
+
+    drawn = {
+        "setback_m": span((0.5, 5.0), (0.5, 5.0)),
+        "building_gap_m": span((1.0, 5.0), (1.0, 8.0)),
+        "building_height_m": span((3.0, 8.0), (1.0, 8.0)),
+        "tree_spacing_m": draw.uniform(7.0, 40.0),
+        "trees_at_kerb": draw.uniform(0.0, 0.7),
+        "lamp_spacing_m": draw.uniform(20.0, 50.0),
+        "clutter_spacing_m": draw.uniform(4.0, 14.0),
+        "clutter": _mix(list(CLUTTER), draw),
+        "clutter_size": (draw.uniform(0.5, 0.8), draw.uniform(1.2, 1.6)),
+        "boundary": _mix(list(BOUNDARIES), draw) if draw.random() < 0.85 else {},
+        "boundary_length_m": span((3.0, 10.0), (5.0, 25.0)),
+        "boundary_gap_m": span((0.5, 3.0), (1.0, 8.0)),
+        "boundary_setback_m": (0.05, draw.uniform(0.3, 2.5)),
+        "kerbside": _mix(list(KERBSIDE), draw),
+        "kerbside_spacing_m": draw.uniform(6.0, 30.0),
+    }
+    if street.parked:
+        drawn["parked"] = draw.uniform(0.1, 0.8)
+        drawn["parked_mix"] = {"car": 1.0, "van": draw.uniform(0, 0.25), "truck": draw.uniform(0, 0.05)}
+    return StreetParameters.model_validate(street.model_dump() | drawn)
+
+
+def _mix(names: list[str], draw: Draw) -> dict[str, float]:
+    """Return weights of `names` that sum to 1, from a flat Dirichlet distribution."""
+    return dict(zip(names, draw.dirichlet(np.ones(len(names))).round(4).clip(1e-4).tolist()))
+
+
+def draw_terrain(town: Town, draw: Draw) -> Relief:
+    """Return uneven ground with slopes under a level town: long waves, short ones, and roughness beside the roads."""
+    x0, y0, x1, y1 = town.bounds
+    near = _grid((x0, y0, x1, y1), CELL_M)
+    far = _grid((x0 - LAND_M, y0 - LAND_M, x1 + LAND_M, y1 + LAND_M), FAR_CELL_M)
+    inside = (far[:, 0] > x0) & (far[:, 0] < x1) & (far[:, 1] > y0) & (far[:, 1] < y1)
+    at = np.concatenate((near, far[~inside]))
+    length = np.concatenate((draw.uniform(100, 400, 3), draw.uniform(15, 60, 3)))
+    height = np.concatenate((draw.uniform(0, STEEPEST, 3) * length[:3] / (2 * np.pi), draw.uniform(0, 0.08, 3)))
+    heading, phase = draw.uniform(0, 2 * np.pi, (2, 6))
+    along = at[:, :1] * np.cos(heading) + at[:, 1:] * np.sin(heading)
+    z = (height * np.sin(2 * np.pi * along / length + phase)).sum(axis=1)
+    driven = shapely.union_all([Polygon(outline) for outline in town.roads]).buffer(CELL_M)
+    shapely.prepare(driven)
+    smooth, rough = draw.uniform(0.0, 0.02), draw.uniform(0.02, 0.15)
+    z += draw.standard_normal(len(at)) * np.where(shapely.contains_xy(driven, *at.T), smooth, rough)
+    return Relief(np.column_stack((at, z)))
+
+
+def _grid(bounds: tuple[float, float, float, float], cell_m: float) -> Array:
+    x0, y0, x1, y1 = bounds
+    x = np.linspace(x0, x1, max(2, round((x1 - x0) / cell_m) + 1))
+    y = np.linspace(y0, y1, max(2, round((y1 - y0) / cell_m) + 1))
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def randomise_rig(rig: Rig, draw: Draw) -> Rig:
+    """Return the rig with every LiDAR's mount, beams, reach and losses drawn; other sensors stay as they are."""
+    return rig.model_copy(update={"lidars": {name: _draw_lidar(one, draw) for name, one in rig.lidars.items()}})
+
+
+def _draw_lidar(lidar: MountedLidar, draw: Draw) -> MountedLidar:
+    mount = lidar.mount.model_copy(
+        update={
+            "z": lidar.mount.z + draw.uniform(-0.2, 0.4),
+            "pitch_deg": lidar.mount.pitch_deg + draw.normal(0, 0.7),
+            "roll_deg": lidar.mount.roll_deg + draw.normal(0, 0.7),
+        }
+    )
+    elevations, steps = _draw_beams(str(draw.choice(PATTERNS)), draw)
+    fixed = lidar.settings.model_dump(exclude={"beams", "channels", "elevations_deg", "azimuth_steps"})
+    settings = Lidar.model_validate(
+        fixed
+        | {
+            "channels": len(elevations),
+            "elevations_deg": elevations,
+            "azimuth_steps": steps,
+            "sensitivity_m": float(np.exp(draw.uniform(np.log(80), np.log(300)))),
+            "noise_m": draw.uniform(0.01, 0.035),
+            "dropout": draw.uniform(0.03, 0.25) if draw.random() < DROPPING else draw.uniform(0.0, 0.03),
+            "glass_pass": draw.uniform(0.6, 0.95),
+            "roughness_rad": draw.uniform(0.1, 0.9),
+            "intensity_gamma": draw.uniform(0.4, 1.0),
+            "intensity_floor": draw.uniform(0.0, 0.15),
+        }
+    )
+    return MountedLidar(mount=mount, settings=settings)
+
+
+def _draw_beams(pattern: str, draw: Draw) -> tuple[tuple[float, ...], int]:
+    """Return the elevations [deg] and the azimuth steps of one of `PATTERNS`; each unit's beams are a little off."""
+    if pattern == "even":
+        elevations = np.linspace(draw.uniform(2, 15), draw.uniform(-25, -16), int(draw.integers(40, 97)))
+        steps = int(draw.integers(1000, 2001))
+    else:
+        known = BEAMS[pattern.removesuffix(" twice")]
+        elevations, steps = np.array(known.elevations_deg), known.azimuth_steps
+        if pattern.endswith("twice"):
+            elevations = np.concatenate((elevations, elevations + draw.uniform(-0.3, 0.3)))
+    off = elevations + draw.normal(0, 0.04, len(elevations))
+    return tuple(float(elevation) for elevation in off.round(3)), steps
+
+
+def randomise_sizes(trace: Trace, draw: Draw) -> Trace:
+    """Return the trace with the length, width and height of cars and vans drawn around those of their shapes."""
+    cars = np.isin(trace.category, ("car", "van"))[:, None]
+    low, high = np.transpose(((0.85, LARGEST), (0.92, 1.08), (0.9, 1.12)))
+    factor = draw.uniform(low, high, size=trace.size.shape)
+    return replace(trace, size=np.where(cars, (trace.size * factor).round(3), trace.size))
