@@ -26,10 +26,13 @@ from flcav.experiments.fig3b import tables as fig3b_tables
 from flcav.experiments.fig3b.run import Fig3b
 from flcav.experiments.fig6a import tables as fig6a_tables
 from flcav.experiments.fig6a.results import AllocationResult
+from flcav.experiments.placement import tables as placement_tables
+from flcav.experiments.placement.run import PlacementProof
 from flcav.experiments.roadside import tables as roadside_tables
 from flcav.experiments.roadside.average import RoadAverageResult
 from flcav.experiments.roadside.detector import RoadDetectorResult
 from flcav.experiments.roadside.fig4 import Fig4
+from flcav.experiments.roadside.ranges import SensorRanges
 from flcav.experiments.sim_to_real import tables as sim_to_real_tables
 from flcav.experiments.sim_to_real.run import SimToReal
 from flcav.experiments.studies import objects, signs, trajectory, weather
@@ -66,8 +69,10 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "fig4": _told(Fig4, roadside_tables.fig4_tables),
     "fig6a-allocation": _told(AllocationResult, fig6a_tables.tables),
     "leakage": _told(LeakageResult, attack_tables.leakage_tables),
+    "placement": _told(PlacementProof, placement_tables.tables),
     "road-average": _told(RoadAverageResult, roadside_tables.average_tables),
     "road-detector": _told(RoadDetectorResult, roadside_tables.detector_tables),
+    "sensor-ranges": _told(SensorRanges, roadside_tables.range_tables),
     "sim-to-real": _told(SimToReal, sim_to_real_tables.tables),
     "task-objects": _of_study(objects.STUDY, objects_tables.tables),
     "task-objects-streets": _of_study(objects.STREETS, objects_tables.tables),

@@ -29,6 +29,7 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.arms.run import ARMS, ArmsResult, compare_arms
 from flcav.experiments.fig6a.results import AllocationResult
 from flcav.experiments.fig6a.run import compare_plans
+from flcav.experiments.placement.run import NEAR, TOWN, prove_placement
 from flcav.federation.privacy import account_epsilon
 from flcav.federation.rules import Rules
 from flcav.network.clock.records import load_rounds
@@ -118,6 +119,17 @@ def test_sensors_stand_where_most_errors_or_most_traffic_is(result: Run) -> None
     assert [pole.pole for pole in placed.poles] == load_town("grid").poles.id.tolist()
     assert placed.covered == max(pole.covered for pole in placed.poles) <= placed.errors
     assert result.arms["densest"].placed[0].chosen == (placed.densest,)
+
+
+def test_gains_of_a_pole_are_those_of_its_own_arm_over_the_run_itself(studied: Studied, result: Run) -> None:
+    proof = prove_placement(RECIPE, [result], [studied[0] / "seed1" / "work"])
+    (seed,), site = proof.seeds, next(each for each in result.arms[MAIN].placed[0].poles if each.pole == 8)
+    (pole,) = seed.poles
+    reached = [result.test(arm=arm, stage=EDGE, region="grid", task="objects").estimate.mean for arm in ("pole8", MAIN)]
+    assert result.arms["pole8"].placed[0].chosen == (pole.pole,) == (8,)
+    assert (pole.covered, pole.actors, seed.without[TOWN]) == (site.covered, site.actors, reached[1])
+    assert pole.gain[TOWN] == pytest.approx(reached[0] - reached[1])
+    assert set(pole.gain) == {TOWN, NEAR}
 
 
 def test_central_arms_take_as_many_steps_as_stage_two_on_their_own_samples(finished: Path, result: Run) -> None:
@@ -414,7 +426,7 @@ def killed_at(sign: Path, out: Path) -> None:
 
 def test_a_run_killed_in_edge_fl_ends_the_same(finished: Path, tmp_path: Path) -> None:
     first, redone = "grid-edge-fl-objects", ("grid-edge-fl-objects", "cloud-fl-objects")
-    ending = ("equal", "densest", "no_pole", "ring")
+    ending = ("equal", "densest", "no_pole", "pole8", "ring")
 
     def unwanted(name: str) -> bool:
         return name == "look" or (any(step in name for step in redone) and not name.endswith(ending))

@@ -1,6 +1,6 @@
 """`flcav reproduce`: the figures and comparisons of the article, and the tasks' studies."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +22,8 @@ STUDY = ("seeds", "scale", *RUN)  # options of targets that run over seeds
 TASK = "task-"  # before the name of a task's study
 OWN = "a task of your own that says how it is studied, as module:NAME"
 COMMON_SEEDS = 3
+DEMO_SIZE: Mapping[str, str | None] = {"size": "demo"}  # fields of a run recipe at the scale `quick`
+TOY_SIZE: Mapping[str, str | None] = {"size": "toy", "splits": None, "training": None}  # shows that it runs
 
 
 class Target(StrEnum):
@@ -36,12 +38,20 @@ class Target(StrEnum):
     fig3b = "fig3b"
     fig4 = "fig4"
     fig6a_allocation = "fig6a-allocation"
+    placement = "placement"
     road_average = "road-average"
     road_detector = "road-detector"
+    sensor_ranges = "sensor-ranges"
     sim_to_real = "sim-to-real"
 
 
-RECORDED = (Target.fig3b, Target.fig4, Target.road_average, Target.road_detector)  # one recording, no training
+RECORDED = (  # recordings, no training
+    Target.fig3b,
+    Target.fig4,
+    Target.road_average,
+    Target.road_detector,
+    Target.sensor_ranges,
+)
 ATTACKS = (Target.federation_faults, Target.federation_leakage)  # one recording, several seeds
 
 
@@ -119,8 +129,7 @@ def reproduce(
     if target.startswith(TASK) or ":" in target:
         _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
-        compared = {Target.fig6a_allocation: _fig6a_allocation, Target.distillation: _distillation}
-        run = compared.get(Target(target), _demo_arms)
+        run = COMPARISONS.get(target, _demo_arms)
         run(out, count, "quick" if quick else "paper", jobs, engine, stale)
     typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
 
@@ -158,6 +167,8 @@ def _record_and_draw(target: Target, out: Path) -> None:
             from flcav.experiments.fig3b.run import fig3b as repeat
         elif target == Target.fig4:
             from flcav.experiments.roadside.fig4 import fig4 as repeat
+        elif target == Target.sensor_ranges:
+            from flcav.experiments.roadside.ranges import measure_ranges as repeat
         elif target == Target.road_average:
             from flcav.experiments.roadside.average import evaluate_road_average as repeat
         else:
@@ -225,11 +236,43 @@ def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, 
         typer.echo(sentence)
 
 
+def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+    from flcav.experiments.placement.run import describe_overlaps, draw_proof, list_overlaps, prove_placement
+    from flcav.files import write_bytes, write_json
+    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.pipeline.running import WORK
+    from flcav.sources.recipe import recipe_path
+
+    asked = load_run_recipe(recipe_path("runs/placement"))
+    typer.echo(describe_overlaps(list_overlaps(asked), asked.placement.range_m))
+    recipe, runs = _run_seeds(Target.placement, "placement", out, seeds, scale, jobs, engine, stale, TOY_SIZE)
+    results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs])
+    write_json(out / "result.json", results.as_json())
+    write_bytes(out / "placement.png", draw_proof(results))
+    for sentence in results.sentences():
+        typer.echo(sentence)
+
+
+COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] = {
+    Target.distillation: _distillation,
+    Target.fig6a_allocation: _fig6a_allocation,
+    Target.placement: _placement,
+}
+
+
 @when_interrupted()
 def _run_seeds(
-    target: Target, name: str, out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale
+    target: Target,
+    name: str,
+    out: Path,
+    seeds: int,
+    scale: str,
+    jobs: int,
+    engine: Engine,
+    stale: Stale,
+    quick: Mapping[str, str | None] = DEMO_SIZE,
 ) -> "tuple[RunRecipe, tuple[Run, ...]]":
-    """Run or finish the package's recipe `runs/<name>` with several seeds; of the demo's size unless scale is paper."""
+    """Run or finish the package's recipe `runs/<name>` with several seeds, with the fields `quick` if scale is that."""
     from flcav.cli.steps import live_steps
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import run_seeds
@@ -237,7 +280,7 @@ def _run_seeds(
 
     recipe = load_run_recipe(recipe_path(f"runs/{name}"))
     if scale != "paper":
-        recipe = recipe.model_copy(update={"size": "demo"})
+        recipe = recipe.model_copy(update=dict(quick))
     with live_steps(target.value) as notify:
         runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     return recipe, runs

@@ -286,12 +286,14 @@ class Graph:
         weights = {task: self.recipe.tasks[task].weight for task in errors}
         arguments = {
             "region": region,
-            "how": arm.placement.model_dump(mode="json"),
+            "how": arm.placement.model_dump(mode="json", exclude=None if arm.placement.poles else {"poles"}),
             "errors": errors,
             "weights": weights,
             "registry": registry,
             "edge": edge,
         }
+        if arm.placement.rule == "random":
+            arguments["seed"] = self.recipe.seed
         needs = [*errors.values(), registry, *([edge] if edge else [])]
         self._add(_step(names.place(arm.name, region), place_step, arguments, needs))
 

@@ -1,4 +1,4 @@
-"""Placement of roadside sensors by VRCSP or by traffic density."""
+"""Placement of roadside sensors by VRCSP, by traffic density, at random or as named."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.optimization.placement.solve import coverage, place
 from flcav.perception.errors import PerceptionError
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import Placement
 from flcav.pipeline.results import Placed, Pole
+from flcav.seeds import stream
 from flcav.world.map.census import measure_traffic_density
 from flcav.world.trace import Trace
 
@@ -41,10 +43,13 @@ def place_sensors(
     errors: Mapping[str, Sequence[PerceptionError]],
     weights: Mapping[str, float],
     traces: Sequence[Trace],
+    seed: int = 0,
 ) -> Placed:
-    """Place a region's sensors by the rule in `how`: VRCSP over registered errors, or the densest traffic.
+    """Place a region's sensors by the rule in `how`: VRCSP over errors, the densest traffic, at random, or as named.
 
     `errors` and `weights` are by task: an error weighs its own weight times its task's. `traces` give the traffic.
+    Random poles are a stream of `seed` and the region: fewer are the first of more. Raises `InputError` for a named
+    pole that the region does not have.
     """
     every = [replace(error, weight=error.weight * weights[task]) for task in how.tasks for error in errors[task]]
     xyz = np.array([(error.x, error.y, error.z) for error in every]).reshape(-1, 3)
@@ -59,6 +64,10 @@ def place_sensors(
         chosen = list(place(xyz, sites.position, how.range_m, count, weight=weight).chosen)
     elif how.rule == "densest":
         chosen = np.argsort(-actors, kind="stable")[:count].tolist()
+    elif how.rule == "random":
+        chosen = stream(seed, "placement", region).permutation(len(sites.number))[:count].tolist()
+    elif how.rule == "fixed":
+        chosen = [_find_row(region, sites, pole) for pole in how.poles]
     return Placed(
         region=region,
         rule=how.rule,
@@ -77,6 +86,14 @@ def read_traces(data: Dataset, frames: Sequence[int]) -> list[Trace]:
     """Return the recorded traffic of the frames' scenes; scenes without a trace are left out."""
     scenes = sorted({data.keys[i].scene for i in frames})
     return [trace for scene in scenes if (trace := data.trace(scene)) is not None]
+
+
+def _find_row(region: str, sites: Sites, pole: int) -> int:
+    known = sites.number.tolist()
+    if pole not in known:
+        told = ", ".join(map(str, known))
+        raise InputError(f"placement.poles: {pole} is none of the candidate poles of region '{region}': {told}")
+    return known.index(pole)
 
 
 def _none() -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -154,15 +154,24 @@ class Limits(Config):
 class Placement(Config):
     """Settings of the choice of sites for roadside sensors."""
 
-    rule: Literal["vrcsp", "densest", "none"] = (
-        "vrcsp"  # vrcsp: poles that cover most errors; densest: poles with most traffic; none: no sensors
+    rule: Literal["vrcsp", "densest", "random", "fixed", "none"] = (
+        "vrcsp"  # vrcsp: covers most errors; densest: most traffic; random; fixed: those in `poles`; none: no sensors
     )
-    count: int = Field(default=1, ge=1, le=100)  # sensors per region
+    poles: tuple[int, ...] = ()  # numbers of the poles that have a sensor, of the rule `fixed`
+    count: int = Field(default=1, ge=1, le=100)  # sensors per region, of the other rules
     range_m: float = Field(default=40.0, gt=0, le=1000)  # radius within which a sensor covers an error
     group_range_m: float = Field(
         default=60.0, gt=0, le=10_000
     )  # vehicles train on frames recorded within this distance of a sensor of any arm
     tasks: tuple[str, ...] = ()  # tasks whose errors are to be covered; default: objects, if the run has it
+
+    @model_validator(mode="after")
+    def _fixed_or_chosen(self) -> Self:
+        if (self.rule == "fixed") != bool(self.poles):
+            raise ValueError("'poles' and the rule 'fixed' belong together")
+        if len(set(self.poles)) < len(self.poles):
+            raise ValueError("'poles': one of them is named twice")
+        return self
 
 
 StrategySpec = str | Mapping[str, Mapping[str, Any]]  # a name, or a name with settings

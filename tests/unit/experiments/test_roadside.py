@@ -1,14 +1,22 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from flcav.cli.planning.place_inputs import read_given
+from flcav.config import parse_config
+from flcav.experiments.fig3b.cover import TownCover, cover_town, list_kinds
 from flcav.experiments.fig3b.run import ZONE_M, _count_zones
 from flcav.experiments.roadside.detector import _Frames, fit_threshold, score_town
 from flcav.experiments.roadside.errors import Errors, apply_errors
-from flcav.experiments.roadside.fig4 import EDGES_M, _range
+from flcav.experiments.roadside.fig4 import EDGES_M, find_range
+from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
+from flcav.experiments.roadside.ranges import SHARED, Model, SensorRanges
 from flcav.fusion.pose_graph import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
+from flcav.sensors.rig import RIGS, Rig
+from flcav.sources.recipe import Recipe
 from flcav.world.map.town import load_town
 
 EXACT = Navigation(0.01, 0.001)
@@ -95,5 +103,46 @@ def test_zones_count_errors_around_poles_per_hectare_and_per_frame() -> None:
 
 def test_a_range_ends_where_too_few_cars_are_found_in_all() -> None:
     cars = (10,) * (len(EDGES_M) - 1)
-    assert _range(cars, (10, 8, 6) + (0,) * (len(EDGES_M) - 4)) == EDGES_M[3]
-    assert _range(cars, (0,) * (len(EDGES_M) - 1)) == 0.0
+    assert find_range(EDGES_M, cars, (10, 8, 6) + (0,) * (len(EDGES_M) - 4)) == EDGES_M[3]
+    assert find_range(EDGES_M, cars, (0,) * (len(EDGES_M) - 1)) == 0.0
+
+
+def test_the_sensors_of_a_range_are_read_by_the_placement(tmp_path: Path) -> None:
+    intervals = len(SENSOR_EDGES_M) - 1
+    cars, all_to_20 = (10,) * intervals, (10,) * 4 + (0,) * (intervals - 4)
+    models = (
+        Model("few", 16, (0,) * intervals, 0.0),
+        Model("many", 64, all_to_20, find_range(SENSOR_EDGES_M, cars, all_to_20)),
+    )
+    assert models[1].range_m == 25.0  # 40 of 50 cars
+    results = SensorRanges(8, cars, models)
+    files = {name: tmp_path / f"{name}.csv" for name in ("errors", "poles", "sensors")}
+    files["errors"].write_text("x,y,z\n1,2,0\n")
+    files["poles"].write_text("id,x,y,z\n1,0,0,6\n")
+    files["sensors"].write_bytes(results.sensors_csv())
+    given = read_given(files["errors"], files["poles"], files["sensors"], None, [])
+    assert (given.names, given.ranges_m.tolist(), given.sensor_cost.tolist()) == (("many",), [25.0], [4.0])
+    assert SensorRanges.from_json(results.as_json(), "result.json") == results
+
+
+def test_sensor_models_are_those_of_a_rig() -> None:
+    recipe = parse_config(Recipe, {**SHARED, "town": "grid", "seed": 1}, "ranges")
+    assert isinstance(recipe.pole_rig, Rig)
+    channels = {name: each.settings.channels for name, each in recipe.pole_rig.lidars.items()}
+    assert channels == {"pole_16": 16, "pole_32": 32, "pole_64": 64, "pole_128": 128, "hdl32e": 32, "os1_128": 128}
+    assert recipe.pole_rig.lidars["pole_64"] == RIGS["lidar_pole"].lidars["lidar"]
+
+
+def test_a_town_takes_as_many_sensors_as_its_errors_are_spread() -> None:
+    town = load_town("grid")
+    near = dict(zip(town.poles.id.tolist(), town.poles.position, strict=True))
+    errors = np.array([near[2], near[2], near[3], near[9], [900.0, 900.0, 0.0]])  # the last out of reach
+    found = cover_town(town, errors, 30.0)
+    assert (found.errors, found.poles) == (5, 9)
+    assert found.shares[:4] == (0.4, pytest.approx(0.6), 0.8, 0.8)
+    assert found.wanted == (1, 2, 3)
+    straight = [number for number, kind in zip(town.poles.id.tolist(), town.poles.kind) if kind == "straight"]
+    assert found.kinds["straight"] == pytest.approx(3 / len(straight))
+    assert cover_town(town, errors[[0, 4]], 30.0).wanted == (1, 1, None)
+    other = TownCover("ring", 4, 2, (0.5, 1.0), (1, 1, 2), {"tee": 0.1, "straight": 9.0})
+    assert list_kinds([found, other]) == ["tee", "cross", "straight"]

@@ -2,6 +2,7 @@
 
 Vehicles drive through `grid` with the detector of the package. Its errors are counted in zones around the candidate
 poles; the pole that covers most errors is compared with conventional placements, by visible objects and by traffic.
+Fewer drives in every town of the package show how many sensors each takes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +16,10 @@ from numpy.typing import NDArray
 from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.experiments.fig3b.cover import TownCover, cover_town, list_kinds
 from flcav.optimization.placement.baselines import place_by_score
 from flcav.optimization.placement.solve import Candidates, Placement, find_candidates, place_count
+from flcav.perception.errors import Registry
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.task import OBJECTS
 from flcav.pipeline.provenance import Provenance, provenance
@@ -24,6 +27,7 @@ from flcav.progress import Report, ignore_progress
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.figures import town_map
+from flcav.report.charts.placement import draw_cover
 from flcav.report.pictures.maps import ErrorMap, poles_of
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
@@ -41,6 +45,8 @@ RECIPE: Mapping[str, Any] = {
     "cavs": 4,
     "vehicle_rig": "kitti_lidar",
 }
+OTHERS: Mapping[str, int] = {"ring": 8302, "suburb": 8303, "arterial": 8304}  # towns compared, and their seeds
+COMPARED = 2  # scenes of each town
 RANGE_M = 40.0  # within which a sensor covers an error
 ZONE_M = 30.0  # radius of a scenario zone around a candidate pole
 COUNTS = (1, 2, 3)  # sensors
@@ -76,6 +82,7 @@ class Fig3b(Record):
     errors: int
     zones: tuple[Zone, ...]  # densest in errors first
     placed: tuple[Placed, ...]
+    towns: Annotated[tuple[TownCover, ...] | None, LEFT_OUT] = None  # None in older results
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
     def sentences(self) -> list[str]:
@@ -92,17 +99,22 @@ class Fig3b(Record):
                 if each.count == count
             ]
             told.append(f"{count} sensor{'s' if count > 1 else ''}, errors covered by the poles of {'; '.join(rules)}")
+        for town in self.towns or ():
+            first = f"{town.town}: {town.errors} errors; one sensor covers {town.shares[0]:.0%}"
+            told.append(f"{first}, {town.poles} cover {town.shares[-1]:.0%}")
         return told
 
 
 def fig3b(out: Path, progress: Report = ignore_progress) -> tuple[Fig3b, dict[str, bytes]]:
-    """Record drives into `out`, register the detector's errors; return the numbers, and the map as PNG by file name."""
-    record(EmbeddedSource(parse_config(Recipe, dict(RECIPE), "fig3b")), out / "data")
-    data = Dataset.open(out / "data")
-    town = data.town()
-    assert town is not None  # one of the package's
-    network = resolve_network(OBJECTS, None)
-    found = OBJECTS.register_errors(network, data, progress=progress)
+    """Record drives into `out`, register the detector's errors; return the numbers, and PNG files by name."""
+    data, town, found = _drive(RECIPE, out / "data", progress)
+    scenes = sorted({key.scene for key in data.keys})[:COMPARED]
+    first = np.array([error.scene in scenes for error in found.errors], dtype=np.bool_)
+    towns = [cover_town(town, found.positions[first], RANGE_M)]
+    for name, seed in OTHERS.items():
+        asked = {**RECIPE, "town": name, "seed": seed, "scenes": COMPARED}
+        _, other, errors = _drive(asked, out / name, progress)
+        towns.append(cover_town(other, errors.positions, RANGE_M))
     traces = [trace for scene in sorted({key.scene for key in data.keys}) if (trace := data.trace(scene)) is not None]
     places = np.array([data.world_from_agent(number)[:2, 3] for number in range(len(data))])
     candidates = find_candidates(found.positions, town.poles.position, [RANGE_M]).at_unit_cost()
@@ -113,9 +125,28 @@ def fig3b(out: Path, progress: Report = ignore_progress) -> tuple[Fig3b, dict[st
         errors=len(found),
         zones=_count_zones(town, found.positions, places, density),
         placed=tuple(_place(candidates, town, {"visible objects": visible, "traffic density": density})),
+        towns=tuple(towns),
         provenance=provenance(),
     )
-    return results, {"fig3b.png": _draw(town, found.positions, np.array(found.kinds, dtype=np.str_), results)}
+    pictures = {"fig3b.png": _draw(town, found.positions, np.array(found.kinds, dtype=np.str_), results)}
+    return results, pictures | {"cover.png": draw_towns(towns)}
+
+
+def _drive(recipe: Mapping[str, Any], folder: Path, progress: Report) -> tuple[Dataset, Town, Registry]:
+    """Record drives in a town of the package; return them, the town, and the errors of the package's detector."""
+    record(EmbeddedSource(parse_config(Recipe, dict(recipe), "fig3b")), folder)
+    data = Dataset.open(folder)
+    town = data.town()
+    assert town is not None
+    return data, town, OBJECTS.register_errors(resolve_network(OBJECTS, None), data, progress=progress)
+
+
+def draw_towns(towns: Sequence[TownCover]) -> bytes:
+    """Return the picture of what each number of sensors covers in each town, and of errors by scenario, as a PNG."""
+    kinds = list_kinds(towns)
+    shares = {each.town: each.shares for each in towns}
+    around = {each.town: [each.kinds.get(kind) for kind in kinds] for each in towns}
+    return style.png(draw_cover(shares, kinds, around))
 
 
 def _count_zones(

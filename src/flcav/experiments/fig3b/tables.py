@@ -1,11 +1,12 @@
 """Markdown tables of Fig. 3b."""
 
-from flcav.experiments.fig3b.run import Fig3b
+from flcav.experiments.fig3b.cover import ASKED
+from flcav.experiments.fig3b.run import COUNTS, Fig3b
 from flcav.markdown import format_table
 
 
 def tables(results: Fig3b) -> dict[str, str]:
-    """Return Markdown by name: zones, placed."""
+    """Return Markdown by name: zones, placed, towns."""
     zones = [
         [
             zone.pole,
@@ -19,7 +20,21 @@ def tables(results: Fig3b) -> dict[str, str]:
     ]
     placed = [[each.count, each.rule, ", ".join(map(str, each.poles)), each.covered] for each in results.placed]
     header = ("pole", "zone", "errors", "per hectare", "per frame driven there", "actors in reach")
+    towns = [
+        [
+            each.town,
+            each.errors,
+            each.poles,
+            *(f"{each.shares[count - 1]:.0%}" for count in COUNTS),
+            f"{each.shares[-1]:.0%}",
+            *("" if wanted is None else wanted for wanted in each.wanted),
+        ]
+        for each in results.towns or ()
+    ]
+    covered = (*(f"covered by {count}" for count in COUNTS), "by all poles")
+    asked = tuple(f"sensors for {share:.0%}" for share in ASKED)
     return {
+        "towns": format_table(("town", "errors", "poles", *covered, *asked), towns),
         "zones": format_table(header, zones),
         "placed": format_table(("sensors", "rule", "poles", "errors covered"), placed),
     }

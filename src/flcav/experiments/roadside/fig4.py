@@ -5,6 +5,7 @@ off from where its calibration says. The second and third are registered to the 
 background; then the road detector's boxes of all three are averaged.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -113,7 +114,7 @@ def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str,
     )
     placed = {ARMS[0]: guess[:1], ARMS[1]: guess, ARMS[2]: registered}
     cars, found = _find_cars(data, truth[0], placed)
-    ranges = {arm: _range(cars, counts) for arm, counts in found.items()}
+    ranges = {arm: find_range(EDGES_M, cars, counts) for arm, counts in found.items()}
     result = Fig4(suites, cars, found, ranges, provenance())
     shown = [
         Shown(
@@ -159,7 +160,8 @@ def _find_cars(
             detect(network, read(number).lidar[lidar], score_threshold=THRESHOLD)
             for number, (_, lidar) in zip(numbers, SUITES, strict=True)
         ]
-        targets = _targets(data, numbers).transform(inverse(world_from_first))
+        views = [(number, lidar) for number, (_, lidar) in zip(numbers, SUITES, strict=True)]
+        targets = list_cars(data, views).transform(inverse(world_from_first))
         distance = np.linalg.norm(targets.center[:, :2], axis=1)
         cars += np.histogram(distance, EDGES_M)[0]
         for arm, poses in placed.items():
@@ -170,12 +172,11 @@ def _find_cars(
     return tuple(cars.tolist()), {arm: tuple(counts.tolist()) for arm, counts in hits.items()}
 
 
-def _targets(data: Dataset, numbers: list[int]) -> Boxes:
-    """Return the cars of one spin with `MIN_RETURNS` of one of the suites, world frame."""
-    first = data.frame(numbers[0])
-    truth = first.annotations
+def list_cars(data: Dataset, views: Sequence[tuple[int, str]]) -> Boxes:
+    """Return the cars of one spin, world frame, with `MIN_RETURNS` of one of the `views`: frame number and LiDAR."""
+    truth = data.frame(views[0][0]).annotations
     most = np.zeros(len(truth), dtype=np.int64)
-    for number, (_, lidar) in zip(numbers, SUITES, strict=True):
+    for number, lidar in views:
         frame = data.frame(number)
         points = transform_points(frame.world_from_sensor(lidar), frame.lidar[lidar][:, :3].astype(np.float64))
         most = np.maximum(most, points_in_boxes(points, truth.boxes).sum(axis=1))
@@ -183,8 +184,11 @@ def _targets(data: Dataset, numbers: list[int]) -> Boxes:
     return replace(seen, label=np.full(len(seen), "Car"))
 
 
-def _range(cars: tuple[int, ...], found: tuple[int, ...]) -> float:
-    """Return the largest edge of `EDGES_M` within which the share `REACHED` of the cars is found."""
+def find_range(edges_m: Sequence[float], cars: Sequence[int], found: Sequence[int]) -> float:
+    """Return the largest of the edges within which the share `REACHED` of the cars is found; 0 where nowhere.
+
+    cars, found: in each interval between `edges_m`.
+    """
     every, own = np.cumsum(cars), np.cumsum(found)
     good = np.flatnonzero((own >= REACHED * every) & (every > 0))
-    return float(EDGES_M[good[-1] + 1]) if len(good) else 0.0
+    return float(edges_m[good[-1] + 1]) if len(good) else 0.0

@@ -1,4 +1,4 @@
-"""Markdown tables of the road detector, the road average, and Fig. 4."""
+"""Markdown tables of the road detector, the road average, sensors' ranges, and Fig. 4."""
 
 from itertools import pairwise
 
@@ -6,6 +6,8 @@ from flcav.experiments.roadside.average import ARMS, BOTH, GRAPH, KNOBS, RoadAve
 from flcav.experiments.roadside.detector import BINS_M, WITHIN_M, RoadDetectorResult
 from flcav.experiments.roadside.fig4 import ARMS as PLACED
 from flcav.experiments.roadside.fig4 import EDGES_M, Fig4
+from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
+from flcav.experiments.roadside.ranges import SensorRanges
 from flcav.markdown import format_table
 
 
@@ -86,3 +88,25 @@ def fig4_tables(results: Fig4) -> dict[str, str]:
         "residuals": format_table(("suite", "from the first [m]", "off as calibrated", "off as registered"), rows),
         "range": format_table(header, [["cars", *results.cars, ""], *found]),
     }
+
+
+def range_tables(results: SensorRanges) -> dict[str, str]:
+    """Return Markdown by name: ranges."""
+    rows = [
+        [
+            f"`{each.name}`",
+            each.channels,
+            *(f"{found / cars:.2f}" if cars else "" for found, cars in zip(each.found, results.cars, strict=True)),
+            f"{each.range_m:g}" if each.range_m else "none",
+            f"{each.cost:g}",
+        ]
+        for each in results.models
+    ]
+    header = (
+        "share of cars found",
+        "channels",
+        *(f"{a}–{b} m" for a, b in pairwise(SENSOR_EDGES_M)),
+        "range [m]",
+        "cost",
+    )
+    return {"ranges": format_table(header, [["cars", "", *results.cars, "", ""], *rows])}

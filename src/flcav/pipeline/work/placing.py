@@ -55,13 +55,14 @@ def place_step(
     weights: Mapping[str, float],
     registry: str,
     edge: str | None,
+    seed: int = 0,
 ) -> None:
     """Place a region's roadside sensors by the errors and weights of each task.
 
-    `edge`: step of the recorded training data, if any, whose poles are the only candidates.
+    `edge`: step of the recorded training data, if any, whose poles are the only candidates; `seed`: of random poles.
     """
     drive = Frames.open(work.inputs[registry])
     sites = find_sites(drive, None if edge is None else Frames.open(work.inputs[edge]))
     found = {task: load_errors(work.inputs[step] / ERRORS) for task, step in errors.items()}
     traces = read_traces(drive.data, drive.vehicles)
-    place_sensors(region, Placement.model_validate(how), sites, found, weights, traces).save(work.folder)
+    place_sensors(region, Placement.model_validate(how), sites, found, weights, traces, seed).save(work.folder)

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from flcav.report import style
 
 ARM_COLOURS = (style.MUTED, style.SKY, style.BLUE)  # of the arms of a comparison, in their order
+WIDTHS = (5.0, 3.0, 1.3)  # of their lines: where they lie on each other, all are seen
 
 
 @style.styled
@@ -48,13 +49,29 @@ def draw_errors(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float, f
     for axes in drawn[len(panels) :]:
         axes.remove()
     for number, (axes, (title, arms)) in enumerate(zip(drawn, panels.items())):
-        for (arm, points), colour in zip(arms.items(), ARM_COLOURS, strict=True):
+        for (arm, points), colour, width in zip(arms.items(), ARM_COLOURS, WIDTHS, strict=True):
             size, mean, low, high = np.array(points).T
             axes.fill_between(size, low, high, color=colour, alpha=0.2, linewidth=0)
-            axes.plot(size, mean, "o-", color=colour, markersize=4, label=arm)
+            axes.plot(size, mean, "o-", color=colour, linewidth=width, markersize=width + 2.5, label=arm)
         axes.set_xlabel(title)
         axes.grid(axis="y")
         if number % columns == 0:
             axes.set_ylabel("AP50 of the labels")
     style.key(figure, list(drawn[0].get_lines()))
+    return figure
+
+
+@style.styled
+def draw_ranges(edges_m: Sequence[float], shares: Mapping[str, Sequence[float | None]]) -> Figure:
+    """Return recall against distance, a line per sensor: shares in the intervals of `edges_m`, None without cars."""
+    figure = style.canvas(6.4, 3.6)
+    axes = figure.subplots()
+    middle = (np.array(edges_m[:-1]) + np.array(edges_m[1:])) / 2
+    colours = (style.SKY, style.GREEN, style.BLUE, style.INK, style.ORANGE, style.VERMILLION)
+    for number, (name, own) in enumerate(shares.items()):
+        drawn = np.array([np.nan if share is None else share for share in own])
+        axes.plot(middle, drawn, "o-", color=colours[number % len(colours)], markersize=4, label=name)
+    axes.set(xlim=(0, edges_m[-1]), ylim=(0, 1.02), xlabel="distance from the pole [m]", ylabel="share of cars found")
+    axes.grid(axis="y")
+    style.key(figure, axes.get_lines())
     return figure

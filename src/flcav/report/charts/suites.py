@@ -55,7 +55,7 @@ def draw_suites(
         for axes, bar_m in ((wide, 20), (near, 5)):
             style.hide_axes(axes)
             style.scale_bar(axes, bar_m)
-    axes = figure.add_subplot(grid[:, 2])
+    axes, below = figure.add_subplot(grid[0, 2]), figure.add_subplot(grid[1, 2])
     middle = (np.array(edges_m[:-1]) + np.array(edges_m[1:])) / 2
     for (arm, values), colour in zip(shares.items(), ARM_COLOURS, strict=True):
         drawn = np.array([np.nan if value is None else value for value in values])
@@ -64,7 +64,8 @@ def draw_suites(
         ylim=(0, 1.02), xlim=(0, edges_m[-1]), xlabel="distance from the first suite [m]", title="share of cars found"
     )
     axes.grid(axis="y")
-    axes.legend(loc="upper right", frameon=False)
+    below.legend(handles=axes.get_lines(), loc="upper left", frameon=False)  # curves fill the axes themselves
+    style.hide_axes(below)
     handles = [
         axes.plot([], [], "o", color=colour, label=f"{number}: {name}")[0]
         for number, (name, colour) in enumerate(zip(names, SUITE_COLOURS, strict=True), start=1)

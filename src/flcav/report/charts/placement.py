@@ -1,0 +1,63 @@
+"""Charts of placement: what sensors cover, and what vehicles learn from each pole against what predicts it."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from flcav.report import style
+
+SEED_COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION)
+
+
+@style.styled
+def draw_gains(panels: Mapping[tuple[str, str], Mapping[int, Sequence[tuple[float, float]]]]) -> Figure:
+    """Return gain in AP50 against a predictor, a row of panels per choice of frames.
+
+    panels: by (frames, predictor) the points (predictor, gain) of each seed, a point for every pole.
+    """
+    rows, columns = (list(dict.fromkeys(key[axis] for key in panels)) for axis in (0, 1))
+    figure = style.canvas(3.6 * len(columns), 2.6 * len(rows) + 0.4)
+    drawn = np.atleast_2d(figure.subplots(len(rows), len(columns), sharey="row", sharex="col", squeeze=False))
+    for (frames, predictor), seeds in panels.items():
+        axes = drawn[rows.index(frames), columns.index(predictor)]
+        axes.axhline(0, color=style.RULE, linewidth=1)
+        for number, (seed, points) in enumerate(seeds.items()):
+            x, y = np.array(points, dtype=np.float64).T
+            colour = SEED_COLOURS[number % len(SEED_COLOURS)]
+            axes.plot(x, y, "o", color=colour, markersize=5, alpha=0.8, label=f"seed {seed}")
+        axes.grid(axis="y")
+        if frames == rows[-1]:
+            axes.set_xlabel(f"{predictor} of the pole")
+        if predictor == columns[0]:
+            axes.set_ylabel(f"gain in AP50\n{frames}")
+    style.key(figure, [line for line in drawn[0, 0].get_lines() if not line.get_label().startswith("_")])
+    return figure
+
+
+@style.styled
+def draw_cover(
+    shares: Mapping[str, Sequence[float]], kinds: Sequence[str], around: Mapping[str, Sequence[float | None]]
+) -> Figure:
+    """Return the share of errors covered against the number of sensors, and errors around a pole by kind of scenario.
+
+    shares: by town, of 1, 2, ... sensors. around: by town, mean number of errors in reach of a pole of each of `kinds`;
+    None where the town has no such pole.
+    """
+    figure = style.canvas(8.4, 3.4)
+    left, right = figure.subplots(1, 2)
+    others = iter(style.OTHER_COLOURS)
+    colours = {town: style.TOWN_COLOURS.get(town) or next(others) for town in shares}
+    for town, own in shares.items():
+        left.plot(range(len(own) + 1), [0.0, *own], "o-", color=colours[town], markersize=4, label=town)
+    for row, (town, means) in enumerate(around.items()):
+        known = [(place, mean) for place, mean in enumerate(means) if mean is not None]
+        places = [place + (row - (len(around) - 1) / 2) * 0.16 for place, _ in known]
+        right.bar(places, [mean for _, mean in known], width=0.14, color=colours[town])
+    left.set(xlim=(0, None), ylim=(0, 1.02), xlabel="sensors, placed best", ylabel="share of errors covered")
+    right.set_xticks(range(len(kinds)), kinds)
+    right.set_ylabel("errors in reach of a pole, mean")
+    for axes in (left, right):
+        axes.grid(axis="y")
+    style.key(figure, left.get_lines())
+    return figure
