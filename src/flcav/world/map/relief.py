@@ -46,6 +46,11 @@ class Relief:
         """Return a search tree of the triangles, seen from above."""
         return shapely.STRtree([shapely.Polygon(corners) for corners in self.points[self.triangles, :2]])
 
+    @cached_property
+    def area(self) -> shapely.Polygon:
+        """Return the area of the triangles, seen from above."""
+        return shapely.Polygon(shapely.convex_hull(shapely.multipoints(self.points[:, :2])))
+
     def heights(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Return the height [m] of the ground at `x`, `y` (...) [m]; outside as at their edge; NaN at NaN."""
         low, high = self.points[:, :2].min(axis=0), self.points[:, :2].max(axis=0)
