@@ -76,7 +76,7 @@ def _cross_sections(edge: Edge) -> tuple[Array, Array]:
 
 def _thin(points: Array, apart_m: float, keep: int = 0) -> Array:
     """Return the first `keep` points (N, 3), and of the others those at least `apart_m` from all kept before."""
-    tree = shapely.STRtree(shapely.points(points[:, :2]))
+    tree = shapely.STRtree(np.asarray(shapely.points(points[:, :2])))
     kept = np.ones(len(points), np.bool_)
     one, other = tree.query(shapely.points(points[:, :2]), predicate="dwithin", distance=apart_m)
     near: dict[int, list[int]] = {}
