@@ -24,6 +24,7 @@ from flcav.perception.tasks import task_named
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import EDGE
 from flcav.progress import Report
+from flcav.world.map.relief import Relief
 
 PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
 
@@ -98,8 +99,9 @@ def pseudo_label_samples(
     the package's road detector if `trained`, else by an ideal one, as their messages have them, which enter `book` as
     downlinks; stage III passes none, since its labels are those of stage II.
     """
-    data = split.data
-    views = _views(split, poles, trained)
+    data, town = split.data, split.data.town()
+    relief = None if town is None else town.relief
+    views = _views(split, poles, trained, relief)
     samples: dict[str, list[Sample]] = {}
     for done, i in enumerate(frames):
         key, frame = data.keys[i], data.frame(i)
@@ -109,19 +111,22 @@ def pseudo_label_samples(
         if book is not None:
             about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
             told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
-        samples.setdefault(name, []).append(label_sample(frame, detections, told, network.config, lidar))
+        samples.setdefault(name, []).append(label_sample(frame, detections, told, network.config, lidar, relief))
         report(done, len(frames), "labels")
     return samples
 
 
-def _views(split: Frames, poles: Sequence[int], trained: bool) -> dict[tuple[str, int], list[RoadView]]:
+def _views(
+    split: Frames, poles: Sequence[int], trained: bool, relief: Relief | None
+) -> dict[tuple[str, int], list[RoadView]]:
     views: dict[tuple[str, int], list[RoadView]] = {}
     find = road_detector(split.data) if trained and poles else None
     for pole in poles:
         for i in split.poles.get(pole, ()):
             key, frame = split.data.keys[i], split.data.frame(i)
             boxes = label_ideally(frame) if find is None else find(i)
-            views.setdefault((key.scene, key.index), []).append(build_road_view(frame, boxes, choose_lidar(frame)))
+            view = build_road_view(frame, boxes, choose_lidar(frame), relief)
+            views.setdefault((key.scene, key.index), []).append(view)
     return views
 
 
