@@ -2,7 +2,7 @@
 
 The reference traces the sweep's rays, and those that pass glass again behind each pane; the sensor also looks up
 materials, applies the power equation, noise and dropout, and writes points. Beside that: the sensor in rain and in fog,
-and over a spin that takes time.
+and over a spin that takes time. `--slopes` compares a town with its hilly twin instead: the same streets and traffic.
 """
 
 import argparse
@@ -74,12 +74,52 @@ def measure(scene: Scene, rig_name: str, agent: str, repeats: int) -> dict[str, 
     }
 
 
+def compare_slopes(name: str, repeats: int) -> dict[str, float]:
+    """Return CPU-ms of tracing a vehicle's rays, and of its annotated frame, in a town and in its hilly twin."""
+    rig, rays = RIGS["lidar32"], build_ray_pattern(RIGS["lidar32"].lidars["lidar"].settings)
+    works = []
+    for town in (load_town(name), load_town(f"hilly_{name}")):
+        scene = Scene(town, simulate(town, seed=1, cavs=4, times_s=np.array([60.0])))
+        own = [int(np.flatnonzero(scene.trace.actor == f"cav{i}")[0]) for i in range(4)]
+        at = [scene.world_from_actor(actor) @ rig.lidars["lidar"].mount.agent_from_sensor() for actor in own]
+
+        def trace(scene: Scene = scene, at: list[np.ndarray] = at, own: list[int] = own) -> None:
+            for here, actor in zip(at, own):
+                scene.cast(here, rays, far_m=100.0, hidden=actor)
+
+        def sense(scene: Scene = scene) -> None:
+            for i in range(4):
+                observe(scene, rig, f"cav{i}", 0, scene_name="bench", seed=0)
+
+        works += [trace, sense]
+    level_trace, level_frame, hilly_trace, hilly_frame = cpu_ms(works, repeats)
+    return {
+        "level_trace_ms": level_trace,
+        "hilly_trace_ms": hilly_trace,
+        "trace_ratio": hilly_trace / level_trace,
+        "level_frame_ms": level_frame,
+        "hilly_frame_ms": hilly_frame,
+        "frame_ratio": hilly_frame / level_frame,
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--town", default="suburb")
     parser.add_argument("--repeats", type=int, default=50)
+    parser.add_argument("--slopes", action="store_true")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
+    if arguments.slopes:
+        row = compare_slopes(arguments.town, arguments.repeats)
+        if arguments.json:
+            print(json.dumps(row, indent=1))
+            return
+        print(f"{arguments.town}, sweeps of four vehicles; CPU-ms of one thread, median of {arguments.repeats}")
+        for what in ("trace", "frame"):
+            level, hilly, ratio = (row[f"{name}"] for name in (f"level_{what}_ms", f"hilly_{what}_ms", f"{what}_ratio"))
+            print(f"{what}: level {level:.2f} ms, hilly {hilly:.2f} ms, ratio {ratio:.2f} (aim 1.10 or less)")
+        return
     town = load_town(arguments.town)
     scene = Scene(town, simulate(town, seed=1, cavs=1, times_s=np.array([60.0])))
     agents = {"lidar32": "cav0", "lidar_pole": f"pole{town.poles.id[0]}"}

@@ -34,7 +34,7 @@ from flcav.sensors.rig import (
     Rig,
 )
 from flcav.sources.recipe import Recipe
-from flcav.world.map.town import TOWNS
+from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.weather import WEATHER_CLASSES, WEATHERS, Keyframe, Weather, WeatherSchedule
 
@@ -78,7 +78,7 @@ def page() -> str:
     return jinja.get_template(TEMPLATE.name).render(
         {model.__name__: model for model in EXPLAINED},
         fields=fields_of,
-        towns=", ".join(f"`{name}`" for name in TOWNS),
+        towns=", ".join(f"`{name}`" for name in PACKAGED),
         rigs=format_table(
             ("rig", "its sensors"), ((f"`{name}`", "; ".join(sensors_of(rig))) for name, rig in RIGS.items())
         ),

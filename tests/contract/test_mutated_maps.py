@@ -1,4 +1,4 @@
-"""Mutated OpenDRIVE maps: 60 read, and a few imported and driven; `python tools/mutate_maps.py` does any number."""
+"""Mutated OpenDRIVE maps: 200 read, and a few imported and driven; `python tools/mutate_maps.py` does any number."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map
 
 CROSS = Path(__file__).parents[1] / "data" / "cross.xodr"
-READ, IMPORTED = 60, (6, 9)
+READ, IMPORTED = 200, (6, 9)
 SLOPE = '<elevationProfile><elevation s="0" a="1" b="0.05" c="0" d="0"/></elevationProfile><lanes>'
 
 

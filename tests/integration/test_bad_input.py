@@ -267,7 +267,8 @@ def test_a_town_is_looked_for_beside_the_recipe_too(
     recipe.write_text(yaml.safe_dump(RECIPE | {"town": "town02", "poles": [99]}))
     monkeypatch.chdir(tmp_path)
     sentence = refused("record", recipe, "--out", tmp_path / "data")
-    assert "unknown town 'town02'; known towns: suburb, grid, ring, arterial, or a folder" in sentence
+    assert "unknown town 'town02'; known towns: suburb, grid, ring, arterial, hilly_suburb, hilly_grid" in sentence
+    assert "hilly_arterial, or a folder" in sentence
     assert f"there is no {recipe.parent / 'town02'} nor {tmp_path / 'town02'}" in sentence
     shutil.copytree(load_town("suburb").net.parent, recipe.parent / "town02")
     assert "field 'poles' = 99: no pole of town02" in refused("record", recipe, "--out", tmp_path / "data")

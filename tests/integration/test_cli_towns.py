@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from flcav.cli.main import run
-from flcav.world.map.town import TOWNS
+from flcav.world.map.town import PACKAGED
 
 CROSS = Path(__file__).parents[1] / "data" / "cross.xodr"
 
@@ -20,7 +20,7 @@ def flcav(*arguments: str) -> int:
 def test_list_says_what_towns_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert flcav("towns", "list", "--json") == 0
     rows = json.loads(capsys.readouterr().out)["towns"]
-    assert [row["name"] for row in rows] == list(TOWNS)
+    assert [row["name"] for row in rows] == list(PACKAGED)
     assert all(row["junctions"] >= 8 and row["driving_km"] > 2 and row["buildings"] > 100 for row in rows)
 
 

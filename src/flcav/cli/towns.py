@@ -24,12 +24,12 @@ def register(app: typer.Typer) -> None:
 def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead.")) -> None:
     """List the towns that come with flcav, and what they have."""
     from flcav.world.map.census import summarise_town
-    from flcav.world.map.town import TOWNS, load_town
+    from flcav.world.map.town import PACKAGED, load_town
 
-    found = {name: load_town(name) for name in TOWNS}
+    found = {name: load_town(name) for name in PACKAGED}
     counts = {name: summarise_town(town) for name, town in found.items()}
     if as_json:
-        rows = [{"name": name, "description": found[name].parameters.description, **counts[name]} for name in TOWNS]
+        rows = [{"name": name, "description": found[name].parameters.description, **counts[name]} for name in PACKAGED]
         print_json({"towns": rows})
         return
     for name, town in found.items():

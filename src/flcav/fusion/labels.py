@@ -20,13 +20,19 @@ from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
 from flcav.sensors.frame import Frame
+from flcav.world.map.relief import Relief
 
 CONTRADICTED = 0.5  # a detection is dropped where the roadside sensors observed more than this share of its footprint
 SAME_OBJECT_M = 1.0  # boxes of roadside sensors with centres at most this far apart are of one object
 
 
 def label_sample(
-    frame: Frame, detections: Boxes, views: Sequence[RoadView], config: SecondConfig, lidar: str = "lidar"
+    frame: Frame,
+    detections: Boxes,
+    views: Sequence[RoadView],
+    config: SecondConfig,
+    lidar: str = "lidar",
+    relief: Relief | None = None,
 ) -> Sample:
     """Return a training sample of a vehicle's `frame`, labelled without ground truth; network's frame.
 
@@ -35,6 +41,7 @@ def label_sample(
     of the network's classes from which the vehicle has returns, then the detections that the road does not contradict.
     Roadside boxes without a return, and of lookalike classes (trucks, buses), are ignored in the loss. `free` holds the
     cell centres that the vehicle saw as free ground or a roadside sensor observed; `exact` marks the roadside boxes.
+    `relief` are the heights of the ground, world frame; None where it is level.
     """
     world_from_lidar = frame.world_from_sensor(lidar)
     points = crop_to_range(frame.lidar[lidar], config)
@@ -52,7 +59,11 @@ def label_sample(
     for view in views:
         looked |= view.at(view.ground, cells_world) | view.at(view.occupied, cells_world)
     own = detections[~_contradicted(detections, told, cells, looked)]
-    known = _free_ground(points, height, cells) | looked
+    above = points[:, 2] + height
+    if relief is not None:
+        world = transform_points(world_from_lidar, points[:, :3].astype(np.float64))
+        above = world[:, 2] - relief.heights(*world[:, :2].T)
+    known = _free_ground(points, above, cells) | looked
     boxes = concatenate([road[targets], own])
     exact = np.arange(len(boxes)) < targets.sum() if views else None
     sample = Sample(points, boxes, road[ignored], cells[known].astype(np.float32), exact)
@@ -89,16 +100,17 @@ def _contradicted(detections: Boxes, told: Boxes, cells: NDArray, looked: NDArra
     return seen | (offset < told.size[None, :, 0] / 2).any(axis=1)
 
 
-def _free_ground(points: NDArray[np.float32], height: float, cells: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _free_ground(points: NDArray[np.float32], above: NDArray, cells: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return (K,): whether the vehicle saw the ground within two cells of each cell, and nothing standing within two.
 
-    `points` (N, 4) and the centres `cells` (K, 2) are in the LiDAR frame; `height` is the LiDAR's above ground [m].
+    `points` (N, 4) and the centres `cells` (K, 2) are in the LiDAR frame; `above` (N,) are the points' heights over the
+    ground [m].
     """
     origin = cells[0] - CELL_M / 2
     shape = np.round((cells[-1] - cells[0]) / CELL_M).astype(int) + 1
     index = np.floor((points[:, :2] - origin) / CELL_M).astype(np.int64)
     inside = ((index >= 0) & (index < shape)).all(axis=1)
-    index, z = index[inside], points[inside, 2] + height
+    index, z = index[inside], above[inside]
 
     def hit(returns: NDArray[np.bool_]) -> NDArray[np.bool_]:
         grid = np.zeros(shape, dtype=bool)

@@ -13,6 +13,7 @@ from scipy.ndimage import binary_dilation
 from flcav.geometry import Boxes, transform_points
 from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.sensors.frame import Frame
+from flcav.world.map.relief import Relief
 
 MIN_RETURNS = 10  # an object with fewer returns from the roadside LiDAR is not labelled
 CELL_M = 0.4  # edge of a cell of the free and occupied grids
@@ -70,18 +71,20 @@ def label_ideally(frame: Frame) -> Boxes:
     return frame.annotations.boxes[frame.annotations.returns >= MIN_RETURNS]
 
 
-def build_road_view(frame: Frame, boxes: Boxes, lidar: str = "lidar") -> RoadView:
+def build_road_view(frame: Frame, boxes: Boxes, lidar: str = "lidar", relief: Relief | None = None) -> RoadView:
     """Return the view of the roadside sensor that recorded `frame`: its LiDAR `lidar`, and what its detector found.
 
-    `boxes`: world frame, label = actor category. The grids cover the returns of the sweep.
+    `boxes`: world frame, label = actor category. The grids cover the returns of the sweep; `relief` are the heights of
+    the ground, None where it is level.
     """
     points = transform_points(frame.world_from_sensor(lidar), frame.lidar[lidar][:, :3].astype(np.float64))
     origin = np.floor(points[:, :2].min(axis=0) / CELL_M) * CELL_M
     shape = tuple(np.floor((points[:, :2].max(axis=0) - origin) / CELL_M).astype(int) + 1)
     ground, occupied = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     x, y = np.floor((points[:, :2] - origin) / CELL_M).astype(np.int64).T
-    low = (points[:, 2] > GROUND_M[0]) & (points[:, 2] < GROUND_M[1])
-    high = (points[:, 2] >= GROUND_M[1]) & (points[:, 2] < TOP_M)
+    above = points[:, 2] if relief is None else points[:, 2] - relief.heights(*points[:, :2].T)
+    low = (above > GROUND_M[0]) & (above < GROUND_M[1])
+    high = (above >= GROUND_M[1]) & (above < TOP_M)
     ground[x[low], y[low]] = True
     occupied[x[high], y[high]] = True
     return RoadView(boxes, origin, find_free_cells(ground, occupied), occupied)

@@ -194,20 +194,12 @@ def _turn_back(offset: Array, yaw: ArrayLike) -> Array:
 def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> NDArray[np.bool_]:
     """Return (S, N) whether each of S segments meets each of N boxes, by slabs (Kay and Kajiya, SIGGRAPH 1986).
 
-    Tilted boxes are taken as upright ones.
-
     `starts` and `ends` are (S, 3), x, y, z [m] in the frame of the boxes. Faces belong to the box.
     """
     start, end = np.asarray(starts, dtype=np.float64), np.asarray(ends, dtype=np.float64)
-    cos, sin = np.cos(boxes.yaw), np.sin(boxes.yaw)
-
-    def turn(vector: Array) -> Array:
-        """Return vectors (S, N, 3) in the axes of each box."""
-        x, y, z = np.moveaxis(vector, -1, 0)
-        return np.stack((x * cos + y * sin, y * cos - x * sin, z), axis=-1)
-
-    local = turn(start[:, None] - boxes.center)
-    along = turn(np.broadcast_to((end - start)[:, None], local.shape))
+    axes = boxes.rotations()
+    local = np.einsum("sni,nij->snj", start[:, None] - boxes.center, axes)
+    along = np.einsum("si,nij->snj", end - start, axes)
     half = boxes.size / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (-half - local) / along, (half - local) / along

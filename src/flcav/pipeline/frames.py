@@ -22,7 +22,7 @@ from flcav.progress import Report
 from flcav.seeds import derive_seed, stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.world.map.town import TOWNS
+from flcav.world.map.town import PACKAGED
 
 DATA = "data"
 SHORTEST_S = 10.0  # shortest scene for tracks: it takes a past, a future, and several presents
@@ -139,7 +139,7 @@ def hash_town(town: str, beside: Path) -> dict[str, str]:
 
     Raises `InputError` where there is no such town.
     """
-    if town in TOWNS:
+    if town in PACKAGED:
         return {}
     folder = find_path(town, beside)
     if folder is None:

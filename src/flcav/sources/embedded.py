@@ -14,7 +14,7 @@ from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.randomisation import randomise_rig, randomise_sizes, randomise_town, town_files
 from flcav.sources.recipe import Recipe
-from flcav.world.map.town import HEIGHTS, TOWNS, load_town
+from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
 from flcav.world.traffic.traffic import simulate
@@ -81,7 +81,7 @@ class EmbeddedSource:
 
     def town_files(self) -> Mapping[str, bytes]:
         """Return the contents of the town's files by name; empty for a town that comes with flcav."""
-        kept = self.recipe.town not in TOWNS or self.recipe.randomise is not None
+        kept = self.recipe.town not in PACKAGED or self.recipe.randomise is not None
         return self._files() if kept else {}
 
     def scenes(self) -> list[str]:
@@ -139,7 +139,8 @@ class EmbeddedSource:
         """Return the contents of the files of the town, as drawn, by name."""
         if self.recipe.randomise is not None:
             return town_files(self.town)
-        names = ("town.yaml", *([] if self.town.relief is None else [HEIGHTS]))
+        heights = HILLS if self.recipe.town in HILLY else HEIGHTS
+        names = ("town.yaml", *([] if self.town.relief is None else [heights]))
         paths = [self.town.net, *(self.town.net.parent / name for name in names)]
         return {path.name: path.read_bytes() for path in paths}
 

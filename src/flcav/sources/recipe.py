@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from flcav.config import Config, InputError, read_config, shorten
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
-from flcav.world.map.town import TOWNS
+from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
@@ -152,6 +152,6 @@ def load_recipe(path: Path | str) -> Recipe:
     """
     recipe = read_config(Recipe, Path(path))
     folder = Path(path).absolute().parent / recipe.town
-    if recipe.town in TOWNS or not os.path.isdir(folder):  # noqa: PTH112 - Path.is_dir raises for too long a name
+    if recipe.town in PACKAGED or not os.path.isdir(folder):  # noqa: PTH112 - Path.is_dir raises for too long a name
         return recipe
     return recipe.model_copy(update={"town": str(folder)})

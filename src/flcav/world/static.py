@@ -17,7 +17,7 @@ from flcav.world.map.relief import Relief
 from flcav.world.map.town import KERB_M, Town
 from flcav.world.materials import Material
 from flcav.world.meshes.buildings import make_building
-from flcav.world.meshes.drape import drape_polygon, drape_wall
+from flcav.world.meshes.drape import drape_area, drape_polygon, drape_wall
 from flcav.world.meshes.furniture import (
     make_clutter,
     make_lamp,
@@ -32,6 +32,7 @@ from flcav.world.meshes.furniture import (
 from flcav.world.meshes.mesh import Mesh, join_meshes, sheet, transform_mesh
 
 GROUND_M = -0.03  # height of open ground, a little below the road
+UNDER_M, ROUGH_M = 1.5, 1.0  # by which sloping ground reaches below roads and sidewalks, and how roughly it is cut
 LAND_M = 150.0  # width of open ground beyond the town's bounds
 TOWNS_KEPT = 4  # size of the cache of meshes
 
@@ -128,10 +129,11 @@ def _parts(town: Town) -> Iterator[Owned]:
 
 
 def _ground(town: Town) -> Mesh:
+    """Return the land around the roads; on a relief cut out below them, where rays would search it in vain."""
     if town.relief is not None:
-        vertices = (town.relief.points + np.array([0.0, 0.0, GROUND_M])).astype(np.float32)
-        faces = town.relief.triangles.astype(np.int32)
-        return Mesh(vertices, faces, np.full(len(faces), Material.GROUND, np.uint8))
+        paved = shapely.union_all([shapely.Polygon(ring) for ring in (*town.roads, *town.sidewalks)])
+        hidden = shapely.simplify(shapely.buffer(paved, -UNDER_M), ROUGH_M)
+        return drape_area(shapely.difference(town.relief.area, hidden), town.relief, GROUND_M, Material.GROUND)
     x0, y0, x1, y1 = town.bounds
     x = np.linspace(x0 - LAND_M, x1 + LAND_M, 16)
     y = np.linspace(y0 - LAND_M, y1 + LAND_M, 16)

@@ -4,9 +4,10 @@ import numpy as np
 
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
-from flcav.geometry import Boxes, pose
+from flcav.geometry import Boxes, pose, transform_points
 from flcav.perception.objects.model import second_tiny
 from flcav.sensors.frame import Annotations, Calibration, Frame
+from flcav.world.map.relief import Relief
 
 CONFIG = second_tiny().config
 CAR = (4.4, 1.8, 1.6)
@@ -126,6 +127,33 @@ def test_an_ideal_detector_labels_what_its_own_lidar_has_ten_returns_from():
     fewer = replace(truth, returns=np.array([9, 10, 0, 30]))
     view = ideal_view(replace(road, annotations=fewer))
     assert list(view.boxes.label) == ["van", "truck"]
+
+
+def test_on_a_slope_the_labels_are_those_of_the_level():
+    ego, road, detections = scene()
+    corners = np.array([[-200.0, -200], [200, -200], [200, 200], [-200, 200]])
+    slope = Relief(np.column_stack((corners, 4 + corners @ (0.06, -0.03))))
+
+    def lift(each):  # upright sensors at another height, whose points follow the slope
+        world = transform_points(each.world_from_sensor("lidar"), each.lidar["lidar"][:, :3].astype(np.float64))
+        rise = slope.heights(*world[:, :2].T)
+        base = slope.heights(*each.world_from_agent[:2, 3])
+        points = each.lidar["lidar"].copy()
+        points[:, 2] += rise - base
+        moved = each.world_from_agent.copy()
+        moved[2, 3] += base
+        return replace(each, world_from_agent=moved, lidar={"lidar": points})
+
+    level = build_road_view(road, label_ideally(road))
+    view = build_road_view(lift(road), label_ideally(road), relief=slope)
+    np.testing.assert_array_equal(view.ground, level.ground)
+    np.testing.assert_array_equal(view.occupied, level.occupied)
+    assert not np.array_equal(build_road_view(lift(road), label_ideally(road)).ground, level.ground)
+    wanted = label_sample(ego, detections, [], CONFIG)
+    found = label_sample(lift(ego), detections, [], CONFIG, relief=slope)
+    assert wanted.free is not None
+    assert found.free is not None
+    np.testing.assert_array_equal(found.free, wanted.free)
 
 
 def test_a_view_answers_outside_its_grid_and_weighs_what_it_sends():

@@ -1,8 +1,11 @@
 """States of paths: against dense samples of the segment, against rays through the town's mesh, and along a drive."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from moving import make_trace, open_town
+from scipy.optimize import linprog
 
 from flcav.config import InputError
 from flcav.geometry import Boxes, points_in_boxes, segments_meet_boxes
@@ -11,7 +14,7 @@ from flcav.network.radio.budget import Radio
 from flcav.network.radio.coverage import cover_town, share_in_state
 from flcav.network.radio.links import link_vehicles, unit_positions
 from flcav.network.radio.propagation import State
-from flcav.network.radio.sight import find_sight, raise_walls
+from flcav.network.radio.sight import find_sight, raise_walls, vehicle_boxes
 from flcav.seeds import stream
 from flcav.world.map.town import load_town
 
@@ -33,6 +36,39 @@ def test_segments_meet_boxes_as_dense_samples_of_them_do():
     assert found[inside].all()
     assert not found[~near].any()
     assert 500 < found.sum() < 7500
+
+
+def test_segments_meet_tilted_boxes_where_linear_programming_finds_a_common_point():
+    rng = np.random.default_rng(5)
+    rows = np.c_[rng.uniform(-4, 4, (12, 3)), rng.uniform(1, 8, (12, 3)), rng.uniform(-4, 4, 12)]
+    boxes = replace(Boxes.from_array(rows, "x"), tilt=rng.uniform(-0.6, 0.6, (12, 2)))
+    starts, ends = rng.uniform(-9, 9, (30, 3)), rng.uniform(-9, 9, (30, 3))
+    wanted = np.zeros((30, 12), np.bool_)
+    for (i, j), _ in np.ndenumerate(wanted):
+        inverse_pose = np.linalg.inv(boxes.pose(j))
+        start, end = (inverse_pose[:3, :3] @ each[i] + inverse_pose[:3, 3] for each in (starts, ends))
+        faces = np.r_[end - start, start - end][:, None]  # along the segment, within the six faces
+        room = np.r_[boxes.size[j] / 2 - start, boxes.size[j] / 2 + start]
+        wanted[i, j] = linprog([0.0], A_ub=faces, b_ub=room, bounds=[(0.0, 1.0)]).status == 0
+    found = segments_meet_boxes(starts, ends, boxes)
+    np.testing.assert_array_equal(found, wanted)
+    upright = segments_meet_boxes(starts, ends, replace(boxes, tilt=None))
+    assert 20 < found.sum() < 340
+    assert (found != upright).sum() > 5
+
+
+def test_vehicles_on_a_slope_block_as_tilted_boxes():
+    level = make_trace([0.0], {"van1": [80.0, 0.0]}, {"van1": ("truck", 0)})
+    pitch = -0.2
+    boxes, actor = vehicle_boxes(replace(level, tilt=np.array([[[pitch, 0.0]]])), 0)
+    length, _, height = level.size[0]
+    ahead, up = np.array([np.cos(pitch), -np.sin(pitch)]), np.array([np.sin(pitch), np.cos(pitch)])
+    assert actor.tolist() == [0]
+    front_top = (80.0, 0.0) + length / 2 * ahead + height * up  # x, z
+    assert (np.abs(boxes.corners()[0][:, [0, 2]] - front_top).max(axis=1) < 1e-9).any()
+    over = np.array([[60.0, 0.0, front_top[1] - 0.05]]), np.array([[100.0, 0.0, front_top[1] - 0.05]])
+    assert find_sight(*over, None, boxes).blocker.tolist() == [[0]]
+    assert find_sight(*over, None, vehicle_boxes(level, 0)[0]).blocker.tolist() == [[-1]]
 
 
 @pytest.mark.parametrize(

@@ -41,8 +41,10 @@ def raise_walls(town: Town) -> Assembly:
 def vehicle_boxes(trace: Trace, instant: int) -> tuple[Boxes, NDArray[np.int64]]:
     """Return the vehicles that can block a path at an instant of a trace, world frame, and their actors (B,)."""
     actor = np.flatnonzero(trace.present[instant] & np.isin(trace.category, BLOCKING))
-    center = trace.position[instant, actor] + trace.size[actor] * (0.0, 0.0, 0.5)
-    return Boxes(center, trace.size[actor], trace.yaw[instant, actor], trace.category[actor]), actor
+    tilt = None if trace.tilt is None else trace.tilt[instant, actor]
+    center = trace.box_centres(instant)[actor]
+    label = trace.category[actor]
+    return Boxes(center, trace.size[actor], trace.yaw[instant, actor], label, tilt=tilt), actor
 
 
 def find_sight(
@@ -61,7 +63,7 @@ def find_sight(
         carried = np.repeat(carrier, len(sites))
         rows = np.flatnonzero(carried >= 0)
         crossed[rows, carried[rows]] = False
-    tops = np.where(crossed, vehicles.center[:, 2] + vehicles.size[:, 2] / 2, -np.inf)
+    tops = np.where(crossed, vehicles.corners()[..., 2].max(axis=1), -np.inf)
     hidden = crossed.any(axis=1)
     blocker = np.where(hidden, tops.argmax(axis=1) if len(vehicles) else 0, -1)
     state = np.where(walled, State.NLOS, np.where(hidden, State.NLOSV, State.LOS)).astype(np.int8)

@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import Delaunay, QhullError
+from shapely.geometry.base import BaseGeometry
 
 from flcav.compiled import compiled
 from flcav.config import InputError
@@ -45,6 +46,11 @@ class Relief:
     def tree(self) -> shapely.STRtree:
         """Return a search tree of the triangles, seen from above."""
         return shapely.STRtree([shapely.Polygon(corners) for corners in self.points[self.triangles, :2]])
+
+    @cached_property
+    def area(self) -> BaseGeometry:
+        """Return the area of the triangles, seen from above."""
+        return shapely.MultiPoint(self.points[:, :2]).convex_hull
 
     def heights(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Return the height [m] of the ground at `x`, `y` (...) [m]; outside as at their edge; NaN at NaN."""

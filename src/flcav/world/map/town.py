@@ -22,7 +22,10 @@ from flcav.world.map.surfaces import add, build_ground_surfaces, find_kerbs, spl
 Array = NDArray[np.float64]
 
 TOWNS: tuple[str, ...] = ("suburb", "grid", "ring", "arterial")
+HILLY: dict[str, str] = {f"hilly_{name}": name for name in TOWNS}  # the same towns with slopes and camber
+PACKAGED: tuple[str, ...] = (*TOWNS, *HILLY)  # all that come with flcav
 HEIGHTS = "heights.parquet"  # file of a town's relief, beside its net
+HILLS = "hills.parquet"  # that of a town of `HILLY`, beside the net of the level one
 KERB_M = 0.12  # height of a sidewalk above the road
 MARGIN_M = 5.0  # from the outermost surface or building to the bounds
 
@@ -86,7 +89,7 @@ class Town:
 
 
 def load_town(name: str | Path, beside: Path | None = None) -> Town:
-    """Return a town of `TOWNS`, or the town of a folder that holds `town.net.xml`, `town.yaml` and maybe its heights.
+    """Return a town of `PACKAGED`, or that of a folder with `town.net.xml`, `town.yaml` and maybe its heights.
 
     A `Path` is that folder; any other name is a folder in `beside`, where given, or else in the working directory. The
     same files give the same town. Raises `InputError` for an unknown name, and for files that are missing, not of their
@@ -99,6 +102,8 @@ def load_town(name: str | Path, beside: Path | None = None) -> Town:
     Traceback (most recent call last):
     flcav.config.InputError: unknown town 'atlantis'; known towns: ...
     """
+    if isinstance(name, str) and name in HILLY:
+        return _raise_hills(name, _folder(HILLY[name], beside))
     folder = name if isinstance(name, Path) else _folder(name, beside)
     return _build_town(folder.absolute(), _hash_files(folder))
 
@@ -121,6 +126,12 @@ def _build_town(folder: Path, files: str) -> Town:
     return town if relief is None else lift_town(town, relief)
 
 
+@lru_cache(maxsize=4)
+def _raise_hills(name: str, folder: Path) -> Town:
+    """Return the level town of a folder of flcav with its slopes and camber, under another name."""
+    return lift_town(replace(load_town(folder), name=name), Relief.load(folder / HILLS))
+
+
 def _folder(name: str, beside: Path | None) -> Path:
     if name in TOWNS:
         return Path(__file__).parents[1] / "towns" / name
@@ -130,7 +141,7 @@ def _folder(name: str, beside: Path | None) -> Path:
             return folder
     places = " nor ".join(map(str, dict.fromkeys(folder.absolute() for folder in sought)))
     raise InputError(
-        f"unknown town {shorten(name)}; known towns: {', '.join(TOWNS)}, or a folder, and there is no {places}"
+        f"unknown town {shorten(name)}; known towns: {', '.join(PACKAGED)}, or a folder, and there is no {places}"
     )
 
 

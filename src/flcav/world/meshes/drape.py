@@ -1,8 +1,11 @@
-"""Draping over a relief: polygons are cut along the relief's triangles, lines at short intervals, and then lifted."""
+"""Draping over a relief: polygons and lines are cut along the relief's triangles, and then lifted."""
+
+from itertools import pairwise
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from flcav.world.map.relief import Relief
 from flcav.world.materials import Material
@@ -10,13 +13,17 @@ from flcav.world.meshes.mesh import Mesh, sheet
 
 Array = NDArray[np.float64]
 
-SPACING_M = 1.0  # between the points at which a line is lifted
+FLAT_M = 0.01  # by which a wall may differ from the relief between its corners
 GRID_M = 1e-3  # of coordinates, where exact ones defeat GEOS
 
 
 def drape_polygon(polygon: Array, relief: Relief, above_m: float, material: Material) -> Mesh:
     """Return the part of a relief inside a polygon (K, 2) [m], raised by `above_m`: exact, plane in each triangle."""
-    area = shapely.make_valid(shapely.Polygon(polygon))
+    return drape_area(shapely.make_valid(shapely.Polygon(polygon)), relief, above_m, material)
+
+
+def drape_area(area: BaseGeometry, relief: Relief, above_m: float, material: Material) -> Mesh:
+    """Return the part of a relief inside a valid area, which may have holes: see `drape_polygon`."""
     shapely.prepare(area)
     near = relief.tree.geometries[relief.tree.query(area, predicate="intersects")]
     try:
@@ -33,7 +40,31 @@ def drape_polygon(polygon: Array, relief: Relief, above_m: float, material: Mate
 
 
 def drape_wall(ring: Array, relief: Relief, between_m: tuple[float, float], material: Material) -> Mesh:
-    """Return an upright wall along a closed ring (K + 1, 2) [m], between two heights above the relief."""
-    line = shapely.get_coordinates(shapely.segmentize(shapely.LineString(ring), SPACING_M))
-    ground = relief.heights(*line.T)
-    return sheet(np.stack([np.c_[line, ground + above] for above in between_m]), material)
+    """Return an upright wall along a closed ring (K + 1, 2) [m], between two heights above the relief.
+
+    It is exact at the ring's corners, and to `FLAT_M` at the edges of triangles between them.
+    """
+    line = shapely.LineString(ring)
+    near = relief.tree.geometries[relief.tree.query(line, predicate="intersects")]
+    cuts = shapely.get_coordinates(shapely.intersection(shapely.boundary(near), line))
+    corners = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(ring, axis=0).T))))
+    along = np.unique(np.concatenate((corners, shapely.line_locate_point(line, shapely.points(cuts)))))
+    points = shapely.get_coordinates(shapely.line_interpolate_point(line, along))
+    ground = relief.heights(*points.T)
+    kept = np.flatnonzero(_find_bends(along, ground, np.isin(along, corners)))
+    points, ground = points[kept], ground[kept]
+    return sheet(np.stack([np.c_[points, ground + above] for above in between_m]), material)
+
+
+def _find_bends(along: Array, height: Array, corner: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return (N,) the corners and those between which `height` is linear to `FLAT_M` (Douglas-Peucker)."""
+    kept, waiting = corner.copy(), list(pairwise(np.flatnonzero(corner).tolist()))
+    while waiting:
+        first, last = waiting.pop()
+        chord = np.interp(along[first : last + 1], along[[first, last]], height[[first, last]])
+        error = np.abs(height[first : last + 1] - chord)
+        worst = first + int(error.argmax())
+        if error.max() > FLAT_M:
+            kept[worst] = True
+            waiting += [(first, worst), (worst, last)]
+    return kept

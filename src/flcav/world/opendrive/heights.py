@@ -58,7 +58,7 @@ def sample_heights(root: ElementTree.Element, origin: Path) -> Heights:
     room = np.minimum(np.array(ASIDE_M) - 0.1, CLEAR_M)
     aside = aside[distance > np.tile(room, len(aside) // len(room))]
     merged = _merge(np.concatenate((surface, aside)))
-    return Heights(np.concatenate((merged, _frame(merged))).round(4), bridges)
+    return Heights(np.concatenate((merged, surround(merged))).round(4), bridges)
 
 
 def _cross_sections(road: Road) -> tuple[Array, Array]:
@@ -129,9 +129,9 @@ def _merge(points: Array) -> Array:
     return np.stack([np.bincount(cells, column) / count for column in points.T], axis=1)
 
 
-def _frame(points: Array) -> Array:
-    """Return points (K, 3) on a frame `FAR_M` around, at the height of the nearest point."""
-    low, high = points[:, :2].min(axis=0) - FAR_M, points[:, :2].max(axis=0) + FAR_M
+def surround(points: Array, far_m: float = FAR_M) -> Array:
+    """Return points (K, 3) on a frame `far_m` around, at the height of the nearest point."""
+    low, high = points[:, :2].min(axis=0) - far_m, points[:, :2].max(axis=0) + far_m
     share = np.linspace(0.0, 1.0, 9)
     x, y = low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])
     sides = [np.stack(np.broadcast_arrays(x, edge), axis=1) for edge in (low[1], high[1])]

@@ -11,7 +11,7 @@ from pathlib import Path
 from flcav.config import InputError, shorten
 
 LINES, ROADS = "9.2", "10"  # clauses
-ELEVATIONS, LANES, WIDTHS, JUNCTIONS = "10.5", "11.3", "11.6", "12"
+ELEVATIONS, NUMBERS, LANES, WIDTHS, OFFSETS, JUNCTIONS = "10.5", "11.1", "11.3", "11.6", "11", "12"
 SHAPES: dict[str, tuple[str, ...]] = {  # children of <geometry> with their coefficients
     "line": (),
     "arc": ("curvature",),
@@ -23,7 +23,7 @@ POLYNOMIALS: dict[str, tuple[str, str]] = {  # elements that hold a cubic polyno
     "elevationProfile/elevation": (ELEVATIONS, "s"),
     "lateralProfile/superelevation": (ELEVATIONS, "s"),
     "lateralProfile/shape": (ELEVATIONS, "s"),
-    "lanes/laneOffset": (WIDTHS, "s"),
+    "lanes/laneOffset": (OFFSETS, "s"),
 }
 FARTHEST_M = 1e7  # largest coordinate of a map: zones of UTM reach so far from their origin
 WIDEST_M = 100.0  # largest number of a lane's width
@@ -104,7 +104,7 @@ def _check_lanes(road: ElementTree.Element, name: str) -> None:
         for side, sign in (("left", 1), ("right", -1)):
             numbers = [_lane_number(lane, name) for lane in section.iterfind(f"{side}/lane")]
             if sorted(sign * number for number in numbers) != list(range(1, len(numbers) + 1)):
-                raise _Broken(f"{name}: its {side} lanes are not numbered one by one (OpenDRIVE 1.8, {LANES})")
+                raise _Broken(f"{name}: its {side} lanes are not numbered one by one (OpenDRIVE 1.8, {NUMBERS})")
         for lane in _side_lanes(section):
             for row in lane:
                 if row.tag in ("width", "border"):
@@ -118,7 +118,7 @@ def _lane_number(lane: ElementTree.Element, name: str) -> int:
         return int(lane.get("id", ""))
     except ValueError:
         raise _Broken(
-            f"{name}: the lane id {shorten(lane.get('id', ''))} is no integer (OpenDRIVE 1.8, {LANES})"
+            f"{name}: the lane id {shorten(lane.get('id', ''))} is no integer (OpenDRIVE 1.8, {NUMBERS})"
         ) from None
 
 

@@ -139,6 +139,14 @@ def test_gaps_are_mended() -> None:
     assert len(notes) == 2
 
 
+def test_limits_that_are_not_finite_are_left_out() -> None:
+    limits = "".join(f'<speed sOffset="0" max="{text}"/>' for text in ("nan", "inf", "13.9", "no limit"))
+    road = f'<road id="1"><type s="0">{limits}</type><lanes><laneSection><right><lane id="-1">{limits}</lane></right>'
+    root = ElementTree.fromstring(f"<OpenDRIVE>{road}</laneSection></lanes></road></OpenDRIVE>")
+    assert mend_map(root) == ("Speed limits that are not finite, left out: 4.",)
+    assert [row.get("max") for row in root.iter("speed")] == ["13.9", "no limit"] * 2
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.interpolate import LinearNDInterpolator
+from shapely import box, contains_xy
 from shapely.geometry import Polygon
 
 from flcav.geometry import Boxes, angles_of, inverse, points_in_boxes, pose, rotations
 from flcav.world.map.relief import Relief
 from flcav.world.materials import Material
-from flcav.world.meshes.drape import drape_polygon, drape_wall
+from flcav.world.meshes.drape import FLAT_M, drape_area, drape_polygon, drape_wall
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.reference_line import ReferenceLine
 from flcav.world.opendrive.road_surface import Road
@@ -127,6 +128,18 @@ def test_polygons_are_draped_exactly() -> None:
     wall = drape_wall(np.concatenate((square, square[:1])), relief, (-0.03, 0.12), Material.SIDEWALK)
     above = wall.vertices[:, 2] - relief.heights(*wall.vertices[:, :2].T)
     np.testing.assert_allclose(np.unique(above.round(3)), (-0.03, 0.12))
+    foot = wall.vertices[: len(wall.vertices) // 2].astype(np.float64)
+    between = foot[:-1] + np.linspace(0, 1, 7)[:, None, None] * (foot[1:] - foot[:-1])
+    assert np.abs(between[..., 2] + 0.03 - relief.heights(*between[..., :2].T).T).max() <= FLAT_M + 1e-4
+
+
+def test_an_area_with_a_hole_is_draped_around_it() -> None:
+    area = box(-9, -8, 12, 11).difference(box(-2, -2, 3, 4))
+    mesh = drape_area(area, Relief(POINTS), 0.0, Material.GROUND)
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    one, other = (corners[:, i, :2] - corners[:, 0, :2] for i in (1, 2))
+    assert np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum() / 2 == pytest.approx(area.area, rel=1e-5)
+    assert not contains_xy(box(-1.9, -1.9, 2.9, 3.9), *corners.mean(axis=1)[:, :2].T).any()
 
 
 def slope(ahead: float, left: float) -> Relief:
