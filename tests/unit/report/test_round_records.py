@@ -90,7 +90,7 @@ def test_rounds_are_a_table_curves_and_rows_of_the_page(tmp_path: Path) -> None:
 def test_the_page_has_precision_and_recall_of_labels_where_they_were_measured() -> None:
     run = made_up_run()
     labels = (LabelQuality(1, 8, 10, 0.75, 0.6), LabelQuality(2, 0, 10, None, 0.0))
-    stage = StageResult(EDGE, "objects", "grid", 2, 9, 2, (), (0.5, 0.25), None, labels)
+    stage = StageResult(EDGE, "objects", "grid", 2, 9, 2, (), (0.5, 0.25), labels=labels)
     measured = replace(run, arms={MAIN: replace(run.arms[MAIN], stages=(stage,))})
     text = html.render(page(measured), {})
     assert "<td>grid</td><td>1</td><td>8</td><td>10</td><td>0.750</td><td>0.600</td>" in text
