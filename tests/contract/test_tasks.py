@@ -186,6 +186,7 @@ def test_a_client_is_trainable(task, samples):
     }
     assert set(asked) - {"weights", "steps", "learning_rate", "seed"} == {
         "proximal",
+        "centre",
         "shift",
         "layers",
     }  # of the strategies that ask for them

@@ -334,12 +334,11 @@ class Graph:
                     self._add(self._central(arm, region, task))
                     continue
                 steps = self._rests_on(arm, region, task, EDGE)
+                name = self.names.edge(arm.name, region, task)
                 own: dict[str, Any] = {"region": region, "vehicles": self._vehicles(), "steps": steps}
+                own |= self._replan(arm, task, EDGE, region, name)
                 if self._scored(task):
                     own["scored"] = True
-                name = self.names.edge(arm.name, region, task)
-                own = {"region": region, "vehicles": self._vehicles(), "steps": steps}
-                own |= self._replan(arm, task, EDGE, region, name)
                 self._add(_step(name, edge_step, self._federation(arm, task, EDGE) | own, _named_in(steps, own)))
 
     def _scored(self, task: str) -> bool:

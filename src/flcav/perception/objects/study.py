@@ -28,7 +28,7 @@ STUDY = StudyRecipe(
 
 # Training in drawn streets, three of each town, beside the authored ones with half of the sweeps of `STUDY`.
 DRAWN = read_recipe("streets")
-DRAWN_TEST = {**DRAWN, "split": "test", "scenes": 6}
+DRAWN_TEST = {**DRAWN, "split": "test", "scenes": 10}
 STREETS_STUDY = StudyRecipe(
     network="small",
     train=(
@@ -37,7 +37,7 @@ STREETS_STUDY = StudyRecipe(
     ),
     validation={**DRAWN, "town": "suburb", "seed": 123, "split": "validation", "scenes": 2},
     tests={
-        **{town: {**TESTED, "town": town, "seed": 433, "scenes": 6} for town in TOWNS},
+        **{town: {**TESTED, "town": town, "seed": 433} for town in TOWNS},
         "streets": {**DRAWN_TEST, "town": "suburb", "seed": 435},
         "streets-arterial": {**DRAWN_TEST, "town": "arterial", "seed": 437},
     },

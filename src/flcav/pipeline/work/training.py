@@ -186,8 +186,9 @@ def edge_step(
     if scored and stage == EDGE:
         group = _select_group(work, Frames.open(work.inputs[steps["frames"]]), steps)
         quality = score_labels(work, region, steps, group, start.config, samples)
-    found: Any = (stage, task, region, len(losses), held, len(clients), poles, losses, records, made, quality)
-    StageResult(*found).save(work.folder)
+    StageResult(
+        stage, task, region, len(losses), held, len(clients), poles, losses, records, plans=made, labels=quality
+    ).save(work.folder)
 
 
 def cloud_step(
@@ -259,7 +260,9 @@ def cloud_step(
         asked = (learning, start, servers, rounds, k, federating, driven.rules)
         losses = federate_cloud(*asked, book, work.folder, work.report, driven.outages, shared=shared)
     records = read_rounds(work.folder, None, before, driven.seconds)
-    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses, records, made).save(work.folder)
+    StageResult(CLOUD, task, None, len(losses), held, count, tuple(helped), losses, records, plans=made).save(
+        work.folder
+    )
 
 
 def central_step(
