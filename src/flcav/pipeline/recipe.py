@@ -182,7 +182,7 @@ class Federation(Rules):
 
     strategy: StrategySpec = "fedavg"  # name, or {name: settings}; module:NAME of your own
     cloud_strategy: StrategySpec | None = (
-        None  # of the cloud; default: `strategy`, or fedavg where that one corrects local steps
+        None  # of the cloud; default: `strategy`, or fedavg where that corrects local steps or is fedmd
     )
     edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)  # in every region
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
@@ -250,7 +250,7 @@ class RunRecipe(Config):
     regions: Annotated[Mapping[Name, Region], Field(min_length=1)]  # regions by name
     budgets_mb: Budgets  # uplink budgets
     replan: Replanning = (
-        "stages"  # the plan is made anew, from what was reached and sent, after stages I and II; rounds: also in them
+        "stages"  # the plan is made anew, from what was reached and sent, after stages I and II; rounds: and each round
     )
     uploads: Literal["drawn", "planned"] = (
         "drawn"  # samples of stage I: drawn from all vehicles' frames; or the plan says how many each vehicle uploads
