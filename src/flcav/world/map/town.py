@@ -129,7 +129,10 @@ def _build_town(folder: Path, files: str) -> Town:
 @lru_cache(maxsize=4)
 def _raise_hills(name: str, folder: Path) -> Town:
     """Return the level town of a folder of flcav with its slopes and camber, under another name."""
-    return lift_town(replace(load_town(folder), name=name), Relief.load(folder / HILLS))
+    level = load_town(folder)
+    told = f"{level.parameters.description.rstrip('.')}; with slopes and camber."
+    named = replace(level, name=name, parameters=level.parameters.model_copy(update={"description": told}))
+    return lift_town(named, Relief.load(folder / HILLS))
 
 
 def _folder(name: str, beside: Path | None) -> Path:
