@@ -17,6 +17,7 @@ from flcav.config import InputError
 from flcav.extras import format_install_command
 from flcav.threads import VARIABLES, threads_of_children
 
+_STARTING = threading.Lock()  # of the fork server: only one thread at a time changes the environment
 STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
 
 
@@ -27,12 +28,12 @@ def start_server() -> BaseContext:
     fork of it, so that many workers import them once. Where it cannot start, each worker is a process that imports
     them itself (spawn).
     """
-    multiprocessing.set_forkserver_preload([name for name in sys.modules if name.partition(".")[0] == "flcav"])
-    try:
-        with threads_of_children(1):
+    with _STARTING, threads_of_children(1):
+        multiprocessing.set_forkserver_preload([name for name in [*sys.modules] if name.partition(".")[0] == "flcav"])
+        try:
             forkserver.ensure_running()
-    except OSError:  # its socket is in the folder of temporary files, whose path may be too long for one
-        return multiprocessing.get_context("spawn")
+        except OSError:  # its socket is in the folder of temporary files, whose path may be too long for one
+            return multiprocessing.get_context("spawn")
     return multiprocessing.get_context("forkserver")
 
 

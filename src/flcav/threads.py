@@ -21,14 +21,15 @@ def use_threads(count: int) -> None:
 
 @contextlib.contextmanager
 def threads_of_children(count: int) -> Iterator[None]:
-    """Set the environment variables in VARIABLES to `count` within the context: processes started there inherit it."""
-    before = {name: os.environ.get(name) for name in VARIABLES}
-    os.environ.update(dict.fromkeys(VARIABLES, str(count)))
+    """Set the environment variables in VARIABLES to `count` within the context: processes started there inherit it.
+
+    Such a process does not import from the working directory either, where a file may have the name of a module.
+    """
+    values = dict.fromkeys(VARIABLES, str(count)) | {"PYTHONSAFEPATH": "1"}
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
     try:
         yield
     finally:
         for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})

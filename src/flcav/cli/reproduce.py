@@ -1,6 +1,6 @@
 """`flcav reproduce`: the figures and comparisons of the article, and the tasks' studies."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +14,7 @@ from flcav.experiments.studies import STUDIES
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
+    from flcav.files import Json
     from flcav.pipeline.recipe import RunRecipe
     from flcav.pipeline.results import Run
 
@@ -129,8 +130,7 @@ def reproduce(
     if target.startswith(TASK) or ":" in target:
         _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
-        run = COMPARISONS.get(target, _demo_arms)
-        run(out, count, "quick" if quick else "paper", jobs, engine, stale)
+        COMPARISONS[target](out, count, "quick" if quick else "paper", jobs, engine, stale)
     typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
 
 
@@ -160,7 +160,6 @@ def _fig3a(out: Path) -> None:
 @when_interrupted()
 def _record_and_draw(target: Target, out: Path) -> None:
     from flcav import progress
-    from flcav.files import write_bytes, write_json
 
     with progress.show_progress(target.value) as report:
         if target == Target.fig3b:
@@ -174,17 +173,12 @@ def _record_and_draw(target: Target, out: Path) -> None:
         else:
             from flcav.experiments.roadside.detector import evaluate_road_detector as repeat
         results, pictures = repeat(out, report)
-    write_json(out / "result.json", results.as_json())
-    for name, picture in pictures.items():
-        write_bytes(out / name, picture)
-    for sentence in results.sentences():
-        typer.echo(sentence)
+    _write_figures(out, results.as_json(), pictures, results.sentences())
 
 
 @when_interrupted()
 def _attack(target: Target, out: Path, seeds: int) -> None:
     from flcav import progress
-    from flcav.files import write_bytes, write_json
 
     with progress.show_progress(target.value) as report:
         if target == Target.federation_faults:
@@ -192,10 +186,17 @@ def _attack(target: Target, out: Path, seeds: int) -> None:
         else:
             from flcav.experiments.attacks.leakage import repeat_leakage as repeat
         results, pictures = repeat(out, seeds, report)
-    write_json(out / "result.json", results.as_json())
+    _write_figures(out, results.as_json(), pictures, results.sentences())
+
+
+def _write_figures(out: Path, numbers: "Json", pictures: Mapping[str, bytes], sentences: Sequence[str]) -> None:
+    """Write numbers and pictures, and say what was found."""
+    from flcav.files import write_bytes, write_json
+
+    write_json(out / "result.json", numbers)
     for name, picture in pictures.items():
         write_bytes(out / name, picture)
-    for sentence in results.sentences():
+    for sentence in sentences:
         typer.echo(sentence)
 
 
@@ -254,6 +255,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
 
 
 COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] = {
+    Target.demo_arms: _demo_arms,
     Target.distillation: _distillation,
     Target.fig6a_allocation: _fig6a_allocation,
     Target.placement: _placement,

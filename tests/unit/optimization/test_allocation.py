@@ -19,7 +19,7 @@ from flcav.optimization.solvers.separable import ContinuousOptimum, Separable, r
 MODELS = ("additive", "effective", "federated")
 
 
-@pytest.mark.parametrize(("model", "seed", "k"), itertools.product(MODELS, range(4), (0, 1, 2)))
+@pytest.mark.parametrize(("model", "seed", "k"), [*itertools.product(MODELS, range(4), (0, 1, 2))])
 def test_one_task_is_solved_exactly(model, seed, k):
     limits = {"samples": [1, 600], "edge_rounds": [0, 12], "cloud_rounds": [0, 8]}
     values = written(seed, 1, model, limits, budget=900.0, k=k)
@@ -30,7 +30,7 @@ def test_one_task_is_solved_exactly(model, seed, k):
 
 @pytest.mark.parametrize(
     ("model", "seed", "objective"),
-    itertools.product((*MODELS, "shared"), range(3), ("weighted", "max-min")),
+    [*itertools.product((*MODELS, "shared"), range(3), ("weighted", "max-min"))],
 )
 def test_small_instances_equal_exhaustive_search(model, seed, objective):
     values = written(seed, 3, model, SMALL, budget=300.0) | {"objective": objective}

@@ -21,7 +21,7 @@ def with_more(values: dict[str, Any], link: str, added: float) -> dict[str, Any]
 
 
 @pytest.mark.parametrize(
-    ("model", "seed", "objective"), itertools.product(("additive", "effective"), range(3), ("weighted", "max-min"))
+    ("model", "seed", "objective"), [*itertools.product(("additive", "effective"), range(3), ("weighted", "max-min"))]
 )
 def test_what_more_of_a_budget_saves_is_what_trying_every_plan_finds(model: str, seed: int, objective: str) -> None:
     values: dict[str, Any] = written(seed, 2, model, SMALL, budget=150.0) | {"objective": objective}

@@ -74,6 +74,9 @@ def test_noise_of_runs_and_what_it_leaves_attainable() -> None:
     residual = np.repeat(draw.normal(0, 0.03, 200), 12) + draw.normal(0, 0.01, 2400)
     assert noise_of_runs(residual, runs) == pytest.approx((0.03, 0.01), rel=0.1)
     assert noise_of_runs(np.tile([0.01, -0.01], 1200), runs)[0] == 0
+    assert noise_of_runs(np.array([0.1, -0.1, 0.0]), np.array(["a", "b", "c"])) == pytest.approx(
+        (0.1, 0)
+    )  # a point each
     expected = draw.normal(0, 0.04, 2400)  # independent normals correlate by r, their ranks by 6/pi asin(r/2)
     normal = 0.04 / np.sqrt(0.04**2 + 0.03**2 + 0.01**2)
     assert attainable_correlation(expected, runs, 0.03, 0.01) == pytest.approx(

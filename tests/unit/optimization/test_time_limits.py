@@ -53,7 +53,9 @@ def test_plans_of_vehicles_without_names_are_the_best_of_all(
     assert busy_s <= horizon_s * (1 + 1e-9)
 
 
-@pytest.mark.parametrize(("model", "objective"), itertools.product(("additive", "effective"), ("weighted", "max-min")))
+@pytest.mark.parametrize(
+    ("model", "objective"), [*itertools.product(("additive", "effective"), ("weighted", "max-min"))]
+)
 def test_many_tasks_are_proven_within_a_thousandth(model: str, objective: str) -> None:
     limits = {"samples": [100, 3000], "edge_rounds": [0, 40], "cloud_rounds": [0, 20]}
     values = timed(3, 12, model, 250.0, limits=limits) | {"objective": objective}

@@ -12,6 +12,7 @@ from typing import Any
 from flcav.dataset.recording.jobs import Engine, Job, perform
 from flcav.processes import exit_with_parent, start_server
 from flcav.sources.source import Source
+from flcav.threads import use_threads
 
 POLL_S = 0.2
 
@@ -90,6 +91,7 @@ def _raise_failure(future: Future[None]) -> None:
 def _begin(source: Source, work: Path, written: Any) -> None:
     global _job
     _job = source, work, written
+    use_threads(1)
     exit_with_parent()
 
 

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.stats import rankdata
+from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.files import Json
 from flcav.intervals import MOST_SEEDS, MeanOverSeeds, half_width, mean_over_seeds
+from flcav.optimization.curves.held_out import rank_correlation
 from flcav.perception.errors import load_errors
 from flcav.perception.outcomes import Outcomes, as_measurable
 from flcav.perception.tasks import task_named
@@ -191,14 +191,6 @@ def plan_half_width(sd: float, half: float = HALF_WIDTH) -> int | None:
     return next((seeds for seeds in range(2, MOST_SEEDS) if half_width(sd, seeds) <= half), None)
 
 
-def rank_correlation(first: ArrayLike, second: ArrayLike) -> float:
-    """Return Spearman's rank correlation of two lists of numbers (N,), ties at mean ranks; 0 where one is constant."""
-    one, other = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    if not (np.ptp(one) and np.ptp(other)):
-        return 0.0
-    return float(np.corrcoef(rankdata(one), rankdata(other))[0, 1])
-
-
 def choose_near(places: NDArray[np.float64], errors: NDArray[np.float64], range_m: float) -> NDArray[np.bool_]:
     """Return (F,) whether a frame is of the half with most errors within `range_m`, horizontally.
 
@@ -294,7 +286,8 @@ def _choose_one(poles: Sequence[PoleGain]) -> tuple[ChoiceGain, ...]:
 
 
 def _correlate(poles: Sequence[PoleGain], predictor: Sequence[float]) -> dict[str, float]:
-    return {frames: rank_correlation([pole.gain[frames] for pole in poles], predictor) for frames in (TOWN, NEAR)}
+    gains = {frames: np.array([pole.gain[frames] for pole in poles]) for frames in (TOWN, NEAR)}
+    return {frames: rank_correlation(gain, np.asarray(predictor, dtype=np.float64)) for frames, gain in gains.items()}
 
 
 def _find_choice(seed: SeedGains, rule: str, count: int) -> ByFrames:

@@ -64,18 +64,22 @@ def hold_out_runs(history: History, fit: Callable[[History], CurveFit], k: int =
 
 
 def rank_correlation(one: Array, other: Array) -> float:
-    """Return Spearman's rank correlation of two samples (n,)."""
+    """Return Spearman's rank correlation of two samples (n,), ties at mean ranks; 0 where one is constant."""
+    if not (np.ptp(one) and np.ptp(other)):
+        return 0.0
     return float(np.corrcoef(rankdata(one), rankdata(other))[0, 1])
 
 
 def noise_of_runs(residual: Array, runs: NDArray[np.str_]) -> tuple[float, float]:
     """Return the standard deviations between and within runs of residuals (n,), each of the run in `runs` (n,).
 
-    That between runs is 0 where their means differ by less than the scatter within them explains.
+    That between runs is 0 where their means differ by less than the scatter within them explains; that within them is 0
+    where each has one point.
     """
     names, run, count = np.unique(runs, return_inverse=True, return_counts=True)
     means = np.bincount(run, residual) / count
-    within = float(((residual - means[run]) ** 2).sum() / (len(residual) - len(names)))
+    free = len(residual) - len(names)
+    within = float(((residual - means[run]) ** 2).sum() / free) if free else 0.0
     spread = float((count * (means - residual.mean()) ** 2).sum() / (len(names) - 1))
     size = (len(residual) - (count**2).sum() / len(residual)) / (len(names) - 1)
     return float(np.sqrt(max(spread - within, 0) / size)), float(np.sqrt(within))

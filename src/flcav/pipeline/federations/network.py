@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flcav.config import InputError
-from flcav.federation.rules import Rules
+from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.runtimes.metered import Outage
 from flcav.federation.selection import Selection
@@ -179,7 +179,11 @@ def open_network(
     if settings is None:
         return lambda rules, seeds: DrivenRounds(rules, {}, ())
     weights = to_arrays(learning.build_network())
-    sizes = update_bytes(weights), update_bytes(weights, how.upload, exchanging=exchanges_more(how.strategy))
+    both = isinstance(how.personal, RegionalModels)  # the region's and the global model go down together
+    sizes = (
+        update_bytes(weights, exchanging=both),
+        update_bytes(weights, how.upload, exchanging=exchanges_more(how.strategy)),
+    )
     fleet = Fleet(region, tuple(clients), *sizes, train_s, speeds)
     split, placed = Frames.open(work.inputs[steps["frames"]]), Placed.load(work.inputs[steps["place"]])
     scenes: list[RadioLinks] = []

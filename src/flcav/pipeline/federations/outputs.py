@@ -15,7 +15,7 @@ from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.messages import send_to_vehicles
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import CLOUD, EDGE
+from flcav.pipeline.recipe import EDGE
 from flcav.pipeline.results import Pretrained
 from flcav.pipeline.stages import Learning
 from flcav.pipeline.steps import Work
@@ -38,10 +38,10 @@ class SharedFrames:
             send_to_vehicles(book, message, self.samples.task, region, clients)
 
 
-def send_region_network(book: Ledger, task: Task, weights: Weights, clients: Iterable[str]) -> None:
-    """Send a region's network after stage II to its vehicles, who go on from it in stage III."""
+def send_region_network(book: Ledger, task: Task, weights: Weights, clients: Iterable[str], stage: str) -> None:
+    """Send a region's network after stage II to its vehicles, who go on from it in a later `stage`."""
     for client in clients:
-        send(book, pack(weights), stage=CLOUD, task=task.name, link="wireless", direction="down", client=client)
+        send(book, pack(weights), stage=stage, task=task.name, link="wireless", direction="down", client=client)
 
 
 def share_frames(

@@ -158,6 +158,8 @@ def edge_step(
         shown = share_frames(work, learning, start.config, strategy, steps["pools"], steps["pretrain"])
         if "edge" not in steps:  # where the vehicles have them
             shown.send(book, start, region, [*clients])
+        else:
+            send_region_network(book, learning.task, to_arrays(start), clients, EDGE)
         shared = shown.samples
     simulate = open_network(work, learning, how, region, [*clients], steps, earlier, train_s, speeds)
 
@@ -235,7 +237,7 @@ def cloud_step(
         shown = share_frames(work, learning, start.config, federating.edge, first["pools"], first["pretrain"])
         shared = shown.samples
         for at in servers.values():
-            send_region_network(book, learning.task, at.weights, at.clients)
+            send_region_network(book, learning.task, at.weights, at.clients, CLOUD)
     before, schedule = len(book.entries), learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
     networks = {
         name: open_network(work, learning, how, name, [*at.clients], regions[name], at.earlier, train_s, speeds)
