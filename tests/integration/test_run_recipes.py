@@ -22,6 +22,7 @@ from flcav.pipeline.recipe import (
     MAIN,
     PRETRAIN,
     SPLITS_OF,
+    Arm,
     Role,
     RunRecipe,
     Split,
@@ -30,7 +31,7 @@ from flcav.pipeline.recipe import (
     load_run_recipe,
 )
 from flcav.pipeline.results import WEIGHTS, Difference, Pretrained, Run
-from flcav.pipeline.running import RESULTS, run
+from flcav.pipeline.running import RESULTS, run, run_several
 from flcav.pipeline.seeds.learning_history import ORIGIN, HistoryOrigin
 from flcav.report.pages.run_page import page, write_report
 from flcav.verdicts import UNDECIDED
@@ -104,11 +105,14 @@ def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) ->
     }
 
 
-def test_vehicles_join_the_rounds_that_they_have_time_for(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def timed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunRecipe, Run]:
+    """Return the folder of a run with little time, its recipe, and what it gave."""
+    beside = tmp_path_factory.mktemp("timed")
     points = [(s, e, c) for s in (2, 4) for e in range(4) for c in range(3)]
     scores = [0.9 - s**-0.5 / 2 - 0.3 / (e + 1) - 0.05 / (c + 1) for s, e, c in points]
     rows = [f"{s},{e},{c},{score:.4f}" for (s, e, c), score in zip(points, scores, strict=True)]
-    (tmp_path / "own.csv").write_text("\n".join(["samples,edge_rounds,cloud_rounds,accuracy", *rows]) + "\n")
+    (beside / "own.csv").write_text("\n".join(["samples,edge_rounds,cloud_rounds,accuracy", *rows]) + "\n")
     few = {"scenes": 2, "spins": 1, "cavs": 2}
     recipe = RunRecipe.model_validate(
         {
@@ -127,7 +131,11 @@ def test_vehicles_join_the_rounds_that_they_have_time_for(tmp_path: Path) -> Non
             },
         }
     )
-    result = run(recipe, tmp_path / "out", beside=tmp_path)
+    return beside / "out", recipe, run(recipe, beside / "out", beside=beside)
+
+
+def test_vehicles_join_the_rounds_that_they_have_time_for(timed: tuple[Path, RunRecipe, Run]) -> None:
+    folder, _, result = timed
     main = result.arms[MAIN]
     plan = main.plan.tasks["weather"]
     assert plan.joins is not None
@@ -136,7 +144,7 @@ def test_vehicles_join_the_rounds_that_they_have_time_for(tmp_path: Path) -> Non
     assert set(fast) | set(slow) == set(range(1, rounds + 1))
     assert len(fast) <= 4
     assert 2 * len(slow) <= 4 < 2 * rounds
-    book = Ledger.load(tmp_path / "out/ledgers/main.parquet").entries
+    book = Ledger.load(folder / "ledgers/main.parquet").entries
     sent = [(e.stage, e.client, e.round) for e in book if (e.link, e.direction) == ("wireless", "up") and e.round]
     assert sorted(sent) == sorted(
         (EDGE, name, number) if number <= plan.edge_rounds else (CLOUD, name, number - plan.edge_rounds)
@@ -148,11 +156,32 @@ def test_vehicles_join_the_rounds_that_they_have_time_for(tmp_path: Path) -> Non
             assert few.clients == many.clients
             if few.server != CLOUD and few.clients:
                 assert 0 < few.up_bytes < many.up_bytes / 100
-    sent = {(e.link, e.client) for e in Ledger.load(tmp_path / "out/ledgers/outputs.parquet").entries if not e.round}
+    sent = {(e.link, e.client) for e in Ledger.load(folder / "ledgers/outputs.parquet").entries if not e.round}
     assert {("wireline", "ring"), *(("wireless", f"ring/cav{number}") for number in range(2))} <= sent
     tested = result.arms["regional"].regional
     assert {(test.model, test.region) for test in tested or ()} == {("ring", "suburb"), ("ring", "ring")}
-    assert not (tmp_path / "out/work/ring-edge-fl-weather-regional").exists()
+    assert not (folder / "work/ring-edge-fl-weather-regional").exists()
+
+
+def test_the_rest_of_a_stage_is_planned_after_each_round(timed: tuple[Path, RunRecipe, Run]) -> None:
+    beside, recipe = timed[0].parent, timed[1]
+    arms = {"further": Arm(stages=("edge", "more_edge")), "oracle": Arm(central="federate")}
+    asked = recipe.model_copy(update={"replan": "rounds", "arms": arms})
+    _, result = run_several({"out": recipe, "again": asked}, beside, beside=beside)  # the same recordings
+    edge, cloud = result.arms[MAIN].stages
+    for stage, count in ((edge, "edge_rounds"), (cloud, "cloud_rounds")):
+        assert stage.plans is not None
+        assert [made.round for made in stage.plans] == list(range(1, stage.rounds + 1))
+        assert getattr(stage.plans[-1].plan, count) == stage.rounds  # the last plan is what was carried out
+        assert all(made.sent_mb.wireless_mb > 0 and made.reached is not None for made in stage.plans)
+    book = Ledger.load(beside / "again/ledgers/main.parquet").entries
+    for stage in (edge, cloud):
+        sent = [e for e in book if (e.stage, e.link, e.direction) == (stage.stage, "wireless", "up") and e.round]
+        assert {e.round for e in sent} <= set(range(1, stage.rounds + 1))
+    for use in result.arms[MAIN].links.values():
+        assert use.used_mb <= use.budget_mb
+    central = next(each for each in result.arms["oracle"].stages)
+    assert central.rounds == edge.rounds
 
 
 def test_signs_are_federated_and_their_errors_place_the_sensor(tmp_path: Path) -> None:

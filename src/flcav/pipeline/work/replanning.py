@@ -1,113 +1,98 @@
 """What the steps of stages II and III need to plan their rest anew after each round."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
-from flcav.config import read_config
+from flcav.config import Config, read_config
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Ledger
 from flcav.network.plan import Price
 from flcav.optimization.problem import Problem
 from flcav.pipeline.federations.replanning import Course, Follower, Planner, Terms, restrict_problem
 from flcav.pipeline.recipe import CLOUD, EDGE
-from flcav.pipeline.results import PROBLEM, Plan, StageResult
+from flcav.pipeline.results import PROBLEM, Plan, StageResult, TaskPlan
 from flcav.pipeline.steps import Work
-from flcav.pipeline.work import Fields
 from flcav.pipeline.work.budgets import read_entries, share_plan_budget
 
 
-def open_edge_course(
-    work: Work,
-    plan: Plan,
-    task: str,
-    region: str,
-    k: int,
-    budget_mb: tuple[float, float],
-    replan: Fields,
-    book: Ledger,
-    pretrained: str,
-) -> Course:
-    """Return the course of a region's stage II, whose ledger is `book`; `replan` as in `edge_step`."""
-    vehicles: Mapping[str, int] = replan["vehicles"]
-    terms = _edge_terms(work, plan, task, region, k, budget_mb, replan, book, pretrained)
-    if "follows" in replan:
-        return _follow(work, plan, task, replan["follows"], terms, book)
-    problem = restrict_problem(read_config(Problem, work.inputs[replan["first"]] / PROBLEM), vehicles, region)
-    return Course(plan.tasks[task], Planner(problem, plan, task, terms), book)
+class RoundPlans(Config):
+    """How a step plans its rest anew after each of its rounds: by the learning curve, or as another step did."""
+
+    vehicles: Mapping[str, int]  # of each region
+    headroom: float  # fraction of the budgets left unspent
+    first: str | None = None  # step of the first plan, whose problem is solved for the rest
+    follows: str | None = None  # step whose rounds are kept to instead
+    frames: Mapping[str, str] = {}  # steps of the validation frames that rounds are scored on, by region
 
 
-def open_cloud_course(
-    work: Work,
-    plan: Plan,
-    task: str,
-    regions: Mapping[str, object],
-    k: int,
-    budget_mb: tuple[float, float],
-    replan: Fields,
-    book: Ledger,
-) -> Course:
-    """Return the course of stage III of these regions, whose ledger is `book`; `replan` as in `cloud_step`."""
-    whole, rest = share_plan_budget(plan, budget_mb, task), 1 - replan["headroom"]
-    terms = Terms(
-        CLOUD,
-        tuple(replan["vehicles"][region] for region in regions),
-        k,
-        Price(rest * whole.wireless_mb, rest * whole.wireline_mb),
-        Price(whole.wireless_mb, whole.wireline_mb),
-    )
-    if "follows" in replan:
-        return _follow(work, plan, task, replan["follows"], terms, book)
-    problem = read_config(Problem, work.inputs[replan["first"]] / PROBLEM)
-    return Course(plan.tasks[task], Planner(problem, plan, task, terms), book)
+@dataclass(frozen=True)
+class Rest:
+    """The rest of a stage of one task, which is planned anew after each of its rounds."""
 
+    work: Work
+    plan: Plan  # at the beginning of the stage
+    task: str
+    k: int  # edge rounds per cloud round
+    budget_mb: tuple[float, float]  # of the run: wireless, wireline
+    how: RoundPlans
+    book: Ledger  # of the stage
 
-def count_further_rounds(
-    work: Work,
-    plan: Plan,
-    task: str,
-    region: str,
-    k: int,
-    budget_mb: tuple[float, float],
-    replan: Fields,
-    book: Ledger,
-    pretrained: str,
-) -> int:
-    """Return the number of further edge rounds in a region: those of the stage III in `replan`, if they are paid."""
-    terms = _edge_terms(work, plan, task, region, k, budget_mb, replan, book, pretrained)
-    rounds = StageResult.load(work.inputs[replan["follows"]]).rounds * k
-    further = replace(plan.tasks[task], edge_rounds=rounds, cloud_rounds=0)
-    return terms.cut(further, 0, _sum_sent(book)).edge_rounds
+    def open_edge(self, region: str, pretrained: str) -> Course:
+        """Return the course of a region's stage II, after the step `pretrained`."""
+        terms = self._edge_terms(region, pretrained)
+        if self.how.first is None:
+            return self._follow(terms)
+        problem = restrict_problem(self._problem(self.how.first), self.how.vehicles, region)
+        return Course(self._own, Planner(problem, self.plan, self.task, terms), self.book)
 
+    def open_cloud(self, regions: Iterable[str]) -> Course:
+        """Return the course of stage III of these regions."""
+        whole, kept = share_plan_budget(self.plan, self.budget_mb, self.task), 1 - self.how.headroom
+        terms = Terms(
+            CLOUD,
+            tuple(self.how.vehicles[region] for region in regions),
+            self.k,
+            Price(kept * whole.wireless_mb, kept * whole.wireline_mb),
+            Price(whole.wireless_mb, whole.wireline_mb),
+        )
+        if self.how.first is None:
+            return self._follow(terms)
+        return Course(self._own, Planner(self._problem(self.how.first), self.plan, self.task, terms), self.book)
 
-def _edge_terms(
-    work: Work,
-    plan: Plan,
-    task: str,
-    region: str,
-    k: int,
-    budget_mb: tuple[float, float],
-    replan: Fields,
-    book: Ledger,
-    pretrained: str,
-) -> Terms:
-    """Return the terms of a region: its part of the wireless budget by vehicles, and an equal part of the wireline."""
-    vehicles, headroom = replan["vehicles"], replan["headroom"]
-    whole = share_plan_budget(plan, budget_mb, task)
-    uploaded = sum(
-        entry.bytes for entry in read_entries(work, pretrained) if (entry.link, entry.direction) == ("wireline", "up")
-    )
-    part = vehicles[region] / sum(vehicles.values())
-    wireline = whole.wireline_mb - uploaded / BYTES_PER_MB
-    budget = Price(book.budget.wireless_mb, wireline / len(vehicles))
-    kept = Price(headroom * whole.wireless_mb * part, headroom * whole.wireline_mb / len(vehicles))
-    allowed = Price(budget.wireless_mb - kept.wireless_mb, budget.wireline_mb - kept.wireline_mb)
-    return Terms(EDGE, (vehicles[region],), k, allowed, budget)
+    def count_further(self, region: str, pretrained: str) -> int:
+        """Return the number of further edge rounds in a region: those of the stage III followed, if they are paid."""
+        rounds = self._followed().rounds * self.k
+        further = replace(self._own, edge_rounds=rounds, cloud_rounds=0)
+        return self._edge_terms(region, pretrained).cut(further, 0, _sum_sent(self.book)).edge_rounds
 
+    @property
+    def _own(self) -> TaskPlan:
+        return self.plan.tasks[self.task]
 
-def _follow(work: Work, plan: Plan, task: str, follows: str, terms: Terms, book: Ledger) -> Course:
-    """Return the course that keeps to the plans of another federation, no longer than that went on."""
-    other = StageResult.load(work.inputs[follows])
-    follower = Follower({made.round: made.plan for made in other.plans or ()}, terms)
-    return Course(terms.cut(plan.tasks[task], 0, _sum_sent(book)), follower, book, other.rounds)
+    def _problem(self, first: str) -> Problem:
+        return read_config(Problem, self.work.inputs[first] / PROBLEM)
+
+    def _edge_terms(self, region: str, pretrained: str) -> Terms:
+        """Return the terms of a region: its part of the wireless budget by vehicles, an equal part of the wireline."""
+        vehicles, headroom = self.how.vehicles, self.how.headroom
+        whole = share_plan_budget(self.plan, self.budget_mb, self.task)
+        spent = read_entries(self.work, pretrained)
+        uploaded = sum(entry.bytes for entry in spent if (entry.link, entry.direction) == ("wireline", "up"))
+        part = vehicles[region] / sum(vehicles.values())
+        wireline = whole.wireline_mb - uploaded / BYTES_PER_MB
+        budget = Price(self.book.budget.wireless_mb, wireline / len(vehicles))
+        kept = Price(headroom * whole.wireless_mb * part, headroom * whole.wireline_mb / len(vehicles))
+        allowed = Price(budget.wireless_mb - kept.wireless_mb, budget.wireline_mb - kept.wireline_mb)
+        return Terms(EDGE, (vehicles[region],), self.k, allowed, budget)
+
+    def _follow(self, terms: Terms) -> Course:
+        """Return the course that keeps to the plans of another federation, no longer than that went on."""
+        other = self._followed()
+        follower = Follower({made.round: made.plan for made in other.plans or ()}, terms)
+        return Course(terms.cut(self._own, 0, _sum_sent(self.book)), follower, self.book, other.rounds)
+
+    def _followed(self) -> StageResult:
+        assert self.how.follows is not None  # where there is no first plan
+        return StageResult.load(self.work.inputs[self.how.follows])
 
 
 def _sum_sent(book: Ledger) -> Price:

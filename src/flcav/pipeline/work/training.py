@@ -11,6 +11,7 @@ from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.stages import edge_seeds
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.network.ledger import Ledger
+from flcav.perception.distillation import SharedSamples
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import save_network, to_arrays
 from flcav.pipeline.arms import find_strategies
@@ -49,7 +50,7 @@ from flcav.pipeline.steps import Work
 from flcav.pipeline.work import Fields
 from flcav.pipeline.work.budgets import open_region_book, read_entries, share_plan_budget
 from flcav.pipeline.work.distilling import label_by_average, learn_by_distillation, score_labels
-from flcav.pipeline.work.replanning import count_further_rounds, open_cloud_course, open_edge_course
+from flcav.pipeline.work.replanning import Rest, RoundPlans
 from flcav.pipeline.work.uploads import list_frames
 
 
@@ -114,7 +115,7 @@ def edge_step(
     validation: Mapping[str, str] = {},
     processes: int = 1,
     runtime: str = "embedded",
-    replan: Mapping[str, Any] = {},
+    replan: Fields | None = None,
     distillation: Fields | None = None,
     scored: bool = False,
 ) -> None:
@@ -122,10 +123,9 @@ def edge_step(
 
     With a step "edge" it goes on from that stage II, for as many rounds as the region has in stage III. On a network,
     a vehicle trains `train_s` / speed in a round [s]. Each round is scored on the frames of the steps `validation`, by
-    region. Vehicles train in so many `processes` of a `runtime`. `replan` is empty where the plan is not made anew
-    after each round; it has the `vehicles` of each region, the `headroom`, and the step that the rounds keep to
-    (`follows`) or those of the `first` plan and of the region's validation `frames`. `distillation`: settings of the
-    labels "road-average". `scored`: the labels are compared with ground truth.
+    region. Vehicles train in so many `processes` of a `runtime`. `replan`: `RoundPlans`; None: the plan is not made
+    anew after each round. `distillation`: settings of the labels "road-average". `scored`: the labels are compared with
+    ground truth.
     """
     if distillation is not None and (processes > 1 or runtime != "embedded"):
         raise InputError("labels 'road-average' are renewed between rounds: vehicles train in one process, --jobs 1")
@@ -144,10 +144,10 @@ def edge_step(
         samples, poles = _label_samples(work, learning, region, labels, steps, book, distillation)
     if distillation is not None:
         learning = learn_by_distillation(learning, distillation)
-    terms: Any = (work, plan, task, region, k, budget_mb, replan, book, steps["pretrain"])
-    course = open_edge_course(*terms) if replan and stage == EDGE else None
-    if replan and stage == MORE_EDGE:
-        rounds = count_further_rounds(*terms)
+    rest = None if replan is None else Rest(work, plan, task, k, budget_mb, RoundPlans.model_validate(replan), book)
+    course = rest.open_edge(region, steps["pretrain"]) if rest is not None and stage == EDGE else None
+    if rest is not None and stage == MORE_EDGE:
+        rounds = rest.count_further(region, steps["pretrain"])
     start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
     clients = make_clients(learning, start.config, samples)
     earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
@@ -155,12 +155,7 @@ def edge_step(
     strategy, _ = find_strategies(how)
     shared = None
     if isinstance(strategy, FedMD):
-        shown = share_frames(work, learning, start.config, strategy, steps["pools"], steps["pretrain"])
-        if "edge" not in steps:  # where the vehicles have them
-            shown.send(book, start, region, [*clients])
-        else:
-            send_region_network(book, learning.task, to_arrays(start), clients, EDGE)
-        shared = shown.samples
+        shared = _share_with_vehicles(work, learning, start, strategy, steps, book, region, [*clients])
     simulate = open_network(work, learning, how, region, [*clients], steps, earlier, train_s, speeds)
 
     def drive(by: TaskPlan, rounds: int) -> DrivenRounds:
@@ -168,7 +163,7 @@ def edge_step(
         return simulate(follow_plan(how, by, earlier), seeds)
 
     before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
-    frames = replan.get("frames", {}) | validation if course is not None else validation
+    frames = validation if rest is None or course is None else {**rest.how.frames, **validation}
     watched = {name: Frames.open(work.inputs[step]) for name, step in frames.items()}
     about: Any = {"shared": shared}
     if isinstance(samples, RoadAverageLabels) and stage == EDGE:
@@ -205,7 +200,7 @@ def cloud_step(
     regions: Mapping[str, Mapping[str, Any]],
     train_s: float = 0.0,
     speeds: Mapping[str, float] = {},
-    replan: Mapping[str, Any] = {},
+    replan: Fields | None = None,
     distillation: Fields | None = None,
 ) -> None:
     """Run stage III of a task: the edge servers of `regions` federate with the cloud, vehicles with edge servers.
@@ -250,9 +245,10 @@ def cloud_step(
         driven = {name: network(rules, seeds[name]) for name, network in networks.items()}
         return join_regions(driven, k, how.network, update_bytes(to_arrays(start)))
 
-    if replan:
-        course = open_cloud_course(work, own, task, regions, k, budget_mb, replan, book)
-        watched = {name: Frames.open(work.inputs[step]) for name, step in replan.get("frames", {}).items()}
+    if replan is not None:
+        rest = Rest(work, own, task, k, budget_mb, RoundPlans.model_validate(replan), book)
+        course = rest.open_cloud(regions)
+        watched = {name: Frames.open(work.inputs[step]) for name, step in rest.how.frames.items()}
         replanning = Replanning(course, drive, lambda scores: mean_by_frames(scores, watched))
         asked = (learning, start, servers, rounds, k, federating, how)
         losses = federate_cloud(*asked, book, work.folder, work.report, {}, watched, replanning, shared)
@@ -302,6 +298,25 @@ def central_step(
     losses = train_centrally(learning, trained, samples, rounds, vehicles, source)
     save_network(learning.task, trained, work.folder / WEIGHTS)
     StageResult(CENTRAL, task, region, rounds, len(samples), 1, (), losses).save(work.folder)
+
+
+def _share_with_vehicles(
+    work: Work,
+    learning: Learning,
+    start: Any,
+    strategy: FedMD,
+    steps: Mapping[str, Any],
+    book: Ledger,
+    region: str,
+    vehicles: Sequence[str],
+) -> SharedSamples:
+    """Return the samples that a region's vehicles answer on, after sending what they lack: frames, and the network."""
+    shown = share_frames(work, learning, start.config, strategy, steps["pools"], steps["pretrain"])
+    if "edge" in steps:  # they have the frames, and go on from the region's network
+        send_region_network(book, learning.task, to_arrays(start), vehicles, EDGE)
+    else:
+        shown.send(book, start, region, vehicles)
+    return shown.samples
 
 
 def _label_samples(
