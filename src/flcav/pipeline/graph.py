@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError, shorten
-from flcav.federation.strategies.fedmd import FedMD
-from flcav.pipeline.arms import Names, Setting, find_strategies, name_repeat, resolve_settings
+from flcav.federation.strategies import sends_outputs
+from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import count_training_frames, hash_manifest, hash_town, recording_fields
 from flcav.pipeline.labels import LABEL_SOURCES, choose_labels
 from flcav.pipeline.planning import UpdateForm, read_history, update_forms
@@ -302,7 +302,7 @@ class Graph:
         names = self.names
         helped = any(LABEL_SOURCES[each.labels[task]].from_poles for each in self.settings.values())
         reported = {"errors": names.errors(arm.name, region, task)} if task in arm.placement.tasks else {}
-        if isinstance(find_strategies(arm.federation)[0], FedMD):
+        if sends_outputs(arm.federation.strategy):
             reported |= {"pools": self._pools(task)}  # shared frames are drawn from them
         return reported | {
             "plan": names.plan(arm.name, stage),

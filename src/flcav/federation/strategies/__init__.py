@@ -76,6 +76,12 @@ def exchanges_more(spec: Spec) -> bool:
     return name in STRATEGIES and issubclass(STRATEGIES[name], Exchanges)
 
 
+def sends_outputs(spec: Spec) -> bool:
+    """Return whether clients of one of `STRATEGIES` send probabilities instead of weights; see `exchanges_more`."""
+    name = spec if isinstance(spec, str) else next(iter(spec), "")
+    return name in STRATEGIES and issubclass(STRATEGIES[name], FedMD)
+
+
 def of_servers(strategy: Strategy) -> Strategy:
     """Return the strategy among edge servers, which federate with the cloud, where vehicles have `strategy`.
 
