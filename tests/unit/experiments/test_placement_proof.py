@@ -21,10 +21,10 @@ from flcav.experiments.placement.run import (
     list_overlaps,
     overlap_of_circles,
     plan_half_width,
-    rank_correlation,
     summarise_gains,
 )
 from flcav.experiments.placement.tables import tables
+from flcav.optimization.curves.held_out import rank_correlation
 from flcav.pipeline.recipe import load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.world.map.town import load_town

@@ -286,8 +286,7 @@ def _choose_one(poles: Sequence[PoleGain]) -> tuple[ChoiceGain, ...]:
 
 
 def _correlate(poles: Sequence[PoleGain], predictor: Sequence[float]) -> dict[str, float]:
-    gains = {frames: np.array([pole.gain[frames] for pole in poles]) for frames in (TOWN, NEAR)}
-    return {frames: rank_correlation(gain, np.asarray(predictor, dtype=np.float64)) for frames, gain in gains.items()}
+    return {frames: rank_correlation([pole.gain[frames] for pole in poles], predictor) for frames in (TOWN, NEAR)}
 
 
 def _find_choice(seed: SeedGains, rule: str, count: int) -> ByFrames:

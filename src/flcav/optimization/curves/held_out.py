@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import rankdata
 
 from flcav.config import InputError
@@ -63,7 +63,7 @@ def hold_out_runs(history: History, fit: Callable[[History], CurveFit], k: int =
     )
 
 
-def rank_correlation(one: Array, other: Array) -> float:
+def rank_correlation(one: ArrayLike, other: ArrayLike) -> float:
     """Return Spearman's rank correlation of two samples (n,), ties at mean ranks; 0 where one is constant."""
     if not (np.ptp(one) and np.ptp(other)):
         return 0.0
