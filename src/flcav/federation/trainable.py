@@ -89,7 +89,7 @@ class Trainable(Protocol):
 
 
 class Distiller(Protocol):
-    """What a server needs where clients send outputs on shared samples: its own, and a network that learns them."""
+    """Network of the server in output distillation: its outputs on shared samples, and training towards the mean of all."""
 
     def outputs(self, weights: Weights) -> Weights:
         """Return the outputs of a network with these weights."""

@@ -67,7 +67,7 @@ class Distillation(Config):
 
 @dataclass(frozen=True)
 class Guidance:
-    """What the edge server tells a vehicle of one of its frames: the road average, in the vehicle's frame."""
+    """Message of the edge server on one frame of a vehicle: the road average, in the vehicle's frame."""
 
     boxes: Boxes  # (K,) label = detection class, or the actor category of a lookalike; with scores and variances
     confirmed: NDArray[np.bool_]  # (K,) whether a road sensor or several vehicles tell of the box; others are ignored

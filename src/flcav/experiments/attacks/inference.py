@@ -1,4 +1,4 @@
-"""What a server can tell from weights: gradient inversion of an update, and membership inference on the final weights.
+"""Attacks of a curious server: gradient inversion of an update, and membership inference on the final weights.
 
 Inversion: the gradient of a dense layer with bias is at_hidden x^T and at_hidden, of one picture with the layer's
 input x; so the quotient of both is x (Geiping et al., "Inverting Gradients", NeurIPS 2020, proposition 3.1), and their

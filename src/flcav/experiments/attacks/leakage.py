@@ -53,7 +53,7 @@ LONG_STEP = 1.0  # rate of the single step on one picture: longer than what clip
 
 @dataclass(frozen=True)
 class Leaked:
-    """What was reached and what leaked in one seed, or by name of one of these numbers its mean over seeds."""
+    """Accuracy and leakage of one seed, or the means over seeds by the name of each number."""
 
     accuracy: float  # on held-out drives
     membership_auc: float  # 0.5: members cannot be told from others

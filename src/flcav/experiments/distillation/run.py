@@ -1,4 +1,4 @@
-"""What vehicles learn from in stage II, as the arms of recipes/runs/distillation.yaml: same frames, steps and budget.
+"""Comparison of labels for stage II, the arms of recipes/runs/distillation.yaml: same frames, steps and budget.
 
 Arms differ in their labels and in the terms of the loss alone. Every arm has a ledger of its own with the boxes that
 its vehicles send. Over seeds, which have recordings of their own, intervals cover training and traffic. The verdicts on
@@ -50,7 +50,7 @@ COMPARED = (  # (after, before): claims that the difference is positive
 
 @dataclass(frozen=True)
 class DistillationArm:
-    """What one arm reached in one seed."""
+    """Result of one arm in one seed."""
 
     ap50: float
     ap70: float

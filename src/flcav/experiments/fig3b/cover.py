@@ -1,4 +1,4 @@
-"""How many sensors a town takes: the share of a detector's errors that the best placement of each number covers.
+"""Coverage by number of sensors: the share of a detector's errors that the best placement of each number covers.
 
 Simple scenarios take few sensors, complex ones many (Wang et al., IEEE Network 37(3), 2023).
 """

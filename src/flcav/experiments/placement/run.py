@@ -54,7 +54,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class PoleGain:
-    """What vehicles learn from the sensor on one pole."""
+    """Gain in AP of vehicles that learn from the sensor on one pole."""
 
     pole: int
     covered: int  # errors within range
@@ -64,7 +64,7 @@ class PoleGain:
 
 @dataclass(frozen=True)
 class ChoiceGain:
-    """What vehicles learn from the sensors that a rule places."""
+    """Gain in AP of vehicles that learn from the sensors that a rule places."""
 
     rule: str
     count: int

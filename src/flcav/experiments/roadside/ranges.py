@@ -66,7 +66,7 @@ class Model:
 
 @dataclass(frozen=True)
 class SensorRanges(Record):
-    """What the road detector finds in the sweeps of each LiDAR model, against distance."""
+    """Recall of the road detector in the sweeps of each LiDAR model, by distance."""
 
     sweeps: int  # of each model
     cars: tuple[int, ...]  # that some model has returns of, in each interval of `EDGES_M`

@@ -79,7 +79,7 @@ class BenchmarkEvaluation(Evaluated):
 
 @dataclass(frozen=True)
 class _Found:
-    """What a frame's evaluation needs of its detections and objects: G objects, D detections."""
+    """Detections and objects of a frame, as its evaluation needs them: G objects, D detections."""
 
     boxes: Boxes  # (D,)
     rectangle: Array  # (D, 4) [px]

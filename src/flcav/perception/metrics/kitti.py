@@ -26,7 +26,7 @@ SIMILAR = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
 class Level(NamedTuple):
-    """Which objects count at a level of difficulty."""
+    """Criteria of a level of difficulty: the objects that count at it."""
 
     height_px: float  # of the rectangle in the image: higher ones count
     occlusion: int  # at most: 0 fully visible, 1 partly and 2 largely occluded

@@ -30,7 +30,7 @@ LEAST_MB = 1e-9  # of a budget, which is above 0
 
 @dataclass(frozen=True)
 class Terms:
-    """What the rounds of a stage cost, and what may be sent in it and after it.
+    """Prices and budgets of a stage: what its rounds cost, and what may be sent in it and after it.
 
     Of stage II they are those of one region, whose part of the wireline is the same as that of each other region.
     """

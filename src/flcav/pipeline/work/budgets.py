@@ -1,4 +1,4 @@
-"""What tasks have sent in earlier steps, and their shares of the budgets."""
+"""Ledger entries of earlier steps, and the tasks' shares of the budgets."""
 
 from collections.abc import Mapping
 

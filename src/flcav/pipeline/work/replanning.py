@@ -1,4 +1,4 @@
-"""What the steps of stages II and III need to plan their rest anew after each round."""
+"""Re-planning after each round, in the steps of stages II and III."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from flcav.pipeline.work.budgets import read_entries, share_plan_budget
 
 
 class RoundPlans(Config):
-    """How a step plans its rest anew after each of its rounds: by the learning curve, or as another step did."""
+    """Settings of re-planning in a step: after each of its rounds, by the learning curve or as another step did."""
 
     vehicles: Mapping[str, int]  # of each region
     headroom: float  # fraction of the budgets left unspent

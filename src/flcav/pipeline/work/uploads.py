@@ -1,4 +1,4 @@
-"""Which vehicle of the pretraining regions uploads how many samples, as the plan says."""
+"""Planned uploads: the number of samples of each vehicle of the pretraining regions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
