@@ -89,7 +89,7 @@ class Trainable(Protocol):
 
 
 class Distiller(Protocol):
-    """Network of the server in output distillation: its outputs on shared samples, and training towards the mean of all."""
+    """Network of the server in output distillation: its outputs on shared samples, and training towards a mean."""
 
     def outputs(self, weights: Weights) -> Weights:
         """Return the outputs of a network with these weights."""
