@@ -73,7 +73,7 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> Studied:
     """Return the folder of both comparisons of one seed, and their results."""
     out = tmp_path_factory.mktemp("toy") / "studies"
     runs, _ = run_seeds(RECIPE, out, seeds=1)
-    return out, compare_arms(RECIPE, runs), compare_plans(RECIPE, runs)
+    return out, compare_arms(RECIPE, runs), compare_plans(RECIPE, {1.0: runs})
 
 
 @pytest.fixture(scope="module")
@@ -373,13 +373,14 @@ def test_the_comparison_of_arms_is_that_of_the_run(studied: Studied, result: Run
 
 
 def test_the_proof_by_training_compares_two_plans(studied: Studied, result: Run) -> None:
-    (seed,) = studied[2].seeds
+    (at,) = studied[2].budgets
+    (seed,) = at.seeds
     equal, joint = seed.plans["equal-stages"], seed.plans["joint"]
     assert joint.samples == result.arms[MAIN].plan.tasks["objects"].samples
     assert equal.samples == result.arms["equal"].plan.tasks["objects"].samples
     assert seed.predicted["joint"] == result.arms[MAIN].plan.tasks["objects"].predicted
     assert set(seed.realised) == set(seed.differences) == {"grid", "ring"}
-    assert len(studied[2].findings) == 5
+    assert len(at.findings) == 5
 
 
 def test_a_finished_run_is_not_done_again(finished: Path, tmp_path: Path) -> None:

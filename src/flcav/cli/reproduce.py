@@ -215,15 +215,23 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
         )
 
 
+@when_interrupted()
 def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.experiments.fig6a.run import compare_plans, draw_allocation
+    from flcav.cli.steps import live_steps
+    from flcav.experiments.fig6a.run import BUDGETS, budget_recipes, compare_plans, draw_allocation
     from flcav.files import write_bytes, write_json
+    from flcav.pipeline.running import run_several
 
-    results = compare_plans(*_run_seeds(Target.fig6a_allocation, "allocation", out, seeds, scale, jobs, engine, stale))
+    recipe, numbers = _load_sized("allocation", scale), range(1, seeds + 1)
+    with live_steps(Target.fig6a_allocation.value) as notify:
+        recipes = budget_recipes(recipe, numbers)
+        runs = iter(run_several(recipes, out, jobs=jobs, notify=notify, stale=stale, engine=engine))
+    results = compare_plans(recipe, {factor: [next(runs) for _ in numbers] for factor in BUDGETS})
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "plans.png", draw_allocation(results))
-    for finding in results.findings:
-        typer.echo(f"{finding.question} {finding.verdict}. {finding.sentence}")
+    for each in results.budgets:
+        for finding in each.findings:
+            typer.echo(f"Budgets {each.name}. {finding.question} {finding.verdict}. {finding.sentence}")
 
 
 def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
@@ -276,16 +284,21 @@ def _run_seeds(
 ) -> "tuple[RunRecipe, tuple[Run, ...]]":
     """Run or finish the package's recipe `runs/<name>` with several seeds, with the fields `quick` if scale is that."""
     from flcav.cli.steps import live_steps
-    from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import run_seeds
-    from flcav.sources.recipe import recipe_path
 
-    recipe = load_run_recipe(recipe_path(f"runs/{name}"))
-    if scale != "paper":
-        recipe = recipe.model_copy(update=dict(quick))
+    recipe = _load_sized(name, scale, quick)
     with live_steps(target.value) as notify:
         runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     return recipe, runs
+
+
+def _load_sized(name: str, scale: str, quick: Mapping[str, str | None] = DEMO_SIZE) -> "RunRecipe":
+    """Return the package's recipe `runs/<name>`, with the fields `quick` unless scale is paper."""
+    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.sources.recipe import recipe_path
+
+    recipe = load_run_recipe(recipe_path(f"runs/{name}"))
+    return recipe if scale == "paper" else recipe.model_copy(update=dict(quick))
 
 
 @when_interrupted()

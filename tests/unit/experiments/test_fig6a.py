@@ -5,11 +5,14 @@ import pytest
 
 from flcav.config import InputError
 from flcav.experiments.fig6a.findings import allocation_findings
-from flcav.experiments.fig6a.results import EQUAL, JOINT, AllocationResult, AllocationSeed, Planned, Reached
-from flcav.experiments.fig6a.run import PLANS, STAGES, draw_allocation, summarise
+from flcav.experiments.fig6a.results import EQUAL, JOINT, AllocationResult, AllocationSeed, AtBudgets, Planned, Reached
+from flcav.experiments.fig6a.run import BUDGETS, PLANS, STAGES, _collect, budget_recipes, draw_allocation, summarise
 from flcav.experiments.fig6a.tables import tables
 from flcav.intervals import Estimate
+from flcav.pipeline.recipe import load_run_recipe
 from flcav.pipeline.results import LinkUse, Placed, Pole
+from flcav.report.charts.plans import predicted_and_realised
+from flcav.sources.recipe import recipe_path
 
 TOWNS = ("grid", "ring")
 PREDICTED = {EQUAL: (0.49, 0.60, 0.62), JOINT: (0.53, 0.63, 0.66)}
@@ -34,10 +37,10 @@ def seed_of(number: int, equal: tuple[float, ...], joint: tuple[float, ...]) -> 
     )
 
 
-def results_of(*seeds: tuple[tuple[float, ...], tuple[float, ...]]) -> AllocationResult:
+def results_of(*seeds: tuple[tuple[float, ...], tuple[float, ...]]) -> AtBudgets:
     rows = tuple(seed_of(number, *aps) for number, aps in enumerate(seeds, start=1))
-    results = AllocationResult(HISTORY, rows, summarise(rows))
-    return replace(results, findings=allocation_findings(results))
+    results = AtBudgets(1.0, rows, summarise(rows))
+    return replace(results, findings=allocation_findings([results], HISTORY)[0])
 
 
 RIGHT = results_of(
@@ -52,7 +55,7 @@ WRONG = results_of(
 )
 
 
-def verdicts(results: AllocationResult) -> list[str]:
+def verdicts(results: AtBudgets) -> list[str]:
     return [finding.verdict for finding in results.findings]
 
 
@@ -123,20 +126,43 @@ def test_a_budget_that_was_exceeded_is_said() -> None:
     own = first.ledger[JOINT]
     above = {**own, "wireline": replace(own["wireline"], used_mb=111.0)}
     broken = replace(RIGHT, seeds=(replace(first, ledger={**first.ledger, JOINT: above}), *others))
-    found = allocation_findings(broken)[-1]
+    found = allocation_findings([broken], HISTORY)[0][-1]
     assert found.verdict == "did not hold"
     assert "above its budgets" in found.sentence
 
 
+def test_claims_under_several_budgets_are_corrected_together() -> None:
+    both = allocation_findings([RIGHT, replace(WRONG, factor=4.0)], HISTORY)
+    assert [own[0].verdict for own in both] == ["held", "did not hold"]
+    assert all("corrected for 10 claims" in own[2].sentence for own in both)
+
+
+def test_budgets_are_multiples_of_the_recipe_s() -> None:
+    recipe = load_run_recipe(recipe_path("runs/allocation"))
+    found = budget_recipes(recipe, (1, 2))
+    assert list(found) == [f"x{factor:g}-seed{seed}" for factor in BUDGETS for seed in (1, 2)]
+    asked = found["x0.25-seed2"]
+    assert (asked.seed, asked.budgets_mb.wireless, asked.budgets_mb.wireline) == (
+        2,
+        0.25 * recipe.budgets_mb.wireless,
+        0.25 * recipe.budgets_mb.wireline,
+    )
+    assert found["x1-seed1"] == recipe
+
+
 def test_tables_hold_a_row_per_run() -> None:
-    found = tables(RIGHT)
-    assert found["plans"].count("\n") == 1 + 6
-    assert "| 1 | joint | 118 | 12 | 1 | 0.620 | 3 / 5 |" in found["plans"]
-    assert "| cloud FL | joint | 0.660 | 0.667 (" in found["accuracy"]
-    assert "| grid | cloud FL | +0.040 | +0.053 (" in found["differences"]
-    assert "| 2 | joint | wireline | 110.0 | 70.0 | 69.5 | -0.50 |" in found["megabytes"]
-    assert found["findings"].count("\n- ") == 4
+    found = tables(AllocationResult(HISTORY, (replace(WRONG, factor=0.25), RIGHT)))
+    assert found["plans"].count("\n") == 1 + 12
+    assert "| x 1 | 1 | joint | 118 | 12 | 1 | 0.620 | 3 / 5 |" in found["plans"]
+    assert "| x 1 | cloud FL | joint | 0.660 | 0.667 (" in found["accuracy"]
+    assert "| x 1 | grid | cloud FL | +0.040 | +0.053 (" in found["differences"]
+    assert "| x 0.25 | 2 | joint | wireline | 110.0 | 70.0 | 69.5 | -0.50 |" in found["megabytes"]
+    assert found["findings"].count("\n- ") == 9
 
 
-def test_the_picture_is_a_png() -> None:
-    assert draw_allocation(WRONG).startswith(b"\x89PNG")
+def test_the_picture_has_a_row_per_budgets() -> None:
+    results = AllocationResult(HISTORY, (replace(WRONG, factor=0.25), RIGHT))
+    assert draw_allocation(results).startswith(b"\x89PNG")
+    collected = {each.name: _collect(each) for each in results.budgets}
+    titles = [axes.get_title(loc="left") for axes in predicted_and_realised(collected, "grid").axes]
+    assert titles[::2] == ["budgets x 0.25: AP50 on grid", "budgets x 1: AP50 on grid"]

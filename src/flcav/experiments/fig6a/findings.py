@@ -1,37 +1,49 @@
 """Findings of the comparison of two plans: verdicts on claims, as sentences with the numbers behind them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from flcav.experiments.fig6a.results import EQUAL, JOINT, TOWN, AllocationResult, AllocationSeed, PlanFinding
+from flcav.experiments.fig6a.results import EQUAL, JOINT, TOWN, AllocationSeed, AtBudgets, PlanFinding
 from flcav.intervals import LEVEL, MOST_SEEDS, Estimate, MeanOverSeeds, mean_over_seeds, plan_seeds
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, Claim, Judged, judge, signed
 
 STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"}
 Gain = tuple[str, str]  # plan, stage
+Ranges = Mapping[str, tuple[float, float]]
 GAINS: tuple[Gain, ...] = tuple((name, stage) for name in (EQUAL, JOINT) for stage in (EDGE, CLOUD))
 COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
 
 
-def allocation_findings(results: AllocationResult) -> tuple[PlanFinding, ...]:
-    """Return the findings: gain, ranking by prediction, gain of every stage, accuracy of prediction, budgets.
+def allocation_findings(budgets: Sequence[AtBudgets], history: Ranges) -> tuple[tuple[PlanFinding, ...], ...]:
+    """Return the findings under each pair of budgets: gain, ranking by prediction, gain of every stage, accuracy, use.
 
-    The claims that are tests over seeds, the joint plan's gain and those of the stages, are judged together.
+    The claims that are tests over seeds, the joint plan's gain and those of the stages under all budgets, are judged
+    together. `history`: least and most of each count in the history that the plans are predicted from.
     """
-    difference = results.summary.realised_difference[TOWN][CLOUD]
-    gains = {key: _gain(results, TOWN, *key) for key in GAINS}
-    first, *others = judge([Claim(mean) for mean in (difference, *gains.values())])
+    claims = [[each.summary.realised_difference[TOWN][CLOUD], *_stage_gains(each).values()] for each in budgets]
+    judged = iter(judge([Claim(mean) for own in claims for mean in own]))
+    return tuple(_told(each, history, [next(judged) for _ in own]) for each, own in zip(budgets, claims, strict=True))
+
+
+def _told(results: AtBudgets, history: Ranges, judged: Sequence[Judged]) -> tuple[PlanFinding, ...]:
+    """Return the findings under one pair of budgets, from the verdicts on its claims."""
+    difference, gains = results.summary.realised_difference[TOWN][CLOUD], _stage_gains(results)
+    first, *others = judged
     verdicts = {key: each.verdict for key, each in zip(gains, others, strict=True)}
     return (
         _better(results, difference, first),
-        _ranking(results, difference, first),
+        _ranking(results, history, difference, first),
         _every_stage(results, gains, verdicts, first.family),
         _accuracy(results),
         _budgets(results),
     )
 
 
-def _better(results: AllocationResult, difference: MeanOverSeeds, judged: Judged) -> PlanFinding:
+def _stage_gains(results: AtBudgets) -> dict[Gain, MeanOverSeeds]:
+    return {key: _gain(results, TOWN, *key) for key in GAINS}
+
+
+def _better(results: AtBudgets, difference: MeanOverSeeds, judged: Judged) -> PlanFinding:
     realised = results.summary.realised[TOWN]
     sentence = (
         f"On {TOWN}, AP50 after the last stage was {realised[EQUAL][CLOUD].mean:.3f} with equal stages and "
@@ -47,7 +59,7 @@ def _better(results: AllocationResult, difference: MeanOverSeeds, judged: Judged
     return _finding("Does the joint plan beat equal shares for every stage?", judged.verdict, sentence)
 
 
-def _needed(results: AllocationResult, difference: MeanOverSeeds, judged: Judged) -> str:
+def _needed(results: AtBudgets, difference: MeanOverSeeds, judged: Judged) -> str:
     """Return how many seeds it takes to tell the difference that was predicted."""
     predicted = results.summary.predicted_difference[CLOUD]
     seeds = plan_seeds(predicted, difference.sd, LEVEL / max(judged.family, 1))
@@ -55,7 +67,7 @@ def _needed(results: AllocationResult, difference: MeanOverSeeds, judged: Judged
     return f"To tell the predicted difference of {signed(predicted)} takes {count} seeds."
 
 
-def _ranking(results: AllocationResult, difference: MeanOverSeeds, judged: Judged) -> PlanFinding:
+def _ranking(results: AtBudgets, history: Ranges, difference: MeanOverSeeds, judged: Judged) -> PlanFinding:
     predicted = results.summary.predicted_difference[CLOUD]
     question = "Does the prediction rank the two plans rightly?"
     if predicted == 0:
@@ -68,10 +80,10 @@ def _ranking(results: AllocationResult, difference: MeanOverSeeds, judged: Judge
     sure = ", but that is undecided" if decided == UNDECIDED else ""
     if difference.mean * predicted > 0:
         return _finding(question, decided, f"{expected}, and so does their mean{sure}.")
-    return _finding(question, decided, f"{expected}, and their mean does not{sure}. {_why(results)}")
+    return _finding(question, decided, f"{expected}, and their mean does not{sure}. {_why(results, history)}")
 
 
-def _why(results: AllocationResult) -> str:
+def _why(results: AtBudgets, history: Ranges) -> str:
     """Return where prediction and training differ most, and which counts of the plans are outside the history."""
     summary = results.summary
     predicted = _gains(summary.predicted_difference)
@@ -83,7 +95,7 @@ def _why(results: AllocationResult) -> str:
     )
     beyond = [
         f"{COUNT_NAMES[count]} {plans[name].counts[count]} of the {name} plan (history: {low:g} to {high:g})"
-        for count, (low, high) in results.history.items()
+        for count, (low, high) in history.items()
         for plans in (results.seeds[0].plans,)
         for name in (EQUAL, JOINT)
         if not low <= plans[name].counts[count] <= high
@@ -92,7 +104,7 @@ def _why(results: AllocationResult) -> str:
 
 
 def _every_stage(
-    results: AllocationResult, gains: Mapping[Gain, MeanOverSeeds], verdicts: Mapping[Gain, str], family: int
+    results: AtBudgets, gains: Mapping[Gain, MeanOverSeeds], verdicts: Mapping[Gain, str], family: int
 ) -> PlanFinding:
     """Return the gain of each federated stage in each plan; the learning curves cannot predict a loss."""
     plans = results.seeds[0].plans
@@ -118,7 +130,7 @@ def _every_stage(
     return _finding("Did every stage raise the accuracy?", decided, " ".join(sentences))
 
 
-def _gain(results: AllocationResult, town: str, name: str, stage: str) -> MeanOverSeeds:
+def _gain(results: AtBudgets, town: str, name: str, stage: str) -> MeanOverSeeds:
     """Return a stage's gain over the stage before it, as the mean over seeds."""
     before = {EDGE: PRETRAIN, CLOUD: EDGE}[stage]
     rows = [seed.realised[town][name] for seed in results.seeds]
@@ -137,7 +149,7 @@ def _gains(after: Mapping[str, float]) -> dict[str, float]:
     return {stage: after[stage] - before[stage] for stage in STAGE_NAMES}
 
 
-def _accuracy(results: AllocationResult) -> PlanFinding:
+def _accuracy(results: AtBudgets) -> PlanFinding:
     errors = [_ap(seed, name, CLOUD) - seed.predicted[name][CLOUD] for seed in results.seeds for name in (EQUAL, JOINT)]
     wide = sum(abs(error) for error in errors) / len(errors)
     claimed = abs(results.summary.predicted_difference[CLOUD])
@@ -151,7 +163,7 @@ def _accuracy(results: AllocationResult) -> PlanFinding:
     return _finding("Is the prediction exact enough to tell the plans apart?", decided, sentence)
 
 
-def _budgets(results: AllocationResult) -> PlanFinding:
+def _budgets(results: AtBudgets) -> PlanFinding:
     rows = [row for seed in results.seeds for book in seed.ledger.values() for row in book.values()]
     within = all(row.used_mb <= row.budget_mb for row in rows)
     off = [row.used_mb - row.planned_mb for row in rows]

@@ -72,13 +72,26 @@ class PlanFinding:
 
 
 @dataclass(frozen=True)
-class AllocationResult(Record):
-    """Results of the comparison: numbers of both plans by seed, means over seeds, and findings."""
+class AtBudgets:
+    """Both plans under one pair of budgets: numbers by seed, means over seeds, and findings."""
 
-    history: Mapping[str, tuple[float, float]]  # least and most of each count in the planner's history
+    factor: float  # of the recipe's budgets
     seeds: tuple[AllocationSeed, ...]
     summary: AllocationSummary
     findings: tuple[PlanFinding, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Return the budgets in words: x 0.25, x 1."""
+        return f"x {self.factor:g}"
+
+
+@dataclass(frozen=True)
+class AllocationResult(Record):
+    """Results of the comparison, under several multiples of the recipe's budgets."""
+
+    history: Mapping[str, tuple[float, float]]  # least and most of each count in the planner's history
+    budgets: tuple[AtBudgets, ...]
     recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
     note: str = "road labels come from an ideal road detector: AP after edge FL and cloud FL is an upper bound"

@@ -1,13 +1,14 @@
 """Validation of MLGRA by training (Wang et al., IEEE Network 37(3), 2023, Fig. 6a): joint plan against equal stages.
 
-Both plans, the arms of recipes/runs/allocation.yaml, have the demo's budgets, the same learning curve, and the same
-limits, wider than the demo's, so that only the budgets bind. They share their recorded frames; each places its sensors
-by the errors of its own pretrained network. The score that the curve predicts after each stage is compared with the
-score after training.
+Both plans, the arms of recipes/runs/allocation.yaml, have the same budgets (a quarter of the recipe's, the recipe's, or
+four times as much), the same learning curve, and the same limits, so wide that only the budgets bind. Runs of a seed
+share their recorded frames; each places its sensors by the errors of its own pretrained network. The score that the
+curve predicts after each stage is compared with the score after training.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -20,32 +21,55 @@ from flcav.experiments.fig6a.results import (
     AllocationResult,
     AllocationSeed,
     AllocationSummary,
+    AtBudgets,
     Planned,
     Reached,
 )
 from flcav.intervals import Estimate, mean_over_seeds
 from flcav.pipeline.planning import load_history
 from flcav.pipeline.provenance import provenance
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
 from flcav.pipeline.results import Run
 from flcav.report import style
 from flcav.report.charts import plans
 
 TASK = "objects"
 PLANS = (EQUAL, JOINT)
+BUDGETS = (0.25, 1.0, 4.0)  # multiples of the recipe's
 ARM_OF = {EQUAL: "equal", JOINT: MAIN}
 STAGES = (PRETRAIN, EDGE, CLOUD)
 
 
-def compare_plans(recipe: RunRecipe, runs: Sequence[Run]) -> AllocationResult:
-    """Return the results of both plans of `recipe`, from a run of each seed.
+def budget_recipes(recipe: RunRecipe, seeds: Sequence[int]) -> dict[str, RunRecipe]:
+    """Return the recipe of each run, every factor of `BUDGETS` with every seed, by the name of its folder."""
+    return {
+        _name_run(factor, seed): recipe.model_copy(
+            update={
+                "seed": seed,
+                "budgets_mb": Budgets(
+                    wireless=factor * recipe.budgets_mb.wireless, wireline=factor * recipe.budgets_mb.wireline
+                ),
+            }
+        )
+        for factor, seed in product(BUDGETS, seeds)
+    }
+
+
+def _name_run(factor: float, seed: int) -> str:
+    return f"x{factor:g}-seed{seed}"
+
+
+def compare_plans(recipe: RunRecipe, runs: Mapping[float, Sequence[Run]]) -> AllocationResult:
+    """Return the results of both plans of `recipe`, from runs of each seed by the factor of its budgets.
 
     Raises `InputError` where no sensor was placed in a region.
     """
-    rows = tuple(one_seed(run) for run in runs)
-    asked = recipe.model_dump(mode="json", exclude={"seed"})
-    results = AllocationResult(_history_ranges(), rows, summarise(rows), recipe=asked, provenance=provenance())
-    return replace(results, findings=allocation_findings(results))
+    rows = {factor: tuple(one_seed(run) for run in own) for factor, own in runs.items()}
+    budgets = [AtBudgets(factor, own, summarise(own)) for factor, own in rows.items()]
+    asked, history = recipe.model_dump(mode="json", exclude={"seed"}), _history_ranges()
+    found = allocation_findings(budgets, history)
+    told = tuple(replace(each, findings=own) for each, own in zip(budgets, found, strict=True))
+    return AllocationResult(history, told, recipe=asked, provenance=provenance())
 
 
 def one_seed(run: Run) -> AllocationSeed:
@@ -134,7 +158,11 @@ def summarise(seeds: Sequence[AllocationSeed]) -> AllocationSummary:
 
 
 def draw_allocation(results: AllocationResult) -> bytes:
-    """Return predicted and realised AP of both plans, and their paired differences, as a PNG."""
+    """Return predicted and realised AP of both plans, and their paired differences, as a PNG; a row per budgets."""
+    return style.png(plans.predicted_and_realised({each.name: _collect(each) for each in results.budgets}, TOWN))
+
+
+def _collect(results: AtBudgets) -> plans.PlansReached:
     summary, seeds = results.summary, results.seeds
     ap = {
         name: {
@@ -155,4 +183,4 @@ def draw_allocation(results: AllocationResult) -> bytes:
         )
         for stage in STAGES
     }
-    return style.png(plans.predicted_and_realised(ap, differences, TOWN))
+    return plans.PlansReached(ap, differences)

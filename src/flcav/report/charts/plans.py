@@ -98,13 +98,25 @@ class StageReached:
 ByStage = Mapping[str, StageReached]  # of each of `STAGES`
 
 
+@dataclass(frozen=True)
+class PlansReached:
+    """AP50 after each stage, by plan, and the paired differences of the two plans."""
+
+    ap: Mapping[str, ByStage]
+    differences: ByStage
+
+
 @style.styled
-def predicted_and_realised(ap: Mapping[str, ByStage], differences: ByStage, town: str) -> Figure:
-    """Return AP50 of both plans after each stage in `town`, predicted and trained, and their paired differences."""
-    figure = style.canvas(9.0, 3.9)
-    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    _draw_ap(left, ap, town)
-    _draw_differences(right, differences)
+def predicted_and_realised(budgets: Mapping[str, PlansReached], town: str) -> Figure:
+    """Return AP50 of both plans after each stage in `town`, predicted and trained, and their paired differences.
+
+    A row of axes for each of the `budgets`, by name.
+    """
+    figure = style.canvas(9.0, 0.6 + 3.3 * len(budgets))
+    rows = figure.subplots(len(budgets), 2, width_ratios=(3, 2), squeeze=False, sharey="col")
+    for (name, own), (left, right) in zip(budgets.items(), rows, strict=True):
+        _draw_ap(left, own.ap, f"budgets {name}: AP50 on {town}")
+        _draw_differences(right, own.differences)
     handles = [
         Line2D([], [], color=colour, marker="o", label=PLAN_NAMES[name]) for name, colour in PLAN_COLOURS.items()
     ]
@@ -117,7 +129,7 @@ def predicted_and_realised(ap: Mapping[str, ByStage], differences: ByStage, town
     return figure
 
 
-def _draw_ap(axes: Axes, ap: Mapping[str, ByStage], town: str) -> None:
+def _draw_ap(axes: Axes, ap: Mapping[str, ByStage], title: str) -> None:
     for side, (name, colour) in zip((-ASIDE, ASIDE), PLAN_COLOURS.items(), strict=True):
         places = [number + side for number in range(len(STAGES))]
         reached = [ap[name][stage] for stage in STAGES]
@@ -129,7 +141,7 @@ def _draw_ap(axes: Axes, ap: Mapping[str, ByStage], town: str) -> None:
             for seed in each.seeds:
                 axes.plot(place, seed, ".", color=colour, alpha=0.5)
     axes.set_xticks(range(len(STAGES)), list(STAGES.values()))
-    axes.set_title(f"AP50 on {town} after each stage", fontweight="bold")
+    axes.set_title(title, fontweight="bold")
     axes.grid(axis="y")
 
 
