@@ -40,8 +40,8 @@ ARM_OF = {EQUAL: "equal", JOINT: MAIN}
 STAGES = (PRETRAIN, EDGE, CLOUD)
 
 
-def budget_recipes(recipe: RunRecipe, seeds: Sequence[int]) -> dict[str, RunRecipe]:
-    """Return the recipe of each run, every factor of `BUDGETS` with every seed, by the name of its folder."""
+def budget_recipes(recipe: RunRecipe, seeds: Sequence[int], factors: Sequence[float] = BUDGETS) -> dict[str, RunRecipe]:
+    """Return the recipe of each run, every factor of the budgets with every seed, by the name of its folder."""
     return {
         _name_run(factor, seed): recipe.model_copy(
             update={
@@ -51,8 +51,16 @@ def budget_recipes(recipe: RunRecipe, seeds: Sequence[int]) -> dict[str, RunReci
                 ),
             }
         )
-        for factor, seed in product(BUDGETS, seeds)
+        for factor, seed in product(factors, seeds)
     }
+
+
+def plans_differ(run: Run) -> bool:
+    """Return whether the joint plan of a run has other samples or rounds than equal stages.
+
+    Where it has not, both arms are one training, and more seeds tell nothing about their difference.
+    """
+    return not one_seed(run).coincide
 
 
 def _name_run(factor: float, seed: int) -> str:
