@@ -84,11 +84,19 @@ def test_the_average_has_what_the_road_sees_and_what_it_cannot_see_but_a_vehicle
     assert near(blind.boxes, GHOST)  # nobody saw that the ground is free
 
 
-def test_two_vehicles_that_agree_are_surer_than_each() -> None:
-    one, other = (Sighting(f"cav{n}", 1.0, np.eye(4), boxes(UNSURE, score=0.5), navigation=ACCURATE) for n in (0, 1))
-    assert not len(average_spin([one], [], CONFIG, 0.7)[0].boxes)
-    both = average_spin([one, other], [], CONFIG, 0.7)
-    assert [each.confirmed.tolist() for each in both] == [[True], [True]]  # 1 - .5 * .5 is above the threshold
+def test_two_vehicles_confirm_an_object_that_each_is_sure_of() -> None:
+    def told(*scores: float, threshold: float) -> list[list[bool]]:
+        seen = [
+            Sighting(f"cav{n}", 1.0, np.eye(4), boxes(UNSURE, score=score), navigation=ACCURATE)
+            for n, score in enumerate(scores)
+        ]
+        return [each.confirmed.tolist() for each in average_spin(seen, [], CONFIG, threshold)]
+
+    assert told(0.5, threshold=0.6) == [[]]
+    assert told(0.5, 0.5, threshold=0.4) == [[True], [True]]
+    assert told(0.5, 0.5, threshold=0.6) == [[False], [False]]  # 1 - .5 * .5 is no probability: both run one network
+    assert told(0.9, 0.5, threshold=0.6) == [[False], [False]]
+    assert told(0.9, 0.5, 0.8, threshold=0.6) == [[True]] * 3
 
 
 def test_nobody_tells_of_anything_and_that_is_an_average_too() -> None:
