@@ -81,7 +81,10 @@ def compare_plans(recipe: RunRecipe, runs: Mapping[float, Sequence[Run]]) -> All
 
 
 def one_seed(run: Run) -> AllocationSeed:
-    """Return the numbers of one seed's run."""
+    """Return the numbers of one seed's run.
+
+    What is predicted is told by the plans before the run: those made anew by the joint plan's run rest on its scores.
+    """
     towns = run.recipe.with_role("federate")
     arms = {name: run.arms[arm] for name, arm in ARM_OF.items()}
     plan_of = {name: arm.plan.tasks[TASK] for name, arm in arms.items()}
@@ -90,7 +93,7 @@ def one_seed(run: Run) -> AllocationSeed:
         for each in run.differences
         if (each.arm, each.before_arm) == (MAIN, ARM_OF[EQUAL])
     }
-    predicted = {name: dict(plan.predicted or {}) for name, plan in plan_of.items()}
+    predicted = {name: dict(arm.plans[0].tasks[TASK].predicted or {}) for name, arm in arms.items()}
     return AllocationSeed(
         seed=run.recipe.seed,
         plans={
