@@ -5,11 +5,14 @@ from dataclasses import replace
 import pytest
 
 from flcav.intervals import Estimate, Spread
-from flcav.pipeline import results
-from flcav.pipeline.findings import findings
+from flcav.pipeline.collecting.findings import findings
+from flcav.pipeline.collecting.history import gap_closed, gaps_closed
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results import ArmResult, Difference, Placed, Plan
-from flcav.pipeline.running import gap_closed, gaps_closed
+from flcav.pipeline.results import tests as results
+from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.run import ArmResult
+from flcav.pipeline.results.tests import Difference
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
 
 CAVEAT = "ideal road detector, upper bound"

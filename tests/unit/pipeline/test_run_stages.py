@@ -27,19 +27,14 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Practice, Task
 from flcav.perception.training import train
 from flcav.perception.weights import to_arrays
-from flcav.pipeline import stages
 from flcav.pipeline.federations.rounds import FederationCheckpoints, round_path
 from flcav.pipeline.recipe import Training
-from flcav.pipeline.results import WEIGHTS
-from flcav.pipeline.stages import (
-    Learning,
-    choose_planned_uploads,
-    choose_uploads,
-    pretrain,
-    region_budget,
-    share_budget,
-    train_centrally,
-)
+from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.stages import centralised
+from flcav.pipeline.stages.centralised import pretrain, train_centrally
+from flcav.pipeline.stages.learning import Learning
+from flcav.pipeline.stages.uploads import choose_planned_uploads, choose_uploads
+from flcav.pipeline.work.budgets import region_budget, share_budget
 from flcav.progress import Report, ignore_progress
 from flcav.seeds import derive_seed
 
@@ -237,7 +232,7 @@ def test_pretraining_takes_the_tasks_schedule_and_ends_with_its_last_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learning = Learning(LINEAR, None, Training(steps=25), 3)
-    monkeypatch.setattr(stages, "mean_score", lambda task, network, splits: -float(network.weight.detach()))
+    monkeypatch.setattr(centralised, "mean_score", lambda task, network, splits: -float(network.weight.detach()))
     found = pretrain(learning, SAMPLES, (), tmp_path, ignore_progress)
     other = learning.build_network()
     history = train(LINEAR, other, SAMPLES, steps=25, schedule="one_cycle", seed=derive_seed(3, "pretrain"))
@@ -249,7 +244,7 @@ def test_pretraining_takes_the_tasks_schedule_and_ends_with_its_last_step(
 
 
 def test_a_kill_does_not_change_pretraining(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages, "mean_score", lambda task, network, splits: float(network.bias.detach()))
+    monkeypatch.setattr(centralised, "mean_score", lambda task, network, splits: float(network.bias.detach()))
 
     def killed(done: int, total: int, note: str = "") -> None:
         if done == 70:
@@ -291,7 +286,7 @@ def test_a_central_control_takes_the_steps_of_all_vehicles_at_the_same_rates(mon
         taken.append(how)
         return 0.5
 
-    monkeypatch.setattr(stages, "train_steps", counted)
+    monkeypatch.setattr(centralised, "train_steps", counted)
     learning = Learning(OBJECTS, "tiny", Training(local_steps=16), 3)
     losses = train_centrally(learning, None, [1, 2, 3], rounds=5, clients=4, name="federate")
     edge = learning.schedule(5, 16, "edge", "grid")

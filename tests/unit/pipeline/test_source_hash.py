@@ -13,7 +13,7 @@ import pytest
 from flcav.experiments.splits import record_split
 from flcav.experiments.studies import STUDIES, study_named
 from flcav.pipeline.steps.source_hash import PACKAGES, Sources, find_definitions
-from flcav.pipeline.work import recording, testing, training
+from flcav.pipeline.work import cloud, edge, pretraining, recording, testing
 
 TOY = {
     "__init__.py": """
@@ -149,10 +149,10 @@ def test_one_constant_of_a_module_is_reached_or_all_where_the_module_is_passed_o
 STEPS = {
     "recording": record_split,
     "frames": recording.record_step,
-    "pretraining": training.pretrain_step,
+    "pretraining": pretraining.pretrain_step,
     "evaluation": testing.test_step,
-    "stage II": training.edge_step,
-    "stage III": training.cloud_step,
+    "stage II": edge.edge_step,
+    "stage III": cloud.cloud_step,
 } | {f"{name}, {part}": getattr(study_named(name), part) for name in STUDIES for part in ("learn", "test")}
 
 

@@ -8,7 +8,8 @@ if the interval contains 0 or the spread is not known: another training on the s
 from collections.abc import Mapping, Sequence
 
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
-from flcav.pipeline.results import ArmResult, Difference, Finding, Test
+from flcav.pipeline.results.run import ArmResult
+from flcav.pipeline.results.tests import Difference, Finding, Test
 from flcav.verdicts import UNDECIDED, explain_verdict, signed, verdict
 
 WORDS = {
