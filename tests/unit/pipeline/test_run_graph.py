@@ -303,6 +303,8 @@ def test_arms_of_distillation_share_all_but_stage_two_and_have_their_labels_meas
     scored = [name for name, own in settings.items() if getattr(own, "scored", False)]
     assert scored == ["grid-edge-fl-objects", *edges]
     assert settings["grid-edge-fl-objects"].distillation is None
+    several = {step.name: settings_of(step) for step in Graph(recipe_of(tasks=SEVERAL, arms=arms), Path()).steps}
+    assert [several[f"grid-edge-fl-{task}"].scored for task in SEVERAL] == [True, False, False]
     before = {step.name: settings_of(step) for step in Graph(recipe_of(), Path()).steps}
     assert not any(getattr(own, name, False) for own in before.values() for name in ("scored", "distillation"))
     same = {"grid-edge-fl-objects"}  # whose labels are measured now

@@ -36,7 +36,6 @@ def collect_results(graph: Graph, work: Path) -> Run:
     ]
     arms = {name: _arm(graph, work, arm) for name, arm in settings.items()}
     differences = list_differences(graph, work)
-    rules = {name: arm.placement.rule for name, arm in settings.items()}
     roles = {name: region.role for name, region in recipe.regions.items()}
     rests = {task: LABEL_SOURCES[kind].caveat for task, kind in main.labels.items()}
     return Run(
@@ -46,7 +45,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
         watched=tuple(watched),
         tested=tuple(tests),
         differences=tuple(differences),
-        findings=findings(differences, tests, arms, rules, roles, rests),
+        findings=findings(differences, tests, arms, settings, roles, rests),
         gap_closed=gaps_closed(tests, recipe),
         provenance=provenance(recipe.seed),
         caveats=tuple(dict.fromkeys(filter(None, rests.values()))),

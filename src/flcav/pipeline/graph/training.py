@@ -34,8 +34,8 @@ def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:
 
 def list_edge_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
     """Yield stage II of an arm, or its centralised training, for each task and region."""
-    averaged = any(LABEL_SOURCES[kind].averaged for each in outline.settings.values() for kind in each.labels.values())
     for task in outline.recipe.tasks:
+        averaged = any(LABEL_SOURCES[each.labels[task]].averaged for each in outline.settings.values())
         for region in arm.regions:
             if arm.central:
                 yield _centralise(outline, arm, region, task)
