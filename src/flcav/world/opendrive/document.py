@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flcav.config import SHOWN, InputError, shorten
-from flcav.world.opendrive.objects import read_limit
+from flcav.world.opendrive.objects.signs import read_limit
 from flcav.world.opendrive.standard import check_standard
 
 FASTEST = 100.0  # [m/s] a limit beyond is none
