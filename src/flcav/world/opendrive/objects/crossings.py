@@ -19,6 +19,7 @@ NEAR_M = 8.0  # from a crosswalk to the crossing at a junction that it is
 ALIGNED = np.cos(np.radians(30.0))  # least cosine of the angle between them
 ENDS_M = 12.0  # no crossing of a street is nearer to its ends than this: it is one of the junction
 ON_ROAD_M = 1.5  # from the middle of a crosswalk to the road that it crosses
+BEYOND_M = 3.0  # from the kerb of a street to the end of a crosswalk, at most
 SAME_M = 1.0  # between the middle lines of the two directions of a street
 
 
@@ -83,9 +84,14 @@ def _match(crosswalks: tuple[Crosswalk, ...], guesses: list[_Guess]) -> dict[int
 
 
 def _move(guess: _Guess, crosswalk: Crosswalk) -> ElementTree.Element:
-    """Return a guessed crossing moved onto the crosswalk: from kerb to kerb, in the middle of it and as wide."""
-    way, _, width = crosswalk.along(guess.line[1] - guess.line[0])
-    ends = crosswalk.centre + np.outer((guess.line - crosswalk.centre) @ way, way)
+    """Return a guessed crossing moved onto the crosswalk: from kerb to kerb, in the middle of it and as wide.
+
+    It goes on as far as the crosswalk does, `BEYOND_M` at most: kerbs are farther apart in the corners of a junction.
+    """
+    way, length, width = crosswalk.along(guess.line[1] - guess.line[0])
+    low, high = (guess.line - crosswalk.centre) @ way
+    low, high = min(low, max(-length / 2, low - BEYOND_M)), max(high, min(length / 2, high + BEYOND_M))
+    ends = crosswalk.centre + np.outer((low, high), way)
     return _crossing(guess.row.attrib["node"], guess.row.attrib["edges"], guess.row.get("priority", "0"), width, ends)
 
 

@@ -94,25 +94,30 @@ class _Ways:
         shapely.prepare(self._road)
 
     def find(self, references: list[Placed], own: Placed) -> Connection | None:
-        """Return the way that a signal is for: by its references in junctions, else by others and its own road.
+        """Return the way that a signal is for: by its references in junctions, else by others, else by its own road.
 
-        Of several the straight one is taken first.
+        Of several from the street of the nearest one, the straight one is taken first.
         """
-        places = [*references, own]
-        for inside in (True, False):
+        inside = [place for place in references if _is_inside(place)]
+        outside = [place for place in references if not _is_inside(place)]
+        for places in (inside, outside, [own]):
             found = [
                 way
                 for row, signal in places
-                if (row.get("junction", "-1") != "-1") == inside
                 for start, end in _travelled(row, signal)
-                if (way := self._nearest(start + self._offset, end + self._offset, inside=inside)) is not None
+                if (way := self._nearest(start + self._offset, end + self._offset, inside=_is_inside((row, signal))))
             ]
             if found:
-                return min(found, key=lambda way: way.turn != "s")
+                street = min(found, key=lambda item: item[0])[1].start.rpartition("_")[0]
+                own_street = [way for _, way in found if way.start.rpartition("_")[0] == street]
+                return min(own_street, key=lambda way: way.turn != "s")
         return None
 
-    def _nearest(self, start: Array, end: Array, *, inside: bool) -> Connection | None:
-        """Return the way next to a road travelled from `start` to `end`; of those of one lane the straight one."""
+    def _nearest(self, start: Array, end: Array, *, inside: bool) -> tuple[float, Connection] | None:
+        """Return the way next to a road travelled from `start` to `end`, and how far it is [m].
+
+        Outside junctions only the end counts; of the ways of one lane the straight one is taken.
+        """
         rated = []
         for way in self._lit:
             before, after = self._lanes[way.start], self._lanes[way.end]
@@ -123,7 +128,8 @@ class _Ways:
                 continue
             if apart <= (WAY_M if inside else PLACE_M):
                 rated.append((round(apart, 3), way.turn != "s", way.light, way))
-        return min(rated, key=lambda item: item[:3])[3] if rated else None
+        nearest = min(rated, key=lambda item: item[:3], default=None)
+        return None if nearest is None else (nearest[0], nearest[3])
 
     def heading(self, way: Connection) -> Array:
         """Return the unit vector in which traffic comes to the light of a way."""
@@ -133,6 +139,11 @@ class _Ways:
     def on_road(self, x: float, y: float) -> bool:
         """Return whether a place is on a lane, or within `KERB_M` of one."""
         return bool(shapely.dwithin(self._road, shapely.Point(x, y), KERB_M))
+
+
+def _is_inside(place: Placed) -> bool:
+    """Return whether a road lies in a junction."""
+    return place[0].get("junction", "-1") != "-1"
 
 
 def _travelled(row: ElementTree.Element, signal: ElementTree.Element) -> Iterator[tuple[Array, Array]]:
