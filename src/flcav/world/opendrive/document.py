@@ -50,14 +50,15 @@ def read_map(path: Path) -> ElementTree.Element:
     header = root.find("header")
     if root.tag.lower() != "opendrive" or header is None:
         raise InputError(
-            f"{path}: not an OpenDRIVE map (its root is <{root.tag[:SHOWN]}>, expected <OpenDRIVE> with a <header>)"
+            f"{path}: not an OpenDRIVE map (its root is <{root.tag[:SHOWN]}>, "
+            "expected <OpenDRIVE> with a <header>: OpenDRIVE 1.8, 6.4)"
         )
     if header.get("revMajor") != "1":
         raise InputError(
             f"{path}: OpenDRIVE version {shorten(header.get('revMajor', ''))} is not supported; supported: 1.x"
         )
     if root.find("road") is None:
-        raise InputError(f"{path}: has no <road>")
+        raise InputError(f"{path}: has no <road> (OpenDRIVE 1.8, 10.1)")
     check_standard(root, path)
     return root
 

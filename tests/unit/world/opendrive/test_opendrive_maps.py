@@ -147,13 +147,24 @@ def test_limits_that_are_not_finite_are_left_out() -> None:
     assert [row.get("max") for row in root.iter("speed")] == ["13.9", "no limit"] * 2
 
 
+def test_roads_that_are_linked_across_a_country_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.xodr"
+    path.write_text(CROSS.read_text().replace('y="5428000.0000"', 'y="7"', 1))
+    with pytest.raises(InputError, match=r"roads that are linked lie apart: .* to join 0\.\d+ km of roads .*10\.3\)"):
+        import_town(path, tmp_path / "town")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ('length="60.0000"', 'length="nan"', r"road '1': <geometry> needs a number as 'length', not 'nan' .*9\.2"),
         ('length="60.0000"', 'length="6"', r"road '1' is 90 m long, and its geometry 36 m .*9\.2"),
         ('<arc curvature="0.02"/>', "", r"a <geometry> needs one of line, arc"),
-        ('id="2" junction', 'id="1" junction', r"each road needs an id of its own, and two have '1' .*10\)"),
+        ('id="2" junction', 'id="1" junction', r"each road needs an id of its own, and two have '1' .*10\.1\)"),
+        ('revMajor="1"', 'revMajor="2"', "version '2' is not supported"),
+        ("<header", "<heading", r"expected <OpenDRIVE> with a <header>: OpenDRIVE 1.8, 6\.4"),
+        ("<lanes>", '<lanes><laneOffset s="x"/>', r"<laneOffset> needs a number as 's', not 'x' .*11\.4\)"),
+        ("<junction ", '<junction id="10"/><junction ', r"each junction needs an id of its own.*12\.2\)"),
         ('<lane id="1" type', '<lane id="2" type', r"road '1': its left lanes are not numbered one by one .*11\.1"),
         ('a="3.5"', 'a="3500"', r"a lane is 3500 m wide"),
         ('<laneSection s="0">', '<laneSection s="">', r"<laneSection> needs a number as 's', not '' .*11\.3"),
@@ -161,7 +172,7 @@ def test_limits_that_are_not_finite_are_left_out() -> None:
     ],
 )
 def test_a_broken_rule_is_told_with_its_clause(old: str, new: str, message: str, tmp_path: Path) -> None:
-    text = CROSS.read_text()
+    text = CROSS.read_text().replace("</header>", f"</{new.removeprefix('<') if 'head' in new else 'header'}>")
     assert old in text
     path = tmp_path / "map.xodr"
     path.write_text(text.replace(old, new, 1))
