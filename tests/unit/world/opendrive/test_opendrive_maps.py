@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shapely.affinity import scale
 from shapely.geometry import LineString, Point, Polygon
 
 from flcav.config import InputError
+from flcav.world.map.lanes import map_layers
 from flcav.world.map.roads import Edge, RoadNet, read_net
 from flcav.world.map.surfaces import subtract, unite
 from flcav.world.map.town import Town
@@ -22,6 +24,7 @@ from flcav.world.traffic.reach import find_driven, find_walked
 from flcav.world.traffic.traffic import simulate
 
 CROSS = Path(__file__).parents[3] / "data" / "cross.xodr"
+OBJECTS = CROSS.with_name("cross_with_objects.xodr")
 
 pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
 
@@ -36,7 +39,7 @@ def write(root: ElementTree.Element, path: Path) -> Path:
 
 
 def test_left_hand_traffic_is_the_mirror_image(tmp_path: Path) -> None:
-    root = read_map(CROSS)
+    root = read_map(OBJECTS)
     for geometry in root.iter("geometry"):  # the map at its origin, so that both towns are mirrored in the same axis
         geometry.set("x", str(float(geometry.attrib["x"]) - 458_000))
         geometry.set("y", str(float(geometry.attrib["y"]) - 5_428_000))
@@ -50,10 +53,16 @@ def test_left_hand_traffic_is_the_mirror_image(tmp_path: Path) -> None:
             assert min(line.hausdorff_distance(known) for known in lines(one, 1, kind)) < 0.1
             start = Point(line.coords[0])
             assert min(start.distance(Point(known.coords[0])) for known in lines(one, 1, kind)) < 0.1
-    for name in ("poles", "signs"):
+    for name in ("poles", "signs", "signals"):
         here, there = getattr(right, name), getattr(left, name)
         away = np.linalg.norm(here.position[:, None] - there.position * (1, -1, 1), axis=2)
         assert (away.min(axis=0) < 0.3).all(), name
+    crossings = [[Polygon(row.outline) for row in map_layers(town).crossings] for town in (right, left)]
+    assert len(crossings[0]) == len(crossings[1]) == 2
+    for area in crossings[0]:
+        mirrored = scale(area, 1, -1, origin=(0, 0))
+        assert min(mirrored.symmetric_difference(other).area for other in crossings[1]) < 0.3
+    assert len(left.parameters.parking) == len(right.parameters.parking) == 4
     trace = simulate(left, seed=1, cavs=1, times_s=np.array([20.0, 21.0]))
     _keeps_to_its_lanes(left, trace.position[:, np.char.startswith(trace.actor, "cav"), :2].reshape(-1, 2))
 
