@@ -1,10 +1,13 @@
 """Conversion between weights and updates (NumPy) and the records of Flower's messages."""
 
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
+from flwr.common.constant import SType
+from numpy.typing import NDArray
 
 from flcav.federation.trainable import LocalUpdate, Update, Weights
 
@@ -38,7 +41,15 @@ class LocalWork:
 
 def to_arrays(weights: Weights) -> ArrayRecord:
     """Return weights as a Flower array record, in the same order."""
-    return ArrayRecord({name: Array(np.asarray(value, order="C")) for name, value in weights.items()})
+    return ArrayRecord({name: _to_array(np.asarray(value, order="C")) for name, value in weights.items()})
+
+
+def _to_array(value: NDArray[np.number]) -> Array:
+    """Return an array in C order as Flower does, in NumPy's file format, but copied once instead of twice."""
+    head = BytesIO()
+    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(value))
+    data = b"".join((head.getvalue(), value.data))
+    return Array(dtype=str(value.dtype), shape=value.shape, stype=SType.NUMPY, data=data)
 
 
 def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
