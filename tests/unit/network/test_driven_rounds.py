@@ -1,5 +1,6 @@
 """Rounds on a network: who takes part, who is lost, by name and in bytes, and how long a round takes."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,11 @@ from flcav.network.clock.rounds import NetworkSettings, RoundRules
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.wireline import Wireline
+from flcav.pipeline.federations import prediction
 from flcav.pipeline.federations.network import DrivenRounds, Fleet, drive_rounds, join_regions
-from flcav.pipeline.federations.prediction import predict_air_s
+from flcav.pipeline.federations.prediction import link_drive, measure_uplinks, predict_air_s
 from flcav.pipeline.recipe import CLOUD
+from flcav.pipeline.stages.placement import Sites
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
 MB = 1_000_000
@@ -186,3 +189,33 @@ def test_a_plan_s_time_on_the_air_is_the_mean_of_those_that_share_the_band():
     assert predict_air_s([alone], 5_000_000, 10_000_000) == pytest.approx(6.0)
     assert predict_air_s([alone, pair, deaf], 5_000_000, 10_000_000) == pytest.approx((6.0 + 12.0 + 12.0) / 3)
     assert predict_air_s([deaf, made_links([0.0], {"cav0": 30.0})], 5_000_000, 10_000_000) is None
+
+
+def test_before_sensors_are_placed_vehicles_are_linked_to_the_pole_with_most_traffic(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    linked = {"s0": made_links(TIMES, {"cav0": GOOD, "cav1": NAN}), "s1": made_links(TIMES, {"cav0": NONE})}
+    asked: list[Any] = []
+
+    def link(data: Any, radio: Any, poles: Any, scene: str, seed: int) -> Any:
+        asked.append((poles, scene, seed))
+        return SimpleNamespace(links=linked[scene])
+
+    sites, nowhere = (
+        Sites(np.array([4, 7]), np.array([[0.0, 0, 6], [50.0, 0, 6]])),
+        Sites(np.zeros(0, int), np.zeros((0, 3))),
+    )
+    monkeypatch.setattr(prediction, "link_scene", link)
+    monkeypatch.setattr(prediction, "find_sites", lambda drive, edge: sites if edge is None else nowhere)
+    monkeypatch.setattr(prediction, "read_traces", lambda data, frames: ())
+    monkeypatch.setattr(prediction, "measure_traffic_density", lambda at, traces, range_m: np.array([1.0, 3.0]))
+    keys = [SimpleNamespace(scene=scene) for scene in ("s0", "s0", "s1")]
+    pool: Any = SimpleNamespace(data=SimpleNamespace(keys=keys, town=lambda: "grid"), vehicles=(0, 1, 2))
+    settings = NetworkSettings()
+    assert link_drive("grid", pool, settings, 40.0, 3, recorded=False) == [*linked.values()]
+    assert asked == [((7,), "s0", 3), ((7,), "s1", 3)]
+    rates = measure_uplinks("grid", pool, settings, 40.0, 3)
+    best = linked["s0"].rate_bps[0, 0, 0] / 1e6
+    assert rates == pytest.approx({"grid/cav0": best / 2, "grid/cav1": 0.0}, abs=1e-3)
+    with pytest.raises(InputError, match="'grid' has no poles"):
+        link_drive("grid", pool, settings, 40.0, 3, recorded=True)

@@ -7,8 +7,6 @@ roadside units are on the poles of its sensors.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from flcav.config import InputError
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Outage
@@ -21,8 +19,6 @@ from flcav.network.radio.recorded import link_scene
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import CLOUD
 from flcav.pipeline.results.placement import Placed
-from flcav.pipeline.stages.placement import find_sites, read_traces
-from flcav.world.map.census import measure_traffic_density
 
 CLOCK = "clock"  # begins the names of the files of rounds on the network, by region
 AWAY, TOO_SLOW = "not in the town", "predicted past the deadline"
@@ -74,26 +70,6 @@ def link_scenes(
     poles = placed.chosen or (placed.densest,)
     linked = (link_scene(split.data, settings.radio, poles, scene, seed).links for scene in scenes[len(known) :])
     return [*known, *linked]
-
-
-def measure_uplinks(
-    region: str, split: Frames, settings: NetworkSettings, range_m: float, seed: int
-) -> dict[str, float]:
-    """Return the mean rate of the uplink [Mbit/s] of each vehicle of a split, "region/vehicle", over all its scenes.
-
-    The roadside unit is on the pole with most traffic within `range_m`, and each vehicle has its whole band; where it
-    is not in the town, its rate is 0. Raises `InputError` where there is no pole, and as `link_scene`.
-    """
-    sites = find_sites(split, split if split.data.town() is None else None)
-    if not len(sites.number):
-        raise InputError(f"federation.network: '{region}' has no poles for roadside units")
-    density = measure_traffic_density(sites.position, read_traces(split.data, split.vehicles), range_m)
-    pole, rates = int(sites.number[int(np.argmax(density))]), dict[str, list[float]]()
-    for scene in dict.fromkeys(split.data.keys[i].scene for i in split.vehicles):
-        links = link_scene(split.data, settings.radio, (pole,), scene, seed).links
-        for vehicle, mean in zip(links.vehicle, links.rate_bps[:, :, 0].mean(axis=0) / 1e6, strict=True):
-            rates.setdefault(f"{region}/{vehicle}", []).append(float(mean))
-    return {name: float(np.mean(each)) for name, each in rates.items()}
 
 
 def drive_rounds(

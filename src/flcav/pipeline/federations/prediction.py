@@ -1,4 +1,7 @@
-"""Time that messages of a round take on the air, predicted for a plan before vehicles are driven in training data."""
+"""Links of vehicles before sensors are placed, and what a plan takes from them: rates, and time on the air of a round.
+
+The roadside unit is on the pole with most traffic.
+"""
 
 from collections.abc import Sequence
 
@@ -29,6 +32,20 @@ def link_drive(
     pole = int(sites.number[int(np.argmax(actors))])
     scenes = dict.fromkeys(drive.data.keys[i].scene for i in drive.vehicles)
     return [link_scene(drive.data, settings.radio, (pole,), scene, seed).links for scene in scenes]
+
+
+def measure_uplinks(
+    region: str, drive: Frames, settings: NetworkSettings, range_m: float, seed: int
+) -> dict[str, float]:
+    """Return the mean rate of the uplink [Mbit/s] of each vehicle of a drive, "region/vehicle", over all its scenes.
+
+    Each vehicle has the whole band; where it is not in the town, its rate is 0. See `link_drive`.
+    """
+    rates = dict[str, list[float]]()
+    for links in link_drive(region, drive, settings, range_m, seed, recorded=drive.data.town() is None):
+        for vehicle, mean in zip(links.vehicle, links.rate_bps[:, :, 0].mean(axis=0) / 1e6, strict=True):
+            rates.setdefault(f"{region}/{vehicle}", []).append(float(mean))
+    return {name: float(np.mean(each)) for name, each in rates.items()}
 
 
 def predict_air_s(scenes: Sequence[RadioLinks], download_bytes: int, upload_bytes: int) -> float | None:
