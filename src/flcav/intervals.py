@@ -18,13 +18,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logit, nctdtr, stdtr, stdtrit
+from scipy.optimize import root_scalar
+from scipy.special import expit, logit, nctdtr, ndtri, stdtr, stdtrit
 
 CONFIDENCE = 0.95
 REDRAWS = 1000
 TAILS = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
 EDGE = 1e-6  # log-odds are taken of shares this far from 0 and 1
 LEVEL = 1 - CONFIDENCE  # of a test, two-sided
+LEAST_P = 1e-12  # p-values below are 0
 POWER = 0.8  # chance to tell an effect that a number of seeds is planned for
 MOST_SEEDS = 1000  # that a plan of seeds is sought up to
 
@@ -153,6 +155,44 @@ def widen(estimate: Estimate, spread: Spread) -> Estimate:
     below, above = estimate.mean - estimate.low, estimate.high - estimate.mean
     half = spread.half_width
     return Estimate(estimate.mean, estimate.mean - np.hypot(below, half), estimate.mean + np.hypot(above, half))
+
+
+@dataclass(frozen=True)
+class OneTraining(MeanOverSeeds):
+    """A number of one training whose standard deviation over trainings on the same frames is known from others.
+
+    `shared` is that of the test scenes, towards 0. Interval and p-value are those of `widen`.
+    """
+
+    trainings: int = 2  # that the standard deviation was estimated from
+
+    @property
+    def known(self) -> bool:
+        """Return that there is a test."""
+        return True
+
+    def p_value(self, hypothesis: float = 0.0) -> float:
+        """Return the level at which the interval of `widen` ends at `hypothesis`."""
+        far = abs(self.distance(hypothesis))
+
+        def beyond(p: float) -> float:
+            scenes, trainings = ndtri(1 - p / 2) * self.shared.sd, stdtrit(self.trainings - 1, 1 - p / 2) * self.sd
+            return float(np.hypot(scenes, trainings)) - far
+
+        if far == 0:
+            return 1.0
+        return 0.0 if beyond(LEAST_P) < 0 else float(root_scalar(beyond, bracket=(LEAST_P, 1.0)).root)
+
+
+def of_one_training(over_scenes: Estimate, scenes: int, spread: Spread) -> OneTraining | None:
+    """Return a number of one training with the interval of `widen`; None where there is none over its scenes."""
+    mean, low, high = over_scenes.mean, over_scenes.low, over_scenes.high
+    if low is None or high is None:
+        return None
+    wide = widen(over_scenes, spread)
+    half = mean - low if mean > 0 else high - mean
+    shared = SharedScenes(half / float(ndtri(TAILS[1])), scenes)
+    return OneTraining(mean, wide.low, wide.high, 1, spread.sd, shared, trainings=spread.trainings)
 
 
 def widen_share(estimate: Estimate, spread: Spread) -> Estimate:

@@ -27,11 +27,11 @@ def verdict(low: float | None, high: float | None) -> str:
 
 
 def explain_verdict(decided: str) -> str:
-    """Return a clause that explains the verdict `decided` of `verdict`, for one run."""
+    """Return a clause that says the verdict `decided` on a claim of one run."""
     return {
-        HELD: "the interval lies above 0, so the claim held in this run",
-        NOT_HELD: "the interval lies below 0, so the claim did not hold in this run",
-        UNDECIDED: "the interval contains 0, so this run does not decide",
+        HELD: "the claim held in this run",
+        NOT_HELD: "the claim did not hold in this run",
+        UNDECIDED: "this run does not decide",
     }[decided]
 
 
@@ -53,8 +53,11 @@ class Judged:
     family: int  # number of claims that are judged together
     seeds: int | None  # that it takes to decide, if the effect is as large as was found; None: unknown, or too many
 
-    def describe(self) -> str:
-        """Return p and the number of claims as text, and of an undecided claim how many seeds it would take."""
+    def describe(self, takes: str = "seeds") -> str:
+        """Return p and the number of claims as text, and of an undecided claim how many seeds it would take.
+
+        `takes`: the word for seeds.
+        """
         if self.p is None:
             return "the spread over seeds is not known"
         corrected = f", corrected for {self.family} claims" if self.family > 1 else ""
@@ -62,7 +65,7 @@ class Judged:
         if self.verdict != UNDECIDED:
             return said
         seeds = f"more than {MOST_SEEDS}" if self.seeds is None else f"about {self.seeds}"
-        return f"{said}; to tell an effect of this size takes {seeds} seeds"
+        return f"{said}; to tell an effect of this size takes {seeds} {takes}"
 
 
 def correct_p_values(p_values: Sequence[float]) -> list[float]:
