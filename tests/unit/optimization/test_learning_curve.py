@@ -202,10 +202,3 @@ def test_bands_are_infinite_where_the_error_is():
 def test_an_exponent_at_a_bound_of_the_search_is_not_identified(b: float, said: str | None) -> None:
     found = explain_exponent("cloud", b)
     assert found is None if said is None else found is not None and said in found
-
-
-def test_a_step_in_the_history_does_not_identify_an_exponent() -> None:
-    """The accuracy rises with the second sample and stays: the steeper the decay, the better it fits."""
-    samples = np.arange(1.0, 9.0)
-    fit = fit_additive(samples, np.zeros(8), np.zeros(8), np.where(samples > 1, 0.8, 0.4))
-    assert any("exponent 10 is the largest that is tried" in warning for warning in fit.warnings)
